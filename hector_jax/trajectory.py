@@ -1,0 +1,74 @@
+"""What is walked: state, wrench and trajectory, and the one place that packs them into x and u.
+
+Frames: everything is in the world frame. A wrench is that of the ground on the robot, at the foot point (on the sole, under the
+ankle axis), left foot then right. The paper's state is x = [e; p; omega; v; g] with 15 entries and its input
+u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+LEFT, RIGHT = 0, 1
+
+
+class State(NamedTuple):
+    """Floating base of the single rigid body, in the world frame."""
+
+    euler: Float[Array, "*batch 3"]  # roll, pitch, yaw [rad]; yaw is continuous, not wrapped
+    position: Float[Array, "*batch 3"]  # centre of mass [m]
+    ang_velocity: Float[Array, "*batch 3"]  # [rad/s]
+    velocity: Float[Array, "*batch 3"]  # [m/s]
+
+
+class Wrench(NamedTuple):
+    """Force and moment of the ground on each foot at its foot point, world frame."""
+
+    force: Float[Array, "*batch 2 3"]  # [N], left then right
+    moment: Float[Array, "*batch 2 3"]  # [N m]
+
+
+class Trajectory(NamedTuple):
+    """One walk, sampled evenly; every world returns this and nothing else.
+
+    Sample j covers the interval from j*period to (j+1)*period: `command` is held over it, `effect` is the mean wrench of the
+    ground over it, `state`, `joints` and `feet` are true values at its end, `reference` is what the state should be there.
+    """
+
+    period: Float[Array, "*batch"]  # [s] between samples: 0.01 in srbm, 0.001 in the MuJoCo worlds
+    initial: State  # true state at t = 0, batch axes only
+    state: State  # (T, 3) each
+    reference: State  # (T, 3) each
+    command: Wrench  # (T, 2, 3) each, what the MPC asked for
+    effect: Wrench  # (T, 2, 3) each, what the ground returned
+    contact: Bool[Array, "*batch T 2"]  # planned stance
+    feet: Float[Array, "*batch T 2 3"]  # foot points [m]
+    joints: Float[Array, "*batch T 10"]  # [rad] left leg then right: hip yaw, roll, pitch, knee, ankle
+    fallen: Bool[Array, "*batch T"]  # true from the sample of the fall on
+    residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
+
+
+def pack_state(state: State, gravity: Float[Array, "3"]) -> Float[Array, "15"]:
+    """x = [e; p; omega; v; g] of Eq. 3."""
+    return jnp.concatenate([*state, gravity])
+
+
+def unpack_state(x: Float[Array, "15"]) -> State:
+    """State of x = [e; p; omega; v; g]."""
+    return State(x[0:3], x[3:6], x[6:9], x[9:12])
+
+
+def pack_wrench(wrench: Wrench) -> Float[Array, "12"]:
+    """u = [F_0; F_1; M_0; M_1] of Eq. 3."""
+    return jnp.concatenate([wrench.force.reshape(6), wrench.moment.reshape(6)])
+
+
+def unpack_wrench(u: Float[Array, "12"]) -> Wrench:
+    """Wrench of u = [F_0; F_1; M_0; M_1]."""
+    return Wrench(u[:6].reshape(2, 3), u[6:].reshape(2, 3))
+
+
+def zero_wrench(shape: tuple[int, ...] = ()) -> Wrench:
+    """No wrench on either foot, with leading axes `shape`."""
+    return Wrench(jnp.zeros((*shape, 2, 3)), jnp.zeros((*shape, 2, 3)))
