@@ -1,0 +1,1 @@
+"""The learned map from command to effect (phi)."""

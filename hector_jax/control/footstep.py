@@ -1,0 +1,75 @@
+"""Where the feet come down: touchdown points for the feet in the air and for those that will lift next.
+
+The paper's rule p_c + v dt/2 (Eq. 6) knows neither the hips nor the speed error; it is kept as `rule="paper"`. The rule that walks adds
+the lateral offset of the hip, the travel until touchdown, a velocity feedback and the lean of a turn (Raibert's rule with the capture-point turn term).
+"""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hector_jax.geometry import rot_z
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State
+
+
+@dataclass(frozen=True)
+class FootstepConfig:
+    """The rule and its gains."""
+
+    rule: str = "raibert"  # or "paper"
+    width: float = 0.08  # [m] each foot beside the middle
+    feedback: float = 0.12  # [s] k_v, on the velocity error
+    turn: float = 0.5  # share of the lean (z/g) v x omega
+
+    def __post_init__(self) -> None:
+        if self.rule not in ("raibert", "paper"):
+            raise ValueError(f"FootstepConfig.rule must be 'raibert' or 'paper', got {self.rule!r}")
+
+
+def touchdown_points(
+    config: FootstepConfig,
+    robot: Robot,
+    state: State,
+    reference: State,
+    remaining: Float[Array, "2"],
+    stance: float,
+    swing: float,
+) -> tuple[Float[Array, "2 3"], Float[Array, "2"]]:
+    """Foot points [m] and yaw [rad] at which the feet are to touch down, world frame.
+
+    Args:
+        config: the rule.
+        robot: gravity, for the lean in a turn.
+        state: base now.
+        reference: where the base should be now, for the commanded velocity and yaw rate.
+        remaining: time until each foot touches down [s].
+        stance: duration of a stance [s].
+        swing: duration of a swing [s].
+
+    Source: Eq. 6; Raibert 1986.
+    """
+    if config.rule == "paper":
+        point = state.position + state.velocity * swing / 2
+        points = jnp.stack([point, point])
+        return points.at[:, 2].set(0.0), jnp.full(2, state.euler[2])
+    yaw = state.euler[2] + reference.ang_velocity[2] * (remaining + stance / 2)
+    side = config.width * jnp.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    hips = jnp.stack([rot_z(yaw[0]) @ side[0], rot_z(yaw[1]) @ side[1]])
+    lean = jnp.cross(state.velocity, reference.ang_velocity) * state.position[2] / robot.gravity[2]
+    # Far ahead (a foot that still stands) the sway of this moment says nothing: the commanded velocity carries on from the next step.
+    travel = jnp.where(
+        (remaining > swing)[:, None],
+        state.velocity * swing / 2 + reference.velocity * (remaining[:, None] - swing / 2),
+        state.velocity * remaining[:, None],
+    )
+    points = (
+        state.position
+        + hips
+        + travel
+        + stance / 2 * state.velocity
+        + config.feedback * (state.velocity - reference.velocity)
+        + config.turn * lean
+    )
+    return points.at[:, 2].set(0.0), yaw

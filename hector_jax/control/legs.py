@@ -1,0 +1,123 @@
+"""What the joints do for the plan: stance torques, swing foot, joint PD (Eq. 5).
+
+A stance leg pushes with tau = -J^T wrench, because the wrench is that of the ground on the robot (the paper prints no minus). A swing leg
+follows a smooth path from where the foot left to where it is to land, through closed-form inverse kinematics and a joint PD that feeds the
+path's own joint rates and the leg's weight forward. The target lies a little under the ground so that the foot does land.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from hector_jax.geometry import rot_z, rotation_from_euler, wrap_angle
+from hector_jax.model.kinematics import foot_jacobians, inverse_legs, leg_gravity
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State, Wrench
+
+
+@dataclass(frozen=True)
+class LegConfig:
+    """Swing path and joint gains."""
+
+    height: float = 0.08  # [m] apex of the swing foot
+    landing: float = -0.005  # [m] height aimed at
+    kp: tuple[float, ...] = (
+        60.0,
+        60.0,
+        60.0,
+        60.0,
+        20.0,
+    )  # [N m/rad] yaw, roll, pitch, knee, ankle
+    kd: tuple[float, ...] = (1.5, 1.5, 1.5, 1.5, 0.5)  # [N m s/rad]
+    stance_weight: bool = False  # add the leg's own weight to the stance torque
+
+    def __post_init__(self) -> None:
+        for name in ("kp", "kd"):
+            gains = getattr(self, name)
+            if len(gains) != 5 or min(gains) < 0.0:
+                raise ValueError(f"LegConfig.{name} needs five gains >= 0, got {gains}")
+
+
+def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:
+    """Trunk origin [m] of a base state: p_c less the constant offset of the centre of mass."""
+    return state.position - rotation_from_euler(state.euler) @ robot.com_offset
+
+
+def stance_torques(
+    robot: Robot, state: State, joints: Float[Array, "10"], wrench: Wrench
+) -> Float[Array, "10"]:
+    """Joint torques [N m] by which the feet return `wrench` (world frame). Source: Eq. 5 with its physical sign."""
+    R_wb = rotation_from_euler(state.euler)
+    Jv, Jw = foot_jacobians(robot, joints)
+    force, moment = wrench.force @ R_wb, wrench.moment @ R_wb
+    return -(jnp.einsum("fxj,fx->fj", Jv, force) + jnp.einsum("fxj,fx->fj", Jw, moment)).reshape(10)
+
+
+def swing_path(
+    config: LegConfig, start: Float[Array, "2 3"], end: Float[Array, "2 3"], s: Float[Array, "2"]
+) -> Float[Array, "2 3"]:
+    """Foot points [m] at share s of the swing: smooth in the plane, up to the apex and down to `landing`."""
+    smooth = (s * s * (3.0 - 2.0 * s))[:, None]
+    point = start + smooth * (end - start)
+    half = jnp.where(s < 0.5, 2.0 * s, 2.0 - 2.0 * s)
+    rise = half * half * (3.0 - 2.0 * half)
+    ends = jnp.where(s < 0.5, start[:, 2], end[:, 2] + config.landing)
+    apex = jnp.maximum(start[:, 2], end[:, 2]) + config.height
+    return point.at[:, 2].set(ends + rise * (apex - ends))
+
+
+def swing_joints(
+    config: LegConfig,
+    robot: Robot,
+    state: State,
+    start: Float[Array, "2 3"],
+    start_yaw: Float[Array, "2"],
+    end: Float[Array, "2 3"],
+    end_yaw: Float[Array, "2"],
+    elapsed: Float[Array, "2"],
+    swing: float,
+) -> tuple[Float[Array, "10"], Float[Array, "10"]]:
+    """Joint angles [rad] and rates [rad/s] that carry the feet along their swing paths, soles level.
+
+    `elapsed` is the time since each foot's lift-off [s]. The rates are the derivative of the angles along the path while the trunk
+    moves on with its present velocity.
+    """
+
+    def angles(time: Float[Array, ""]) -> Float[Array, "10"]:
+        s = jnp.clip((elapsed + time) / swing, 0.0, 1.0)
+        R_wb = rotation_from_euler(state.euler)
+        trunk = trunk_position(robot, state) + time * state.velocity
+        target = swing_path(config, start, end, s)
+        local = (target - trunk) @ R_wb
+        turn = wrap_angle(end_yaw - start_yaw)
+        yaw = wrap_angle(start_yaw + s * s * (3.0 - 2.0 * s) * turn - state.euler[2])
+        yaw = jnp.clip(yaw, robot.joint_lower[::5], robot.joint_upper[::5])
+        up = R_wb[2]  # world z in the trunk
+        in_leg = jnp.stack([up @ rot_z(yaw[0]), up @ rot_z(yaw[1])])
+        return inverse_legs(robot, local, yaw, jnp.arctan2(in_leg[:, 0], in_leg[:, 2]))
+
+    return jax.jvp(angles, (jnp.zeros(()),), (jnp.ones(()),))
+
+
+def joint_torques(
+    config: LegConfig,
+    robot: Robot,
+    state: State,
+    joints: Float[Array, "10"],
+    joint_rates: Float[Array, "10"],
+    contact: Bool[Array, "2"],
+    wrench: Wrench,
+    target: Float[Array, "10"],
+    target_rates: Float[Array, "10"],
+) -> Float[Array, "10"]:
+    """Torque commands [N m] within the motors' limits: stance legs push, swing legs follow their target."""
+    weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
+    kp, kd = jnp.tile(jnp.array(config.kp), 2), jnp.tile(jnp.array(config.kd), 2)
+    swing = kp * (target - joints) + kd * (target_rates - joint_rates) + weight
+    stance = stance_torques(robot, state, joints, wrench)
+    if config.stance_weight:
+        stance = stance + weight
+    torque = jnp.where(jnp.repeat(contact, 5), stance, swing)
+    return jnp.clip(torque, -robot.torque_limit, robot.torque_limit)

@@ -1,0 +1,186 @@
+r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stance inputs -> wrench.
+
+    minimise    sum_{k=1}^{N} |x_k - x_ref,k|^2_Q + sum_{k=0}^{N-1} |u_k|^2_R
+    subject to  x_{k+1} = A_k x_k + B_k u_k                                  dynamics
+                |F_x|, |F_y| <= mu F_z,   0 <= F_z <= F_max                  each stance foot
+                M_x = 0,   -l_t F_z <= M_y <= l_h F_z                        line foot, in the foot's yaw frame
+                F = M = 0                                                    each foot in the air
+
+States are condensed away, a foot in the air has no variables and M_x is eliminated, so that a stance foot has the five inputs
+(F_x, F_y, F_z, M_y, M_z): F in the world, M in the foot's yaw frame. `slots` is the number of feet that may stand at once; an empty slot has
+zero columns and a unit Hessian, so that shapes stay static.
+
+Where this leaves the paper: x_1..x_N are priced instead of x_0..x_{N-1}, because x_0 is given; toe and heel of the line foot are in their
+physical places (pressure at the toe gives M_y = -l_t F_z; the paper prints them swapped); a foot in the air has no M_z.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from hector_jax.control.qp import QP, QpConfig, Solution, solve_qp
+from hector_jax.control.weights import Weights
+from hector_jax.geometry import rot_z
+from hector_jax.model import srbm
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
+
+NX = 12  # states that move; gravity stays what it is
+
+
+@dataclass(frozen=True)
+class MpcConfig:
+    """What the MPC is compiled for."""
+
+    horizon: int = 10  # steps N
+    step_ticks: int = 3  # ticks per step: dt = 0.03 s
+    friction: float = 0.5  # mu; below the floor's own, or the feet slip
+    max_force: float = 500.0  # [N] per foot
+    effort_about: str = (
+        "zero"  # R prices u ("zero", the paper) or u less the weight's share ("weight")
+    )
+    qp: QpConfig = QpConfig()
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1 or self.step_ticks < 1:
+            raise ValueError(
+                f"MpcConfig needs horizon >= 1 and step_ticks >= 1, got {self.horizon}, {self.step_ticks}"
+            )
+        if self.effort_about not in ("zero", "weight"):
+            raise ValueError(
+                f"MpcConfig.effort_about must be 'zero' or 'weight', got {self.effort_about!r}"
+            )
+
+
+class Horizon(NamedTuple):
+    """What the MPC plans about: nominal motion, footholds and contact of each step."""
+
+    reference: State  # (N, 3) each, at the end of each step
+    euler: Float[Array, "N 3"]  # to linearise about [rad]
+    lever: Float[Array, "N 2 3"]  # centre of mass to foot points [m]
+    foot_yaw: Float[Array, "N 2"]  # [rad]
+    contact: Bool[Array, "N 2"]
+
+
+def _slot_feet(contact: Bool[Array, "2"], slots: int) -> Float[Array, "slots 2"]:
+    """Which foot each slot serves, as rows of a selection matrix; all zero for an empty slot."""
+    chosen = contact.astype(float)
+    if slots == 2:
+        return jnp.diag(chosen)
+    return (chosen * jnp.array([1.0, 1.0 - chosen[0]]))[None]
+
+
+def _input_map(
+    contact: Bool[Array, "2"], foot_yaw: Float[Array, "2"], slots: int
+) -> Float[Array, "12 b"]:
+    """G with u = G v: the slots' inputs (F_x, F_y, F_z, M_y, M_z) to the paper's u."""
+    feet = _slot_feet(contact, slots)
+    moment_axes = jax.vmap(lambda yaw: rot_z(yaw)[:, 1:])(foot_yaw)  # (2, 3, 2)
+    force = jnp.einsum("sf,xi->fxsi", feet, jnp.eye(3))
+    moment = jnp.einsum("sf,fxi->fxsi", feet, moment_axes)
+    blocks = jnp.zeros((2, 2, 3, slots, 5))
+    blocks = blocks.at[0, :, :, :, :3].set(force).at[1, :, :, :, 3:].set(moment)
+    return blocks.reshape(12, slots * 5)
+
+
+def _rows(config: MpcConfig, robot: Robot) -> tuple[Array, Array, Array]:
+    """Constraint rows of one slot: matrix (7, 5) and bounds (7,) each."""
+    mu, inf = config.friction, jnp.inf
+    rows = jnp.array(
+        [
+            [1.0, 0.0, -mu, 0.0, 0.0],
+            [1.0, 0.0, mu, 0.0, 0.0],
+            [0.0, 1.0, -mu, 0.0, 0.0],
+            [0.0, 1.0, mu, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0, 0.0],
+        ]
+    )
+    rows = rows.at[5, 2].set(robot.toe).at[6, 2].set(-robot.heel)
+    lower = jnp.array([-inf, 0.0, -inf, 0.0, 0.0, 0.0, -inf])
+    upper = jnp.array([0.0, inf, 0.0, inf, config.max_force, inf, 0.0])
+    return rows, lower, upper
+
+
+def write_qp(
+    config: MpcConfig,
+    robot: Robot,
+    weights: Weights,
+    state: State,
+    horizon: Horizon,
+    dt: float,
+    slots: int,
+) -> tuple[QP, Float[Array, "12 b"]]:
+    """The MPC as a condensed QP, and the map from the first step's inputs to u_0.
+
+    Args:
+        config, robot, weights: the controller.
+        state: base now, x_0.
+        horizon: what to plan about.
+        dt: MPC step [s].
+        slots: feet that may stand at once (static).
+
+    Returns:
+        QP in the inputs of all steps, n = N * 5 * slots, constraint rows block-diagonal by step (N, 7 * slots, 5 * slots); and
+        G_0 with u_0 = G_0 v_0.
+
+    Source: Eq. 3, 4.
+    """
+    N, b = config.horizon, 5 * slots
+    A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
+    G = jax.vmap(lambda c, y: _input_map(c, y, slots))(horizon.contact, horizon.foot_yaw)
+    inputs = B @ G  # (N, 15, b)
+
+    def respond(carry, step):
+        free, forced = carry
+        k, A_k, B_k = step
+        free = A_k @ free
+        forced = A_k[:NX, :NX] @ forced
+        forced = jax.lax.dynamic_update_slice(forced, B_k[:NX], (0, k * b))
+        return (free, forced), (free[:NX], forced)
+
+    start = (pack_state(state, jnp.asarray(robot.gravity)), jnp.zeros((NX, N * b)))
+    _, (free, forced) = jax.lax.scan(respond, start, (jnp.arange(N), A, inputs))
+
+    Q = jnp.concatenate(list(weights.Q))
+    error = free - jnp.concatenate(list(horizon.reference), axis=-1)
+    R = pack_wrench(Wrench(*weights.R))
+    effort = jnp.einsum("kui,u,kuj->kij", G, R, G)
+    empty = jnp.repeat(
+        1.0 - jax.vmap(lambda c: _slot_feet(c, slots).sum(-1))(horizon.contact), 5, axis=-1
+    )
+    effort = effort + jax.vmap(jnp.diag)(empty)
+    S = forced.reshape(N * NX, N * b)
+    weighted = (Q[:, None] * forced).reshape(N * NX, N * b)
+    effort_matrix = jnp.einsum("kij,kl->kilj", effort, jnp.eye(N)).reshape(N * b, N * b)
+    P = 2.0 * (S.T @ weighted + effort_matrix)
+    q = 2.0 * (weighted.T @ error.reshape(-1))
+    if config.effort_about == "weight":
+        share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
+        weight = jnp.zeros((N, 12)).at[:, 2].set(share).at[:, 5].set(share)
+        q = q - 2.0 * jnp.einsum("kui,u,ku->ki", G, R, weight).reshape(-1)
+
+    rows, lower, upper = _rows(config, robot)
+    block = jnp.einsum("st,ri->srti", jnp.eye(slots), rows).reshape(slots * 7, b)
+    C = jnp.broadcast_to(block, (N, slots * 7, b))
+    tile = lambda bound: jnp.tile(bound, N * slots)  # noqa: E731
+    return QP(P, q, C, tile(lower), tile(upper)), G[0]
+
+
+def solve_mpc(
+    config: MpcConfig,
+    robot: Robot,
+    weights: Weights,
+    state: State,
+    horizon: Horizon,
+    dt: float,
+    slots: int,
+) -> tuple[Wrench, Solution]:
+    """Wrench of the first step [N, N m], world frame, with the solution it was read from."""
+    qp, first = write_qp(config, robot, weights, state, horizon, dt, slots)
+    solution = solve_qp(qp, config.qp)
+    return unpack_wrench(first @ solution.x[: 5 * slots]), solution

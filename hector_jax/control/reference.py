@@ -1,0 +1,106 @@
+"""Where the robot should be: a velocity command, integrated open loop from t = 0 (Eq. 14-16).
+
+The reference does not follow the robot: what the MPC tracks is what the loss measures. Yaw is integrated first and the velocity
+turned by it; on each piece of constant yaw rate the path is an exact arc. Height, roll and pitch are constant.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hector_jax.trajectory import State
+
+
+class Command(NamedTuple):
+    """Velocity command, constant on each of S pieces; it repeats from the start after the last one."""
+
+    duration: Float[Array, "*batch S"]  # [s]
+    velocity: Float[Array, "*batch S 2"]  # [m/s] ahead and to the left
+    yaw_rate: Float[Array, "*batch S"]  # [rad/s]
+
+
+class Anchor(NamedTuple):
+    """Where the reference starts, and when: t = 0 at gait tick `tick`."""
+
+    position: Float[Array, "*batch 3"]  # of the centre of mass [m]
+    yaw: Float[Array, "*batch"]  # [rad]
+    tick: Int[Array, "*batch"]
+
+
+COMMANDS = ("straight", "c", "s")
+
+
+def named_command(name: str) -> Command:
+    """The paper's three trajectories: straight line, C curve, S curve (period 4 s).
+
+    Raises:
+        ValueError: the name is none of COMMANDS.
+    """
+    speed, rates = {
+        "straight": (0.5, (0.0, 0.0)),
+        "c": (0.25, (0.25 * np.pi, 0.25 * np.pi)),
+        "s": (0.5, (0.5 * np.pi, -0.5 * np.pi)),
+    }.get(name, (None, None))
+    if speed is None:
+        raise ValueError(f"unknown trajectory {name!r}; there are: {', '.join(COMMANDS)}")
+    return Command(np.array([2.0, 2.0]), np.array([[speed, 0.0]] * 2), np.array(rates))
+
+
+def _turn(angle: Float[Array, "*batch"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], axis=-1)
+
+
+def _displacement(command: Command, time: Float[Array, ""]) -> tuple[Array, Array]:
+    """Planar displacement (2,) and turn () from the start to `time` within the first period."""
+    start = jnp.cumsum(command.duration) - command.duration
+    spent = jnp.clip(time - start, 0.0, command.duration)
+    turned = command.yaw_rate * spent
+    heading = jnp.cumsum(turned) - turned
+    chord = (
+        jnp.sinc(turned / (2 * jnp.pi)) * spent
+    )  # of an arc of unit speed; np.sinc is sin(pi x)/(pi x)
+    arcs = _turn(heading + turned / 2, command.velocity * chord[:, None])
+    return arcs.sum(axis=0), turned.sum()
+
+
+def reference_at(
+    tick_length: float, command: Command, anchor: Anchor, tick: Float[Array, ""]
+) -> State:
+    """Reference state at a gait tick; before t = 0 it stands at the anchor.
+
+    Args:
+        tick_length: length of a tick [s].
+        command: what to walk.
+        anchor: where and at which tick it starts.
+        tick: gait tick, fractions allowed.
+
+    Source: Eq. 14-16, repeated with the period of the command.
+    """
+    time = tick_length * (tick - anchor.tick)
+    walking = time >= 0.0
+    period = command.duration.sum()
+    rounds = jnp.floor(jnp.maximum(time, 0.0) / period)
+    inside = jnp.maximum(time, 0.0) - rounds * period
+    lap, lap_turn = _displacement(command, period)
+    # n laps are a geometric series of turned displacements: sum_i R(i a) = R((n-1) a/2) sin(n a/2)/sin(a/2).
+    half = lap_turn / 2
+    flat = jnp.abs(jnp.sin(half)) < 1e-9
+    ratio = jnp.where(flat, rounds, jnp.sin(rounds * half) / jnp.where(flat, 1.0, jnp.sin(half)))
+    laps = _turn((rounds - 1.0) * half, lap * ratio)
+    step, turned = _displacement(command, inside)
+    heading = anchor.yaw + rounds * lap_turn
+    plane = _turn(anchor.yaw, laps) + _turn(heading, step)
+    yaw = heading + turned
+    piece = jnp.minimum(jnp.sum(inside >= jnp.cumsum(command.duration)), command.duration.size - 1)
+    velocity = jnp.where(walking, _turn(yaw, command.velocity[piece]), 0.0)
+    yaw_rate = jnp.where(walking, command.yaw_rate[piece], 0.0)
+    zero = jnp.zeros_like(yaw)
+    return State(
+        euler=jnp.stack([zero, zero, yaw]),
+        position=anchor.position + jnp.concatenate([plane, zero[None]]),
+        ang_velocity=jnp.stack([zero, zero, yaw_rate]),
+        velocity=jnp.concatenate([velocity, zero[None]]),
+    )

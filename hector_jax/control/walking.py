@@ -1,0 +1,228 @@
+"""The whole controller: once a tick `plan` decides the wrench, every millisecond `actuate` turns it into joint torques.
+
+One controller in all worlds: the rigid-body rollout calls `plan` with the feet that it carries along;
+the MuJoCo worlds call `step_plan` and `actuate` with what they measure. The controller knows the
+nominal robot only, never the plant's own numbers.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hector_jax.control import gait
+from hector_jax.control.footstep import FootstepConfig, touchdown_points
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.legs import LegConfig, joint_torques, swing_joints, trunk_position
+from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
+from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.weights import Weights
+from hector_jax.geometry import rotation_from_euler, wrap_angle
+from hector_jax.model.kinematics import foot_poses
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State, Wrench
+
+
+@dataclass(frozen=True)
+class WalkConfig:
+    """What the walking controller is compiled for."""
+
+    gait: GaitConfig = GaitConfig()
+    mpc: MpcConfig = MpcConfig()
+    footstep: FootstepConfig = FootstepConfig()
+    legs: LegConfig = LegConfig()
+
+    def __post_init__(self) -> None:
+        if 2 * self.gait.tick > self.mpc_step + 1e-12:
+            raise ValueError(
+                f"the plan interval must be at most half the MPC step, got tick {self.gait.tick} s and step {self.mpc_step} s"
+            )
+
+    @property
+    def mpc_step(self) -> float:
+        """MPC step dt [s]."""
+        return self.mpc.step_ticks * self.gait.tick
+
+
+class Feet(NamedTuple):
+    """Foot points in the world and where they point."""
+
+    position: Float[Array, "*batch 2 3"]  # [m]
+    yaw: Float[Array, "*batch 2"]  # [rad]
+
+
+class Measurement(NamedTuple):
+    """What the robot knows of itself."""
+
+    state: State  # estimate of the base
+    joints: Float[Array, "*batch 10"]  # [rad], motor side
+    joint_rates: Float[Array, "*batch 10"]  # [rad/s]
+
+
+class Memory(NamedTuple):
+    """What the controller remembers: where each foot last stood."""
+
+    liftoff: Feet
+
+
+class Plan(NamedTuple):
+    """What holds over a tick."""
+
+    wrench: Wrench  # commanded, world frame
+    contact: Bool[Array, "*batch 2"]
+    touchdown: Feet  # where each foot next comes down
+    swing_ticks: Int[Array, "*batch 2"]  # since lift-off
+    residual: Float[Array, "*batch"]  # worst relative KKT residual of the QP
+    status: Int[Array, "*batch"]  # of the QP, see control.qp
+
+
+def slots_needed(config: WalkConfig, tick: int) -> int:
+    """Feet that may stand at once in the plan made at `tick`: 2 before the gait starts or with double support, else 1."""
+    return 2 if tick < config.gait.first_tick or config.gait.double_support else 1
+
+
+def plan(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    tick: Int[Array, ""],
+    state: State,
+    feet: Feet,
+    *,
+    slots: int = 1,
+) -> Plan:
+    """The wrench to command over the tick, from the MPC, and where the feet are to land.
+
+    Args:
+        config, robot, weights: the controller.
+        command, anchor: what to walk.
+        tick: gait tick now.
+        state: base now.
+        feet: foot points now; of a foot in the air they are not used.
+        slots: from `slots_needed` (static).
+
+    Source: Eq. 3-6.
+    """
+    ticks, dt = config.gait, config.mpc_step
+    steps = tick + config.mpc.step_ticks * jnp.arange(config.mpc.horizon + 1)
+    reference = jax.vmap(lambda t: reference_at(ticks.tick, command, anchor, t))(steps)
+    now = jax.tree.map(lambda r: r[0], reference)
+
+    wait = ticks.tick * gait.ticks_to_touchdown(ticks, tick)
+    points, yaws = touchdown_points(
+        config.footstep,
+        robot,
+        state,
+        now,
+        wait,
+        ticks.tick * ticks.stance,
+        ticks.tick * ticks.swing,
+    )
+    # The contact of step 0 is the present one, of a later step that at the middle of its interval.
+    middles = jnp.concatenate([tick[None], steps[1:-1] + config.mpc.step_ticks // 2])
+    landed = gait.touchdowns(ticks, tick, middles) > 0
+    foot_points = jnp.where(landed[..., None], points, feet.position)
+    foot_yaw = jnp.where(landed, yaws, feet.yaw)
+
+    # Linearised about the reference's motion carried on from where the robot is: levers stay true under a tracking error.
+    start = jax.tree.map(lambda r: r[:-1], reference)
+    path = state.position + start.position - now.position
+    heading = state.euler[2] + start.euler[:, 2] - now.euler[2]
+    target = jax.tree.map(lambda r: r[1:], reference)
+    horizon = Horizon(
+        reference=target,
+        euler=jnp.zeros_like(start.euler).at[:, 2].set(heading),
+        lever=foot_points - path[:, None],
+        foot_yaw=foot_yaw,
+        contact=gait.contact(ticks, middles),
+    )
+    wrench, solution = solve_mpc(config.mpc, robot, weights, state, horizon, dt, slots)
+    residual = jnp.maximum(
+        jnp.maximum(solution.primal_residual, solution.dual_residual), solution.gap
+    )
+    return Plan(
+        wrench=wrench,
+        contact=gait.contact(ticks, tick),
+        touchdown=Feet(points, yaws),
+        swing_ticks=gait.swing_ticks(ticks, tick),
+        residual=residual,
+        status=solution.status,
+    )
+
+
+def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
+    """Foot points in the world, from the estimate and the encoders."""
+    R_wb = rotation_from_euler(measurement.state.euler)
+    local = foot_poses(robot, measurement.joints)
+    axes = R_wb @ local.rotation[:, :, 0].T  # the feet's x axes, as columns
+    offset = wrap_angle(jnp.arctan2(axes[1], axes[0]) - measurement.state.euler[2])
+    position = trunk_position(robot, measurement.state) + local.position @ R_wb.T
+    return Feet(position, measurement.state.euler[2] + offset)
+
+
+def init_memory(robot: Robot, measurement: Measurement) -> Memory:
+    """Memory of a robot that stands."""
+    return Memory(measured_feet(robot, measurement))
+
+
+def step_plan(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    tick: Int[Array, ""],
+    memory: Memory,
+    measurement: Measurement,
+    *,
+    slots: int = 1,
+) -> tuple[Memory, Plan]:
+    """`plan` from what is measured; remembers where the standing feet are. Once a tick."""
+    feet = measured_feet(robot, measurement)
+    decided = plan(
+        config, robot, weights, command, anchor, tick, measurement.state, feet, slots=slots
+    )
+    stands = decided.contact
+    liftoff = Feet(
+        jnp.where(stands[:, None], feet.position, memory.liftoff.position),
+        jnp.where(stands, feet.yaw, memory.liftoff.yaw),
+    )
+    return Memory(liftoff), decided
+
+
+def actuate(
+    config: WalkConfig,
+    robot: Robot,
+    decided: Plan,
+    memory: Memory,
+    substep: Int[Array, ""],
+    measurement: Measurement,
+) -> Float[Array, "10"]:
+    """Joint torque commands [N m]; every millisecond, `substep` ms after the plan. Source: Eq. 5."""
+    elapsed = decided.swing_ticks * config.gait.tick + 1e-3 * substep
+    target, target_rates = swing_joints(
+        config.legs,
+        robot,
+        measurement.state,
+        memory.liftoff.position,
+        memory.liftoff.yaw,
+        decided.touchdown.position,
+        decided.touchdown.yaw,
+        elapsed,
+        config.gait.tick * config.gait.swing,
+    )
+    return joint_torques(
+        config.legs,
+        robot,
+        measurement.state,
+        measurement.joints,
+        measurement.joint_rates,
+        decided.contact,
+        decided.wrench,
+        target,
+        target_rates,
+    )

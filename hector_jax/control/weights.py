@@ -1,0 +1,78 @@
+"""theta: the 24 diagonal weights of the MPC, their box, and the sets with a name.
+
+The diagonal of Q has the shape of a state and that of R the shape of a wrench (Eq. 3); the three gravity weights of the paper's
+15-state cost are zero and not tuned. Trees of this shape also carry bounds, step sizes and gradients.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hector_jax.trajectory import State, Wrench
+
+
+class Weights(NamedTuple):
+    """Diagonals of the stage cost |x - x_ref|^2_Q + |u|^2_R."""
+
+    Q: State  # of the error of each state
+    R: Wrench  # of the input of each foot
+
+
+WEIGHT_NAMES = tuple(
+    [
+        f"Q_{name}"
+        for name in ("roll", "pitch", "yaw", "x", "y", "z", "wx", "wy", "wz", "vx", "vy", "vz")
+    ]
+    + [f"R_{kind}{axis}_{foot}" for kind in "FM" for foot in ("left", "right") for axis in "xyz"]
+)
+"""Names of the entries of `weights_to_vector`."""
+
+
+def _weights(
+    euler: tuple, position: tuple, ang_velocity: tuple, velocity: tuple, force: tuple, moment: tuple
+) -> Weights:
+    rows = [np.array(row, float) for row in (euler, position, ang_velocity, velocity)]
+    both = [np.array([row, row], float) for row in (force, moment)]
+    return Weights(State(*rows), Wrench(*both))
+
+
+def nominal() -> Weights:
+    """Flat, untuned weights that still walk: what an engineer writes down before tuning."""
+    ones = (1.0, 1.0, 1.0)
+    return _weights((50.0,) * 3, (50.0,) * 3, ones, ones, (1e-4,) * 3, (1e-3,) * 3)
+
+
+def expert() -> Weights:
+    """The weights that the robot's own laboratory published for its walking controller."""
+    ones = (1.0, 1.0, 1.0)
+    return _weights(
+        (100.0, 100.0, 250.0), (200.0, 200.0, 300.0), ones, ones, (1e-4, 1e-4, 5e-4), (1e-2,) * 3
+    )
+
+
+def bounds() -> tuple[Weights, Weights]:
+    """Box Theta of feasible weights, lower and upper: Q in 0.01..1e4, R in 1e-7..1."""
+    like = nominal()
+    fill = lambda q, r: Weights(  # noqa: E731
+        jax.tree.map(lambda w: np.full_like(w, q), like.Q),
+        jax.tree.map(lambda w: np.full_like(w, r), like.R),
+    )
+    return fill(1e-2, 1e-7), fill(1e4, 1.0)
+
+
+def weights_to_vector(weights: Weights) -> Float[Array, "*batch 24"]:
+    """The 24 weights in the order of WEIGHT_NAMES; also for gradients and other trees of this shape."""
+    flat = [*weights.Q, *(w.reshape(*w.shape[:-2], 6) for w in weights.R)]
+    return jnp.concatenate([jnp.asarray(w) for w in flat], axis=-1)
+
+
+def vector_to_weights(vector: Float[Array, "*batch 24"]) -> Weights:
+    """Weights from the 24 numbers of `weights_to_vector`."""
+    rows = [vector[..., 3 * i : 3 * i + 3] for i in range(4)]
+    feet = [
+        vector[..., 12 + 6 * i : 18 + 6 * i].reshape(*vector.shape[:-1], 2, 3) for i in range(2)
+    ]
+    return Weights(State(*rows), Wrench(*feet))

@@ -1,0 +1,87 @@
+"""The single rigid body: what wrenches on the feet do to the base (Eq. 2), exactly and linearised.
+
+The body turns with the constant composite inertia of the standing robot. The linearisation is forward Euler and drops the gyroscopic
+term, as the public controllers of this robot do; the simulated body keeps it.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hector_jax.geometry import euler_rates, rotation_from_euler, skew
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State, Wrench
+
+
+def centroidal_rates(
+    robot: Robot, wrench: Wrench, lever: Float[Array, "2 3"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Linear acceleration [m/s^2] and rate of angular momentum [N m], world frame.
+
+    Args:
+        robot: mass [kg] and gravity [m/s^2], the latter pointing up as in the paper.
+        wrench: force [N] and moment [N m] of the ground on each foot.
+        lever: centre of mass to foot point [m].
+
+    Source: Eq. 2.
+    """
+    torque = jnp.cross(lever, wrench.force) + wrench.moment
+    return wrench.force.sum(axis=0) / robot.mass - robot.gravity, torque.sum(axis=0)
+
+
+def rates(robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"]) -> State:
+    """Time derivative of the state; `feet` are the foot points in the world [m]. Source: Eq. 2."""
+    acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
+    R_wb = rotation_from_euler(state.euler)
+    momentum = R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
+    torque = torque - jnp.cross(state.ang_velocity, momentum)
+    ang_acceleration = R_wb @ jnp.linalg.solve(robot.inertia, R_wb.T @ torque)
+    return State(
+        euler=euler_rates(state.euler) @ state.ang_velocity,
+        position=state.velocity,
+        ang_velocity=ang_acceleration,
+        velocity=acceleration,
+    )
+
+
+def step(robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], dt: float) -> State:
+    """State after `dt` [s] of constant wrench (fourth-order Runge-Kutta)."""
+
+    def ahead(slope: State, h: float) -> State:
+        return jax.tree.map(lambda x, dx: x + h * dx, state, slope)
+
+    k1 = rates(robot, state, wrench, feet)
+    k2 = rates(robot, ahead(k1, dt / 2), wrench, feet)
+    k3 = rates(robot, ahead(k2, dt / 2), wrench, feet)
+    k4 = rates(robot, ahead(k3, dt), wrench, feet)
+    return jax.tree.map(
+        lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), state, k1, k2, k3, k4
+    )
+
+
+def linearise(
+    robot: Robot, euler: Float[Array, "3"], lever: Float[Array, "2 3"], dt: float
+) -> tuple[Float[Array, "15 15"], Float[Array, "15 12"]]:
+    """A and B of x' = A x + B u, with x = [e; p; omega; v; g] and u = [F_0; F_1; M_0; M_1].
+
+    Args:
+        robot: mass and inertia.
+        euler: attitude to linearise about [rad].
+        lever: centre of mass to each foot point [m].
+        dt: step [s], forward Euler.
+
+    Source: Eq. 4a.
+    """
+    R_wb = rotation_from_euler(euler)
+    inverse_inertia = R_wb @ jnp.linalg.inv(robot.inertia) @ R_wb.T
+    eye = jnp.eye(3)
+    A = jnp.eye(15)
+    A = A.at[0:3, 6:9].set(dt * euler_rates(euler))
+    A = A.at[3:6, 9:12].set(dt * eye)
+    A = A.at[9:12, 12:15].set(-dt * eye)
+    by_force = inverse_inertia @ jnp.concatenate([skew(lever[0]), skew(lever[1])], axis=1)
+    by_moment = jnp.concatenate([inverse_inertia, inverse_inertia], axis=1)
+    B = jnp.zeros((15, 12))
+    B = B.at[6:9, 0:6].set(dt * by_force).at[6:9, 6:12].set(dt * by_moment)
+    B = B.at[9:12, 0:6].set(dt / robot.mass * jnp.concatenate([eye, eye], axis=1))
+    return A, B

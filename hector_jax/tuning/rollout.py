@@ -1,0 +1,161 @@
+"""The closed loop on the single rigid body, with phi between command and effect (Eq. 12, 13).
+
+This is the only world that is differentiated. A tick solves the MPC, asks phi what the ground returns and moves the body; in
+between, nothing is remembered but what `Carry` holds. A foot in the air is carried at its planned touchdown point, where an early
+touchdown that phi predicts acts too.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hector_jax.control import gait
+from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
+from hector_jax.control.weights import Weights
+from hector_jax.model import srbm
+from hector_jax.model.effect import HISTORY, Window, turn
+from hector_jax.model.kinematics import foot_poses
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State, Trajectory, Wrench
+
+MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it the robot has fallen
+MAX_TILT = 0.8  # [rad] of roll or pitch
+
+
+@dataclass(frozen=True)
+class RolloutConfig:
+    """What a rollout is compiled for."""
+
+    walk: WalkConfig = WalkConfig()
+    ticks: int = 400  # T; 4 s
+
+    def __post_init__(self) -> None:
+        if self.ticks < 2:
+            raise ValueError(f"RolloutConfig.ticks must be at least 2, got {self.ticks}")
+
+
+class Carry(NamedTuple):
+    """What one tick hands to the next."""
+
+    state: State
+    feet: Feet
+    commands: Wrench  # (HISTORY, 2, 3) each, world frame, newest first
+    fallen: Bool[Array, ""]
+
+
+def has_fallen(state: State) -> Bool[Array, "*batch"]:
+    """Whether a base state is that of a fallen robot: too low, too tilted, or not finite."""
+    low = state.position[..., 2] < MIN_HEIGHT
+    tilted = jnp.any(jnp.abs(state.euler[..., :2]) > MAX_TILT, axis=-1)
+    finite = jnp.all(jnp.array([jnp.isfinite(x).all(axis=-1) for x in state]), axis=0)
+    return low | tilted | ~finite
+
+
+def standing_anchor(robot: Robot, start_tick: int = 0) -> Anchor:
+    """Reference that starts under a robot standing at the origin, at gait tick `start_tick`."""
+    height = jnp.asarray(robot.standing_height)
+    zero = jnp.zeros_like(height)
+    return Anchor(jnp.stack([zero, zero, height]), zero, jnp.asarray(start_tick))
+
+
+def init_carry(robot: Robot) -> Carry:
+    """A robot that stands still at the origin and has been commanded to stand, its weight shared by the feet."""
+    zero = jnp.zeros(3)
+    position = zero.at[2].set(robot.standing_height)
+    local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
+    half = 0.5 * robot.mass * jnp.asarray(robot.gravity)
+    standing = jnp.broadcast_to(half, (HISTORY, 2, 3))
+    return Carry(
+        state=State(zero, position, zero, zero),
+        feet=Feet(position + local - robot.com_offset, jnp.zeros(2)),
+        commands=Wrench(standing, jnp.zeros_like(standing)),
+        fallen=jnp.asarray(False),
+    )
+
+
+def step_carry(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+    carry: Carry,
+    tick: Int[Array, ""],
+) -> tuple[Carry, Trajectory]:
+    """One tick of the closed loop: plan, effect, motion.
+
+    Returns the next carry and the tick's sample of the trajectory (its `initial` and `period` are filled in by `rollout`).
+    """
+    walk, ticks = config.walk, config.walk.gait
+    state, feet = carry.state, carry.feet
+    decided = plan(
+        walk, robot, weights, command, anchor, tick, state, feet, slots=slots_needed(walk, 0)
+    )
+    commands = jax.tree.map(
+        lambda new, old: jnp.concatenate([new[None], old[:-1]]), decided.wrench, carry.commands
+    )
+    yaw = state.euler[2]
+    window = Window(
+        commands=turn(commands, -yaw),
+        contact=decided.contact,
+        phase=gait.cycle_phase(ticks, tick),
+        since_switch=gait.since_switch(ticks, tick),
+    )
+    returned = turn(effect(window).wrench, yaw)
+    stands = decided.contact
+    feet = Feet(
+        jnp.where(stands[:, None], feet.position, decided.touchdown.position),
+        jnp.where(stands, feet.yaw, decided.touchdown.yaw),
+    )
+    moved = srbm.step(robot, state, returned, feet.position, ticks.tick)
+    fallen = carry.fallen | has_fallen(moved)
+    sample = Trajectory(
+        period=jnp.asarray(ticks.tick),
+        initial=state,
+        state=moved,
+        reference=reference_at(ticks.tick, command, anchor, tick + 1.0),
+        command=decided.wrench,
+        effect=returned,
+        contact=stands,
+        feet=feet.position,
+        joints=jnp.asarray(robot.standing_joints),
+        fallen=fallen,
+        residual=decided.residual,
+    )
+    return Carry(moved, feet, commands, fallen), sample
+
+
+def rollout(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+) -> Trajectory:
+    """Walk `config.ticks` ticks on the single rigid body, from standing at gait tick `anchor.tick`.
+
+    Args:
+        config, robot: what is compiled, and the body.
+        weights: theta; the gradient is taken with respect to these.
+        command, anchor: what to walk, see `standing_anchor`.
+        effect: phi, `Window -> Effect`.
+
+    Returns:
+        Trajectory of T samples. Nothing raises: read `fallen` and `residual` before believing it.
+
+    Source: Eq. 12, 13.
+    """
+    carry = init_carry(robot)
+
+    @jax.checkpoint
+    def tick(carry: Carry, j: Int[Array, ""]) -> tuple[Carry, Trajectory]:
+        return step_carry(config, robot, weights, command, anchor, effect, carry, anchor.tick + j)
+
+    _, samples = jax.lax.scan(tick, carry, jnp.arange(config.ticks))
+    return samples._replace(initial=carry.state, period=jnp.asarray(config.walk.gait.tick))
