@@ -1,0 +1,275 @@
+"""Trees of arrays to files and back, and weights to JSON.
+
+Nothing is pickled, nothing is half-written, nothing is believed unseen. A file is a plain `.npz`
+(`numpy.load` opens it) whose entry `card` is JSON: format, kind, robot, what each array is,
+versions, and `about`, which belongs to whoever wrote it. The archive's comment is the sha256 of all
+bytes before it, so a file that was cut or changed anywhere is refused as a whole. The robot is
+known by the hash of its numbers: what was learned on one body is not loaded for another. Files
+appear by rename, so a reader finds the old one or the new one and never a part.
+"""
+
+import difflib
+import hashlib
+import io
+import json
+import os
+import platform
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from hector_jax.control.weights import Weights
+from hector_jax.trajectory import State, Wrench
+
+FORMAT = 1
+_DIGEST = 64  # hexadecimal digits of a sha256
+_PACKAGES = ("hector-jax", "jax", "jaxlib", "flax", "numpy", "mujoco", "mujoco-mjx")
+
+Tree = TypeVar("Tree")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of those packages that shape our numbers and are installed."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def fingerprint(tree: Any) -> str:
+    """Sixteen digits that stand for the numbers of a tree, such as a `Robot`."""
+    digest = hashlib.sha256()
+    for name, leaf in _named_leaves(tree).items():
+        # rounded to 9 digits, so that two machines' last bits make the same robot
+        digest.update(f"{name}{np.shape(leaf)}".encode())
+        digest.update(" ".join(f"{x:.9g}" for x in np.ravel(leaf).astype(float) + 0.0).encode())
+    return digest.hexdigest()[:16]
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Put `data` under `path`, whole or not at all; missing folders are made.
+
+    Raises:
+        OSError: one line with the path, where the folder or the disk refuses.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException as error:
+        Path(name).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
+        raise
+
+
+def save_tree(
+    path: Path, tree: Any, *, kind: str, robot: Any = None, about: Mapping[str, Any] | None = None
+) -> None:
+    """Write a tree of arrays.
+
+    Args:
+        path: file, replaced if it is there.
+        tree: NamedTuples and dictionaries of arrays.
+        kind: what it is, in a word; `load_tree` asks for the same.
+        robot: the `Robot` that the numbers belong to, or None.
+        about: JSON values for the card: units, frames, seeds, settings.
+
+    Raises:
+        OSError: where the file cannot be written.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
+    card = {
+        "format": FORMAT,
+        "kind": kind,
+        "robot": None if robot is None else fingerprint(robot),
+        "arrays": {n: {"shape": list(a.shape), "dtype": str(a.dtype)} for n, a in arrays.items()},
+        "versions": versions(),
+        "about": dict(about or {}),
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, array in {"card": np.array(json.dumps(card)), **arrays}.items():
+            with archive.open(f"{name}.npy", "w") as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+        archive.comment = b"0" * _DIGEST  # makes room; a zip file ends with its comment
+    content = buffer.getvalue()[:-_DIGEST]
+    write_file(path, content + hashlib.sha256(content).hexdigest().encode())
+
+
+def load_tree(
+    path: Path, like: Tree, *, kind: str, robot: Any = None
+) -> tuple[Tree, dict[str, Any]]:
+    """Read what `save_tree` wrote.
+
+    Args:
+        path: the file.
+        like: a tree of the expected structure. Shapes must agree with its leaves, where an axis of
+            length 0 stands for any length; dtypes are those of the file.
+        kind: as given to `save_tree`.
+        robot: the `Robot` in use, or None to take any.
+
+    Returns:
+        The tree, with numpy arrays, and its card.
+
+    Raises:
+        ValueError: one line naming the file, for one that is missing, cut, changed, of another
+            kind, format, layout or robot.
+    """
+    arrays, card = _read(path)
+    if card["kind"] != kind:
+        raise ValueError(f"{path}: holds {card['kind']}, expected {kind}")
+    if robot is not None and card["robot"] != (expected := fingerprint(robot)):
+        raise ValueError(
+            f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
+        )
+    wanted = _named_leaves(like)
+    if arrays.keys() != wanted.keys():
+        odd = sorted(arrays.keys() ^ wanted.keys())
+        raise ValueError(f"{path}: another layout of {kind}; fields that differ: {', '.join(odd)}")
+    for name, leaf in wanted.items():
+        shape, got = np.shape(leaf), arrays[name].shape
+        if len(shape) != len(got) or any(s not in (0, g) for s, g in zip(shape, got, strict=True)):
+            text = ", ".join("any" if s == 0 else str(s) for s in shape)
+            raise ValueError(f"{path}: {name} has shape {got}, expected ({text})")
+    leaves = [arrays[name] for name in wanted]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), card
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """The card of a file that `save_tree` wrote, once the file as a whole is found sound.
+
+    Raises:
+        ValueError: one line naming the file, as `load_tree`.
+    """
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    data = _read_bytes(Path(path))
+    content, digest = data[:-_DIGEST], data[-_DIGEST:]
+    if hashlib.sha256(content).hexdigest().encode() != digest:
+        raise ValueError(f"{path}: cut or changed since it was written, or not a hector_jax file")
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        card = json.loads(str(arrays.pop("card")))
+    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: no card or no plain arrays inside: {error}") from error
+    if card["format"] != FORMAT:
+        raise ValueError(f"{path}: file format {card['format']}, this version reads {FORMAT}")
+    return arrays, card
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def save_weights(path: Path, weights: Weights) -> None:
+    """Write weights as JSON, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`.
+
+    Raises:
+        OSError: where the file cannot be written.
+    """
+    tree = {
+        "Q": {name: np.asarray(value).tolist() for name, value in weights.Q._asdict().items()},
+        "R": {name: np.asarray(value).tolist() for name, value in weights.R._asdict().items()},
+    }
+    write_file(path, (json.dumps(tree, indent=2) + "\n").encode())
+
+
+def load_weights(path: Path) -> Weights:
+    """Read weights that `save_weights` or a person wrote; positive, but not held to the box.
+
+    Raises:
+        ValueError: one line naming the file and the entry that is missing, unknown, of the wrong
+            shape, or not a positive number.
+    """
+    path = Path(path)
+    try:
+        tree = json.loads(_read_bytes(path).decode(), object_pairs_hook=_no_twins)
+    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors too
+        if str(error).startswith("cannot read"):
+            raise
+        raise ValueError(f"{path}: no valid JSON: {error}") from error
+    except RecursionError as error:
+        raise ValueError(f"{path}: no valid JSON: nested too deeply") from error
+    shapes: dict[str, dict[str, tuple[int, ...]]] = {
+        "Q": dict.fromkeys(State._fields, (3,)),
+        "R": dict.fromkeys(Wrench._fields, (2, 3)),
+    }
+    _check_keys(path, tree, shapes.keys(), "")
+    values = {}
+    for part, entries in shapes.items():
+        _check_keys(path, tree[part], entries.keys(), f"{part}.")
+        values[part] = {
+            name: _positive(path, f"{part}.{name}", tree[part][name], shape)
+            for name, shape in entries.items()
+        }
+    return Weights(Q=State(**values["Q"]), R=Wrench(**values["R"]))
+
+
+def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    tree = dict(pairs)
+    if len(tree) < len(pairs):
+        names = [name for name, _ in pairs]
+        twin = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f'"{twin}" is given twice')
+    return tree
+
+
+def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
+    expected = f"expected {', '.join(names)}"
+    if not isinstance(tree, dict):
+        where = prefix.rstrip(".") or "the file"
+        raise ValueError(f"{path}: {where} must be an object; {expected}")
+    for key in tree:
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=1)
+            hint = f'did you mean "{prefix}{near[0]}"?' if near else expected
+            raise ValueError(f"{path}: unknown weight {json.dumps(prefix + key[:40])}; {hint}")
+    for name in names:
+        if name not in tree:
+            raise ValueError(f'{path}: missing weight "{prefix}{name}"; {expected}')
+
+
+def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.ndarray:
+    wanted = " x ".join(str(s) for s in shape)
+    try:
+        array = np.array(entry)
+    except (ValueError, OverflowError):
+        array = np.array(None)
+    if array.shape != shape or array.dtype.kind not in "if":
+        raise ValueError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
+    array = array.astype(float)
+    bad = ~(np.isfinite(array) & (array > 0))
+    if bad.any():
+        place = "".join(f"[{i}]" for i in np.argwhere(bad)[0])
+        raise ValueError(f"{path}: {name}{place} must be positive, got {array[bad][0]:g}")
+    return array

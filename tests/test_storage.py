@@ -1,0 +1,202 @@
+"""Files: what is written comes back, and what was tampered with does not."""
+
+import json
+import pickle
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+from hector_jax import storage
+from hector_jax.control.weights import expert, nominal
+from hector_jax.storage import load_tree, load_weights, read_card, save_tree, save_weights
+
+
+class Leaf(NamedTuple):
+    """Two arrays."""
+
+    force: np.ndarray
+    flag: np.ndarray
+
+
+class Tree(NamedTuple):
+    """NamedTuples and dictionaries mixed, as in network parameters."""
+
+    leaf: Leaf
+    table: dict
+
+
+TREE = Tree(
+    Leaf(np.arange(6.0).reshape(2, 3), np.array([True, False])),
+    {"Dense_0": {"kernel": np.ones((3, 4), np.float32)}, "count": np.array(3)},
+)
+ROBOT = Leaf(np.array([12.0, 9.81]), np.array(0.25))
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "tree.npz"
+    save_tree(path, TREE, kind="thing", robot=ROBOT, about={"units": "N"})
+    return path
+
+
+def test_a_tree_comes_back_as_it_was_written(saved):
+    tree, card = load_tree(saved, TREE, kind="thing", robot=ROBOT)
+    assert jax.tree.structure(tree) == jax.tree.structure(TREE)
+    for got, expected in zip(jax.tree.leaves(tree), jax.tree.leaves(TREE), strict=True):
+        assert got.dtype == expected.dtype
+        np.testing.assert_array_equal(got, expected)
+    assert card["about"] == {"units": "N"}
+    assert card["arrays"]["leaf.force"] == {"shape": [2, 3], "dtype": "float64"}
+    assert read_card(saved) == card
+
+
+def test_the_file_is_a_plain_npz(saved):
+    with np.load(saved, allow_pickle=False) as archive:
+        np.testing.assert_array_equal(archive["leaf.force"], TREE.leaf.force)
+
+
+def test_the_same_tree_makes_the_same_bytes(saved, tmp_path):
+    again = tmp_path / "again.npz"
+    save_tree(again, TREE, kind="thing", robot=ROBOT, about={"units": "N"})
+    assert again.read_bytes() == saved.read_bytes()
+
+
+def test_truncated_files_are_refused_by_name(saved):
+    data = saved.read_bytes()
+    for length in np.linspace(0, len(data) - 1, 16).astype(int):
+        saved.write_bytes(data[:length])
+        with pytest.raises(ValueError, match="tree.npz: cut or changed"):
+            load_tree(saved, TREE, kind="thing")
+
+
+def test_flipped_bytes_are_refused_by_name(saved):
+    data = saved.read_bytes()
+    rng = np.random.default_rng(0)
+    for place in rng.choice(len(data), 200, replace=False):
+        flipped = bytearray(data)
+        flipped[place] ^= 1 << rng.integers(8)
+        saved.write_bytes(bytes(flipped))
+        with pytest.raises(ValueError, match="tree.npz: cut or changed"):
+            load_tree(saved, TREE, kind="thing")
+
+
+def test_a_renamed_pickle_is_refused(tmp_path):
+    path = tmp_path / "tree.npz"
+    path.write_bytes(pickle.dumps({"a": 1}) * 20)
+    with pytest.raises(ValueError, match="tree.npz: cut or changed"):
+        load_tree(path, TREE, kind="thing")
+
+
+def test_objects_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match="[Oo]bject"):
+        save_tree(tmp_path / "tree.npz", {"a": np.array([None])}, kind="thing")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_kind_robot_format_layout_or_shape_is_refused(saved, monkeypatch):
+    with pytest.raises(ValueError, match="tree.npz: holds thing, expected net"):
+        load_tree(saved, TREE, kind="net")
+    other = ROBOT._replace(force=np.array([13.0, 9.81]))
+    with pytest.raises(ValueError, match="tree.npz: made for robot"):
+        load_tree(saved, TREE, kind="thing", robot=other)
+    with pytest.raises(ValueError, match="tree.npz: another layout of thing.*count"):
+        load_tree(saved, TREE._replace(table={"Dense_0": TREE.table["Dense_0"]}), kind="thing")
+    narrow = TREE._replace(leaf=TREE.leaf._replace(force=np.zeros((2, 4))))
+    with pytest.raises(ValueError, match=r"tree.npz: leaf.force has shape \(2, 3\)"):
+        load_tree(saved, narrow, kind="thing")
+    monkeypatch.setattr(storage, "FORMAT", 2)
+    with pytest.raises(ValueError, match="tree.npz: file format 1, this version reads 2"):
+        load_tree(saved, TREE, kind="thing")
+
+
+def test_an_axis_of_length_zero_takes_any_length(saved):
+    free = TREE._replace(leaf=TREE.leaf._replace(force=np.zeros((0, 3))))
+    assert load_tree(saved, free, kind="thing")[0].leaf.force.shape == (2, 3)
+
+
+def test_a_missing_file_is_one_line_with_its_name(tmp_path):
+    with pytest.raises(ValueError, match="cannot read .*nothing.npz: No such file"):
+        load_tree(tmp_path / "nothing.npz", TREE, kind="thing")
+
+
+def test_an_unwritable_folder_is_one_line_with_its_name(tmp_path):
+    (tmp_path / "wall").write_text("a file, no folder")
+    with pytest.raises(OSError, match="cannot write .*wall/tree.npz"):
+        save_tree(tmp_path / "wall" / "tree.npz", TREE, kind="thing")
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypatch):
+    before = saved.read_bytes()
+
+    def full_disk(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(storage.os, "fsync", full_disk)
+    with pytest.raises(OSError, match="cannot write .*tree.npz: No space left"):
+        save_tree(saved, TREE, kind="other")
+    assert saved.read_bytes() == before
+    assert [p.name for p in saved.parent.iterdir()] == ["tree.npz"]
+
+
+def test_a_robot_is_known_by_its_numbers():
+    same = jax.tree.map(lambda x: np.array(x, copy=True), ROBOT)
+    other = ROBOT._replace(flag=np.array(0.2501))
+    assert storage.fingerprint(ROBOT) == storage.fingerprint(same)
+    assert storage.fingerprint(ROBOT) != storage.fingerprint(other)
+
+
+def test_weights_come_back_as_they_were_written(tmp_path):
+    path = tmp_path / "weights.json"
+    for weights in (nominal(), expert()):
+        save_weights(path, weights)
+        again = load_weights(path)
+        assert jax.tree.structure(again) == jax.tree.structure(weights)
+        jax.tree.map(np.testing.assert_array_equal, again, weights)
+
+
+def _edit(change):
+    tree = {
+        "Q": {n: [1.0, 2.0, 3.0] for n in ("euler", "position", "ang_velocity", "velocity")},
+        "R": {n: [[1e-4, 1e-4, 1e-4]] * 2 for n in ("force", "moment")},
+    }
+    change(tree)
+    return json.dumps(tree)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t["Q"].pop("velocity"), 'missing weight "Q.velocity"'),
+        (lambda t: t.pop("R"), 'missing weight "R"'),
+        (lambda t: t["Q"].update(eular=[1, 1, 1]), 'unknown weight "Q.eular"; did you mean "Q.eul'),
+        (lambda t: t.update(note="x"), 'unknown weight "note"; expected Q, R'),
+        (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be positive, got -1"),
+        (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\] must be positive, got 0"),
+        (lambda t: t["Q"].update(euler=[1, float("nan"), 1]), r"Q.euler\[1\].*got nan"),
+        (lambda t: t["Q"].update(euler=[1, 1, float("inf")]), r"Q.euler\[2\].*got inf"),
+        (lambda t: t["Q"].update(euler=[1, 1]), "Q.euler must be 3 numbers, got"),
+        (lambda t: t["Q"].update(euler=["a", 1, 1]), "Q.euler must be 3 numbers, got"),
+        (lambda t: t["Q"].update(euler=[10**400, 1, 1]), "Q.euler must be 3 numbers, got"),
+        (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
+        (lambda t: t["R"].update(moment=None), "R.moment must be 2 x 3 numbers, got null"),
+        (lambda t: t.update(Q=[1, 2]), "Q must be an object"),
+    ],
+)
+def test_bad_weights_are_one_line_with_file_and_entry(tmp_path, change, message):
+    path = tmp_path / "weights.json"
+    path.write_text(_edit(change))
+    with pytest.raises(ValueError, match=message) as caught:
+        load_weights(path)
+    assert "weights.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", "\udc80", '{"Q": 1, "Q": 2}', "[" * 100_000])
+def test_weights_that_are_no_json_object_are_refused(tmp_path, text):
+    path = tmp_path / "weights.json"
+    path.write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(ValueError, match="weights.json: ") as caught:
+        load_weights(path)
+    assert "\n" not in str(caught.value)
