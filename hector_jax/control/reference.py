@@ -79,9 +79,10 @@ def reference_at(
 
     Source: Eq. 14-16, repeated with the period of the command.
     """
+    command = Command(*map(jnp.asarray, command))
     time = tick_length * (tick - anchor.tick)
     walking = time >= 0.0
-    period = command.duration.sum()
+    period = jnp.sum(command.duration)
     rounds = jnp.floor(jnp.maximum(time, 0.0) / period)
     inside = jnp.maximum(time, 0.0) - rounds * period
     lap, lap_turn = _displacement(command, period)

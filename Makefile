@@ -1,0 +1,47 @@
+# Each target does its own set-up: .venv is built once from requirements.lock, by stamp.
+TRAJ ?= straight
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# The first interpreter here that is Python 3.11 to 3.13 and can make environments.
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
+	>/dev/null 2>&1 && echo $$p && break; done)
+
+.PHONY: help setup tune test test-all check format lock
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+setup: $(STAMP) ## build .venv from the lock
+
+$(STAMP): requirements.lock pyproject.toml
+	@test -n "$(PYTHON)" || { echo "hector_jax needs Python 3.11 to 3.13; none found" >&2; exit 2; }
+	@echo "setting up $(VENV) with $$($(PYTHON) --version) (once, about a minute)"
+	@$(PYTHON) -m venv --clear $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch $@
+
+tune: $(STAMP) ## tune one trajectory and judge it: make tune TRAJ=straight|c|s
+	@$(BIN)/hector tune --traj $(TRAJ)
+
+test: $(STAMP) ## the fast suite (under 8 minutes on 2 cores)
+	@$(BIN)/pytest -q -n 2
+
+test-all: $(STAMP) ## the fast suite and the slow stories
+	@$(BIN)/pytest -q -n 2 -m "slow or not slow"
+
+check: $(STAMP) ## format, lint and types
+	@$(BIN)/ruff format --check --quiet .
+	@$(BIN)/ruff check --quiet .
+	@$(BIN)/pyright
+
+format: $(STAMP) ## put the code in the house's format
+	@$(BIN)/ruff format --quiet .
+	@$(BIN)/ruff check --quiet --fix .
+
+lock: $(STAMP) ## resolve pyproject.toml anew into requirements.lock
+	@$(BIN)/python -m pip install --quiet uv
+	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --no-header \
+		--no-emit-index-url pyproject.toml -o requirements.lock

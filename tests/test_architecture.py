@@ -1,0 +1,79 @@
+"""The house: who imports whom, and which outside package enters through which door."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1] / "hector_jax"
+FLOORS = [
+    ["runtime", "geometry"],
+    ["trajectory"],
+    ["robot"],
+    ["model"],
+    ["control"],
+    ["storage"],
+    ["tuning", "sim"],
+    ["grfm"],
+    ["evaluation"],
+    ["cli", "__main__"],
+]
+FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
+DOORS = {
+    "mujoco": ("robot", "sim", "evaluation.video"),
+    "flax": ("grfm.network",),
+    "optax": ("grfm.training", "tuning.difftune"),
+    "jaxopt": ("control.qp",),
+    "matplotlib": ("evaluation.plots",),
+    "tyro": ("cli",),
+}
+
+
+def modules():
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(part for part in parts if part != "__init__")
+        if not name:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                for alias in node.names:
+                    yield name, alias.name
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                yield name, node.module
+                for alias in node.names:
+                    if (ROOT.parent / node.module.replace(".", "/") / f"{alias.name}.py").exists():
+                        yield name, f"{node.module}.{alias.name}"
+
+
+IMPORTS = sorted(set(modules()))
+
+
+def room(name: str) -> str:
+    return name.split(".")[0]
+
+
+def test_every_room_has_a_floor():
+    assert {room(name) for name, _ in IMPORTS} <= set(FLOOR)
+
+
+def test_imports_point_downwards():
+    wrong = [
+        (name, target)
+        for name, target in IMPORTS
+        if target.startswith("hector_jax.")
+        for below in [room(target.removeprefix("hector_jax."))]
+        if below != room(name) and FLOOR[below] >= FLOOR[room(name)]
+    ]
+    assert not wrong
+
+
+@pytest.mark.parametrize("package", DOORS)
+def test_each_outside_package_has_its_door(package):
+    inside = {name for name, target in IMPORTS if target.split(".")[0] == package}
+    assert {name for name in inside if not name.startswith(DOORS[package])} == set()
+
+
+def test_nothing_that_learns_or_searches_can_reach_the_stand_in():
+    inside = {name for name, target in IMPORTS if target.startswith("hector_jax.sim.standin")}
+    assert all(name.startswith(("cli", "evaluation")) for name in inside), inside

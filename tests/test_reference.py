@@ -1,0 +1,61 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.reference import COMMANDS, Anchor, named_command, reference_at
+
+ANCHOR = Anchor(jnp.array([0.3, -0.2, 0.42]), jnp.array(0.7), jnp.array(10))
+
+
+def path(command, times, anchor=ANCHOR):
+    ticks = jnp.asarray(times) / 0.01 + anchor.tick
+    return jax.vmap(lambda t: reference_at(0.01, command, anchor, t))(ticks)
+
+
+def test_before_the_start_it_stands_at_the_anchor():
+    state = path(named_command("s"), [-1.0, -0.01])
+    np.testing.assert_allclose(state.position, jnp.stack([ANCHOR.position] * 2))
+    assert not np.asarray(state.velocity).any()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_path_is_the_integral_of_its_velocity(name):
+    times = np.arange(0, 9.0, 1e-3)
+    state = path(named_command(name), times)
+    middle = path(named_command(name), times[:-1] + 5e-4)
+    np.testing.assert_allclose(
+        np.diff(state.position, axis=0), 1e-3 * np.asarray(middle.velocity), atol=2e-8
+    )
+    np.testing.assert_allclose(
+        np.diff(np.asarray(state.euler)[:, 2]),
+        1e-3 * np.asarray(middle.ang_velocity)[:, 2],
+        atol=1e-12,
+    )
+
+
+def test_the_c_curve_turns_by_pi_in_four_seconds():
+    state = path(named_command("c"), [0.0, 4.0])
+    np.testing.assert_allclose(state.euler[1, 2] - state.euler[0, 2], np.pi)
+    # Half a circle of radius v / omega: its ends are a diameter apart.
+    span = np.linalg.norm(state.position[1] - state.position[0])
+    np.testing.assert_allclose(span, 2 * 0.25 / (0.25 * np.pi))
+
+
+def test_the_s_curve_repeats_after_four_seconds():
+    state = path(named_command("s"), [0.0, 4.0, 8.0, 1.3, 5.3])
+    step = state.position[1] - state.position[0]
+    np.testing.assert_allclose(state.position[2] - state.position[1], step, atol=1e-12)
+    np.testing.assert_allclose(state.position[4] - state.position[3], step, atol=1e-12)
+    np.testing.assert_allclose(state.euler[4], state.euler[3], atol=1e-12)
+
+
+def test_laps_of_a_turning_command_join():
+    state = path(named_command("c"), [3.999999, 4.000001, 15.999999, 16.000001])
+    np.testing.assert_allclose(state.position[0], state.position[1], atol=1e-6)
+    np.testing.assert_allclose(state.position[2], state.position[3], atol=1e-6)
+
+
+def test_unknown_trajectory_is_named():
+    with pytest.raises(ValueError, match="unknown trajectory 'circle'; there are: straight, c, s"):
+        named_command("circle")
