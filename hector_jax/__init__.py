@@ -1,0 +1,1 @@
+"""Gradient tuning of a walking biped's model predictive controller in JAX."""

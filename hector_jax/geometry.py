@@ -1,7 +1,7 @@
 """Rotations, Euler rates and cross products: mathematics that knows no robot.
 
-Euler angles are (roll, pitch, yaw) with R = Rz(yaw) Ry(pitch) Rx(roll), which takes body vectors to the world; quaternions are
-w, x, y, z as in MuJoCo.
+Euler angles are (roll, pitch, yaw) with R = Rz(yaw) Ry(pitch) Rx(roll), which takes body vectors to
+the world; quaternions are w, x, y, z as in MuJoCo.
 """
 
 import jax.numpy as jnp

@@ -1,7 +1,7 @@
-"""How a process of this project is set up: 64 bits, the persistent compilation cache, and silence of third parties.
+"""How a process of this project is set up: 64 bits and the persistent compilation cache.
 
-The library itself leaves `jax.config` alone; programs (cli, experiments, benchmarks, tests, worker processes) call `setup_jax`
-once, before the first array.
+The library itself leaves `jax.config` alone; programs (cli, experiments, benchmarks, tests, worker
+processes) call `setup_jax` once, before the first array.
 """
 
 import os
@@ -25,7 +25,7 @@ def cache_folder() -> Path:
 
 
 def setup_jax() -> None:
-    """Turn on 64 bits, full-precision products and the persistent compilation cache. Call before the first array."""
+    """Turn on 64 bits, full precision and the compilation cache; call before the first array."""
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -1,8 +1,8 @@
 """What is walked: state, wrench and trajectory, and the one place that packs them into x and u.
 
-Frames: everything is in the world frame. A wrench is that of the ground on the robot, at the foot point (on the sole, under the
-ankle axis), left foot then right. The paper's state is x = [e; p; omega; v; g] with 15 entries and its input
-u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3).
+Frames: everything is in the world frame. A wrench is that of the ground on the robot, at the foot
+    point (on the sole, under the ankle axis), left foot then right. The paper's state is x = [e; p;
+    omega; v; g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3).
 """
 
 from typing import NamedTuple
@@ -32,8 +32,9 @@ class Wrench(NamedTuple):
 class Trajectory(NamedTuple):
     """One walk, sampled evenly; every world returns this and nothing else.
 
-    Sample j covers the interval from j*period to (j+1)*period: `command` is held over it, `effect` is the mean wrench of the
-    ground over it, `state`, `joints` and `feet` are true values at its end, `reference` is what the state should be there.
+    Sample j covers the interval from j*period to (j+1)*period: `command` is held over it, `effect`
+    is the mean wrench of the ground over it, `state`, `joints` and `feet` are true values at its
+    end, `reference` is what the state should be there.
     """
 
     period: Float[Array, "*batch"]  # [s] between samples: 0.01 in srbm, 0.001 in the MuJoCo worlds
@@ -44,7 +45,7 @@ class Trajectory(NamedTuple):
     effect: Wrench  # (T, 2, 3) each, what the ground returned
     contact: Bool[Array, "*batch T 2"]  # planned stance
     feet: Float[Array, "*batch T 2 3"]  # foot points [m]
-    joints: Float[Array, "*batch T 10"]  # [rad] left leg then right: hip yaw, roll, pitch, knee, ankle
+    joints: Float[Array, "*batch T 10"]  # [rad] hip yaw, roll, pitch, knee, ankle; left, right
     fallen: Bool[Array, "*batch T"]  # true from the sample of the fall on
     residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
 

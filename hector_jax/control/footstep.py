@@ -1,7 +1,8 @@
-"""Where the feet come down: touchdown points for the feet in the air and for those that will lift next.
+"""Where the feet come down next, those in the air and those that still stand.
 
-The paper's rule p_c + v dt/2 (Eq. 6) knows neither the hips nor the speed error; it is kept as `rule="paper"`. The rule that walks adds
-the lateral offset of the hip, the travel until touchdown, a velocity feedback and the lean of a turn (Raibert's rule with the capture-point turn term).
+The paper's rule p_c + v dt/2 (Eq. 6) knows neither the hips nor the speed error; it is kept as
+`rule="paper"`. The rule that walks adds the lateral offset of the hip, the travel until touchdown,
+a velocity feedback and the lean of a turn (Raibert's rule with the capture-point turn term).
 """
 
 from dataclasses import dataclass
@@ -58,7 +59,8 @@ def touchdown_points(
     side = config.width * jnp.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
     hips = jnp.stack([rot_z(yaw[0]) @ side[0], rot_z(yaw[1]) @ side[1]])
     lean = jnp.cross(state.velocity, reference.ang_velocity) * state.position[2] / robot.gravity[2]
-    # Far ahead (a foot that still stands) the sway of this moment says nothing: the commanded velocity carries on from the next step.
+    # Far ahead (a foot that still stands) the sway of this moment says nothing: the commanded
+    # velocity carries on from the next step.
     travel = jnp.where(
         (remaining > swing)[:, None],
         state.velocity * swing / 2 + reference.velocity * (remaining[:, None] - swing / 2),

@@ -1,8 +1,8 @@
 """Who stands when: the contact schedule in integer ticks.
 
-A tick is one plan interval. Before the gait starts both feet stand; from `first_tick` on the left foot stands in the first
-`stance` ticks of a cycle and the right one half a cycle later. A switch tick belongs to the new stance. With `stance` longer than
-half a cycle there is double support.
+A tick is one plan interval. Before the gait starts both feet stand; from `first_tick` on the left
+foot stands in the first `stance` ticks of a cycle and the right one half a cycle later. A switch
+tick belongs to the new stance. With `stance` longer than half a cycle there is double support.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ def ticks_to_touchdown(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Ar
 
 
 def touchdowns(
-    config: GaitConfig, tick: Int[Array, ""], later: Int[Array, "N"]
+    config: GaitConfig, tick: Int[Array, ""], later: Int[Array, " N"]
 ) -> Int[Array, "N 2"]:
     """How often each foot touches down after `tick` and up to each of the ticks `later`."""
     count = lambda t: _feet_ticks(config, t) // config.cycle  # noqa: E731

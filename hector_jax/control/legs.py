@@ -1,8 +1,10 @@
 """What the joints do for the plan: stance torques, swing foot, joint PD (Eq. 5).
 
-A stance leg pushes with tau = -J^T wrench, because the wrench is that of the ground on the robot (the paper prints no minus). A swing leg
-follows a smooth path from where the foot left to where it is to land, through closed-form inverse kinematics and a joint PD that feeds the
-path's own joint rates and the leg's weight forward. The target lies a little under the ground so that the foot does land.
+A stance leg pushes with tau = -J^T wrench, because the wrench is that of the ground on the robot
+(the paper prints no minus). A swing leg follows a smooth path from where the foot left to where it
+is to land, through closed-form inverse kinematics and a joint PD that feeds the path's own joint
+rates and the leg's weight forward. The target lies a little under the ground so that the foot does
+land.
 """
 
 from dataclasses import dataclass
@@ -48,7 +50,7 @@ def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:
 def stance_torques(
     robot: Robot, state: State, joints: Float[Array, "10"], wrench: Wrench
 ) -> Float[Array, "10"]:
-    """Joint torques [N m] by which the feet return `wrench` (world frame). Source: Eq. 5 with its physical sign."""
+    """Joint torques [N m] by which the feet return `wrench`, world frame. Source: Eq. 5, signed."""
     R_wb = rotation_from_euler(state.euler)
     Jv, Jw = foot_jacobians(robot, joints)
     force, moment = wrench.force @ R_wb, wrench.moment @ R_wb
@@ -58,7 +60,7 @@ def stance_torques(
 def swing_path(
     config: LegConfig, start: Float[Array, "2 3"], end: Float[Array, "2 3"], s: Float[Array, "2"]
 ) -> Float[Array, "2 3"]:
-    """Foot points [m] at share s of the swing: smooth in the plane, up to the apex and down to `landing`."""
+    """Foot points [m] at share s of the swing: smooth in the plane, up and down to `landing`."""
     smooth = (s * s * (3.0 - 2.0 * s))[:, None]
     point = start + smooth * (end - start)
     half = jnp.where(s < 0.5, 2.0 * s, 2.0 - 2.0 * s)
@@ -79,10 +81,10 @@ def swing_joints(
     elapsed: Float[Array, "2"],
     swing: float,
 ) -> tuple[Float[Array, "10"], Float[Array, "10"]]:
-    """Joint angles [rad] and rates [rad/s] that carry the feet along their swing paths, soles level.
+    """Joint angles [rad] and rates [rad/s] that carry the feet along their swing paths.
 
-    `elapsed` is the time since each foot's lift-off [s]. The rates are the derivative of the angles along the path while the trunk
-    moves on with its present velocity.
+    `elapsed` is the time since each foot's lift-off [s]. The rates are the derivative of the angles
+    along the path while the trunk moves on with its present velocity.
     """
 
     def angles(time: Float[Array, ""]) -> Float[Array, "10"]:
@@ -112,7 +114,7 @@ def joint_torques(
     target: Float[Array, "10"],
     target_rates: Float[Array, "10"],
 ) -> Float[Array, "10"]:
-    """Torque commands [N m] within the motors' limits: stance legs push, swing legs follow their target."""
+    """Torque commands [N m] within the limits: stance legs push, swing legs follow their target."""
     weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
     kp, kd = jnp.tile(jnp.array(config.kp), 2), jnp.tile(jnp.array(config.kd), 2)
     swing = kp * (target - joints) + kd * (target_rates - joint_rates) + weight

@@ -3,15 +3,18 @@ r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stanc
     minimise    sum_{k=1}^{N} |x_k - x_ref,k|^2_Q + sum_{k=0}^{N-1} |u_k|^2_R
     subject to  x_{k+1} = A_k x_k + B_k u_k                                  dynamics
                 |F_x|, |F_y| <= mu F_z,   0 <= F_z <= F_max                  each stance foot
-                M_x = 0,   -l_t F_z <= M_y <= l_h F_z                        line foot, in the foot's yaw frame
-                F = M = 0                                                    each foot in the air
+                M_x = 0,   -l_t F_z <= M_y <= l_h F_z                        line foot, in the
+                foot's yaw frame F = M = 0                                                    each
+                foot in the air
 
-States are condensed away, a foot in the air has no variables and M_x is eliminated, so that a stance foot has the five inputs
-(F_x, F_y, F_z, M_y, M_z): F in the world, M in the foot's yaw frame. `slots` is the number of feet that may stand at once; an empty slot has
-zero columns and a unit Hessian, so that shapes stay static.
+States are condensed away, a foot in the air has no variables and M_x is eliminated, so that a
+stance foot has the five inputs (F_x, F_y, F_z, M_y, M_z): F in the world, M in the foot's yaw
+frame. `slots` is the number of feet that may stand at once; an empty slot has zero columns and a
+unit Hessian, so that shapes stay static.
 
-Where this leaves the paper: x_1..x_N are priced instead of x_0..x_{N-1}, because x_0 is given; toe and heel of the line foot are in their
-physical places (pressure at the toe gives M_y = -l_t F_z; the paper prints them swapped); a foot in the air has no M_z.
+Where this leaves the paper: x_1..x_N are priced instead of x_0..x_{N-1}, because x_0 is given; toe
+    and heel of the line foot are in their physical places (pressure at the toe gives M_y = -l_t
+    F_z; the paper prints them swapped); a foot in the air has no M_z.
 """
 
 from dataclasses import dataclass
@@ -47,7 +50,8 @@ class MpcConfig:
     def __post_init__(self) -> None:
         if self.horizon < 1 or self.step_ticks < 1:
             raise ValueError(
-                f"MpcConfig needs horizon >= 1 and step_ticks >= 1, got {self.horizon}, {self.step_ticks}"
+                "MpcConfig needs horizon >= 1 and step_ticks >= 1, "
+                f"got {self.horizon}, {self.step_ticks}"
             )
         if self.effort_about not in ("zero", "weight"):
             raise ValueError(
@@ -118,15 +122,17 @@ def write_qp(
     """The MPC as a condensed QP, and the map from the first step's inputs to u_0.
 
     Args:
-        config, robot, weights: the controller.
+        config: shape of the problem.
+        robot: nominal body.
+        weights: Q and R.
         state: base now, x_0.
         horizon: what to plan about.
         dt: MPC step [s].
         slots: feet that may stand at once (static).
 
     Returns:
-        QP in the inputs of all steps, n = N * 5 * slots, constraint rows block-diagonal by step (N, 7 * slots, 5 * slots); and
-        G_0 with u_0 = G_0 v_0.
+        QP in the inputs of all steps, n = N * 5 * slots, constraint rows block-diagonal by step (N,
+        7 * slots, 5 * slots); and G_0 with u_0 = G_0 v_0.
 
     Source: Eq. 3, 4.
     """

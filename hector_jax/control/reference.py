@@ -1,7 +1,8 @@
 """Where the robot should be: a velocity command, integrated open loop from t = 0 (Eq. 14-16).
 
-The reference does not follow the robot: what the MPC tracks is what the loss measures. Yaw is integrated first and the velocity
-turned by it; on each piece of constant yaw rate the path is an exact arc. Height, roll and pitch are constant.
+The reference does not follow the robot: what the MPC tracks is what the loss measures. Yaw is
+    integrated first and the velocity turned by it; on each piece of constant yaw rate the path is
+    an exact arc. Height, roll and pitch are constant.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from hector_jax.trajectory import State
 
 
 class Command(NamedTuple):
-    """Velocity command, constant on each of S pieces; it repeats from the start after the last one."""
+    """Velocity command, constant on each of S pieces, repeated from the start after the last."""
 
     duration: Float[Array, "*batch S"]  # [s]
     velocity: Float[Array, "*batch S 2"]  # [m/s] ahead and to the left
@@ -86,7 +87,8 @@ def reference_at(
     rounds = jnp.floor(jnp.maximum(time, 0.0) / period)
     inside = jnp.maximum(time, 0.0) - rounds * period
     lap, lap_turn = _displacement(command, period)
-    # n laps are a geometric series of turned displacements: sum_i R(i a) = R((n-1) a/2) sin(n a/2)/sin(a/2).
+    # n laps are a geometric series of turned displacements: sum_i R(i a) = R((n-1) a/2) sin(n
+    # a/2)/sin(a/2).
     half = lap_turn / 2
     flat = jnp.abs(jnp.sin(half)) < 1e-9
     ratio = jnp.where(flat, rounds, jnp.sin(rounds * half) / jnp.where(flat, 1.0, jnp.sin(half)))

@@ -1,8 +1,8 @@
-"""The whole controller: once a tick `plan` decides the wrench, every millisecond `actuate` turns it into joint torques.
+"""The whole controller: `plan` decides the wrench, `actuate` turns it into joint torques.
 
-One controller in all worlds: the rigid-body rollout calls `plan` with the feet that it carries along;
-the MuJoCo worlds call `step_plan` and `actuate` with what they measure. The controller knows the
-nominal robot only, never the plant's own numbers.
+One controller in all worlds: the rigid-body rollout calls `plan` with the feet that it carries
+along; the MuJoCo worlds call `step_plan` and `actuate` with what they measure. The controller knows
+the nominal robot only, never the plant's own numbers.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,8 @@ class WalkConfig:
     def __post_init__(self) -> None:
         if 2 * self.gait.tick > self.mpc_step + 1e-12:
             raise ValueError(
-                f"the plan interval must be at most half the MPC step, got tick {self.gait.tick} s and step {self.mpc_step} s"
+                "the plan interval must be at most half the MPC step, "
+                f"got tick {self.gait.tick} s and step {self.mpc_step} s"
             )
 
     @property
@@ -79,7 +80,7 @@ class Plan(NamedTuple):
 
 
 def slots_needed(config: WalkConfig, tick: int) -> int:
-    """Feet that may stand at once in the plan made at `tick`: 2 before the gait starts or with double support, else 1."""
+    """Feet that may stand at once in a plan: 2 before the gait starts or with double support."""
     return 2 if tick < config.gait.first_tick or config.gait.double_support else 1
 
 
@@ -128,7 +129,8 @@ def plan(
     foot_points = jnp.where(landed[..., None], points, feet.position)
     foot_yaw = jnp.where(landed, yaws, feet.yaw)
 
-    # Linearised about the reference's motion carried on from where the robot is: levers stay true under a tracking error.
+    # Linearised about the reference's motion carried on from where the robot is: levers stay true
+    # under a tracking error.
     start = jax.tree.map(lambda r: r[:-1], reference)
     path = state.position + start.position - now.position
     heading = state.euler[2] + start.euler[:, 2] - now.euler[2]
@@ -202,7 +204,7 @@ def actuate(
     substep: Int[Array, ""],
     measurement: Measurement,
 ) -> Float[Array, "10"]:
-    """Joint torque commands [N m]; every millisecond, `substep` ms after the plan. Source: Eq. 5."""
+    """Joint torque commands [N m], every ms, `substep` ms after the plan. Source: Eq. 5."""
     elapsed = decided.swing_ticks * config.gait.tick + 1e-3 * substep
     target, target_rates = swing_joints(
         config.legs,

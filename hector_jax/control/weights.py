@@ -1,7 +1,8 @@
 """theta: the 24 diagonal weights of the MPC, their box, and the sets with a name.
 
-The diagonal of Q has the shape of a state and that of R the shape of a wrench (Eq. 3); the three gravity weights of the paper's
-15-state cost are zero and not tuned. Trees of this shape also carry bounds, step sizes and gradients.
+The diagonal of Q has the shape of a state and that of R the shape of a wrench (Eq. 3); the three
+gravity weights of the paper's 15-state cost are zero and not tuned. Trees of this shape also carry
+bounds, step sizes and gradients.
 """
 
 from typing import NamedTuple
@@ -64,7 +65,7 @@ def bounds() -> tuple[Weights, Weights]:
 
 
 def weights_to_vector(weights: Weights) -> Float[Array, "*batch 24"]:
-    """The 24 weights in the order of WEIGHT_NAMES; also for gradients and other trees of this shape."""
+    """The 24 weights in the order of WEIGHT_NAMES; for gradients and other such trees too."""
     flat = [*weights.Q, *(w.reshape(*w.shape[:-2], 6) for w in weights.R)]
     return jnp.concatenate([jnp.asarray(w) for w in flat], axis=-1)
 

@@ -1,8 +1,9 @@
 """phi: what the ground really returns for what was commanded (design of Eq. 12).
 
-An effect is a function `Window -> Effect`, a pytree that can be called (`jax.tree_util.Partial`), so that a rollout takes new
-network parameters without a new compilation. Wrenches enter and leave it in the yaw frame of the robot at the tick, which makes
-what is learned on one heading true on all others.
+An effect is a function `Window -> Effect`, a pytree that can be called (`jax.tree_util.Partial`),
+so that a rollout takes new network parameters without a new compilation. Wrenches enter and leave
+it in the yaw frame of the robot at the tick, which makes what is learned on one heading true on all
+others.
 """
 
 from typing import NamedTuple
@@ -27,14 +28,14 @@ class Window(NamedTuple):
 
 
 class Effect(NamedTuple):
-    """Wrench that the ground returns, yaw frame, with its spread where phi knows one (zero elsewhere)."""
+    """Wrench that the ground returns, yaw frame, with its spread where phi knows one, else zero."""
 
     wrench: Wrench
     spread: Wrench
 
 
 def turn(wrench: Wrench, yaw: Float[Array, ""]) -> Wrench:
-    """The wrench seen from a frame turned by `-yaw`: `turn(w, yaw)` takes the yaw frame to the world, `-yaw` back."""
+    """The wrench turned about z: by `yaw` from the yaw frame to the world, by `-yaw` back."""
     R = rot_z(yaw)
     return Wrench(wrench.force @ R.T, wrench.moment @ R.T)
 

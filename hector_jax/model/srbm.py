@@ -1,7 +1,8 @@
 """The single rigid body: what wrenches on the feet do to the base (Eq. 2), exactly and linearised.
 
-The body turns with the constant composite inertia of the standing robot. The linearisation is forward Euler and drops the gyroscopic
-term, as the public controllers of this robot do; the simulated body keeps it.
+The body turns with the constant composite inertia of the standing robot. The linearisation is
+forward Euler and drops the gyroscopic term, as the public controllers of this robot do; the
+simulated body keeps it.
 """
 
 import jax

@@ -1,11 +1,13 @@
 """DiffTune: step the weights down the gradient of the closed loop, inside the box (Eq. 7, 8).
 
-theta <- P_Theta(theta - beta theta g), with g the gradient in log-weights, divided by its largest magnitude inside Q and inside R: a weight
-moves by at most beta_Q or beta_R of itself, whatever the size of the loss. A step that ends in a fall, a bad solve or a number that is
-not finite is refused: the weights go back, the step is halved and the refusal is told.
+theta <- P_Theta(theta - beta theta g), with g the gradient in log-weights, divided by its largest
+magnitude inside Q and inside R: a weight moves by at most beta_Q or beta_R of itself, whatever the
+size of the loss. A step that ends in a fall, a bad solve or a number that is not finite is refused:
+the weights go back, the step is halved and the refusal is told.
 
-Two results come out of one run: the weights after the paper's `ten` iterations, each accepted unless it is refused, and the `converged`
-ones, for which steps that raise the loss are halved too until nothing is gained any more.
+Two results come out of one run: the weights after the paper's `ten` iterations, each accepted
+    unless it is refused, and the `converged` ones, for which steps that raise the loss are halved
+    too until nothing is gained any more.
 """
 
 from collections.abc import Callable
@@ -108,11 +110,11 @@ def evaluate(
 
 
 tune_step = jax.jit(evaluate, static_argnums=0)
-"""`evaluate`, compiled once per config: new weights, commands and network parameters need no new compilation."""
+"""`evaluate`, compiled once per config: new weights, commands and nets need no compilation."""
 
 
 def relative_step(beta_q: float, beta_r: float) -> optax.GradientTransformation:
-    """Optax transformation: theta * gradient scaled to largest magnitude beta inside Q and inside R, downhill."""
+    """Downhill in log-weights, the largest relative step being beta inside Q and inside R."""
 
     def scaled(tree: Any, weights: Any, beta: float) -> Any:
         logs = jax.tree.map(lambda g, w: g * w, tree, weights)
@@ -145,7 +147,7 @@ def _tied(gradient: Weights) -> Weights:
 
 
 def step_weights(config: TuneConfig, weights: Weights, gradient: Weights, share: float) -> Weights:
-    """Weights after `share` of a full step down the gradient, projected onto the box. Source: Eq. 7."""
+    """Weights after `share` of a full step downhill, projected onto the box. Source: Eq. 7."""
     if config.tie_feet:
         gradient = _tied(gradient)
     optimiser = _optimiser(config)
@@ -240,7 +242,7 @@ def gradient_norms(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> Losses:
-    """Norms of the gradients of the three parts in log-weights, which the paper's footnote aligns."""
+    """Norms of the parts' gradients in log-weights, which the paper's footnote aligns."""
 
     def parts(log_weights: Weights) -> Losses:
         weights = jax.tree.map(jnp.exp, log_weights)
@@ -255,7 +257,7 @@ _jacobian = jax.jit(jax.jacrev, static_argnums=0)
 
 
 def aligned(config: LossConfig, norms: Losses) -> LossConfig:
-    """Loss weights that give the three gradients the order of magnitude of that of L_ctrl (the paper's footnote)."""
+    """Loss weights that bring the three gradients to the order of that of L_ctrl (footnote)."""
     power = lambda ratio: float(10.0 ** np.round(np.log10(max(float(ratio), 1e-12))))  # noqa: E731
     return replace(
         config,

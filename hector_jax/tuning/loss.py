@@ -1,9 +1,11 @@
 """Tracking and smoothness of a walk as one number (Eq. 11), the same in every world.
 
-    L = alpha_1 sum |e - e_ref|^2 + alpha_2 sum |p - p_ref|^2 + sum |u_j - u_{j-1}|^2      over 1 kHz samples
+    L = alpha_1 sum |e - e_ref|^2 + alpha_2 sum |p - p_ref|^2 + sum |u_j - u_{j-1}|^2      over 1
+    kHz samples
 
-A world that ticks slower weighs its tracking sums by the milliseconds a tick stands for; the smoothness counts the changes of the
-held command. A fall is a fall: every missing sample is charged the larger of the last error and a fixed one, and smoothness stops.
+A world that ticks slower weighs its tracking sums by the milliseconds a tick stands for; the
+smoothness counts the changes of the held command. A fall is a fall: every missing sample is charged
+the larger of the last error and a fixed one, and smoothness stops.
 """
 
 from dataclasses import dataclass
@@ -40,15 +42,15 @@ class Losses(NamedTuple):
 
 
 def _charged(
-    error: Float[Array, "T"], fallen: Float[Array, "T"], least: float
-) -> Float[Array, "T"]:
+    error: Float[Array, " T"], fallen: Float[Array, " T"], least: float
+) -> Float[Array, " T"]:
     """Squared errors with those after the fall replaced by what a fall is charged."""
     before = jnp.where(fallen, 0.0, error)
     last = jnp.maximum(jnp.sum(~fallen) - 1, 0)
     return jnp.where(fallen, jnp.maximum(before[last], least**2), before)
 
 
-def _squared_changes(command: Wrench, fallen: Float[Array, "T"]) -> Float[Array, "T-1"]:
+def _squared_changes(command: Wrench, fallen: Float[Array, " T"]) -> Float[Array, " T-1"]:
     change = jnp.sum(jnp.diff(command.force, axis=0) ** 2, axis=(1, 2))
     change = change + jnp.sum(jnp.diff(command.moment, axis=0) ** 2, axis=(1, 2))
     return jnp.where(fallen[1:], 0.0, change)

@@ -1,8 +1,8 @@
 """The closed loop on the single rigid body, with phi between command and effect (Eq. 12, 13).
 
-This is the only world that is differentiated. A tick solves the MPC, asks phi what the ground returns and moves the body; in
-between, nothing is remembered but what `Carry` holds. A foot in the air is carried at its planned touchdown point, where an early
-touchdown that phi predicts acts too.
+This is the only world that is differentiated. A tick solves the MPC, asks phi what the ground
+returns and moves the body; in between, nothing is remembered but what `Carry` holds. A foot in the
+air is carried at its planned touchdown point, where an early touchdown that phi predicts acts too.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from hector_jax.control import gait
 from hector_jax.control.reference import Anchor, Command, reference_at
@@ -63,7 +63,7 @@ def standing_anchor(robot: Robot, start_tick: int = 0) -> Anchor:
 
 
 def init_carry(robot: Robot) -> Carry:
-    """A robot that stands still at the origin and has been commanded to stand, its weight shared by the feet."""
+    """A robot that stands still at the origin, its feet commanded to share the weight."""
     zero = jnp.zeros(3)
     position = zero.at[2].set(robot.standing_height)
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
@@ -89,7 +89,8 @@ def step_carry(
 ) -> tuple[Carry, Trajectory]:
     """One tick of the closed loop: plan, effect, motion.
 
-    Returns the next carry and the tick's sample of the trajectory (its `initial` and `period` are filled in by `rollout`).
+    Returns the next carry and the tick's sample of the trajectory (its `initial` and `period` are
+    filled in by `rollout`).
     """
     walk, ticks = config.walk, config.walk.gait
     state, feet = carry.state, carry.feet

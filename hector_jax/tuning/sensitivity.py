@@ -1,8 +1,9 @@
-"""The paper's own way to the gradient: sensitivities carried forward through the closed loop (Eq. 8-10).
+"""The paper's own way to the gradient: sensitivities carried forward (Eq. 8-10).
 
-The recursion needs no memory in T and no reverse mode; the 24 columns of the sensitivity are 24 tangents of one tick, so that each QP is
-solved and factorised once. With a network in the loop the past commands are part of what is carried. Reverse mode gives the same
-numbers faster (`difftune.evaluate`); this is the check on it, and what online tuning steps along.
+The recursion needs no memory in T and no reverse mode; the 24 columns of the sensitivity are 24
+tangents of one tick, so that each QP is solved and factorised once. With a network in the loop the
+past commands are part of what is carried. Reverse mode gives the same numbers faster
+(`difftune.evaluate`); this is the check on it, and what online tuning steps along.
 """
 
 from typing import NamedTuple
@@ -34,7 +35,7 @@ def propagate(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> tuple[Trajectory, Sensitivities]:
-    """Rollout and its sensitivities by forward recursion. Source: Eq. 9, 10, with the past commands carried along."""
+    """Rollout and its sensitivities by forward recursion. Source: Eq. 9, 10."""
     theta = weights_to_vector(weights)
     directions = jnp.eye(theta.size)
 

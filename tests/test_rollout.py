@@ -1,0 +1,142 @@
+"""Closed loop on the rigid body: physics, compilation, the gradient two ways."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hector_jax.robot import load_robot
+
+from hector_jax.control.reference import COMMANDS, named_command
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.model.effect import last_command
+from hector_jax.tuning import sensitivity
+from hector_jax.tuning.difftune import TuneConfig, tune_step
+from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.rollout import RolloutConfig, rollout, standing_anchor
+
+SHORT, LONG = RolloutConfig(ticks=50), RolloutConfig(ticks=400)
+walk = jax.jit(rollout, static_argnums=0)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot()
+
+
+@pytest.fixture(scope="module")
+def anchor(robot):
+    return standing_anchor(robot)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("weights", [nominal, expert])
+def test_named_weights_walk_every_trajectory(robot, anchor, name, weights):
+    trajectory = walk(LONG, robot, weights(), named_command(name), anchor, last_command)
+    assert not trajectory.fallen.any()
+    assert trajectory.residual.max() < 1e-8
+    assert total(LossConfig(), losses(trajectory)) < 3e6
+
+
+def test_a_foot_in_the_air_gets_no_wrench(robot, anchor):
+    trajectory = walk(SHORT, robot, expert(), named_command("s"), anchor, last_command)
+    swing = ~np.asarray(trajectory.contact)
+    assert not np.asarray(trajectory.command.force)[swing].any()
+    assert not np.asarray(trajectory.command.moment)[swing].any()
+
+
+def test_commands_respect_friction_force_and_line_foot(robot, anchor):
+    trajectory = walk(LONG, robot, nominal(), named_command("s"), anchor, last_command)
+    force = np.asarray(trajectory.command.force)[np.asarray(trajectory.contact)]
+    assert (np.abs(force[:, :2]) <= 0.5 * force[:, 2:] + 1e-4).all()
+    assert (force[:, 2] >= -1e-6).all()
+    assert (force[:, 2] <= 500).all()
+
+
+def test_falling_is_seen_and_charged(robot, anchor):
+    weak = vector_to_weights(
+        weights_to_vector(nominal()).at[12:].set(1.0)
+    )  # effort so dear that it sinks
+    trajectory = walk(LONG, robot, weak, named_command("straight"), anchor, last_command)
+    assert trajectory.fallen[-1]
+    fallen = float(trajectory.fallen.sum())
+    assert losses(trajectory).position >= 10 * fallen * 0.5**2
+    assert losses(trajectory).euler >= 10 * fallen * 0.8**2
+    assert np.isfinite(total(LossConfig(), losses(trajectory)))
+
+
+def test_starting_half_a_cycle_later_mirrors_the_walk(robot):
+    mirror = jnp.array([1.0, -1.0, 1.0])
+    half = RolloutConfig().walk.gait.cycle // 2
+    command = named_command("straight")
+    # A robot that is its own mirror image: the products of inertia that yaw couples to vanish.
+    one = walk(SHORT, robot, nominal(), command, standing_anchor(robot), last_command)
+    other = walk(SHORT, robot, nominal(), command, standing_anchor(robot, half), last_command)
+    np.testing.assert_allclose(one.state.position, other.state.position * mirror, atol=1e-9)
+    np.testing.assert_allclose(one.command.force, other.command.force[:, ::-1] * mirror, atol=1e-6)
+
+
+def random_weights(seed):
+    draws = np.random.default_rng(seed).uniform(-np.log(2), np.log(2), 24)
+    return vector_to_weights(weights_to_vector(nominal()) * np.exp(draws))
+
+
+def differences(config, robot, weights, command, anchor, effect, step):
+    """Central differences of the loss in the 24 log-weights."""
+    return _differences(config, robot, weights_to_vector(weights), command, anchor, effect, step)
+
+
+@jax.jit
+def _shifted(theta, step):
+    eye = jnp.eye(theta.size)
+    return jnp.concatenate([theta * jnp.exp(step * eye), theta * jnp.exp(-step * eye)])
+
+
+def _loss(config, robot, theta, command, anchor, effect):
+    trajectory = rollout(config, robot, vector_to_weights(theta), command, anchor, effect)
+    return total(LossConfig(), losses(trajectory))
+
+
+_losses_of = jax.jit(
+    lambda config, robot, thetas, command, anchor, effect: jax.lax.map(
+        lambda theta: _loss(config, robot, theta, command, anchor, effect), thetas
+    ),
+    static_argnums=0,
+)
+
+
+def _differences(config, robot, theta, command, anchor, effect, step):
+    values = _losses_of(config, robot, _shifted(theta, step), command, anchor, effect)
+    return (values[:24] - values[24:]) / (2 * step)
+
+
+def relative(found, expected):
+    return float(jnp.linalg.norm(found - expected) / jnp.linalg.norm(expected))
+
+
+def check_gradient(config, robot, weights, command, anchor, effect, bar):
+    evaluation = tune_step(TuneConfig(rollout=config), robot, weights, command, anchor, effect)
+    reverse = weights_to_vector(jax.tree.map(jnp.multiply, evaluation.gradient, weights))
+    # Halving the step tells a change of the active set inside it from a wrong derivative.
+    errors = [
+        relative(reverse, differences(config, robot, weights, command, anchor, effect, step))
+        for step in (1e-5, 5e-6)
+    ]
+    assert min(errors) <= bar, errors
+    trajectory, columns = sensitivity.propagate(config, robot, weights, command, anchor, effect)
+    _, forward = sensitivity.gradient(LossConfig(), trajectory, columns)
+    forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
+    assert relative(forward, reverse) <= 1e-8
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor, seed):
+    command = named_command(COMMANDS[seed % 3])
+    check_gradient(SHORT, robot, random_weights(seed), command, anchor, last_command, 1e-6)
+
+
+def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
+    config = TuneConfig(rollout=SHORT)
+    tune_step(config, robot, nominal(), named_command("s"), anchor, last_command)
+    before = tune_step._cache_size()
+    tune_step(config, robot, expert(), named_command("c"), anchor, last_command)
+    assert tune_step._cache_size() == before
