@@ -1,24 +1,31 @@
 """The QP door: minimise 1/2 x'Px + q'x subject to l <= A x <= u, and its derivative.
 
-Decided here: the algorithm, what "solved" means, and what the derivative is where the solution has a kink.
+Decided here: the algorithm, what "solved" means, and what the derivative is where the solution has
+a kink.
 
-Every problem is first brought to one size (`_normalise`): x = kappa D v with D = diag(P)^-1/2, rows of A D of length one, and
-kappa such that the larger of |D q| and the bounds violated at x = 0 is one. The interior point method (Mehrotra's predictor
-and corrector on both sides of every row, proximal in x and in the multipliers) then solves one n x n Cholesky per iteration:
+Size. Every problem is first brought to one size (`_normalise`): x = kappa D v, D = diag(P)^-1/2,
+rows of A D of length one, kappa the larger of |D q| and the bounds violated at v = 0. Residuals are
+those of (x, y) alone in that form, and nothing is called solved by another measure.
 
-    (P + rho I + A'WA) dx = rhs,   W = sum over sides of z / (s + delta z)      (z multiplier, s slack of a side)
+Algorithm. First the active set is guessed and corrected by signs (`_active_set`, a semismooth
+Newton method): one n x n Cholesky per try, three or four tries on the QPs of walking, exact to
+rounding where it settles. Where it does not, Mehrotra's predictor and corrector
+(`_interior_point`), which always gets near, names the active set for a last correction. Both are
+proximal in x and in the multipliers,
 
-The proximal terms bound W by 1/delta, which is how equality rows (s = 0), redundant rows and singular P need no case of
-their own. Residuals are those of (x, y) alone, measured in the normalised problem, and nothing is called solved by any
-other measure.
+    (P + rho I + A'WA) dx = rhs,    W = 1 / (slack / multiplier + delta),
 
-Derivative. Differentiating stationarity and z s = const at the solution gives, for tangents of the data,
+so that equality rows (slack zero), redundant rows and singular P need no case of their own.
 
-    (P + A'WA) dx = -(dP x + dq + dA'y + A'(W dA x - W_u du - W_l dl)),   dy = W (A dx + dA x) - W_u du - W_l dl
+Derivative. Differentiating stationarity and the active rows gives, for tangents of the data,
 
-with W = W_u + W_l, W_side = min(z/s, cap) in the normalised problem: near cap on active rows, near zero on the others, in
-between on a row that is barely active, where the true derivative has one value on either side. The cap keeps the system
-regular at degenerate vertices. Solutions without status SOLVED have derivative zero.
+    P dx + A'dy = -(dP x + dq + dA'y),    A dx - dy / W = du (dl) - dA x,
+
+W_side = ((z + e) / (s + e))^2 from multiplier z and slack s of a side: infinite on active rows,
+zero on the others. The square is that of the central path: a row barely active (z = s = 0), where
+the true derivative has one value on either side, gets one between. W is capped in the matrix that
+is factorised, and a second pass takes the cap's bias off; degenerate vertices stay regular.
+Solutions without status SOLVED have derivative zero.
 """
 
 from dataclasses import dataclass
@@ -47,9 +54,9 @@ class Status(IntEnum):
 class QP(NamedTuple):
     """Minimise 1/2 x'Px + q'x subject to l <= A x <= u.
 
-    P is positive semidefinite (its symmetric part counts). A is dense (m, n), or block-diagonal by step (N, r, b) with
-    m = N r rows and n = N b: rows r k .. r (k+1) read variables b k .. b (k+1). Infinite bounds, rows with l = u, redundant
-    rows and rows of zeros are legal. A batch is vmap.
+    P is positive semidefinite (its symmetric part counts). A is dense (m, n), or block-diagonal by
+    step (N, r, b) with m = N r rows and n = N b: rows r k .. r (k+1) read variables b k .. b (k+1).
+    Infinite bounds, rows with l = u, redundant rows and rows of zeros are legal. A batch is vmap.
     """
 
     P: Float[Array, "n n"]
@@ -62,20 +69,19 @@ class QP(NamedTuple):
 class Solution(NamedTuple):
     """Minimiser and multipliers with their own evidence.
 
-    Residuals are those of (x, y) in the normalised problem (module docstring), so they have no unit and compare between
-    problems: `primal_residual` largest violation of a row over 1 + largest |A x|, `dual_residual` largest entry of
-    P x + q + A'y over 1 + largest entry of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over 1 + its largest term.
-    Where status is BAD_DATA, x and y are zero and the residuals infinite.
+    Residuals are those of (x, y) in the normalised problem (module docstring), so they have no unit
+    and compare between problems: `primal_residual` is the largest violation of a row over 1 +
+    largest |A x|, `dual_residual` the largest entry of P x + q + A'y over 1 + largest entry of its
+    terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over 1 + its largest term. With BAD_DATA or l > u,
+    x and y are zero and the residuals infinite.
     """
 
     x: Float[Array, " n"]
-    y: Float[
-        Array, " m"
-    ]  # positive where the upper bound presses, negative where the lower one does
+    y: Float[Array, " m"]  # positive where the upper bound presses, negative where the lower does
     primal_residual: Float[Array, ""]
     dual_residual: Float[Array, ""]
     gap: Float[Array, ""]
-    iterations: Int[Array, ""]
+    iterations: Int[Array, ""]  # factorisations; with jaxopt its iterations and ours
     status: Int[Array, ""]  # of Status
 
 
@@ -84,14 +90,18 @@ class QpConfig:
     """How QPs are solved. Numbers left None follow the dtype.
 
     Attributes:
-        solver: "interior_point" (ours) or "jaxopt" (BoxOSQP with our derivative).
+        solver: "interior_point" (active set first, interior point where it does not settle) or
+            "jaxopt" (BoxOSQP instead of both, with our last correction and our derivative).
         tolerance: largest residual of a SOLVED problem; 1e-8 in 64 bits, 1e-4 in 32.
+        active_set_tries: before the interior point is asked.
         max_iterations: of the interior point; BoxOSQP takes a hundred times as many, cheaper ones.
-        ratio_cap: largest multiplier-to-slack ratio in the derivative; 1e8 in 64 bits, 1e4 in 32.
+        ratio_cap: largest multiplier-to-slack ratio in a factorised matrix; 1e8 in 64 bits, 1e4 in
+            32.
     """
 
     solver: str = "interior_point"
     tolerance: float | None = None
+    active_set_tries: int = 15
     max_iterations: int = 60
     ratio_cap: float | None = None
 
@@ -100,7 +110,7 @@ class QpConfig:
             raise ValueError(
                 f'QpConfig.solver is "{self.solver}"; there are "interior_point" and "jaxopt"'
             )
-        for name in ("tolerance", "max_iterations", "ratio_cap"):
+        for name in ("tolerance", "active_set_tries", "max_iterations", "ratio_cap"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"QpConfig.{name} is {value}; expected a positive number")
@@ -110,25 +120,32 @@ class _Floors(NamedTuple):
     """What the dtype allows, in the normalised problem."""
 
     tolerance: float  # residuals of a solved problem
-    target: float  # residuals and complementarity at which the iteration stops
-    proximal: float  # rho and delta
-    ratio_cap: float
+    target: float  # residuals and complementarity at which the iterations stop
+    proximal: float  # rho and delta of the interior point; rho of the active set
+    cap: float  # largest W in a factorised matrix
+    rounding: float  # a multiplier or violation this small has no sign
+    kink: float  # e of the derivative
     certificate: float  # of infeasible and unbounded problems
 
 
 def _floors(config: QpConfig, dtype: jnp.dtype) -> _Floors:
-    double = jnp.finfo(dtype).bits == 64
-    tolerance = config.tolerance or (1e-8 if double else 1e-4)
-    ratio_cap = config.ratio_cap or (1e8 if double else 1e4)
-    if double:
-        return _Floors(tolerance, min(1e-12, tolerance), 1e-10, ratio_cap, 1e-8)
-    return _Floors(tolerance, min(1e-6, tolerance), 1e-6, ratio_cap, 1e-4)
+    if jnp.finfo(dtype).bits == 64:
+        floors = _Floors(1e-8, 1e-11, 1e-10, 1e8, 1e-12, 1e-11, 1e-8)
+    else:
+        floors = _Floors(1e-4, 1e-6, 1e-6, 1e4, 1e-6, 1e-6, 1e-4)
+    tolerance = config.tolerance or floors.tolerance
+    return floors._replace(
+        tolerance=tolerance,
+        target=min(floors.target, tolerance),
+        cap=config.ratio_cap or floors.cap,
+    )
 
 
 def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
     """Solve a QP; differentiable in both modes, for jit and vmap, in the dtype of the data.
 
-    Never raises on values and never returns a NaN: `status` says what the answer is worth (`check_solved` looks at it).
+    Never raises on values and never returns a NaN: `status` says what the answer is worth
+    (`check_solved` looks at it).
 
     Raises:
         ValueError: shapes that do not fit together.
@@ -136,7 +153,7 @@ def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
     _check_shapes(qp)
     dtype = jnp.result_type(*qp, jnp.float32)
     P, q, A, lower, upper = (jnp.asarray(v, dtype) for v in qp)
-    # only the symmetric part of P acts; taking it here makes the derivative that of the same function
+    # only the symmetric part of P acts; taken here, the derivative is that of the same function
     return _solve(config, QP(0.5 * (P + P.T), q, A, lower, upper))[0]
 
 
@@ -161,17 +178,13 @@ def check_solved(solution: Solution, what: str = "QP") -> None:
 
 def _check_shapes(qp: QP) -> None:
     P, q, A, lower, upper = (jnp.shape(v) for v in qp)
-    n = q[0] if len(q) == 1 else -1
-    if len(A) == 3:
-        fits = A[0] * A[2] == n
-        rows = A[0] * A[1]
-    else:
-        fits = len(A) == 2 and A[1] == n
-        rows = A[0] if A else -1
-    if not (P == (n, n) and fits and lower == upper == (rows,) and n > 0):
+    n = q[0] if len(q) == 1 else 0
+    rows = A[0] * A[1] if len(A) == 3 else A[0] if len(A) == 2 else -1
+    fits = A[0] * A[2] == n if len(A) == 3 else A[1:] == (n,)
+    if not (n > 0 and P == (n, n) and fits and lower == upper == (rows,)):
         raise ValueError(
-            f"QP shapes P {P}, q {q}, A {A}, l {lower}, u {upper}; expected P (n, n), q (n,), A (m, n) or (N, r, b) with "
-            "n = N b and m = N r, l and u (m,); a batch is vmap"
+            f"QP shapes P {P}, q {q}, A {A}, l {lower}, u {upper}; expected P (n, n), q (n,), "
+            "A (m, n) or (N, r, b) with n = N b and m = N r, l and u (m,); a batch is vmap"
         )
 
 
@@ -189,14 +202,23 @@ def _columns(A: Array, y: Array) -> Array:
     return jnp.einsum("krb,kr->kb", A, y.reshape(A.shape[:2])).ravel()
 
 
+def _on_diagonal(blocks: Array) -> Array:
+    """Block-diagonal matrix of (N, r, b) blocks."""
+    N, r, b = blocks.shape
+    wide = blocks[:, :, None, :] * jnp.eye(N, dtype=blocks.dtype)[:, None, :, None]
+    return wide.reshape(N * r, N * b)
+
+
 def _plus_gram(P: Array, A: Array, w: Array) -> Array:
     """P + A' diag(w) A."""
     if A.ndim == 2:
         return P + (w[:, None] * A).T @ A
-    N, r, b = A.shape
-    blocks = jnp.einsum("krb,krc->kbc", w.reshape(N, r, 1) * A, A)
-    spread = blocks[:, :, None, :] * jnp.eye(N, dtype=P.dtype)[:, None, :, None]
-    return P + spread.reshape(N * b, N * b)
+    weighted = w.reshape(*A.shape[:2], 1) * A
+    return P + _on_diagonal(jnp.einsum("krb,krc->kbc", weighted, A))
+
+
+def _cholesky(matrix: Array) -> Array:
+    return lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
 def _largest(v: Array) -> Array:
@@ -204,36 +226,35 @@ def _largest(v: Array) -> Array:
 
 
 class _Normal(NamedTuple):
-    """A QP in normalised variables: x = size * column * v, A v between bounds, both sides of a row stacked."""
+    """A QP in normalised variables, x = size * column * v; side values stand for (u, l)."""
 
     P: Array
     q: Array
     A: Array
-    bound: Array  # (2, m): u, l; zero where infinite
-    side: Array  # (2, m) bool: there is such a bound, and the row is no equality
+    bound: Array  # (2, m), zero where infinite
+    given: Array  # (2, m) bool: there is such a bound
+    side: Array  # (2, m) bool: a given bound of a row that is neither an equality nor empty
     equality: Array  # (m,) bool
     column: Array  # (n,)
     row: Array  # (m,)
     size: Array
 
 
-_SIGN = np.array([[1.0], [-1.0]])  # slack of a side: sign * (bound - A x)
+_SIGN = np.array([[1.0], [-1.0]])  # a side holds where sign * (A v - bound) <= 0
 
 
 def _scales(qp: QP) -> tuple[Array, Array]:
-    """Columns D = diag(P)^-1/2 and rows that make those of A D unit vectors; 1 where there is nothing to go by."""
+    """Columns D = diag(P)^-1/2, and rows that make those of A D unit vectors; else 1."""
     diagonal = jnp.diagonal(qp.P)
-    reach = jnp.max(jnp.abs(qp.A), axis=-2, initial=0.0).ravel()  # largest entry of each column
-    eps = jnp.finfo(qp.P.dtype).eps
-    priced = diagonal > 1e-3 * eps * jnp.max(diagonal)
-    curvature = jnp.where(priced, diagonal, jnp.where(reach > 0, reach, 1.0) ** 2)
-    column = lax.rsqrt(curvature)
-    per_column = column if qp.A.ndim == 2 else column.reshape(qp.A.shape[0], 1, qp.A.shape[2])
-    squares = jnp.sum((qp.A * per_column) ** 2, axis=-1).ravel()
+    reach = jnp.max(jnp.abs(qp.A), axis=-2, initial=0.0).ravel()  # largest entry of a column
+    priced = diagonal > 1e-3 * jnp.finfo(qp.P.dtype).eps * jnp.max(diagonal)
+    column = lax.rsqrt(jnp.where(priced, diagonal, jnp.where(reach > 0, reach, 1.0) ** 2))
+    wide = column if qp.A.ndim == 2 else column.reshape(qp.A.shape[0], 1, qp.A.shape[2])
+    squares = jnp.sum((qp.A * wide) ** 2, axis=-1).ravel()
     return column, lax.rsqrt(jnp.where(squares > 0, squares, 1.0))
 
 
-def _scale_matrix(A: Array, column: Array, row: Array) -> Array:
+def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
     if A.ndim == 2:
         return row[:, None] * A * column
     N, r, b = A.shape
@@ -242,117 +263,193 @@ def _scale_matrix(A: Array, column: Array, row: Array) -> Array:
 
 def _normalise(qp: QP) -> _Normal:
     column, row = _scales(qp)
-    A = _scale_matrix(qp.A, column, row)
+    A = _scale_rows_and_columns(qp.A, row, column)
+    # rows of zeros bind nothing once 0 lies between their bounds, and nothing helps where not
+    empty = jnp.all(A == 0, axis=-1).ravel()
+    bound = jnp.stack([row * qp.u, row * qp.l])
+    given = jnp.isfinite(bound)
+    bound = jnp.where(given, bound, 0.0)
     q = column * qp.q
-    lower, upper = row * qp.l, row * qp.u
-    pressed = jnp.max(jnp.maximum(lower, -upper), initial=0.0)  # bounds violated at x = 0
-    size = jnp.maximum(_largest(q), jnp.where(jnp.isfinite(pressed), pressed, 0.0))
+    pressed = jnp.max(jnp.where(empty, 0.0, -jnp.asarray(_SIGN, q.dtype) * bound), initial=0.0)
+    size = jnp.maximum(_largest(q), pressed)
     size = jnp.where(size > 0, size, 1.0)
-    bound = jnp.stack([upper, lower]) / size
-    finite = jnp.isfinite(bound)
-    bound = jnp.where(finite, bound, 0.0)
-    width = bound[0] - bound[1]
+    bound = bound / size
     # a row narrower than rounding has no interior: it is an equality
     close = 8 * jnp.finfo(q.dtype).eps * jnp.maximum(1.0, jnp.abs(bound[0]))
-    equality = finite[0] & finite[1] & (width <= close)
-    # rows of zeros bind nothing once 0 is known to lie between their bounds (`_no_point` looks)
-    empty = jnp.all(A == 0, axis=-1).ravel()
+    equality = given[0] & given[1] & (bound[0] - bound[1] <= close) & ~empty
     return _Normal(
         column[:, None] * qp.P * column,
         q / size,
         A,
         bound,
-        finite & ~equality & ~empty,
-        equality & ~empty,
+        given,
+        given & ~equality & ~empty,
+        equality,
         column,
         row,
         size,
     )
 
 
-class _Iterate(NamedTuple):
+class _Point(NamedTuple):
+    """Candidate of one problem; side values stand for (u, l) as in `_Normal`."""
+
     x: Array  # (n,)
-    slack: Array  # (2, m), positive; 1 on sides that are not there
-    z: Array  # (2, m), positive, 0 on sides that are not there; z[0] is the free multiplier of an equality row
+    z: Array  # (2, m) multipliers of the sides; z[0] is the free one of an equality row
 
 
-class _Loop(NamedTuple):
-    iterate: _Iterate
+def _violation(qp: _Normal, x: Array) -> Array:
+    """How far A x lies outside each side (2, m), negative inside; 0 where there is no side."""
+    outside = jnp.asarray(_SIGN, x.dtype) * (_rows(qp.A, x) - qp.bound)
+    return jnp.where(qp.side | qp.equality, outside, 0.0)
+
+
+def _multiplier(z: Array) -> Array:
+    return z[0] - z[1]
+
+
+class _Guess(NamedTuple):
+    point: _Point
+    active: Array  # (2, m) bool
     iterations: Array
     going: Array
 
 
-def _interior_point(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Iterate, Array]:
-    """Mehrotra's method with proximal terms, from a cold start; the last iterate whose entries are all finite."""
+def _active_set(
+    floors: _Floors, qp: _Normal, start: _Point, active: Array, wanted: Array, limit: int
+) -> tuple[_Point, Array]:
+    """Semismooth Newton: active sides as equations, the guess corrected by signs until it stays.
+
+    Exact to rounding where it settles; it may cycle, so `limit` bounds it and the caller looks at
+    the evidence. Does nothing where `wanted` is false.
+    """
+    dtype = qp.q.dtype
+    always = jnp.zeros_like(qp.side).at[0].set(qp.equality)
+    P = qp.P + floors.proximal * jnp.eye(len(qp.q), dtype=dtype)
+
+    def improve(state: _Guess) -> _Guess:
+        weight = jnp.where(state.active, jnp.asarray(floors.cap, dtype), 0.0)
+        factor = _cholesky(_plus_gram(P, qp.A, weight[0] + weight[1]))
+        x, z = state.point.x, jnp.where(state.active, state.point.z, 0.0)
+        for _ in range(2):  # method of multipliers: a pass takes six digits off
+            z = z + weight * _violation(qp, x)
+            slope = qp.P @ x + qp.q + _columns(qp.A, _multiplier(z))
+            dx = -cho_solve((factor, True), slope)
+            x = x + dx
+            z = z + weight * jnp.asarray(_SIGN, dtype) * _rows(qp.A, dx)
+        wrong = jnp.where(state.active, z < -floors.rounding, _violation(qp, x) > floors.rounding)
+        wrong &= ~always
+        iterations = state.iterations + 1
+        going = jnp.any(wrong) & jnp.isfinite(jnp.sum(x)) & (iterations < limit)
+        return _Guess(_Point(x, z), state.active ^ wrong, iterations, going)
+
+    first = _Guess(start, (active & qp.side) | always, jnp.zeros((), jnp.int32), wanted)
+    end = lax.while_loop(lambda state: state.going, improve, first)
+    x, z = end.point
+    return _Point(x, jnp.where(always, z, jnp.maximum(z, 0.0))), end.iterations
+
+
+class _Loop(NamedTuple):
+    point: _Point
+    slack: Array  # (2, m), positive; 1 on sides that are not there
+    iterations: Array
+    going: Array
+
+
+def _interior_point(
+    config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
+) -> tuple[_Point, Array, Array]:
+    """Mehrotra's proximal method, cold; last finite point, its slacks, iterations."""
     dtype = qp.q.dtype
     delta = jnp.asarray(floors.proximal, dtype)
     sign = jnp.asarray(_SIGN, dtype)
-    held = qp.side.at[0].set(qp.side[0] | qp.equality)  # sides that carry a multiplier
-    free = jnp.zeros_like(qp.side).at[0].set(qp.equality)  # of those, the ones without a sign
+    free = jnp.zeros_like(qp.side).at[0].set(qp.equality)  # sides whose multiplier has no sign
+    held = qp.side | free
     count = jnp.maximum(jnp.sum(qp.side), 1)
     P = qp.P + delta * jnp.eye(len(qp.q), dtype=dtype)
 
-    def residuals(it: _Iterate) -> tuple[Array, Array, Array]:
-        dual = qp.P @ it.x + qp.q + _columns(qp.A, it.z[0] - it.z[1])
-        gap = sign * (qp.bound - _rows(qp.A, it.x))
-        primal = jnp.where(held, gap - jnp.where(free, 0.0, it.slack), 0.0)
-        mu = jnp.sum(jnp.where(qp.side, it.slack * it.z, 0.0)) / count
+    def residuals(point: _Point, slack: Array) -> tuple[Array, Array, Array]:
+        dual = qp.P @ point.x + qp.q + _columns(qp.A, _multiplier(point.z))
+        room = sign * (qp.bound - _rows(qp.A, point.x))
+        primal = jnp.where(held, room - jnp.where(free, 0.0, slack), 0.0)
+        mu = jnp.sum(jnp.where(qp.side, slack * point.z, 0.0)) / count
         return dual, primal, mu
 
     def advance(state: _Loop) -> _Loop:
-        it = state.iterate
-        dual, primal, mu = residuals(it)
-        inverse = jnp.where(held, 1.0 / jnp.where(free, delta, it.slack + delta * it.z), 0.0)
-        weight = inverse * jnp.where(free, 1.0, it.z)
-        factor = lax.linalg.cholesky(
-            _plus_gram(P, qp.A, weight[0] + weight[1]), symmetrize_input=False
-        )
+        (x, z), slack = state.point, state.slack
+        dual, primal, mu = residuals(state.point, slack)
+        inverse = jnp.where(held, 1.0 / jnp.where(free, delta, slack + delta * z), 0.0)
+        weight = inverse * jnp.where(free, 1.0, z)
+        factor = _cholesky(_plus_gram(P, qp.A, weight[0] + weight[1]))
 
         def direction(product: Array) -> tuple[Array, Array, Array]:
-            """Newton step for slack * z -> slack * z + product."""
+            """Newton step that takes slack * z to slack * z + product."""
             known = inverse * product - weight * primal
-            dx = cho_solve((factor, True), -dual - _columns(qp.A, known[0] - known[1]))
-            dz = known + weight * (sign * _rows(qp.A, dx))
-            dslack = jnp.where(qp.side, primal - sign * _rows(qp.A, dx) + delta * dz, 0.0)
-            return dx, dslack, dz
+            dx = cho_solve((factor, True), -dual - _columns(qp.A, _multiplier(known)))
+            along = sign * _rows(qp.A, dx)
+            dz = known + weight * along
+            return dx, dz, jnp.where(qp.side, primal - along + delta * dz, 0.0)
 
-        def longest(dslack: Array, dz: Array) -> Array:
-            steps = jnp.where(
-                qp.side, jnp.maximum(-dslack / it.slack, -dz / jnp.where(qp.side, it.z, 1.0)), 0.0
-            )
-            return 1.0 / jnp.maximum(jnp.max(steps, initial=0.0), 1e-30)
+        def longest(dz: Array, dslack: Array) -> Array:
+            """Step at which the first slack or multiplier reaches zero."""
+            rates = jnp.maximum(-dslack / slack, -dz / jnp.where(qp.side, z, 1.0))
+            fastest = jnp.max(jnp.where(qp.side, rates, 0.0), initial=0.0)
+            return 1.0 / jnp.maximum(fastest, jnp.finfo(dtype).tiny)
 
-        product = jnp.where(qp.side, -it.slack * it.z, 0.0)
-        _, dslack, dz = direction(product)
-        step = jnp.minimum(longest(dslack, dz), 1.0)
-        reached = (
-            jnp.sum(jnp.where(qp.side, (it.slack + step * dslack) * (it.z + step * dz), 0.0))
-            / count
+        product = jnp.where(qp.side, -slack * z, 0.0)
+        _, dz, dslack = direction(product)
+        step = jnp.minimum(longest(dz, dslack), 1.0)
+        reached = (slack + step * dslack) * (z + step * dz)
+        ratio = jnp.sum(jnp.where(qp.side, reached, 0.0)) / count / jnp.where(mu > 0, mu, 1.0)
+        centre = mu * jnp.clip(ratio, 0.0, 1.0) ** 3
+        dx, dz, dslack = direction(jnp.where(qp.side, product + centre - dslack * dz, 0.0))
+        step = jnp.minimum(0.995 * longest(dz, dslack), 1.0)
+        new = _Point(x + step * dx, z + step * dz)
+        new_slack = slack + step * dslack
+        finite = jnp.isfinite(jnp.sum(new.x) + jnp.sum(new.z) + jnp.sum(new_slack))
+        new, new_slack = jax.tree.map(
+            lambda a, b: jnp.where(finite, a, b), (new, new_slack), (state.point, slack)
         )
-        target = mu * jnp.clip(reached / jnp.where(mu > 0, mu, 1.0), 0.0, 1.0) ** 3
-        dx, dslack, dz = direction(jnp.where(qp.side, product + target - dslack * dz, 0.0))
-        step = jnp.minimum(0.995 * longest(dslack, dz), 1.0)
-        new = _Iterate(it.x + step * dx, it.slack + step * dslack, it.z + step * dz)
-        finite = jnp.isfinite(jnp.sum(new.x) + jnp.sum(new.slack) + jnp.sum(new.z))
-        new = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, it)
-        dual, primal, mu = residuals(new)
-        reach = 1.0 + _largest(new.z)
+        dual, primal, mu = residuals(new, new_slack)
         done = (
-            (_largest(dual) <= floors.target * reach)
-            & (_largest(primal) <= floors.target * (1.0 + _largest(new.slack)))
+            (_largest(dual) <= floors.target * (1.0 + _largest(new.z)))
+            & (_largest(primal) <= floors.target * (1.0 + _largest(new_slack)))
             & (mu <= floors.target)
         )
-        infeasible, unbounded = _certificates(floors, qp, new.x, new.z[0] - new.z[1])
+        infeasible, unbounded = _certificates(floors, qp, new)
         iterations = state.iterations + 1
         going = finite & ~done & ~infeasible & ~unbounded & (iterations < config.max_iterations)
-        return _Loop(new, iterations, going)
+        return _Loop(new, new_slack, iterations, going)
 
     slack = jnp.where(qp.side, jnp.maximum(sign * qp.bound, 1.0), 1.0)
-    start = _Iterate(jnp.zeros_like(qp.q), slack, qp.side.astype(dtype))
+    start = _Point(jnp.zeros_like(qp.q), qp.side.astype(dtype))
     end = lax.while_loop(
-        lambda state: state.going, advance, _Loop(start, jnp.zeros((), jnp.int32), jnp.array(True))
+        lambda state: state.going, advance, _Loop(start, slack, jnp.zeros((), jnp.int32), wanted)
     )
-    return end.iterate, end.iterations
+    return end.point, end.slack, end.iterations
+
+
+def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, Array, Array]:
+    """BoxOSQP of jaxopt, its derivative left aside; returns what `_interior_point` does."""
+    from jaxopt import BoxOSQP
+
+    held = qp.side | qp.equality
+    bound = jnp.where(held, qp.bound, jnp.asarray(_SIGN, qp.q.dtype) * jnp.inf)
+    solver = BoxOSQP(
+        eq_qp_solve="lu",
+        tol=max(1e-5, floors.target),
+        maxiter=100 * config.max_iterations,
+        termination_check_frequency=25,
+        implicit_diff=False,
+    )
+    A = qp.A if qp.A.ndim == 2 else _on_diagonal(qp.A)
+    params, state = solver.run(None, (qp.P, qp.q), A, (bound[1], bound[0]))
+    finite = jnp.isfinite(jnp.sum(params.primal[0]) + jnp.sum(params.dual_eq))
+    x = jnp.where(finite, params.primal[0], 0.0)
+    y = jnp.where(finite, params.dual_eq, 0.0)
+    z = jnp.maximum(jnp.asarray(_SIGN, y.dtype) * y, 0.0)
+    z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(held, z, 0.0))
+    return _Point(x, z), jnp.maximum(-_violation(qp, x), 0.0), state.iter_num.astype(jnp.int32)
 
 
 def _support(qp: _Normal, y: Array) -> Array:
@@ -360,106 +457,122 @@ def _support(qp: _Normal, y: Array) -> Array:
     return jnp.sum(jnp.where(y > 0, qp.bound[0], qp.bound[1]) * y)
 
 
-def _certificates(floors: _Floors, qp: _Normal, x: Array, y: Array) -> tuple[Array, Array]:
-    """Whether y proves that no point of moderate size meets the rows, and x that the objective falls for ever."""
-    loss = -_support(qp, y)
-    infeasible = _largest(_columns(qp.A, y)) < floors.certificate * loss
-    fall = -jnp.dot(qp.q, x)
-    along = jnp.asarray(_SIGN, x.dtype) * _rows(qp.A, x)
-    held = qp.side | qp.equality
-    outward = jnp.max(
-        jnp.where(held, jnp.where(qp.equality, jnp.abs(along), along), 0.0), initial=0.0
-    )
-    unbounded = jnp.maximum(_largest(qp.P @ x), outward) < floors.certificate * fall
-    return infeasible, unbounded
+def _certificates(floors: _Floors, qp: _Normal, point: _Point) -> tuple[Array, Array]:
+    """Whether z proves that no x of moderate size meets the rows, and x an endless fall."""
+    y = _multiplier(point.z)
+    infeasible = _largest(_columns(qp.A, y)) < -floors.certificate * _support(qp, y)
+    along = jnp.asarray(_SIGN, y.dtype) * _rows(qp.A, point.x)
+    outward = jnp.where(qp.equality, jnp.abs(along), jnp.where(qp.side, along, 0.0))
+    needed = jnp.maximum(_largest(qp.P @ point.x), jnp.max(outward, initial=0.0))
+    return infeasible, needed < -floors.certificate * jnp.dot(qp.q, point.x)
 
 
-def _evidence(qp: _Normal, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Primal residual, dual residual and gap of (x, y), as `Solution` defines them."""
+def _evidence(qp: _Normal, point: _Point) -> Array:
+    """Primal residual, dual residual and gap, as `Solution` defines them; infinite for NaN."""
+    x, y = point.x, _multiplier(point.z)
     rows, pull, price = _rows(qp.A, x), _columns(qp.A, y), qp.P @ x
-    held = qp.side | qp.equality
-    violation = jnp.where(held, jnp.asarray(_SIGN, x.dtype) * (rows - qp.bound), 0.0)
-    primal = jnp.max(violation, initial=0.0) / (1.0 + _largest(rows))
+    outside = jnp.where(qp.given, jnp.asarray(_SIGN, x.dtype) * (rows - qp.bound), 0.0)
+    primal = jnp.max(outside, initial=0.0) / (1.0 + _largest(rows))
     size = jnp.maximum(jnp.maximum(_largest(price), _largest(pull)), _largest(qp.q))
     dual = _largest(price + qp.q + pull) / (1.0 + size)
     terms = jnp.stack([jnp.dot(x, price), jnp.dot(qp.q, x), _support(qp, y)])
-    return primal, dual, jnp.abs(jnp.sum(terms)) / (1.0 + _largest(terms))
+    gap = jnp.abs(jnp.sum(terms)) / (1.0 + _largest(terms))
+    proof = jnp.stack([primal, dual, gap])
+    return jnp.where(jnp.isfinite(jnp.sum(proof)), proof, jnp.inf)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
-    """Solution, and the capped multiplier-to-slack ratios (2, m) of its derivative in the units of the data."""
+    """Solution, and the ratios W (2, m) of its derivative, normalised."""
     floors = _floors(config, qp.q.dtype)
-    finite = jnp.isfinite(jnp.sum(qp.P) + jnp.sum(qp.q) + jnp.sum(qp.A))
-    numbers = ~jnp.any(jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l == jnp.inf) | (qp.u == -jnp.inf))
-    good = finite & numbers
-    crossed = good & jnp.any(qp.l > qp.u)
-    # a problem that cannot be solved is replaced by one that can, so that nothing below meets a NaN
-    plain = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
-    safe = QP(*(jnp.where(good & ~crossed, v, p) for v, p in zip(qp, plain, strict=True)))
+    n, dtype = len(qp.q), qp.q.dtype
+    no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l == jnp.inf) | (qp.u == -jnp.inf)
+    numbers = jnp.isfinite(jnp.sum(jnp.abs(qp.P)) + _largest(qp.q) + jnp.sum(jnp.abs(qp.A)))
+    numbers &= ~jnp.any(no_bound)
+    crossed = jnp.any(qp.l > qp.u)
+    # a problem that means nothing is replaced by one that does: nothing below meets a NaN
+    sane = numbers & ~crossed
+    plain = QP(jnp.eye(n, dtype=dtype), *(jnp.zeros_like(v) for v in qp[1:]))
+    safe = QP(*(jnp.where(sane, v, p) for v, p in zip(qp, plain, strict=True)))
     normal = _normalise(safe)
-    rounding = len(qp.q) * 8 * jnp.finfo(qp.q.dtype).eps
-    trial = lax.linalg.cholesky(
-        normal.P + rounding * jnp.eye(len(qp.q), dtype=qp.q.dtype), symmetrize_input=False
+    idle = normal.given & ~normal.side & ~normal.equality  # rows of zeros
+    unmet = jnp.any(idle & (jnp.asarray(_SIGN, dtype) * normal.bound < 0))
+    factor = _cholesky(normal.P + floors.proximal * jnp.eye(n, dtype=dtype))
+    convex = jnp.isfinite(factor[-1, -1])
+    sane &= convex
+
+    nothing = jnp.zeros(normal.side.shape, dtype)
+    loose = _Point(-cho_solve((factor, True), normal.q), nothing)
+    if config.solver == "interior_point":
+        quick, tries = _active_set(
+            floors, normal, loose, _violation(normal, loose.x) > 0, sane, config.active_set_tries
+        )
+        settled = jnp.max(_evidence(normal, quick)) <= floors.target
+        near, slack, steps = _interior_point(config, floors, normal, sane & ~settled)
+    else:
+        quick, tries, settled = loose, jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        near, slack, steps = _box_osqp(config, floors, normal)
+    infeasible, unbounded = _certificates(floors, normal, near)
+    hopeful = sane & ~settled & ~infeasible & ~unbounded
+    exact, more = _active_set(
+        floors, normal, near, near.z > slack, hopeful, config.active_set_tries
     )
-    good &= jnp.isfinite(trial[-1, -1])
-    iterate, iterations = _interior_point(config, floors, normal)
-    x, y = iterate.x, iterate.z[0] - iterate.z[1]
-    primal, dual, gap = _evidence(normal, x, y)
-    solved = jnp.maximum(jnp.maximum(primal, dual), gap) <= floors.tolerance
-    infeasible, unbounded = _certificates(floors, normal, x, y)
-    zero_row = jnp.all(normal.A == 0, axis=-1).ravel() & ((safe.l > 0) | (safe.u < 0))
-    infeasible |= crossed | jnp.any(zero_row)
+    point, proof = quick, _evidence(normal, quick)
+    for other in (near, exact):
+        other_proof = _evidence(normal, other)
+        better = ~settled & (jnp.max(other_proof) < jnp.max(proof))
+        point = jax.tree.map(lambda a, b, better=better: jnp.where(better, a, b), other, point)
+        proof = jnp.where(better, other_proof, proof)
+    # far from any solution (infeasible, unbounded) all evidence may be infinite, and so may x
+    usable = sane & jnp.all(jnp.isfinite(proof))
+    point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), point)
+
+    solved = jnp.max(proof) <= floors.tolerance
+    infeasible, unbounded = infeasible & ~settled & ~solved, unbounded & ~settled & ~solved
     status = jnp.where(solved, Status.SOLVED, Status.INACCURATE)
-    status = jnp.where(unbounded & ~solved, Status.UNBOUNDED, status)
-    status = jnp.where(
-        (infeasible & ~solved) | crossed | jnp.any(zero_row), Status.INFEASIBLE, status
-    )
-    status = jnp.where(good, status, Status.BAD_DATA).astype(jnp.int32)
-
-    def told(v: Array) -> Array:  # residuals of data that say nothing
-        return jnp.where(good & ~crossed, v, jnp.inf)
-
+    status = jnp.where(unbounded, Status.UNBOUNDED, status)
+    status = jnp.where(infeasible | unmet | crossed, Status.INFEASIBLE, status)
+    status = jnp.where(numbers & convex, status, Status.BAD_DATA).astype(jnp.int32)
+    told = jnp.where(sane, proof, jnp.inf)
     solution = Solution(
-        jnp.where(good & ~crossed, normal.size * normal.column * x, 0.0),
-        jnp.where(good & ~crossed, normal.size * normal.row * y, 0.0),
-        told(primal),
-        told(dual),
-        told(gap),
-        iterations,
+        normal.size * normal.column * point.x,
+        normal.size * normal.row * _multiplier(point.z),
+        *told,
+        tries + steps + more,
         status,
     )
-    cap = jnp.asarray(floors.ratio_cap, x.dtype)
-    ratio = jnp.where(normal.side, jnp.minimum(iterate.z / iterate.slack, cap), 0.0)
-    ratio = jnp.where(
-        normal.equality, 0.5 * cap, ratio
-    )  # half to either bound, which move together
-    return solution, ratio * normal.row**2
+    slack = jnp.maximum(-_violation(normal, point.x), 0.0)
+    ratio = ((point.z + floors.kink) / (slack + floors.kink)) ** 2
+    ratio = jnp.where(normal.side, jnp.minimum(ratio, floors.cap), 0.0)
+    # an equality moves with both of its bounds, half with each
+    return solution, jnp.where(normal.equality, 0.5 * floors.cap, ratio)
 
 
 @_solve.defjvp
 def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple:
     (qp,), (d,) = primals, tangents
     solution, ratio = _solve(config, qp)
+    dtype = qp.q.dtype
+    floors = _floors(config, dtype)
     solved = solution.status == Status.SOLVED
-    column, _ = _scales(qp)
-    n = len(qp.q)
+    column, row = _scales(qp)
+    A = _scale_rows_and_columns(qp.A, row, column)
     both = ratio[0] + ratio[1]
-    scaled = column[:, None] * _plus_gram(qp.P, qp.A, both) * column
-    floor = jnp.asarray(_floors(config, qp.q.dtype).proximal, qp.q.dtype)
-    # unsolved problems get the unit matrix: their tangents are zero, and no NaN may reach them
-    factor = lax.linalg.cholesky(
-        jnp.where(solved, scaled, 0.0)
-        + jnp.where(solved, floor, 1.0) * jnp.eye(n, dtype=qp.q.dtype),
-        symmetrize_input=False,
-    )
-    moved = both * _rows(d.A, solution.x) - ratio[0] * d.u - ratio[1] * d.l
-    pull = d.P @ solution.x + d.q + _columns(d.A, solution.y) + _columns(qp.A, moved)
-    dx = -column * cho_solve((factor, True), jnp.where(solved, column * pull, 0.0))
-    dy = jnp.where(solved, both * _rows(qp.A, dx) + moved, 0.0)
-    zero = jnp.zeros((), qp.q.dtype)
+    firm = both >= floors.cap
+    eye = jnp.eye(len(qp.q), dtype=dtype)
+    # what is not solved gets the unit matrix and no right-hand side: zero, whatever the data are
+    matrix = _plus_gram(column[:, None] * qp.P * column + floors.proximal * eye, A, both)
+    factor = _cholesky(jnp.where(solved, matrix, eye))
+
+    pull = column * (d.P @ solution.x + d.q + _columns(d.A, solution.y))
+    shift = row * (both * _rows(d.A, solution.x) - ratio[0] * d.u - ratio[1] * d.l)
+    dz = jnp.zeros_like(shift)
+    for _ in range(2):  # as in `_active_set`: the second pass takes the cap's bias off firm rows
+        known = jnp.where(firm, dz, 0.0) + shift
+        rhs = pull + _columns(A, known)
+        dv = -cho_solve((factor, True), jnp.where(solved, rhs, 0.0))
+        dz = known + both * _rows(A, dv)
+    zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)
-    return (solution, ratio), (
-        Solution(dx, dy, zero, zero, zero, none, none),
-        jnp.zeros_like(ratio),
-    )
+    change = Solution(column * dv, jnp.where(solved, row * dz, 0.0), zero, zero, zero, none, none)
+    return (solution, ratio), (change, jnp.zeros_like(ratio))
