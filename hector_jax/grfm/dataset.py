@@ -1,0 +1,364 @@
+"""What to walk for learning phi, how walks are kept, and how they become samples.
+
+A shard keeps whole walks at the plan interval, in the world frame, together with the jobs that
+asked for them; windows, frames and labels are made from it anew each time, so another history or
+another label needs no new data. A sample belongs to one tick: the commands of the tick and of those
+before, and the mean wrench that the ground returned over the tick, all in the robot's yaw frame at
+the start of the tick. Training and validation are split by walk: samples of one walk are too alike.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from hector_jax.control import gait
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.reference import COMMANDS, Command, named_command
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.model.effect import HISTORY, Window, turn
+from hector_jax.robot import Robot
+from hector_jax.storage import load_tree, read_card, save_tree, write_file
+from hector_jax.trajectory import State, Trajectory, Wrench
+
+KINDS = (*COMMANDS, "random")  # of walks; a job holds the index
+SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
+PIECES = 4  # of every command, so that jobs can be stacked
+SHARD = 16  # walks in a file
+
+_UNITS = {
+    "period": "s",
+    "euler": "rad",
+    "position": "m",
+    "ang_velocity": "rad/s",
+    "velocity": "m/s",
+    "force": "N",
+    "moment": "N m",
+    "feet": "m",
+    "joints": "rad",
+}
+
+
+class Job(NamedTuple):
+    """One walk to take; fields of a stacked job have leading axes."""
+
+    command: Command  # of PIECES pieces
+    weights: Weights
+    kind: Int[Array, "*batch"]  # index into KINDS
+    plant: Int[Array, "*batch"]  # seed of the drawn imperfections
+
+
+class Walks(NamedTuple):
+    """Walks with what was asked for, stacked; trajectories are sampled at the plan interval."""
+
+    job: Job
+    trajectory: Trajectory
+
+
+class Dataset(NamedTuple):
+    """Samples of phi, n of them; those of one walk follow one another in time."""
+
+    window: Window  # what phi may look at, yaw frame
+    label: Wrench  # (n, 2, 3) each, mean effect over the tick, yaw frame
+    state: State  # (n, 3) each, true state at the start of the tick, world frame
+    walk: Int[Array, " n"]  # which walk
+    tick: Int[Array, " n"]  # which tick of it
+
+
+def draw_jobs(seed: int, count: int, paths: Sequence[Weights] = ()) -> list[Job]:
+    """What to walk so that phi knows the ground that tuning will tread.
+
+    Trajectories take turns: straight, c, s, random velocities. Weights take turns too: each of the
+    24 log-uniform around nominal, around expert and, where tuning paths are given, a point of one.
+    Job i depends on the seed and on i alone, so a longer list begins with the shorter one.
+
+    Args:
+        seed: of everything drawn.
+        count: number of walks.
+        paths: weights that tunings went through, stacked along a first axis each.
+
+    Raises:
+        ValueError: fewer than one walk.
+    """
+    if count < 1:
+        raise ValueError(f"the number of walks must be at least 1, got {count}")
+    return [_draw_job(np.random.default_rng([seed, i]), i, paths) for i in range(count)]
+
+
+def _draw_job(rng: np.random.Generator, i: int, paths: Sequence[Weights]) -> Job:
+    kind = KINDS[i % len(KINDS)]
+    command = _random_command(rng) if kind == "random" else _split_last(named_command(kind))
+    centre = (i // len(KINDS)) % (3 if paths else 2)
+    if centre == 2:
+        path = paths[rng.integers(len(paths))]
+        point = rng.integers(len(path.Q.euler))
+        weights = jax.tree.map(lambda w: np.asarray(w)[point], path)
+    else:
+        weights = jax.tree.map(
+            lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape), (nominal(), expert())[centre]
+        )
+    return Job(command, weights, np.array(KINDS.index(kind)), rng.integers(2**31))
+
+
+def _random_command(rng: np.random.Generator) -> Command:
+    return Command(
+        duration=rng.uniform(0.5, 1.5, PIECES),
+        velocity=rng.uniform([-0.2, -0.2], [0.6, 0.2], (PIECES, 2)),
+        yaw_rate=rng.uniform(-0.5 * np.pi, 0.5 * np.pi, PIECES),
+    )
+
+
+def _split_last(command: Command) -> Command:
+    """The same command in PIECES pieces: the last one is walked in parts."""
+    parts = np.ones(len(command.duration), int)
+    parts[-1] += PIECES - len(parts)
+    whole = jax.tree.map(lambda x: np.repeat(x, parts, axis=0), command)
+    return whole._replace(duration=whole.duration / np.repeat(parts, parts))
+
+
+def at_interval(walk: Trajectory, interval: float) -> Trajectory:
+    """The same walk sampled every `interval` [s]: mean wrenches, states at the end.
+
+    Args:
+        walk: one walk, whose samples fill a whole number of intervals.
+        interval: the plan interval, a multiple of the walk's period.
+
+    Raises:
+        ValueError: the samples do not fill whole intervals.
+    """
+    period, samples = float(walk.period), len(walk.fallen)
+    each = round(interval / period)
+    if each < 1 or not math.isclose(each * period, interval, rel_tol=1e-6) or samples % each:
+        raise ValueError(f"{samples} samples of {period} s do not fill intervals of {interval} s")
+
+    def cut(x: Any) -> np.ndarray:
+        return np.asarray(x).reshape(-1, each, *np.shape(x)[1:])
+
+    def mean(x: Any) -> np.ndarray:
+        return cut(x).mean(axis=1)
+
+    def last(x: Any) -> np.ndarray:
+        return cut(x)[:, -1]
+
+    return Trajectory(
+        period=np.asarray(interval),
+        initial=jax.tree.map(np.asarray, walk.initial),
+        state=jax.tree.map(last, walk.state),
+        reference=jax.tree.map(last, walk.reference),
+        command=jax.tree.map(mean, walk.command),
+        effect=jax.tree.map(mean, walk.effect),
+        contact=cut(walk.contact)[:, 0],
+        feet=last(walk.feet),
+        joints=last(walk.joints),
+        fallen=cut(walk.fallen).any(axis=1),
+        residual=cut(walk.residual).max(axis=1),
+    )
+
+
+def collect(
+    folder: Path,
+    jobs: Sequence[Job],
+    walk_jobs: Callable[[list[Job]], list[Trajectory]],
+    *,
+    robot: Robot,
+    interval: float = GaitConfig.tick,
+    about: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Walk all jobs and keep them under `folder` in shards, taking up what an earlier call left.
+
+    A sound shard of the same jobs is kept, a missing or damaged one is made. `card.json` appears
+    when all are there.
+
+    Args:
+        folder: where; made if missing.
+        jobs: what to walk.
+        walk_jobs: takes the jobs of a shard and returns their walks in order, from any world.
+        robot: the body; shards of another one are refused.
+        interval: the plan interval [s].
+        about: JSON values that tell how it was walked; shards that tell otherwise are refused.
+        progress: called with walks done and walks in all.
+
+    Raises:
+        ValueError: a shard in the folder is of other jobs, another robot or another `about`.
+        OSError: the folder cannot be written.
+    """
+    folder, told = Path(folder), {"interval": interval, **(about or {})}
+    told = json.loads(json.dumps(told))  # as it will be read back
+    facts = {
+        "units": _UNITS,
+        "frames": "world; wrench of the ground on the foot at its foot point, left then right",
+        "kinds": KINDS,
+        "told": told,
+    }
+    names, falls = [], 0
+    for start in range(0, len(jobs), SHARD):
+        chunk = list(jobs[start : start + SHARD])
+        path = folder / f"shard-{start // SHARD:03d}.npz"
+        asked = _stack(chunk)
+        walks = _kept_shard(path, asked, robot, told)
+        if walks is None:
+            taken = [at_interval(walk, interval) for walk in walk_jobs(chunk)]
+            if len(taken) != len(chunk):
+                raise ValueError(f"asked for {len(chunk)} walks, got {len(taken)}")
+            walks = Walks(asked, _stack(taken))
+            save_tree(path, walks, kind="walks", robot=robot, about=facts)
+        names.append(path.name)
+        falls += int(np.any(walks.trajectory.fallen, axis=1).sum())
+        progress(start + len(chunk), len(jobs))
+    card = {"walks": len(jobs), "falls": falls, "shards": names, **facts}
+    write_file(folder / "card.json", (json.dumps(card, indent=2) + "\n").encode())
+
+
+def load_walks(folder: Path, robot: Robot) -> Walks:
+    """All walks that `collect` left in a folder.
+
+    Raises:
+        ValueError: one line naming folder or file: nothing collected, not finished, damaged, or of
+            another robot.
+    """
+    card = Path(folder) / "card.json"
+    try:
+        names = json.loads(card.read_text())["shards"]
+    except FileNotFoundError:
+        raise ValueError(
+            f"{folder}: no finished collection (no card.json); collect first"
+        ) from None
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise ValueError(f"{card}: no card of a collection; collect again") from error
+    shards = [_load_shard(Path(folder) / name, robot) for name in names]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *shards)
+
+
+def _load_shard(path: Path, robot: Robot) -> Walks:
+    return load_tree(path, _like(), kind="walks", robot=robot)[0]
+
+
+def _kept_shard(path: Path, asked: Job, robot: Robot, told: dict[str, Any]) -> Walks | None:
+    if not path.exists():
+        return None
+    try:
+        card = read_card(path)
+    except ValueError:
+        return None  # damaged: to be made again
+    if card["about"].get("told") != told:
+        raise ValueError(f"{path}: collected with other settings; choose another folder")
+    walks = _load_shard(path, robot)
+    equal = jax.tree.map(np.array_equal, walks.job, asked)
+    if not all(jax.tree.leaves(equal)):
+        raise ValueError(f"{path}: collected for other walks; choose another folder or seed")
+    return walks
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *trees)
+
+
+def _like() -> Walks:
+    """Layout of a shard; axes of length 0 are walks and ticks."""
+
+    def zeros(*shape: int) -> np.ndarray:
+        return np.zeros(shape)
+
+    state = State(*[zeros(0, 0, 3)] * 4)
+    wrench = Wrench(zeros(0, 0, 2, 3), zeros(0, 0, 2, 3))
+    job = Job(
+        command=Command(zeros(0, PIECES), zeros(0, PIECES, 2), zeros(0, PIECES)),
+        weights=Weights(State(*[zeros(0, 3)] * 4), Wrench(zeros(0, 2, 3), zeros(0, 2, 3))),
+        kind=zeros(0),
+        plant=zeros(0),
+    )
+    trajectory = Trajectory(
+        period=zeros(0),
+        initial=State(*[zeros(0, 3)] * 4),
+        state=state,
+        reference=state,
+        command=wrench,
+        effect=wrench,
+        contact=zeros(0, 0, 2),
+        feet=zeros(0, 0, 2, 3),
+        joints=zeros(0, 0, 10),
+        fallen=zeros(0, 0),
+        residual=zeros(0, 0),
+    )
+    return Walks(job, trajectory)
+
+
+def make_dataset(walks: Trajectory, config: GaitConfig | None = None) -> tuple[Dataset, int]:
+    """Samples from walks at the plan interval.
+
+    Args:
+        walks: W walks of T ticks, stacked, from t = 0.
+        config: the gait that was walked.
+
+    Returns:
+        The dataset, with numpy arrays, and how many samples were dropped because of a fall. The
+        first HISTORY - 1 ticks of a walk have no full history and are no samples.
+    """
+    config = config or GaitConfig()
+    samples, usable = jax.vmap(lambda walk: _samples(config, walk))(
+        jax.tree.map(jnp.asarray, walks)
+    )
+    count, ticks = usable.shape
+    usable = np.asarray(usable)
+    samples = samples._replace(walk=np.broadcast_to(np.arange(count)[:, None], (count, ticks)))
+    kept = jax.tree.map(lambda x: np.asarray(x)[usable], samples)
+    return kept, int(usable.size - usable.sum())
+
+
+def _samples(config: GaitConfig, walk: Trajectory) -> tuple[Dataset, Bool[Array, " n"]]:
+    """Samples of one walk and whether each is of a robot on its feet."""
+    first, ticks = HISTORY - 1, walk.fallen.shape[0]
+    before = jax.tree.map(
+        lambda start, later: jnp.concatenate([start[None], later[:-1]])[first:],
+        walk.initial,
+        walk.state,
+    )
+
+    def newest_first(w: Array) -> Array:
+        return jnp.stack([w[first - i : ticks - i] for i in range(HISTORY)], axis=1)
+
+    to_yaw_frame = jax.vmap(lambda wrench, yaw: turn(wrench, -yaw))
+    commands = to_yaw_frame(jax.tree.map(newest_first, walk.command), before.euler[:, 2])
+    label = to_yaw_frame(jax.tree.map(lambda w: w[first:], walk.effect), before.euler[:, 2])
+    tick = jnp.arange(first, ticks)
+    window = Window(
+        commands=commands,
+        contact=walk.contact[first:],
+        phase=gait.cycle_phase(config, tick),
+        since_switch=gait.since_switch(config, tick),
+    )
+    finite = [
+        jnp.isfinite(w).reshape(len(tick), -1).all(axis=1)
+        for w in jax.tree.leaves((commands, label))
+    ]
+    usable = jnp.stack([~walk.fallen[first:], *finite]).all(axis=0)
+    return Dataset(window, label, before, jnp.zeros_like(tick), tick), usable
+
+
+def split_by_walk(
+    dataset: Dataset, held_out: float = 0.2, seed: int = 0
+) -> tuple[Dataset, Dataset]:
+    """Training and held-out samples; no walk is in both.
+
+    Args:
+        dataset: samples of at least two walks.
+        held_out: share of the walks to hold out, at least one and not all.
+        seed: which ones.
+
+    Raises:
+        ValueError: fewer than two walks.
+    """
+    walks = np.unique(dataset.walk)
+    if len(walks) < 2:
+        raise ValueError(f"a split by walk needs samples of at least 2 walks, got {len(walks)}")
+    number = int(np.clip(round(held_out * len(walks)), 1, len(walks) - 1))
+    chosen = np.random.default_rng(seed).permutation(walks)[:number]
+    held = np.isin(dataset.walk, chosen)
+    return jax.tree.map(lambda x: x[~held], dataset), jax.tree.map(lambda x: x[held], dataset)

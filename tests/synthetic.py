@@ -1,0 +1,78 @@
+"""Walks that no simulator made: a command with switches, and a ground that answers late and wrong.
+
+In the yaw frame the effect is a lagged, biased and saturated function of the commands, with noise
+that nothing can predict.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hector_jax.geometry import rot_z
+from hector_jax.trajectory import State, Trajectory, Wrench
+
+CYCLE, SUBSTEPS = 40, 10
+
+
+def turn_walk(walk: Trajectory, yaw: float) -> Trajectory:
+    """The same walk in a world turned by `yaw`."""
+    R = np.asarray(rot_z(jnp.asarray(yaw)))
+
+    def state(s: State) -> State:
+        rows = State(s.euler, *(v @ R.T for v in s[1:]))
+        return rows._replace(euler=s.euler + np.array([0.0, 0.0, yaw]))
+
+    return walk._replace(
+        initial=state(walk.initial),
+        state=state(walk.state),
+        reference=state(walk.reference),
+        command=jax.tree.map(lambda w: w @ R.T, walk.command),
+        effect=jax.tree.map(lambda w: w @ R.T, walk.effect),
+        feet=walk.feet @ R.T,
+    )
+
+
+def synthetic_walk(seed: int, ticks: int = 400, noise: float = 1.0) -> Trajectory:
+    """One walk at 1 kHz that turns slowly; numpy arrays."""
+    rng = np.random.default_rng(seed)
+    tick = np.arange(ticks)
+    stands = np.stack([tick % CYCLE < CYCLE // 2, tick % CYCLE >= CYCLE // 2], axis=1)
+    drift = np.cumsum(rng.normal(size=(ticks, 2, 6)), axis=0)
+    drift -= 0.9 * np.concatenate([np.zeros((1, 2, 6)), drift[:-1]])  # nearly white, some memory
+    spread = np.array([8.0, 15.0, 8.0, 0.0, 1.5, 0.8])
+    command = np.array([0.0, 0.0, 118.0, 0.0, 0.0, 0.0]) + spread * drift * 0.4
+    command *= stands[..., None]
+    before = np.concatenate([command[:1], command[:-1]])
+    mixed = 0.7 * command + 0.3 * before
+    limit = np.array([10.0, 15.0, 400.0, 1.0, 0.5, 0.3])
+    effect = mixed / (1.0 + np.abs(mixed / limit)) + np.array([3.0, -2.0, 20.0, 0.05, 0.3, -0.1])
+    effect[..., 2] -= 0.15 * (mixed[..., 2] - 60.0) ** 2 / 60.0 + 2.0 * np.abs(mixed[..., 1])
+    effect += noise * np.array([2.0, 2.0, 5.0, 0.05, 0.2, 0.1]) * rng.normal(size=effect.shape)
+    yaw = 0.3 * np.sin(np.arange(ticks * SUBSTEPS + 1) / 1000) + rng.uniform(-1, 1)
+
+    def to_world(w: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        R = np.asarray(jax.vmap(rot_z)(angle))
+        return np.einsum("tij,tfj->tfi", R, w)
+
+    held = np.repeat(yaw[:-1:SUBSTEPS], SUBSTEPS)
+    fine = lambda w: to_world(np.repeat(w, SUBSTEPS, axis=0), held)  # noqa: E731
+    samples = ticks * SUBSTEPS
+    # ripples inside a tick, which the mean over the tick must not see
+    ripple = np.tile(np.linspace(-1, 1, SUBSTEPS), ticks)[:, None, None]
+    euler = np.zeros((samples + 1, 3))
+    euler[:, 2] = yaw
+    motion = rng.normal(size=(3, samples + 1, 3))
+    states = State(euler, *motion)
+    return Trajectory(
+        period=np.array(0.001),
+        initial=jax.tree.map(lambda s: s[0], states),
+        state=jax.tree.map(lambda s: s[1:], states),
+        reference=jax.tree.map(lambda s: s[1:], states),
+        command=Wrench(fine(command[..., :3]), fine(command[..., 3:])),
+        effect=Wrench(fine(effect[..., :3]) + ripple, fine(effect[..., 3:]) + 0.1 * ripple),
+        contact=np.repeat(stands, SUBSTEPS, axis=0),
+        feet=rng.normal(size=(samples, 2, 3)),
+        joints=rng.normal(size=(samples, 10)),
+        fallen=np.zeros(samples, bool),
+        residual=np.zeros(samples),
+    )

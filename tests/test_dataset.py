@@ -1,0 +1,252 @@
+"""From jobs to walks, shards and samples."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hector_jax.robot import load_robot
+from synthetic import CYCLE, synthetic_walk, turn_walk
+
+from hector_jax.control.reference import Anchor, named_command, reference_at
+from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.grfm import dataset as module
+from hector_jax.grfm.dataset import (
+    KINDS,
+    PIECES,
+    at_interval,
+    collect,
+    draw_jobs,
+    load_walks,
+    make_dataset,
+    split_by_walk,
+)
+from hector_jax.model.effect import HISTORY
+
+TICKS = 40
+
+
+def walks_of(*walks):
+    return jax.tree.map(lambda *x: np.stack(x), *[at_interval(w, 0.01) for w in walks])
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot()
+
+
+@pytest.fixture(scope="module")
+def three():
+    return walks_of(*[synthetic_walk(i, TICKS) for i in range(3)])
+
+
+def leaves_close(a, b, atol):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol), a, b)
+
+
+# --- jobs ---
+
+
+def test_jobs_take_turns_and_a_longer_list_begins_with_the_shorter():
+    short, long = draw_jobs(3, 8), draw_jobs(3, 12)
+    leaves_close(short, long[:8], 0.0)
+    assert [KINDS[int(job.kind)] for job in short] == [*KINDS, *KINDS]
+    assert len({int(job.plant) for job in long}) == 12
+    other = draw_jobs(4, 1)[0]
+    assert not np.array_equal(other.weights.Q.euler, short[0].weights.Q.euler)
+
+
+def test_drawn_weights_lie_within_a_third_and_three_times_of_their_centres():
+    jobs = draw_jobs(0, 64)
+    for i, job in enumerate(jobs):
+        centre = (nominal(), expert())[i // len(KINDS) % 2]
+        ratio = np.asarray(weights_to_vector(job.weights) / weights_to_vector(centre))
+        assert np.all((ratio > 1 / 3.001) & (ratio < 3.001))
+    logs = np.log([np.asarray(weights_to_vector(j.weights)) for j in jobs[:4] + jobs[8:12]])
+    assert np.all(logs.std(axis=0) > 0.1)
+
+
+def test_points_of_tuning_paths_are_walked_where_paths_are_given():
+    path = jax.tree.map(lambda w: np.stack([w * (1 + i) for i in range(5)]), nominal())
+    vectors = np.asarray(weights_to_vector(path))
+    on_path = [
+        np.isclose(vectors, weights_to_vector(job.weights)).all(axis=1).any()
+        for job in draw_jobs(0, 24, [path])
+    ]
+    assert sum(on_path) == 8
+
+
+def test_named_commands_are_walked_unchanged():
+    anchor = Anchor(jnp.zeros(3), jnp.array(0.0), jnp.array(0))
+    for job in draw_jobs(0, 3):
+        name = KINDS[int(job.kind)]
+        assert job.command.duration.shape == (PIECES,)
+        for tick in (0.0, 150.0, 250.0, 399.0, 530.0):
+            leaves_close(
+                reference_at(0.01, job.command, anchor, jnp.array(tick)),
+                reference_at(0.01, named_command(name), anchor, jnp.array(tick)),
+                1e-12,
+            )
+
+
+def test_no_walks_are_refused():
+    with pytest.raises(ValueError, match="number of walks must be at least 1, got 0"):
+        draw_jobs(0, 0)
+
+
+# --- walks at the plan interval ---
+
+
+def test_an_interval_keeps_mean_wrenches_and_last_states():
+    walk = synthetic_walk(0, 4)
+    fallen = walk.fallen.copy()
+    fallen[25:] = True
+    coarse = at_interval(walk._replace(fallen=fallen), 0.01)
+    np.testing.assert_allclose(coarse.effect.force[1], walk.effect.force[10:20].mean(axis=0))
+    np.testing.assert_array_equal(coarse.state.euler[1], walk.state.euler[19])
+    np.testing.assert_array_equal(coarse.fallen, [False, False, True, True])
+    assert coarse.period == 0.01
+    again = at_interval(coarse, 0.01)
+    leaves_close(again, coarse, 0.0)
+
+
+@pytest.mark.parametrize("interval", [0.0004, 0.0015, 0.012])
+def test_samples_that_do_not_fill_intervals_are_refused(interval):
+    with pytest.raises(ValueError, match="40 samples of 0.001 s do not fill"):
+        at_interval(synthetic_walk(0, 4), interval)
+
+
+# --- samples ---
+
+
+def test_a_sample_is_the_newest_commands_and_the_effect_of_its_tick(three):
+    data, dropped = make_dataset(three)
+    assert dropped == 0
+    assert len(data.walk) == 3 * (TICKS - HISTORY + 1)
+    row = np.flatnonzero((data.walk == 1) & (data.tick == 7))[0]
+    yaw = three.state.euler[1, 6, 2]
+    c, s = np.cos(yaw), np.sin(yaw)
+    to_world = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    for age in range(HISTORY):
+        np.testing.assert_allclose(
+            data.window.commands.force[row, age] @ to_world.T,
+            three.command.force[1, 7 - age],
+            atol=1e-12,
+        )
+    np.testing.assert_allclose(
+        data.label.moment[row] @ to_world.T, three.effect.moment[1, 7], atol=1e-12
+    )
+    np.testing.assert_array_equal(data.state.velocity[row], three.state.velocity[1, 6])
+    np.testing.assert_array_equal(data.window.contact[row], three.contact[1, 7])
+    np.testing.assert_allclose(data.window.phase, data.tick / CYCLE % 1.0)
+    np.testing.assert_allclose(data.window.since_switch, 0.01 * (data.tick % 20))
+
+
+def test_the_window_agrees_with_the_planned_contact(three):
+    data, _ = make_dataset(three)
+    np.testing.assert_array_equal(data.window.contact[:, 0], data.window.phase < 0.5)
+
+
+def test_a_walk_on_another_heading_makes_the_same_samples():
+    walk = synthetic_walk(5, TICKS)
+    here, _ = make_dataset(walks_of(walk))
+    there, _ = make_dataset(walks_of(turn_walk(walk, 2.1)))
+    leaves_close(here.window, there.window, 1e-10)
+    leaves_close(here.label, there.label, 1e-10)
+
+
+def test_samples_after_a_fall_are_dropped_and_counted(three):
+    fallen = three.fallen.copy()
+    fallen[2, 30:] = True
+    broken = three._replace(fallen=fallen)
+    broken.effect.force[2, 35:] = np.nan
+    data, dropped = make_dataset(broken)
+    assert dropped == 10
+    assert data.tick[data.walk == 2].max() == 29
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(data))
+
+
+def test_no_walk_is_in_both_parts_of_a_split(three):
+    data, _ = make_dataset(three)
+    for share in (0.01, 0.4, 0.99):
+        train, held = split_by_walk(data, share, seed=1)
+        assert not set(train.walk) & set(held.walk)
+        assert set(train.walk) | set(held.walk) == {0, 1, 2}
+        assert len(train.walk) + len(held.walk) == len(data.walk)
+
+
+def test_a_split_needs_two_walks():
+    data, _ = make_dataset(walks_of(synthetic_walk(0, TICKS)))
+    with pytest.raises(ValueError, match="at least 2 walks, got 1"):
+        split_by_walk(data)
+
+
+# --- collection ---
+
+
+def walker(walked=None):
+    """Walks jobs, and notes in a list which ones."""
+
+    def walk_jobs(jobs):
+        if walked is not None:
+            walked.extend(int(job.plant) for job in jobs)
+        return [synthetic_walk(int(job.plant) % 1000, 4) for job in jobs]
+
+    return walk_jobs
+
+
+@pytest.fixture
+def small_shards(monkeypatch):
+    monkeypatch.setattr(module, "SHARD", 2)
+
+
+@pytest.mark.usefixtures("small_shards")
+def test_collected_walks_come_back_in_order_with_their_jobs(tmp_path, robot):
+    jobs, steps = draw_jobs(0, 5), []
+    collect(
+        tmp_path / "data", jobs, walker(), robot=robot, progress=lambda *done: steps.append(done)
+    )
+    assert steps == [(2, 5), (4, 5), (5, 5)]
+    walks = load_walks(tmp_path / "data", robot)
+    np.testing.assert_array_equal(walks.job.plant, [job.plant for job in jobs])
+    expected = at_interval(synthetic_walk(int(jobs[3].plant) % 1000, 4), 0.01)
+    leaves_close(jax.tree.map(lambda x: x[3], walks.trajectory), expected, 0.0)
+
+
+@pytest.mark.usefixtures("small_shards")
+def test_collection_takes_up_where_it_stopped(tmp_path, robot):
+    jobs, walked = draw_jobs(0, 6), []
+
+    def stops(chunk):
+        if len(walked) >= 4:
+            raise KeyboardInterrupt
+        return walker(walked)(chunk)
+
+    with pytest.raises(KeyboardInterrupt):
+        collect(tmp_path, jobs, stops, robot=robot)
+    with pytest.raises(ValueError, match="no finished collection"):
+        load_walks(tmp_path, robot)
+    shard = tmp_path / "shard-000.npz"
+    shard.write_bytes(shard.read_bytes()[:-1])  # damaged: made again
+    walked.clear()
+    collect(tmp_path, jobs, walker(walked), robot=robot)
+    assert walked == [int(jobs[i].plant) for i in (0, 1, 4, 5)]
+    collect(tmp_path, jobs, walker(walked), robot=robot)
+    assert len(walked) == 4
+    assert len(load_walks(tmp_path, robot).job.kind) == 6
+
+
+@pytest.mark.usefixtures("small_shards")
+def test_a_collection_of_something_else_is_not_overwritten(tmp_path, robot):
+    collect(tmp_path, draw_jobs(0, 2), walker(), robot=robot, about={"ticks": 4})
+    before = (tmp_path / "shard-000.npz").read_bytes()
+    heavier = robot._replace(mass=np.asarray(robot.mass) + 1.0)
+    for jobs, body, ticks, message in (
+        (draw_jobs(1, 2), robot, 4, "shard-000.npz: collected for other walks"),
+        (draw_jobs(0, 2), robot, 5, "shard-000.npz: collected with other settings"),
+        (draw_jobs(0, 2), heavier, 4, "shard-000.npz: made for robot"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            collect(tmp_path, jobs, walker(), robot=body, about={"ticks": ticks})
+    assert (tmp_path / "shard-000.npz").read_bytes() == before
+    with pytest.raises(ValueError, match="shard-000.npz: made for robot"):
+        load_walks(tmp_path, heavier)

@@ -1,0 +1,111 @@
+"""Training GRFM-Net on walks that no simulator made."""
+
+import jax
+import numpy as np
+import pytest
+from synthetic import synthetic_walk
+
+from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk
+from hector_jax.grfm.network import as_effect, fit_linear, linear_effect
+from hector_jax.grfm.training import TrainConfig, errors, report, train
+from hector_jax.model.effect import last_command
+
+
+def dataset(seeds, ticks=200, noise=0.3):
+    walks = [at_interval(synthetic_walk(i, ticks, noise), 0.01) for i in seeds]
+    return make_dataset(jax.tree.map(lambda *x: np.stack(x), *walks))[0]
+
+
+@pytest.fixture(scope="module")
+def parts():
+    return split_by_walk(dataset(range(10)), 0.3)
+
+
+@pytest.fixture(scope="module")
+def trained(parts):
+    return train(TrainConfig(epochs=60, batch=64), *parts)
+
+
+def test_the_net_beats_the_raw_command_and_the_linear_map_on_walks_it_never_saw(parts, trained):
+    held_out = parts[1]
+    told = report(
+        {
+            "raw": last_command,
+            "linear": linear_effect(fit_linear(parts[0])),
+            "net": as_effect(trained[0]),
+        },
+        held_out,
+    )
+    assert told["net"]["force"] < 0.35 * told["raw"]["force"]
+    assert told["net"]["force"] < 0.7 * told["linear"]["force"]
+    assert told["net"]["moment"] < 0.8 * told["linear"]["moment"]
+    assert told["linear"]["force"] < told["raw"]["force"]
+
+
+def test_the_errors_by_phase_and_axis_make_up_the_whole(parts):
+    told = errors(last_command, parts[1])
+    share = parts[1].window.contact.mean()
+    axes = share * told.stance + (1 - share) * told.swing
+    np.testing.assert_allclose(axes[:3].mean(), told.force)
+    np.testing.assert_allclose(axes[3:].mean(), told.moment)
+
+
+def test_the_kept_nets_are_those_of_the_best_held_out_epochs(parts, trained):
+    params, history = trained
+    assert history.valid_force.shape == (60,)
+    told = errors(as_effect(params), parts[1])
+    np.testing.assert_allclose(told.force, history.valid_force.min(), rtol=1e-3)
+    np.testing.assert_allclose(told.moment, history.valid_moment.min(), rtol=1e-3)
+    assert history.train_force[-1] < 0.2 * history.train_force[0]
+
+
+def test_the_same_seed_makes_the_same_bytes(parts):
+    config = TrainConfig(epochs=2, batch=64)
+    one, other = train(config, *parts), train(config, *parts)
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+    third, _ = train(TrainConfig(epochs=2, batch=64, seed=1), *parts)
+    assert not np.array_equal(third.force["Dense_0"]["kernel"], one[0].force["Dense_0"]["kernel"])
+
+
+def test_sixteen_samples_can_be_learned_by_heart():
+    few = jax.tree.map(lambda x: x[20:36], dataset([0], 40))
+    params, history = train(TrainConfig(epochs=1500, batch=16, l2=0.0), few, few)
+    spread = float(few.label.force.var(axis=0).mean())
+    assert history.valid_force.min() < 1e-3 * spread
+    assert errors(as_effect(params), few).force < 1e-3 * spread
+
+
+def test_l2_keeps_the_kernels_small(parts):
+    size = []
+    for l2 in (0.0, 0.1):
+        params, _ = train(TrainConfig(epochs=10, batch=64, l2=l2), *parts)
+        size.append(np.abs(params.force["Dense_1"]["kernel"]).mean())
+    assert size[1] < 0.5 * size[0]
+
+
+def test_progress_is_told_after_each_epoch(parts):
+    told = []
+    train(
+        TrainConfig(epochs=3, batch=64),
+        *parts,
+        progress=lambda epoch, history: told.append((epoch, len(history.valid_force))),
+    )
+    assert told == [(1, 1), (2, 2), (3, 3)]
+
+
+def test_a_batch_larger_than_the_data_is_all_of_it():
+    data = dataset([0], 40)
+    train(TrainConfig(epochs=1, batch=10_000), data, data)
+
+
+def test_no_samples_or_no_sense_are_refused(parts):
+    none = jax.tree.map(lambda x: x[:0], parts[0])
+    with pytest.raises(ValueError, match="held-out set has no samples"):
+        train(TrainConfig(epochs=1), parts[0], none)
+    with pytest.raises(ValueError, match="at least 1 epoch"):
+        TrainConfig(epochs=0)
+    with pytest.raises(ValueError, match="learning_rate > 0"):
+        TrainConfig(learning_rate=float("nan"))
+    broken = parts[0]._replace(label=jax.tree.map(lambda w: w * np.nan, parts[0].label))
+    with pytest.raises(ValueError, match="training diverged"):
+        train(TrainConfig(epochs=1, batch=64), broken, parts[1])
