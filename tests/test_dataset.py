@@ -1,15 +1,15 @@
 """From jobs to walks, shards and samples."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hector_jax.robot import load_robot
 from synthetic import CYCLE, synthetic_walk, turn_walk
 
 from hector_jax.control.reference import Anchor, named_command, reference_at
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.grfm import dataset as module
 from hector_jax.grfm.dataset import (
     KINDS,
     PIECES,
@@ -21,6 +21,7 @@ from hector_jax.grfm.dataset import (
     split_by_walk,
 )
 from hector_jax.model.effect import HISTORY
+from hector_jax.robot import load_robot
 
 TICKS = 40
 
@@ -49,8 +50,8 @@ def leaves_close(a, b, atol):
 def test_jobs_take_turns_and_a_longer_list_begins_with_the_shorter():
     short, long = draw_jobs(3, 8), draw_jobs(3, 12)
     leaves_close(short, long[:8], 0.0)
-    assert [KINDS[int(job.kind)] for job in short] == [*KINDS, *KINDS]
-    assert len({int(job.plant) for job in long}) == 12
+    assert len({float(job.imperfections.backlash) for job in long}) == 12
+    assert [np.ptp(job.command.yaw_rate) > 0 for job in short] == [False, False, True, True] * 2
     other = draw_jobs(4, 1)[0]
     assert not np.array_equal(other.weights.Q.euler, short[0].weights.Q.euler)
 
@@ -77,8 +78,7 @@ def test_points_of_tuning_paths_are_walked_where_paths_are_given():
 
 def test_named_commands_are_walked_unchanged():
     anchor = Anchor(jnp.zeros(3), jnp.array(0.0), jnp.array(0))
-    for job in draw_jobs(0, 3):
-        name = KINDS[int(job.kind)]
+    for name, job in zip(KINDS, draw_jobs(0, 3), strict=False):
         assert job.command.duration.shape == (PIECES,)
         for tick in (0.0, 150.0, 250.0, 399.0, 530.0):
             leaves_close(
@@ -146,6 +146,12 @@ def test_the_window_agrees_with_the_planned_contact(three):
     np.testing.assert_array_equal(data.window.contact[:, 0], data.window.phase < 0.5)
 
 
+def test_the_gait_s_phase_counts_from_the_start_tick(three):
+    data, _ = make_dataset(three, start_tick=[0, 10, 30])
+    starts = np.array([0, 10, 30])[data.walk]
+    np.testing.assert_allclose(data.window.phase, (data.tick + starts) % CYCLE / CYCLE)
+
+
 def test_a_walk_on_another_heading_makes_the_same_samples():
     walk = synthetic_walk(5, TICKS)
     here, _ = make_dataset(walks_of(walk))
@@ -184,58 +190,50 @@ def test_a_split_needs_two_walks():
 
 
 def walker(walked=None):
-    """Walks jobs, and notes in a list which ones."""
+    """Walks jobs, one when asked for one, and notes in a list which ones."""
 
     def walk_jobs(jobs):
-        if walked is not None:
-            walked.extend(int(job.plant) for job in jobs)
-        return [synthetic_walk(int(job.plant) % 1000, 4) for job in jobs]
+        for job in jobs:
+            if walked is not None:
+                walked.append(job.seed)
+            yield synthetic_walk(job.seed, 4)
 
     return walk_jobs
 
 
-@pytest.fixture
-def small_shards(monkeypatch):
-    monkeypatch.setattr(module, "SHARD", 2)
-
-
-@pytest.mark.usefixtures("small_shards")
 def test_collected_walks_come_back_in_order_with_their_jobs(tmp_path, robot):
     jobs, steps = draw_jobs(0, 5), []
-    collect(
-        tmp_path / "data", jobs, walker(), robot=robot, progress=lambda *done: steps.append(done)
-    )
-    assert steps == [(2, 5), (4, 5), (5, 5)]
+    note = lambda *done: steps.append(done)  # noqa: E731
+    collect(tmp_path / "data", jobs, walker(), robot=robot, shard=2, progress=note)
+    assert steps == [(i, 5) for i in range(6)]
     walks = load_walks(tmp_path / "data", robot)
-    np.testing.assert_array_equal(walks.job.plant, [job.plant for job in jobs])
-    expected = at_interval(synthetic_walk(int(jobs[3].plant) % 1000, 4), 0.01)
+    np.testing.assert_array_equal(walks.job.seed, range(5))
+    leaves_close(jax.tree.map(lambda x: x[3], walks.job), jobs[3], 0.0)
+    expected = at_interval(synthetic_walk(3, 4), 0.01)
     leaves_close(jax.tree.map(lambda x: x[3], walks.trajectory), expected, 0.0)
 
 
-@pytest.mark.usefixtures("small_shards")
 def test_collection_takes_up_where_it_stopped(tmp_path, robot):
     jobs, walked = draw_jobs(0, 6), []
 
     def stops(chunk):
-        if len(walked) >= 4:
-            raise KeyboardInterrupt
-        return walker(walked)(chunk)
+        yield from itertools.islice(walker(walked)(chunk), 5)
+        raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect(tmp_path, jobs, stops, robot=robot)
+        collect(tmp_path, jobs, stops, robot=robot, shard=2)
     with pytest.raises(ValueError, match="no finished collection"):
         load_walks(tmp_path, robot)
-    shard = tmp_path / "shard-000.npz"
-    shard.write_bytes(shard.read_bytes()[:-1])  # damaged: made again
+    first = tmp_path / "shard-000.npz"
+    first.write_bytes(first.read_bytes()[:-1])  # damaged: made again
     walked.clear()
-    collect(tmp_path, jobs, walker(walked), robot=robot)
-    assert walked == [int(jobs[i].plant) for i in (0, 1, 4, 5)]
-    collect(tmp_path, jobs, walker(walked), robot=robot)
+    collect(tmp_path, jobs, walker(walked), robot=robot, shard=2)
+    assert walked == [0, 1, 4, 5]
+    collect(tmp_path, jobs, walker(walked), robot=robot, shard=2)
     assert len(walked) == 4
-    assert len(load_walks(tmp_path, robot).job.kind) == 6
+    assert len(load_walks(tmp_path, robot).job.seed) == 6
 
 
-@pytest.mark.usefixtures("small_shards")
 def test_a_collection_of_something_else_is_not_overwritten(tmp_path, robot):
     collect(tmp_path, draw_jobs(0, 2), walker(), robot=robot, about={"ticks": 4})
     before = (tmp_path / "shard-000.npz").read_bytes()
@@ -250,3 +248,10 @@ def test_a_collection_of_something_else_is_not_overwritten(tmp_path, robot):
     assert (tmp_path / "shard-000.npz").read_bytes() == before
     with pytest.raises(ValueError, match="shard-000.npz: made for robot"):
         load_walks(tmp_path, heavier)
+
+
+def test_a_walk_that_did_not_come_is_told(tmp_path, robot):
+    with pytest.raises(ValueError, match="shard-001.npz: 2 walks asked for, 1 came"):
+        collect(
+            tmp_path, draw_jobs(0, 4), lambda jobs: list(walker()(jobs))[:3], robot=robot, shard=2
+        )

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hector_jax.robot import load_robot
 from synthetic import synthetic_walk
 
 from hector_jax.grfm.dataset import at_interval, make_dataset
@@ -18,6 +17,7 @@ from hector_jax.grfm.network import (
     save_net,
 )
 from hector_jax.model.effect import HISTORY, Window
+from hector_jax.robot import load_robot
 from hector_jax.trajectory import Wrench
 
 

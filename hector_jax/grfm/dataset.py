@@ -7,9 +7,10 @@ before, and the mean wrench that the ground returned over the tick, all in the r
 the start of the tick. Training and validation are split by walk: samples of one walk are too alike.
 """
 
+import itertools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,13 +25,14 @@ from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.model.effect import HISTORY, Window, turn
 from hector_jax.robot import Robot
+from hector_jax.sim.walk import Job
+from hector_jax.sim.world import hfs, hfs_drawn
 from hector_jax.storage import load_tree, read_card, save_tree, write_file
 from hector_jax.trajectory import State, Trajectory, Wrench
 
-KINDS = (*COMMANDS, "random")  # of walks; a job holds the index
+KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
 PIECES = 4  # of every command, so that jobs can be stacked
-SHARD = 16  # walks in a file
 
 _UNITS = {
     "period": "s",
@@ -45,19 +47,10 @@ _UNITS = {
 }
 
 
-class Job(NamedTuple):
-    """One walk to take; fields of a stacked job have leading axes."""
-
-    command: Command  # of PIECES pieces
-    weights: Weights
-    kind: Int[Array, "*batch"]  # index into KINDS
-    plant: Int[Array, "*batch"]  # seed of the drawn imperfections
-
-
 class Walks(NamedTuple):
     """Walks with what was asked for, stacked; trajectories are sampled at the plan interval."""
 
-    job: Job
+    job: Job  # arrays with a leading axis; commands of PIECES pieces
     trajectory: Trajectory
 
 
@@ -71,39 +64,43 @@ class Dataset(NamedTuple):
     tick: Int[Array, " n"]  # which tick of it
 
 
-def draw_jobs(seed: int, count: int, paths: Sequence[Weights] = ()) -> list[Job]:
+def draw_jobs(
+    seed: int, count: int, paths: Sequence[Weights] = (), seconds: float = 4.0
+) -> list[Job]:
     """What to walk so that phi knows the ground that tuning will tread.
 
     Trajectories take turns: straight, c, s, random velocities. Weights take turns too: each of the
     24 log-uniform around nominal, around expert and, where tuning paths are given, a point of one.
-    Job i depends on the seed and on i alone, so a longer list begins with the shorter one.
+    Each walk has a plant of its own, drawn around the hfs. Job i depends on the seed and on i
+    alone, so a longer list begins with the shorter one.
 
     Args:
         seed: of everything drawn.
         count: number of walks.
         paths: weights that tunings went through, stacked along a first axis each.
+        seconds: length of each walk.
 
     Raises:
         ValueError: fewer than one walk.
     """
     if count < 1:
         raise ValueError(f"the number of walks must be at least 1, got {count}")
-    return [_draw_job(np.random.default_rng([seed, i]), i, paths) for i in range(count)]
+    return [_draw_job(np.random.default_rng([seed, i]), i, paths, seconds) for i in range(count)]
 
 
-def _draw_job(rng: np.random.Generator, i: int, paths: Sequence[Weights]) -> Job:
+def _draw_job(rng: np.random.Generator, i: int, paths: Sequence[Weights], seconds: float) -> Job:
     kind = KINDS[i % len(KINDS)]
     command = _random_command(rng) if kind == "random" else _split_last(named_command(kind))
     centre = (i // len(KINDS)) % (3 if paths else 2)
     if centre == 2:
-        path = paths[rng.integers(len(paths))]
+        path = paths[int(rng.integers(len(paths)))]
         point = rng.integers(len(path.Q.euler))
         weights = jax.tree.map(lambda w: np.asarray(w)[point], path)
     else:
         weights = jax.tree.map(
             lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape), (nominal(), expert())[centre]
         )
-    return Job(command, weights, np.array(KINDS.index(kind)), rng.integers(2**31))
+    return Job(weights, command, hfs_drawn(int(rng.integers(2**31))), seconds, seed=i)
 
 
 def _random_command(rng: np.random.Generator) -> Command:
@@ -164,56 +161,65 @@ def at_interval(walk: Trajectory, interval: float) -> Trajectory:
 def collect(
     folder: Path,
     jobs: Sequence[Job],
-    walk_jobs: Callable[[list[Job]], list[Trajectory]],
+    walk_jobs: Callable[[list[Job]], Iterable[Trajectory]],
     *,
     robot: Robot,
     interval: float = GaitConfig.tick,
+    shard: int = 16,
     about: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Walk all jobs and keep them under `folder` in shards, taking up what an earlier call left.
 
-    A sound shard of the same jobs is kept, a missing or damaged one is made. `card.json` appears
-    when all are there.
+    A sound shard of the same jobs is kept, a missing or damaged one is made and written as soon as
+    its walks are there. `card.json` appears when all are.
 
     Args:
         folder: where; made if missing.
         jobs: what to walk.
-        walk_jobs: takes the jobs of a shard and returns their walks in order, from any world.
+        walk_jobs: called once, with the jobs whose walks are missing; gives the walks in their
+            order, from any world. An iterator that walks while it is asked loses least to a stop.
         robot: the body; shards of another one are refused.
         interval: the plan interval [s].
+        shard: walks in a file.
         about: JSON values that tell how it was walked; shards that tell otherwise are refused.
         progress: called with walks done and walks in all.
 
     Raises:
-        ValueError: a shard in the folder is of other jobs, another robot or another `about`.
+        ValueError: a shard in the folder is of other jobs, another robot or another `about`, or
+            walks are missing or too short.
         OSError: the folder cannot be written.
     """
-    folder, told = Path(folder), {"interval": interval, **(about or {})}
-    told = json.loads(json.dumps(told))  # as it will be read back
+    told = json.loads(json.dumps({"interval": interval, **(about or {})}))  # as it is read back
     facts = {
         "units": _UNITS,
         "frames": "world; wrench of the ground on the foot at its foot point, left then right",
-        "kinds": KINDS,
         "told": told,
     }
-    names, falls = [], 0
-    for start in range(0, len(jobs), SHARD):
-        chunk = list(jobs[start : start + SHARD])
-        path = folder / f"shard-{start // SHARD:03d}.npz"
-        asked = _stack(chunk)
-        walks = _kept_shard(path, asked, robot, told)
-        if walks is None:
-            taken = [at_interval(walk, interval) for walk in walk_jobs(chunk)]
+    chunks = {
+        Path(folder) / f"shard-{start // shard:03d}.npz": jobs[start : start + shard]
+        for start in range(0, len(jobs), shard)
+    }
+    kept = {path: _kept_shard(path, _stack(chunk), robot, told) for path, chunk in chunks.items()}
+    missing = [job for path, chunk in chunks.items() if kept[path] is None for job in chunk]
+    walks = iter(walk_jobs(missing) if missing else ())
+    done, falls = len(jobs) - len(missing), 0
+    progress(done, len(jobs))
+    for path, chunk in chunks.items():
+        shard_walks = kept[path]
+        if shard_walks is None:
+            taken = []
+            for walk in itertools.islice(walks, len(chunk)):
+                taken.append(at_interval(walk, interval))
+                done += 1
+                progress(done, len(jobs))
             if len(taken) != len(chunk):
-                raise ValueError(f"asked for {len(chunk)} walks, got {len(taken)}")
-            walks = Walks(asked, _stack(taken))
-            save_tree(path, walks, kind="walks", robot=robot, about=facts)
-        names.append(path.name)
-        falls += int(np.any(walks.trajectory.fallen, axis=1).sum())
-        progress(start + len(chunk), len(jobs))
-    card = {"walks": len(jobs), "falls": falls, "shards": names, **facts}
-    write_file(folder / "card.json", (json.dumps(card, indent=2) + "\n").encode())
+                raise ValueError(f"{path}: {len(chunk)} walks asked for, {len(taken)} came")
+            shard_walks = Walks(_stack(chunk), _stack(taken))
+            save_tree(path, shard_walks, kind="walks", robot=robot, about=facts)
+        falls += int(np.any(shard_walks.trajectory.fallen, axis=1).sum())
+    card = {"walks": len(jobs), "falls": falls, "shards": [p.name for p in chunks], **facts}
+    write_file(Path(folder) / "card.json", (json.dumps(card, indent=2) + "\n").encode())
 
 
 def load_walks(folder: Path, robot: Robot) -> Walks:
@@ -269,10 +275,12 @@ def _like() -> Walks:
     state = State(*[zeros(0, 0, 3)] * 4)
     wrench = Wrench(zeros(0, 0, 2, 3), zeros(0, 0, 2, 3))
     job = Job(
-        command=Command(zeros(0, PIECES), zeros(0, PIECES, 2), zeros(0, PIECES)),
         weights=Weights(State(*[zeros(0, 3)] * 4), Wrench(zeros(0, 2, 3), zeros(0, 2, 3))),
-        kind=zeros(0),
-        plant=zeros(0),
+        command=Command(zeros(0, PIECES), zeros(0, PIECES, 2), zeros(0, PIECES)),
+        imperfections=jax.tree.map(lambda x: zeros(0, *np.shape(x)), hfs()),
+        seconds=zeros(0),
+        seed=zeros(0),
+        start_tick=zeros(0),
     )
     trajectory = Trajectory(
         period=zeros(0),
@@ -290,11 +298,14 @@ def _like() -> Walks:
     return Walks(job, trajectory)
 
 
-def make_dataset(walks: Trajectory, config: GaitConfig | None = None) -> tuple[Dataset, int]:
+def make_dataset(
+    walks: Trajectory, start_tick: Any = 0, config: GaitConfig | None = None
+) -> tuple[Dataset, int]:
     """Samples from walks at the plan interval.
 
     Args:
         walks: W walks of T ticks, stacked, from t = 0.
+        start_tick: gait tick of t = 0, of all walks or of each (W,).
         config: the gait that was walked.
 
     Returns:
@@ -302,17 +313,18 @@ def make_dataset(walks: Trajectory, config: GaitConfig | None = None) -> tuple[D
         first HISTORY - 1 ticks of a walk have no full history and are no samples.
     """
     config = config or GaitConfig()
-    samples, usable = jax.vmap(lambda walk: _samples(config, walk))(
-        jax.tree.map(jnp.asarray, walks)
+    count = len(walks.fallen)
+    starts = jnp.broadcast_to(jnp.asarray(start_tick, jnp.int32), (count,))
+    samples, usable = jax.vmap(lambda *walk: _samples(config, *walk))(
+        jnp.arange(count), starts, jax.tree.map(jnp.asarray, walks)
     )
-    count, ticks = usable.shape
     usable = np.asarray(usable)
-    samples = samples._replace(walk=np.broadcast_to(np.arange(count)[:, None], (count, ticks)))
-    kept = jax.tree.map(lambda x: np.asarray(x)[usable], samples)
-    return kept, int(usable.size - usable.sum())
+    return jax.tree.map(lambda x: np.asarray(x)[usable], samples), int((~usable).sum())
 
 
-def _samples(config: GaitConfig, walk: Trajectory) -> tuple[Dataset, Bool[Array, " n"]]:
+def _samples(
+    config: GaitConfig, number: Int[Array, ""], start_tick: Int[Array, ""], walk: Trajectory
+) -> tuple[Dataset, Bool[Array, " n"]]:
     """Samples of one walk and whether each is of a robot on its feet."""
     first, ticks = HISTORY - 1, walk.fallen.shape[0]
     before = jax.tree.map(
@@ -331,15 +343,15 @@ def _samples(config: GaitConfig, walk: Trajectory) -> tuple[Dataset, Bool[Array,
     window = Window(
         commands=commands,
         contact=walk.contact[first:],
-        phase=gait.cycle_phase(config, tick),
-        since_switch=gait.since_switch(config, tick),
+        phase=gait.cycle_phase(config, start_tick + tick),
+        since_switch=gait.since_switch(config, start_tick + tick),
     )
     finite = [
         jnp.isfinite(w).reshape(len(tick), -1).all(axis=1)
         for w in jax.tree.leaves((commands, label))
     ]
     usable = jnp.stack([~walk.fallen[first:], *finite]).all(axis=0)
-    return Dataset(window, label, before, jnp.zeros_like(tick), tick), usable
+    return Dataset(window, label, before, jnp.full_like(tick, number), tick), usable
 
 
 def split_by_walk(
