@@ -1,0 +1,90 @@
+"""Walks, scores and verdicts that no simulator made, for what is only drawn, judged or written."""
+
+import numpy as np
+
+from hector_jax.evaluation.metrics import SETS, Score, Verdict
+from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.tuning.loss import LossConfig
+
+
+def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):
+    """A walk at 0.5 m/s that sways about its reference by `error` [m]; numpy arrays."""
+    rng = np.random.default_rng(seed)
+    count = round(seconds / period)
+    t = period * np.arange(1, count + 1)
+    yaw = turn * t
+    step = 2 * np.pi * t / 0.4
+    along = period * np.cumsum(0.5 * np.stack([np.cos(yaw), np.sin(yaw), 0 * t], axis=1), axis=0)
+    zero = np.zeros((count, 3))
+    reference = State(
+        np.stack([0 * t, 0 * t, yaw], axis=1),
+        along + [0, 0, 0.5],
+        zero,
+        np.gradient(along, t, axis=0),
+    )
+    slow = rng.normal(size=(2, 3)) * error
+    sway = np.stack([np.sin(2 * step), np.sin(step), np.cos(2 * step)], axis=1)
+    state = State(
+        reference.euler + 1.5 * error * sway + slow[0] * t[:, None] / seconds,
+        reference.position + 0.3 * error * sway + slow[1] * t[:, None] / seconds,
+        zero,
+        reference.velocity,
+    )
+    left = np.mod(t - period / 2, 0.4) < 0.2
+    contact = np.stack([left, ~left], axis=1)
+    carried = contact[..., None] * np.array([0.0, 0.0, 118.0])
+    shape = np.stack([np.sin(step), np.cos(step), np.sin(2 * step)], axis=1)[:, None]
+    command = Wrench(
+        carried + contact[..., None] * shape * [15, 20, 10],
+        contact[..., None] * shape * [0, 2.0, 1.0],
+    )
+    effect = Wrench(
+        0.9 * command.force + rng.normal(size=(count, 2, 3)) * [2, 2, 5],
+        0.7 * command.moment + 0.1 * rng.normal(size=(count, 2, 3)),
+    )
+    fallen = np.zeros(count, bool)
+    if fall_at is not None:
+        fallen = t > fall_at
+        state = State(*(np.where(fallen[:, None], np.nan, x) for x in state))
+    feet = state.position[:, None] + np.array([[0, 0.07, -0.5], [0, -0.07, -0.5]])
+    swing = 0.3 * np.sin(step)
+    left_leg = np.stack([0 * t, 0 * t, 0.6 + swing, -1.2 - 0.3 * abs(swing), 0.6 - swing], axis=1)
+    right_leg = np.stack([0 * t, 0 * t, 0.6 - swing, -1.2 - 0.3 * abs(swing), 0.6 + swing], axis=1)
+    return Trajectory(
+        period=np.array(period),
+        initial=State(np.zeros(3), np.array([0, 0, 0.5]), np.zeros(3), np.zeros(3)),
+        state=state,
+        reference=reference,
+        command=command,
+        effect=effect,
+        contact=contact,
+        feet=feet,
+        joints=np.concatenate([left_leg, right_leg], axis=1),
+        fallen=fallen,
+        residual=np.zeros(count),
+    )
+
+
+def pretend_score(loss, fallen=False):
+    """A score whose total is `loss`."""
+    return Score(
+        *(np.array(x) for x in (loss, 4e-6 * loss, 2e-6 * loss, 0.2 * loss, 0.15 * loss)),
+        rms_euler=np.array([0.02, 0.03, 0.01]),
+        rms_position=np.array([0.02, 0.01, 0.005]),
+        fallen=np.array(fallen),
+    )
+
+
+def pretend_verdict(seeds=8, fallen=()):
+    """A verdict over all sets; `fallen` names pairs (set, seed index) that fell."""
+    plant = np.exp(0.3 * np.random.default_rng(0).normal(size=seeds))
+    level = dict(zip(SETS, (3.2e6, 2.9e6, 3.0e6, 1.9e6, 2.6e6, 1.2e6), strict=True))
+    noise = np.random.default_rng(1).normal(size=(len(SETS), seeds))
+    scores = {}
+    for name, row in zip(SETS, noise, strict=True):
+        rows = [
+            pretend_score(level[name] * plant[i] * np.exp(0.05 * row[i]), (name, i) in fallen)
+            for i in range(seeds)
+        ]
+        scores[name] = Score(*(np.stack(x) for x in zip(*rows, strict=True)))
+    return Verdict(np.arange(seeds), scores, LossConfig())

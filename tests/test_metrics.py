@@ -1,0 +1,116 @@
+"""Scores, intervals and comparisons."""
+
+import json
+
+import numpy as np
+import pytest
+from pretend import pretend_score, pretend_verdict, pretend_walk
+
+from hector_jax.evaluation import metrics
+from hector_jax.tuning.loss import LossConfig
+
+
+def _judge(**losses):
+    scores = {name: [pretend_score(x) for x in row] for name, row in losses.items()}
+    return metrics.judge(LossConfig(), range(len(next(iter(losses.values())))), scores)
+
+
+def test_the_total_is_the_weighted_sum_of_the_parts():
+    one = metrics.score(LossConfig(euler=2.0, position=3.0), pretend_walk())
+    assert one.L == pytest.approx(2 * one.L_Eul + 3 * one.L_pos + one.L_ctrl, rel=1e-12)
+    assert 0 < one.switching < one.L_ctrl
+
+
+def test_rms_errors_are_those_of_the_walk_per_axis():
+    walk = pretend_walk()
+    offset = np.array([0.01, 0.02, 0.03])
+    shifted = walk._replace(
+        state=walk.reference._replace(position=walk.reference.position + offset)
+    )
+    one = metrics.score(LossConfig(), shifted)
+    np.testing.assert_allclose(one.rms_position, offset, rtol=1e-12)
+    np.testing.assert_allclose(one.rms_euler, 0.0)
+
+
+def test_a_fall_is_charged_and_told_and_its_missing_samples_stay_out_of_the_rms():
+    upright, fell = (metrics.score(LossConfig(), pretend_walk(fall_at=t)) for t in (None, 2.0))
+    assert fell.fallen
+    assert not upright.fallen
+    assert fell.L > upright.L
+    assert fell.L_pos >= 2000 * 0.5**2
+    assert np.isfinite(fell.rms_position).all()
+
+
+def test_a_bootstrap_interval_holds_its_value_and_is_the_same_each_time():
+    samples = np.random.default_rng(3).lognormal(size=32)
+    first, second = metrics.bootstrap(samples), metrics.bootstrap(samples)
+    assert first == second
+    assert first.low < first.value < first.high
+    assert first.value == pytest.approx(samples.mean())
+
+
+def test_bootstrap_intervals_cover_the_mean_about_as_often_as_they_say():
+    draws = np.random.default_rng(5).normal(size=(100, 32))
+    inside = [i.low < 0 < i.high for i in map(metrics.bootstrap, draws)]
+    assert 0.86 <= np.mean(inside) <= 1.0
+
+
+def test_one_seed_has_an_interval_without_width():
+    assert metrics.bootstrap(np.array([2.0])) == (2.0, 2.0, 2.0)
+
+
+def test_the_change_is_the_median_of_paired_ratios_not_the_ratio_of_means():
+    verdict = _judge(nominal=[1.0, 10.0, 100.0], tuned=[0.5, 8.0, 99.0])
+    change = metrics.compare(verdict, "tuned", "nominal").change["L"]
+    assert change.value == pytest.approx(-20.0)
+    assert change.low == pytest.approx(-50.0)
+    assert change.high == pytest.approx(-1.0)
+
+
+def test_wins_are_counted_by_seed():
+    verdict = _judge(nominal=[1.0, 1.0, 1.0, 1.0], tuned=[0.5, 0.9, 1.1, 1.0])
+    assert metrics.compare(verdict, "tuned", "nominal").wins == 0.5
+
+
+@pytest.mark.parametrize(
+    ("seeds", "fell", "counts"),
+    [(32, 0, True), (32, 1, True), (32, 2, False), (8, 0, True), (8, 1, False), (64, 3, True)],
+)
+def test_a_comparison_counts_only_where_falls_differ_by_less_than_2_of_32(seeds, fell, counts):
+    verdict = pretend_verdict(seeds, {("with", i) for i in range(fell)})
+    assert metrics.compare(verdict, "with", "nominal").counts is counts
+    assert metrics.compare(verdict, "nominal", "with").counts is counts
+
+
+def test_the_result_has_the_promised_keys_and_is_json():
+    result = json.loads(json.dumps(metrics.as_result(pretend_verdict()), allow_nan=False))
+    assert tuple(result["sets"]) == metrics.SETS
+    for name, worlds in result["sets"].items():
+        found = worlds["standin"]
+        for part in metrics.PARTS:
+            assert found[part]["low"] <= found[part]["mean"] <= found[part]["high"]
+        assert found["falls"] == 0
+        assert found["seeds"] == list(range(8))
+        for baseline in {"nominal", "expert"} - {name}:
+            assert {"median", "low", "high", "wins", "counts"} <= found["change"][baseline].keys()
+    assert result["sets"]["with"]["standin"]["change"]["nominal"]["high"] < 0
+
+
+def test_the_result_of_a_set_that_falls_at_once_is_still_json():
+    walk = metrics.score(LossConfig(), pretend_walk(fall_at=-1.0))
+    verdict = metrics.judge(LossConfig(), [0, 1], {"nominal": [walk] * 2, "with": [walk] * 2})
+    found = metrics.as_result(verdict)["sets"]["with"]["standin"]
+    json.dumps(found, allow_nan=False)
+    assert found["falls"] == 2
+    assert found["rms"]["position"] == [None] * 3
+    assert found["change"]["nominal"]["median"] == pytest.approx(0.0)
+
+
+def test_a_missing_walk_or_a_loss_that_is_not_a_number_is_named():
+    one = pretend_score(1.0)
+    with pytest.raises(ValueError, match="set 'with' has 1 walks for 2 seeds"):
+        metrics.judge(LossConfig(), [0, 1], {"with": [one]})
+    with pytest.raises(ValueError, match=r"set 'with': the loss on seeds \[7\]"):
+        metrics.judge(LossConfig(), [3, 7], {"with": [one, one._replace(L=np.array(np.nan))]})
+    with pytest.raises(ValueError, match="at least one seed"):
+        metrics.judge(LossConfig(), [], {})
