@@ -42,6 +42,7 @@ class MpcConfig:
     step_ticks: int = 3  # ticks per step: dt = 0.03 s
     friction: float = 0.5  # mu; below the floor's own, or the feet slip
     max_force: float = 500.0  # [N] per foot
+    line_friction: bool = True  # toe and heel each hold by friction, or the foot turns on the spot
     effort_about: str = (
         "zero"  # R prices u ("zero", the paper) or u less the weight's share ("weight")
     )
@@ -78,36 +79,39 @@ def _slot_feet(contact: Bool[Array, "2"], slots: int) -> Float[Array, "slots 2"]
 
 
 def _input_map(
-    contact: Bool[Array, "2"], foot_yaw: Float[Array, "2"], slots: int
+    feet: Float[Array, "slots 2"], foot_yaw: Float[Array, "2"]
 ) -> Float[Array, "12 b"]:
     """G with u = G v: the slots' inputs (F_x, F_y, F_z, M_y, M_z) to the paper's u."""
-    feet = _slot_feet(contact, slots)
     moment_axes = jax.vmap(lambda yaw: rot_z(yaw)[:, 1:])(foot_yaw)  # (2, 3, 2)
     force = jnp.einsum("sf,xi->fxsi", feet, jnp.eye(3))
     moment = jnp.einsum("sf,fxi->fxsi", feet, moment_axes)
-    blocks = jnp.zeros((2, 2, 3, slots, 5))
+    blocks = jnp.zeros((2, 2, 3, len(feet), 5))
     blocks = blocks.at[0, :, :, :, :3].set(force).at[1, :, :, :, 3:].set(moment)
-    return blocks.reshape(12, slots * 5)
+    return blocks.reshape(12, -1)
 
 
-def _rows(config: MpcConfig, robot: Robot) -> tuple[Array, Array, Array]:
-    """Constraint rows of one slot: matrix (7, 5) and bounds (7,) each."""
-    mu, inf = config.friction, jnp.inf
-    rows = jnp.array(
-        [
-            [1.0, 0.0, -mu, 0.0, 0.0],
-            [1.0, 0.0, mu, 0.0, 0.0],
-            [0.0, 1.0, -mu, 0.0, 0.0],
-            [0.0, 1.0, mu, 0.0, 0.0],
-            [0.0, 0.0, 1.0, 0.0, 0.0],
-            [0.0, 0.0, 0.0, 1.0, 0.0],
-            [0.0, 0.0, 0.0, 1.0, 0.0],
-        ]
-    )
-    rows = rows.at[5, 2].set(robot.toe).at[6, 2].set(-robot.heel)
-    lower = jnp.array([-inf, 0.0, -inf, 0.0, 0.0, 0.0, -inf])
-    upper = jnp.array([0.0, inf, 0.0, inf, config.max_force, inf, 0.0])
-    return rows, lower, upper
+def _rows(config: MpcConfig, robot: Robot, yaw: Float[Array, ""]) -> Float[Array, "rows 5"]:
+    """Constraint rows of a stance foot that points along `yaw`; their bounds are `_bounds`."""
+    mu, toe, heel = config.friction, robot.toe, robot.heel
+    zero = jnp.zeros_like(yaw)
+    fx, fy, fz, my, mz = jnp.eye(5)
+    side = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw), zero, zero, zero])  # force across the foot
+    rows = [fx - mu * fz, fx + mu * fz, fy - mu * fz, fy + mu * fz, fz, my + toe * fz, my - heel * fz]
+    if config.line_friction:
+        at_toe, load = mz + heel * side, heel * fz - my
+        at_heel, rest = toe * side - mz, toe * fz + my
+        rows += [at_toe - mu * load, at_toe + mu * load, at_heel - mu * rest, at_heel + mu * rest]
+    return jnp.stack(rows)
+
+
+def _bounds(config: MpcConfig) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
+    """Lower and upper bounds of `_rows`."""
+    below, above = (-jnp.inf, 0.0), (0.0, jnp.inf)
+    sides = [below, above, below, above, (0.0, config.max_force), above, below]
+    if config.line_friction:
+        sides += [below, above, below, above]
+    lower, upper = jnp.array(sides).T
+    return lower, upper
 
 
 def write_qp(
@@ -132,13 +136,14 @@ def write_qp(
 
     Returns:
         QP in the inputs of all steps, n = N * 5 * slots, constraint rows block-diagonal by step (N,
-        7 * slots, 5 * slots); and G_0 with u_0 = G_0 v_0.
+        rows * slots, 5 * slots); and G_0 with u_0 = G_0 v_0.
 
     Source: Eq. 3, 4.
     """
     N, b = config.horizon, 5 * slots
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
-    G = jax.vmap(lambda c, y: _input_map(c, y, slots))(horizon.contact, horizon.foot_yaw)
+    feet = jax.vmap(lambda c: _slot_feet(c, slots))(horizon.contact)  # (N, slots, 2)
+    G = jax.vmap(_input_map)(feet, horizon.foot_yaw)
     inputs = B @ G  # (N, 15, b)
 
     def respond(carry, step):
@@ -156,9 +161,7 @@ def write_qp(
     error = free - jnp.concatenate(list(horizon.reference), axis=-1)
     R = pack_wrench(Wrench(*weights.R))
     effort = jnp.einsum("kui,u,kuj->kij", G, R, G)
-    empty = jnp.repeat(
-        1.0 - jax.vmap(lambda c: _slot_feet(c, slots).sum(-1))(horizon.contact), 5, axis=-1
-    )
+    empty = jnp.repeat(1.0 - feet.sum(-1), 5, axis=-1)
     effort = effort + jax.vmap(jnp.diag)(empty)
     S = forced.reshape(N * NX, N * b)
     weighted = (Q[:, None] * forced).reshape(N * NX, N * b)
@@ -170,11 +173,11 @@ def write_qp(
         weight = jnp.zeros((N, 12)).at[:, 2].set(share).at[:, 5].set(share)
         q = q - 2.0 * jnp.einsum("kui,u,ku->ki", G, R, weight).reshape(-1)
 
-    rows, lower, upper = _rows(config, robot)
-    block = jnp.einsum("st,ri->srti", jnp.eye(slots), rows).reshape(slots * 7, b)
-    C = jnp.broadcast_to(block, (N, slots * 7, b))
-    tile = lambda bound: jnp.tile(bound, N * slots)  # noqa: E731
-    return QP(P, q, C, tile(lower), tile(upper)), G[0]
+    yaw = jnp.einsum("ksf,kf->ks", feet, horizon.foot_yaw)
+    rows = jax.vmap(jax.vmap(lambda yaw: _rows(config, robot, yaw)))(yaw)
+    C = jnp.einsum("st,ksri->ksrti", jnp.eye(slots), rows).reshape(N, -1, b)
+    lower, upper = (jnp.tile(bound, N * slots) for bound in _bounds(config))
+    return QP(P, q, C, lower, upper), G[0]
 
 
 def solve_mpc(
