@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from hector_jax.control.weights import nominal
 from hector_jax.evaluation.metrics import SETS, Score, Verdict
 from hector_jax.trajectory import State, Trajectory, Wrench
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.difftune import Evaluation, Iteration
+from hector_jax.tuning.loss import LossConfig, Losses
 
 
 def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):
@@ -88,3 +90,20 @@ def pretend_verdict(seeds=8, fallen=()):
         ]
         scores[name] = Score(*(np.stack(x) for x in zip(*rows, strict=True)))
     return Verdict(np.arange(seeds), scores, LossConfig())
+
+
+def pretend_history(iterations=30, pace=5.0, refused=()):
+    """A tuning whose loss falls; refused iterations are not finite."""
+    history = []
+    for i in range(iterations + 1):
+        parts = Losses(
+            *(np.array(x) for x in (8 * np.exp(-i / pace) + 2, 6 * np.exp(-i / 9) + 1)),
+            control=np.array(5.5e5 + 2e4 * np.sqrt(i)),
+        )
+        loss = np.array(
+            np.nan if i in refused else 1e5 * parts.euler + 2e5 * parts.position + parts.control
+        )
+        found = Evaluation(loss, parts, nominal(), np.array(0.0), np.array(1e-12))
+        reason = "loss or gradient not finite" if i in refused else ""
+        history.append(Iteration(i, nominal(), found, not reason, reason, 1.0 if i else 0.0))
+    return history

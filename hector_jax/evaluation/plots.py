@@ -1,0 +1,360 @@
+"""The pictures of a run, and the only door to matplotlib.
+
+Each function draws one picture to a file (the ending of its name decides the format) and returns
+its caption. Weight sets keep their colour, line and marker through all pictures, so that they can
+be told apart in grey too. Figures are made without pyplot: no display, no global state.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from hector_jax.grfm.training import History
+from hector_jax.trajectory import LEFT, Trajectory, Wrench
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
+from hector_jax.tuning.loss import LossConfig
+
+_STYLE = {
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 2.8,
+    "savefig.dpi": 160,
+    "svg.hashsalt": "hector_jax",  # the same picture gives the same bytes
+}
+
+_BLUE, _ORANGE, _GREEN, _GREY, _PURPLE = "#0072b2", "#d55e00", "#007a5e", "0.55", "#7a3e9d"
+
+_LOOK = {
+    "reference": {"color": "black", "linestyle": (0, (1, 1)), "linewidth": 1.1},
+    "nominal": {"color": _GREY, "linestyle": "-", "linewidth": 1.8},
+    "expert": {"color": _BLUE, "linestyle": (0, (5, 1.5))},
+    "without": {"color": _ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
+    "with": {"color": _GREEN, "linestyle": "-"},
+    "commanded": {"color": "black", "linestyle": "-", "linewidth": 0.9},
+    "measured": {"color": _GREY, "linestyle": "-", "linewidth": 2.2},
+    "predicted": {"color": _GREEN, "linestyle": (0, (5, 1.2))},
+    "linear": {"color": _PURPLE, "linestyle": (0, (1.2, 1.2))},
+}
+_MARKER = {"nominal": "o", "expert": "D", "without": "s", "with": "o"}
+_NAMES = {
+    "without": "tuned without net",
+    "with": "tuned with net",
+    "predicted": "predicted by the net",
+    "linear": "predicted by a linear map",
+}
+
+
+@contextmanager
+def _figure(path: Path, width: float, height: float) -> Iterator[Figure]:
+    """A figure [inch] that is written when its block ends."""
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        yield figure
+        # no date and no version inside: the same picture gives the same bytes
+        metadata = {
+            ".png": {"Software": None},
+            ".svg": {"Date": None},
+            ".pdf": {"CreationDate": None},
+        }
+        figure.savefig(path, metadata=metadata.get(path.suffix.lower()))
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """One legend above all panels, from the labels of one of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 6))
+
+
+def _named(name: str) -> str:
+    return _NAMES.get(name, name)
+
+
+def losses(
+    path: Path,
+    alpha: LossConfig,
+    histories: Mapping[str, Sequence[Iteration]],
+    ten: int = PAPER_ITERATIONS,
+) -> str:
+    """Loss on the model by iteration, whole and by part.
+
+    Args:
+        path: file to write.
+        alpha: loss weights, by which the parts are multiplied.
+        histories: of the tunings, by set: `without` and `with`.
+        ten: the iteration to mark.
+    """
+    parts = {
+        "$L$": lambda found: found.loss,
+        r"$\alpha_1 L_\mathrm{Eul}$": lambda found: alpha.euler * found.parts.euler,
+        r"$\alpha_2 L_\mathrm{pos}$": lambda found: alpha.position * found.parts.position,
+        r"$L_\mathrm{ctrl}$": lambda found: found.parts.control,
+    }
+    accepted = {n: np.array([i.accepted for i in history]) for n, history in histories.items()}
+    with _figure(path, 10.0, 2.7) as figure:
+        panels = figure.subplots(1, 4)
+        for panel, (title, part) in zip(panels, parts.items(), strict=True):
+            panel.axvline(ten, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            for name, history in histories.items():
+                values = np.array([float(part(i.evaluation)) for i in history]) / 1e6
+                tried, kept = np.arange(len(values)), accepted[name]
+                panel.plot(
+                    tried[kept],
+                    values[kept],
+                    **_LOOK[name],
+                    marker=_MARKER[name],
+                    markersize=2.6,
+                    label=_named(name),
+                )
+                if title == "$L$":
+                    top = 1.1 * values[kept].max()  # a step that failed need not be a number
+                    seen = np.where(values < top, values, top)[~kept]
+                    panel.plot(tried[~kept], seen, "kx", markersize=4.5)
+            panel.set(title=title, xlabel="iteration", ylim=(0, 1.12 * panel.get_ylim()[1]))
+            panel.xaxis.get_major_locator().set_params(integer=True)
+        panels[0].set_ylabel("loss on the model [10$^6$]")
+        if not all(kept.all() for kept in accepted.values()):
+            panels[0].plot([], [], "kx", markersize=4.5, label="refused step")
+        _legend(figure, panels[0])
+    return (
+        f"Loss on the model by iteration, whole and by part; the line is iteration {ten}, "
+        "a cross is a refused step."
+    )
+
+
+def _times(walk: Trajectory) -> np.ndarray:
+    """Times [s] of the samples, which stand at the ends of their intervals."""
+    return float(walk.period) * np.arange(1, len(walk.fallen) + 1)
+
+
+def _standing(walk: Trajectory, values: np.ndarray) -> np.ndarray:
+    """The values with those after a fall left out of the line."""
+    return np.where(np.asarray(walk.fallen)[:, None], np.nan, values)
+
+
+def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
+    """CoM and Euler angles against their reference, and the errors that a path hides.
+
+    Args:
+        path: file to write.
+        walks: by set, on the same plant and command.
+    """
+    first = next(iter(walks.values()))
+    rows = {
+        "x [m]": lambda s: s.position[:, 0],
+        "y [m]": lambda s: s.position[:, 1],
+        "z [m]": lambda s: s.position[:, 2],
+        "roll [deg]": lambda s: np.rad2deg(s.euler[:, 0]),
+        "pitch [deg]": lambda s: np.rad2deg(s.euler[:, 1]),
+        "yaw [deg]": lambda s: np.rad2deg(s.euler[:, 2]),
+    }
+    errors = {
+        "error in x [cm]": lambda s, r: 100 * (s.position[:, 0] - r.position[:, 0]),
+        "error in y [cm]": lambda s, r: 100 * (s.position[:, 1] - r.position[:, 1]),
+        "error in yaw [deg]": lambda s, r: np.rad2deg(s.euler[:, 2] - r.euler[:, 2]),
+    }
+    with _figure(path, 10.0, 6.2) as figure:
+        panels = figure.subplots(3, 3, sharex=True)
+        for panel, (label, value) in zip(panels.flat, rows.items(), strict=False):
+            for name, walk in walks.items():
+                kept = _standing(walk, value(walk.state)[:, None])
+                panel.plot(_times(walk), kept, **_LOOK[name], label=_named(name))
+            panel.plot(
+                _times(first), value(first.reference), **_LOOK["reference"], label="reference"
+            )
+            panel.set_ylabel(label)
+        for panel, (label, value) in zip(panels[2], errors.items(), strict=True):
+            for name, walk in walks.items():
+                kept = _standing(walk, value(walk.state, walk.reference)[:, None])
+                panel.plot(_times(walk), kept, **_LOOK[name])
+            panel.axhline(0.0, **_LOOK["reference"])
+            panel.set(ylabel=label, xlabel="time [s]")
+        for panel in panels.flat:
+            _widen(panel, 0.02 if "[m]" in panel.get_ylabel() else 1.0)
+        _legend(figure, panels[0, 0])
+    return "Centre of mass and Euler angles of one stand-in walk of each set against the reference."
+
+
+def _widen(axes: Axes, least: float) -> None:
+    """Keep an axis from blowing noise up: at least `least` either side of its middle."""
+    low, high = axes.get_ylim()
+    if high - low < 2 * least:
+        axes.set_ylim((low + high) / 2 - least, (low + high) / 2 + least)
+
+
+def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
+    """Top view of where the centre of mass went, with the footprints of the last set.
+
+    Args:
+        path: file to write.
+        walks: by set, on the same plant and command.
+    """
+    last = list(walks.values())[-1]
+    reference = next(iter(walks.values())).reference.position
+    points = np.concatenate([walk.state.position[~walk.fallen, :2] for walk in walks.values()])
+    span = np.ptp(np.concatenate([points, reference[:, :2]]), axis=0) + 0.35
+    width = 7.0
+    with _figure(path, width, float(np.clip(width * span[1] / span[0], 1.4, 5.0)) + 0.9) as figure:
+        axes = figure.subplots()
+        stands = np.asarray(last.contact)
+        landed = stands & ~np.roll(stands, 1, axis=0)
+        landed[0] = stands[0]
+        for foot, marker in enumerate((4, 5)):
+            spots = np.asarray(last.feet)[landed[:, foot] & ~np.asarray(last.fallen), foot]
+            side = ("left", "right")[foot]
+            axes.plot(
+                *spots[:, :2].T,
+                linestyle="none",
+                marker=marker,
+                color="0.6",
+                markersize=6,
+                label=f"{side} foot set down",
+            )
+        for name, walk in walks.items():
+            kept = _standing(walk, np.asarray(walk.state.position))
+            axes.plot(kept[:, 0], kept[:, 1], **_LOOK[name], label=_named(name))
+        axes.plot(*np.asarray(reference)[:, :2].T, **_LOOK["reference"], label="reference")
+        axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        axes.margins(0.05)
+        figure.legend(loc="outside upper center", ncols=4)
+    return f"Path from above; foot marks are those of the set '{list(walks)[-1]}'."
+
+
+def weights(
+    path: Path,
+    names: Sequence[str],
+    sets: Mapping[str, Float[np.ndarray, " weights"]],
+) -> str:
+    """Weights before and after, as ratios to the nominal ones.
+
+    Args:
+        path: file to write.
+        names: of the weights, such as `WEIGHT_NAMES`.
+        sets: `nominal`, `expert` and the tuned `without`, `with`, flat in the order of `names`.
+    """
+    base = np.asarray(sets["nominal"])
+    tuned = [name for name in ("without", "with") if name in sets]
+    at = np.arange(len(names))
+    with _figure(path, 10.0, 3.4) as figure:
+        axes = figure.subplots()
+        for i, name in enumerate(tuned):
+            ratio = np.asarray(sets[name]) / base
+            axes.bar(
+                at + 0.38 * (i - (len(tuned) - 1) / 2),
+                ratio - 1.0,
+                0.36,
+                bottom=1.0,
+                color=_LOOK[name]["color"],
+                hatch="////" if name == "without" else None,
+                edgecolor="white",
+                linewidth=0.0,
+                label=_named(name),
+            )
+        if "expert" in sets:
+            axes.plot(
+                at,
+                np.asarray(sets["expert"]) / base,
+                linestyle="none",
+                marker=_MARKER["expert"],
+                color=_BLUE,
+                markerfacecolor="white",
+                label="expert",
+            )
+        axes.axhline(1.0, color="black", linewidth=0.8)
+        for edge in range(3, len(names), 3):  # Euler angles, position, and so on
+            axes.axvline(edge - 0.5, color="0.8", linewidth=0.8, zorder=0)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+        axes.grid(visible=False, axis="x")
+        axes.set_xticks(at, [_weight_label(n) for n in names], rotation=60, ha="right", va="center")
+        for label in axes.get_xticklabels():
+            label.set_rotation_mode("anchor")
+        axes.tick_params(axis="x", length=0)
+        axes.set(ylabel="weight / nominal", xlim=(-0.7, len(names) - 0.3))
+        _legend(figure, axes)
+    return "Tuned weights as ratios to the nominal ones (1); diamonds are the expert's."
+
+
+def _weight_label(name: str) -> str:
+    matrix, _, rest = name.partition("_")
+    return f"{matrix} {rest.replace('_', ' ')}"
+
+
+def wrenches(
+    path: Path, period: float, curves: Mapping[str, Wrench], foot: int = LEFT, seconds: float = 0.4
+) -> str:
+    """Commanded, predicted and measured wrench of one foot over the first steps.
+
+    Args:
+        path: file to write.
+        period: [s] between samples.
+        curves: `commanded`, `predicted`, `linear`, `measured`, or some of them, one sample per
+            period, (T, 2, 3) each; held over the period.
+        foot: which.
+        seconds: of the walk's beginning; two steps by default.
+    """
+    count = round(seconds / period)
+    edges = period * np.arange(count + 1)
+    labels = ["$F_x$ [N]", "$F_y$ [N]", "$F_z$ [N]", "$M_x$ [N m]", "$M_y$ [N m]", "$M_z$ [N m]"]
+    order = [name for name in ("measured", "commanded", "linear", "predicted") if name in curves]
+    side = ("left", "right")[foot]
+    with _figure(path, 10.0, 4.4) as figure:
+        panels = figure.subplots(2, 3, sharex=True)
+        for name in order:
+            both = np.concatenate([np.asarray(part)[:count, foot] for part in curves[name]], axis=1)
+            for panel, values in zip(panels.flat, both.T, strict=True):
+                panel.stairs(values, edges, baseline=None, label=_named(name), **_LOOK[name])
+        for panel, label in zip(panels.flat, labels, strict=True):
+            panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
+            panel.set_ylabel(label)
+            _widen(panel, 5.0 if "[N]" in label else 0.5)
+        for panel in panels[1]:
+            panel.set_xlabel("time [s]")
+        _legend(figure, panels[0, 0])
+    return (
+        f"Wrench of the ground on the {side} foot over the first two steps; "
+        "the line is the switch of stance."
+    )
+
+
+def training(path: Path, course: History) -> str:
+    """Errors of the net by epoch, on the walks it learns from and on held-out ones.
+
+    Args:
+        path: file to write.
+        course: mean square errors in physical units.
+    """
+    with _figure(path, 7.0, 2.7) as figure:
+        panels = figure.subplots(1, 2)
+        kinds = {"force": "mean square error [N$^2$]", "moment": "mean square error [(N m)$^2$]"}
+        for panel, (kind, label) in zip(panels, kinds.items(), strict=True):
+            seen, held = (np.asarray(getattr(course, f"{p}_{kind}")) for p in ("train", "valid"))
+            epochs = np.arange(1, len(seen) + 1)
+            panel.plot(epochs, seen, **_LOOK["expert"], label="training walks")
+            panel.plot(epochs, held, color=_ORANGE, label="held-out walks")
+            best = int(np.argmin(held))
+            panel.plot(epochs[best], held[best], "o", color=_ORANGE, label="kept epoch")
+            panel.set(title=kind, xlabel="epoch", ylabel=label, yscale="log")
+            panel.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+            panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+            panel.yaxis.set_minor_formatter(NullFormatter())
+        _legend(figure, panels[0])
+    return "Errors of GRFM-Net by epoch; the epoch with the least held-out error is kept."

@@ -1,0 +1,83 @@
+"""Pictures: each is written, says what it shows, and survives what a run can bring."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from pretend import pretend_history, pretend_walk
+
+from hector_jax.control.weights import WEIGHT_NAMES
+from hector_jax.evaluation import plots
+from hector_jax.grfm.training import History
+from hector_jax.tuning.loss import LossConfig
+
+
+@pytest.fixture(scope="module")
+def walks():
+    return {
+        name: pretend_walk(i, 0.02 + 0.01 * i, seconds=1.0, turn=0.5)
+        for i, name in enumerate(("nominal", "expert", "without", "with"))
+    }
+
+
+def _has_ink(path):
+    with Image.open(path) as picture:
+        grey = np.asarray(picture.convert("L"))
+    return picture.width > 700 and 0.01 < np.mean(grey < 200) < 0.5
+
+
+def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path):
+    path = tmp_path / "loss.png"
+    histories = {"without": pretend_history(12), "with": pretend_history(8, refused=(3, 5))}
+    assert "refused" in plots.losses(path, LossConfig(), histories)
+    assert _has_ink(path)
+
+
+def test_tracking_and_path_are_drawn_up_to_a_fall(tmp_path, walks):
+    fallen = walks | {"without": pretend_walk(2, seconds=1.0, fall_at=0.6)}
+    assert plots.tracking(tmp_path / "tracking.png", fallen)
+    assert plots.path_from_above(tmp_path / "path.png", fallen)
+    assert _has_ink(tmp_path / "tracking.png")
+    assert _has_ink(tmp_path / "path.png")
+
+
+def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):
+    plots.path_from_above(tmp_path / "path.png", {"with": pretend_walk(seconds=4.0)})
+    with Image.open(tmp_path / "path.png") as picture:
+        assert picture.height < picture.width / 2
+
+
+def test_weights_are_drawn_with_and_without_the_expert(tmp_path):
+    nominal = np.geomspace(1e-4, 100, len(WEIGHT_NAMES))
+    sets = {"nominal": nominal, "without": 2 * nominal, "with": nominal / 3}
+    for name, some in {"few.png": sets, "all.png": sets | {"expert": 3 * nominal}}.items():
+        assert "nominal" in plots.weights(tmp_path / name, WEIGHT_NAMES, some)
+        assert _has_ink(tmp_path / name)
+
+
+def test_wrenches_are_drawn_for_the_foot_that_is_asked_for(tmp_path, walks):
+    walk = walks["with"]
+    curves = {"commanded": walk.command, "measured": walk.effect, "predicted": walk.effect}
+    left = plots.wrenches(tmp_path / "left.png", 0.01, curves)
+    right = plots.wrenches(tmp_path / "right.png", 0.01, curves, foot=1)
+    assert "left foot" in left
+    assert "right foot" in right
+    assert _has_ink(tmp_path / "left.png")
+    assert (tmp_path / "left.png").read_bytes() != (tmp_path / "right.png").read_bytes()
+
+
+def test_the_training_of_a_net_is_drawn(tmp_path):
+    falling = np.geomspace(300.0, 60.0, 50)
+    assert plots.training(
+        tmp_path / "net.png", History(falling, falling / 300, falling + 5, falling / 250)
+    )
+    assert _has_ink(tmp_path / "net.png")
+
+
+@pytest.mark.parametrize("ending", ["png", "svg", "pdf"])
+def test_the_same_picture_gives_the_same_bytes(tmp_path, walks, ending):
+    pictures = []
+    for i in range(2):
+        path = tmp_path / f"{i}.{ending}"
+        plots.path_from_above(path, walks)
+        pictures.append(path.read_bytes())
+    assert pictures[0] == pictures[1]
