@@ -95,8 +95,8 @@ class QpConfig:
         tolerance: largest residual of a SOLVED problem; 1e-8 in 64 bits, 1e-4 in 32.
         active_set_tries: before the interior point is asked.
         max_iterations: of the interior point; BoxOSQP takes a hundred times as many, cheaper ones.
-        ratio_cap: largest multiplier-to-slack ratio in a factorised matrix; 1e8 in 64 bits, 1e4 in
-            32.
+        ratio_cap: largest multiplier-to-slack ratio in a factorised matrix; 1e7 in 64 bits, 1e4
+            in 32.
     """
 
     solver: str = "interior_point"
@@ -130,9 +130,9 @@ class _Floors(NamedTuple):
 
 def _floors(config: QpConfig, dtype: jnp.dtype) -> _Floors:
     if jnp.finfo(dtype).bits == 64:
-        floors = _Floors(1e-8, 1e-11, 1e-10, 1e8, 1e-12, 1e-11, 1e-8)
+        floors = _Floors(1e-8, 1e-11, 1e-10, 1e7, 1e-12, 1e-11, 1e-8)
     else:
-        floors = _Floors(1e-4, 1e-6, 1e-6, 1e4, 1e-6, 1e-6, 1e-4)
+        floors = _Floors(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4)
     tolerance = config.tolerance or floors.tolerance
     return floors._replace(
         tolerance=tolerance,
@@ -311,19 +311,22 @@ def _multiplier(z: Array) -> Array:
 class _Guess(NamedTuple):
     point: _Point
     active: Array  # (2, m) bool
+    best: _Point
+    proof: Array  # evidence of the best point
     iterations: Array
     going: Array
 
 
 def _active_set(
     floors: _Floors, qp: _Normal, start: _Point, active: Array, wanted: Array, limit: int
-) -> tuple[_Point, Array]:
+) -> tuple[_Point, Array, Array]:
     """Semismooth Newton: active sides as equations, the guess corrected by signs until it stays.
 
-    Exact to rounding where it settles; it may cycle, so `limit` bounds it and the caller looks at
-    the evidence. Does nothing where `wanted` is false.
+    Exact to rounding where it settles; it may cycle, so `limit` bounds it. Returns the best point
+    on the way with its evidence, and the tries; does nothing where `wanted` is false.
     """
     dtype = qp.q.dtype
+    sign = jnp.asarray(_SIGN, dtype)
     always = jnp.zeros_like(qp.side).at[0].set(qp.equality)
     P = qp.P + floors.proximal * jnp.eye(len(qp.q), dtype=dtype)
 
@@ -336,22 +339,38 @@ def _active_set(
             slope = qp.P @ x + qp.q + _columns(qp.A, _multiplier(z))
             dx = -cho_solve((factor, True), slope)
             x = x + dx
-            z = z + weight * jnp.asarray(_SIGN, dtype) * _rows(qp.A, dx)
-        wrong = jnp.where(state.active, z < -floors.rounding, _violation(qp, x) > floors.rounding)
-        wrong &= ~always
+            z = z + weight * sign * _rows(qp.A, dx)
+        outside = _violation(qp, x)
+        wrong = jnp.where(state.active, z < -floors.rounding, outside > floors.rounding) & ~always
+        point = _Point(x, jnp.where(always, z, jnp.maximum(z, 0.0)))
+        proof = _evidence(qp, point)
+        better = jnp.max(proof) < jnp.max(state.proof)
+        best, proof = _choose(better, (point, proof), (state.best, state.proof))
         iterations = state.iterations + 1
         going = jnp.any(wrong) & jnp.isfinite(jnp.sum(x)) & (iterations < limit)
-        return _Guess(_Point(x, z), state.active ^ wrong, iterations, going)
+        return _Guess(_Point(x, z), state.active ^ wrong, best, proof, iterations, going)
 
-    first = _Guess(start, (active & qp.side) | always, jnp.zeros((), jnp.int32), wanted)
+    first = _Guess(
+        start,
+        (active & qp.side) | always,
+        start,
+        jnp.full(3, jnp.inf, dtype),
+        jnp.zeros((), jnp.int32),
+        wanted,
+    )
     end = lax.while_loop(lambda state: state.going, improve, first)
-    x, z = end.point
-    return _Point(x, jnp.where(always, z, jnp.maximum(z, 0.0))), end.iterations
+    return end.best, end.proof, end.iterations
+
+
+def _choose(first: Array, a, b):
+    """`a` where `first` holds, else `b`, leaf by leaf."""
+    return jax.tree.map(lambda v, w: jnp.where(first, v, w), a, b)
 
 
 class _Loop(NamedTuple):
     point: _Point
     slack: Array  # (2, m), positive; 1 on sides that are not there
+    rho: Array
     iterations: Array
     going: Array
 
@@ -366,7 +385,7 @@ def _interior_point(
     free = jnp.zeros_like(qp.side).at[0].set(qp.equality)  # sides whose multiplier has no sign
     held = qp.side | free
     count = jnp.maximum(jnp.sum(qp.side), 1)
-    P = qp.P + delta * jnp.eye(len(qp.q), dtype=dtype)
+    eye = jnp.eye(len(qp.q), dtype=dtype)
 
     def residuals(point: _Point, slack: Array) -> tuple[Array, Array, Array]:
         dual = qp.P @ point.x + qp.q + _columns(qp.A, _multiplier(point.z))
@@ -380,14 +399,17 @@ def _interior_point(
         dual, primal, mu = residuals(state.point, slack)
         inverse = jnp.where(held, 1.0 / jnp.where(free, delta, slack + delta * z), 0.0)
         weight = inverse * jnp.where(free, 1.0, z)
-        factor = _cholesky(_plus_gram(P, qp.A, weight[0] + weight[1]))
+        factor = _cholesky(_plus_gram(qp.P + state.rho * eye, qp.A, weight[0] + weight[1]))
 
         def direction(product: Array) -> tuple[Array, Array, Array]:
             """Newton step that takes slack * z to slack * z + product."""
-            known = inverse * product - weight * primal
-            dx = cho_solve((factor, True), -dual - _columns(qp.A, _multiplier(known)))
+            dx, dz = jnp.zeros_like(x), inverse * product - weight * primal
+            for _ in range(2):  # the second pass takes off what rounding and rho did
+                step = -cho_solve(
+                    (factor, True), dual + qp.P @ dx + _columns(qp.A, _multiplier(dz))
+                )
+                dx, dz = dx + step, dz + weight * sign * _rows(qp.A, step)
             along = sign * _rows(qp.A, dx)
-            dz = known + weight * along
             return dx, dz, jnp.where(qp.side, primal - along + delta * dz, 0.0)
 
         def longest(dz: Array, dslack: Array) -> Array:
@@ -404,28 +426,31 @@ def _interior_point(
         centre = mu * jnp.clip(ratio, 0.0, 1.0) ** 3
         dx, dz, dslack = direction(jnp.where(qp.side, product + centre - dslack * dz, 0.0))
         step = jnp.minimum(0.995 * longest(dz, dslack), 1.0)
-        new = _Point(x + step * dx, z + step * dz)
-        new_slack = slack + step * dslack
-        finite = jnp.isfinite(jnp.sum(new.x) + jnp.sum(new.z) + jnp.sum(new_slack))
-        new, new_slack = jax.tree.map(
-            lambda a, b: jnp.where(finite, a, b), (new, new_slack), (state.point, slack)
-        )
-        dual, primal, mu = residuals(new, new_slack)
+        new = (_Point(x + step * dx, z + step * dz), slack + step * dslack)
+        # a factorisation that fails is tried again with a larger rho
+        fine = jnp.isfinite(jnp.sum(new[0].x) + jnp.sum(new[0].z) + jnp.sum(new[1]))
+        point, slack = _choose(fine, new, (state.point, state.slack))
+        rho = jnp.where(fine, jnp.maximum(0.1 * state.rho, floors.proximal), 100.0 * state.rho)
+        dual, primal, mu = residuals(point, slack)
         done = (
-            (_largest(dual) <= floors.target * (1.0 + _largest(new.z)))
-            & (_largest(primal) <= floors.target * (1.0 + _largest(new_slack)))
+            (_largest(dual) <= floors.target * (1.0 + _largest(point.z)))
+            & (_largest(primal) <= floors.target * (1.0 + _largest(slack)))
             & (mu <= floors.target)
         )
-        infeasible, unbounded = _certificates(floors, qp, new)
+        infeasible, unbounded = _certificates(floors, qp, point)
         iterations = state.iterations + 1
-        going = finite & ~done & ~infeasible & ~unbounded & (iterations < config.max_iterations)
-        return _Loop(new, new_slack, iterations, going)
+        going = ~done & ~infeasible & ~unbounded & (rho < 1.0)
+        going &= iterations < config.max_iterations
+        return _Loop(point, slack, rho, iterations, going)
 
-    slack = jnp.where(qp.side, jnp.maximum(sign * qp.bound, 1.0), 1.0)
-    start = _Point(jnp.zeros_like(qp.q), qp.side.astype(dtype))
-    end = lax.while_loop(
-        lambda state: state.going, advance, _Loop(start, slack, jnp.zeros((), jnp.int32), wanted)
+    start = _Loop(
+        _Point(jnp.zeros_like(qp.q), qp.side.astype(dtype)),
+        jnp.where(qp.side, jnp.maximum(sign * qp.bound, 1.0), 1.0),
+        delta,
+        jnp.zeros((), jnp.int32),
+        wanted,
     )
+    end = lax.while_loop(lambda state: state.going, advance, start)
     return end.point, end.slack, end.iterations
 
 
@@ -503,26 +528,23 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
 
     nothing = jnp.zeros(normal.side.shape, dtype)
     loose = _Point(-cho_solve((factor, True), normal.q), nothing)
+    tries = config.active_set_tries
     if config.solver == "interior_point":
-        quick, tries = _active_set(
-            floors, normal, loose, _violation(normal, loose.x) > 0, sane, config.active_set_tries
-        )
-        settled = jnp.max(_evidence(normal, quick)) <= floors.target
+        guess = _violation(normal, loose.x) > 0
+        quick, proof, first = _active_set(floors, normal, loose, guess, sane, tries)
+        settled = jnp.max(proof) <= floors.target
         near, slack, steps = _interior_point(config, floors, normal, sane & ~settled)
     else:
-        quick, tries, settled = loose, jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        quick, proof = loose, jnp.full(3, jnp.inf, dtype)
+        first, settled = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         near, slack, steps = _box_osqp(config, floors, normal)
     infeasible, unbounded = _certificates(floors, normal, near)
     hopeful = sane & ~settled & ~infeasible & ~unbounded
-    exact, more = _active_set(
-        floors, normal, near, near.z > slack, hopeful, config.active_set_tries
-    )
-    point, proof = quick, _evidence(normal, quick)
-    for other in (near, exact):
-        other_proof = _evidence(normal, other)
-        better = ~settled & (jnp.max(other_proof) < jnp.max(proof))
-        point = jax.tree.map(lambda a, b, better=better: jnp.where(better, a, b), other, point)
-        proof = jnp.where(better, other_proof, proof)
+    exact, exact_proof, last = _active_set(floors, normal, near, near.z > slack, hopeful, tries)
+    point = quick
+    for other, its_proof in ((near, _evidence(normal, near)), (exact, exact_proof)):
+        better = ~settled & (jnp.max(its_proof) < jnp.max(proof))
+        point, proof = _choose(better, (other, its_proof), (point, proof))
     # far from any solution (infeasible, unbounded) all evidence may be infinite, and so may x
     usable = sane & jnp.all(jnp.isfinite(proof))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), point)
@@ -538,7 +560,7 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
         normal.size * normal.column * point.x,
         normal.size * normal.row * _multiplier(point.z),
         *told,
-        tries + steps + more,
+        first + steps + last,
         status,
     )
     slack = jnp.maximum(-_violation(normal, point.x), 0.0)
@@ -561,18 +583,18 @@ def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tup
     firm = both >= floors.cap
     eye = jnp.eye(len(qp.q), dtype=dtype)
     # what is not solved gets the unit matrix and no right-hand side: zero, whatever the data are
-    matrix = _plus_gram(column[:, None] * qp.P * column + floors.proximal * eye, A, both)
-    factor = _cholesky(jnp.where(solved, matrix, eye))
+    P = jnp.where(solved, column[:, None] * qp.P * column, eye)
+    factor = _cholesky(_plus_gram(P + floors.proximal * eye, A, jnp.where(solved, both, 0.0)))
 
     pull = column * (d.P @ solution.x + d.q + _columns(d.A, solution.y))
     shift = row * (both * _rows(d.A, solution.x) - ratio[0] * d.u - ratio[1] * d.l)
-    dz = jnp.zeros_like(shift)
-    for _ in range(2):  # as in `_active_set`: the second pass takes the cap's bias off firm rows
-        known = jnp.where(firm, dz, 0.0) + shift
-        rhs = pull + _columns(A, known)
-        dv = -cho_solve((factor, True), jnp.where(solved, rhs, 0.0))
-        dz = known + both * _rows(A, dv)
+    pull, shift = jnp.where(solved, pull, 0.0), jnp.where(solved, shift, 0.0)
+    dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
+    for _ in range(2):  # as in `_active_set`: later passes take off what cap and rho did
+        known = jnp.where(firm, dz, 0.0) + both * _rows(A, dv) + shift
+        step = -cho_solve((factor, True), P @ dv + pull + _columns(A, known))
+        dv, dz = dv + step, known + both * _rows(A, step)
     zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)
-    change = Solution(column * dv, jnp.where(solved, row * dz, 0.0), zero, zero, zero, none, none)
+    change = Solution(column * dv, row * dz, zero, zero, zero, none, none)
     return (solution, ratio), (change, jnp.zeros_like(ratio))
