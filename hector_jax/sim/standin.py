@@ -1,0 +1,40 @@
+"""The stand-in for hardware: a family of plants, one per seed, that only verdicts may walk.
+
+No collection, training, tuning, search or choice reads this module; tests/test_architecture.py
+holds that. The plants differ from the hfs in strength and in kind (masses, ground, an estimator
+that errs and drifts), so that a map learned on the hfs is not tested on its own simulator. Seeds
+0-31 are for development, 1000-1031 for the final verdict.
+"""
+
+import numpy as np
+
+from hector_jax.sim.world import Estimator, Imperfections
+
+
+def standin(seed: int) -> Imperfections:
+    """The plant of a seed; every number is drawn uniformly from its range, each on its own."""
+    rng = np.random.default_rng([0x57A, seed])
+    draw = lambda low, high, size=(): np.asarray(rng.uniform(low, high, size))  # noqa: E731
+    return Imperfections(
+        joint_friction=draw(0.3, 0.7),
+        joint_damping=draw(0.1, 0.4),
+        armature=draw(0.9, 1.4),
+        backlash=draw(0.005, 0.015),
+        delay=draw(0.001, 0.005),
+        lag=draw(0.002, 0.006),
+        torque_gain=draw(0.9, 1.0, 10),
+        linkage=draw(0.3, 1.0),
+        contact_time=draw(0.006, 0.02),
+        floor_friction=draw(0.65, 1.0),
+        mass=draw(0.95, 1.08),
+        trunk_com=draw(-0.015, 0.015, 3),
+        estimator=Estimator(
+            position=np.asarray(0.003),
+            velocity=np.asarray(0.03),
+            angle=np.asarray(0.005),
+            ang_velocity=np.asarray(0.03),
+            joint=np.asarray(0.001),
+            drift=np.asarray(0.01),
+            drift_yaw=np.asarray(0.01),
+        ),
+    )

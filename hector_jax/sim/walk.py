@@ -1,0 +1,402 @@
+"""The closed loop in MuJoCo C: one walk, or many on several processes.
+
+Start-up: double stance under the MPC, gait cycles in place, then t = 0, where the reference is
+anchored at the true centre of mass and yaw.
+Controller and sensing are compiled once per process and serve every walk, whatever its weights,
+command and plant: per tick one program
+plans and one observes, per millisecond one turns the plan into torques, and MuJoCo steps between. A
+fall ends the walk: what is missing is held and marked, never started afresh.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.walking import (
+    Memory,
+    Plan,
+    WalkConfig,
+    actuate,
+    init_memory,
+    slots_needed,
+    step_plan,
+)
+from hector_jax.control.weights import Weights
+from hector_jax.robot import Robot
+from hector_jax.runtime import setup_jax
+from hector_jax.sim import sensing
+from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
+from hector_jax.sim.sensing import Contacts, Reading
+from hector_jax.sim.world import TIME_STEP, Imperfections, World, build_world, standing_qpos
+from hector_jax.trajectory import State, Trajectory, Wrench
+
+Progress = Callable[[int, int], None]  # told (done, all)
+
+
+class Job(NamedTuple):
+    """One walk to be walked."""
+
+    weights: Weights
+    command: Command
+    imperfections: Imperfections
+    seconds: float = 4.0  # from t = 0
+    seed: int = 0  # of the estimator's errors
+    start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
+
+
+class Observed(NamedTuple):
+    """What a millisecond turned out to be; see Trajectory."""
+
+    state: State
+    reference: State
+    effect: Wrench
+    feet: Float[Array, "*batch 2 3"]
+    joints: Float[Array, "*batch 10"]
+    fallen: Bool[Array, "*batch"]
+
+
+def decide(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    tick: Int[Array, ""],
+    memory: Memory,
+    yaw: Float[Array, ""],
+    reading: Reading,
+    error: Float[Array, "22"],
+    *,
+    slots: int,
+) -> tuple[Memory, Plan]:
+    """The controller's plan from what it is told; once a tick."""
+    measurement, _ = sensing.measure(robot, reading, yaw, error)
+    return step_plan(
+        config, robot, weights, command, anchor, tick, memory, measurement, slots=slots
+    )
+
+
+def drive(
+    config: WalkConfig,
+    robot: Robot,
+    imperfections: Imperfections,
+    memory: Memory,
+    plan: Plan,
+    motors: Motors,
+    yaw: Float[Array, ""],
+    substep: Int[Array, ""],
+    reading: Reading,
+    error: Float[Array, "22"],
+) -> tuple[Motors, Float[Array, ""], Float[Array, "10"]]:
+    """Motors, true yaw [rad] and the torque at the joints [N m] over the next millisecond."""
+    measurement, yaw = sensing.measure(robot, reading, yaw, error)
+    torque = actuate(config, robot, plan, memory, substep, measurement)
+    motors, applied = step_actuators(robot, imperfections, motors, torque)
+    return motors, yaw, applied
+
+
+def observe(
+    config: WalkConfig,
+    robot: Robot,
+    command: Command,
+    anchor: Anchor,
+    time: Float[Array, ""],
+    yaw: Float[Array, ""],
+    before: Reading,
+    contacts: Contacts,
+    after: Reading,
+    floor: Int[Array, ""],
+    foot_of_geom: Int[Array, " ngeom"],
+) -> Observed:
+    """The truth about one millisecond.
+
+    Args:
+        config: times.
+        robot: nominal body.
+        command: what is walked.
+        anchor: from where.
+        time: gait time at its end, in ticks.
+        yaw: a yaw [rad] shortly before.
+        before: coordinates at its start.
+        contacts: found at its start; their forces act over it.
+        after: coordinates at its end.
+        floor: from the World.
+        foot_of_geom: from the World.
+    """
+    foot, touches = sensing.foot_contacts(contacts, floor, foot_of_geom)
+    points = sensing.foot_points(robot, before)
+    state = sensing.base_state(robot, after, yaw)
+    return Observed(
+        state=state,
+        reference=reference_at(config.gait.tick, command, anchor, time),
+        effect=sensing.ground_wrench(contacts, foot, floor, points),
+        feet=sensing.foot_points(robot, after),
+        joints=after.joints + after.slack,
+        fallen=sensing.is_fallen(state, touches),
+    )
+
+
+def substeps(config: WalkConfig) -> int:
+    """Milliseconds in a tick.
+
+    Raises:
+        ValueError: a tick is no whole number of milliseconds.
+    """
+    count = round(config.gait.tick / TIME_STEP)
+    if count < 1 or abs(count * TIME_STEP - config.gait.tick) > 1e-9:
+        raise ValueError(
+            f"GaitConfig.tick must be a multiple of {TIME_STEP} s, got {config.gait.tick}"
+        )
+    return count
+
+
+def first_tick(config: WalkConfig) -> int:
+    """Tick at which a walk in MuJoCo begins, standing."""
+    return config.gait.first_tick - config.gait.stand
+
+
+def standing_anchor(robot: Robot, start_tick: int) -> Anchor:
+    """Where the robot stands until t = 0."""
+    offset = np.asarray(robot.com_offset)
+    position = np.array([offset[0], offset[1], robot.standing_height])
+    return Anchor(position, np.zeros(()), np.array(start_tick, np.int32))
+
+
+def anchor_at(robot: Robot, state: State, start_tick: int) -> Anchor:
+    """Where the reference starts: the true place and heading of t = 0, at standing height."""
+    height = jnp.asarray(robot.standing_height)
+    position = jnp.concatenate([state.position[:2], height[None]])
+    return Anchor(position, state.euler[2], np.array(start_tick, np.int32))
+
+
+@dataclass(frozen=True)
+class _Programs:
+    """The compiled parts of the loop; readings and their errors enter as flat rows."""
+
+    begin: Callable
+    decide: dict[int, Callable]  # by slots
+    drive: Callable
+    observe: Callable
+
+
+@cache
+def _programs(config: WalkConfig) -> _Programs:
+    def begin(robot: Robot, row: Array) -> Memory:
+        reading = sensing.unpack_reading(row)
+        no_error = jnp.zeros(sensing.ERRORS)
+        return init_memory(robot, sensing.measure(robot, reading, jnp.zeros(()), no_error)[0])
+
+    def decide_(slots: int, robot: Robot, *args) -> tuple[Memory, Plan]:
+        *known, row, error = args
+        return decide(config, robot, *known, sensing.unpack_reading(row), error, slots=slots)
+
+    def drive_(robot: Robot, *args) -> tuple[Motors, Array, Array]:
+        *known, row, error = args
+        return drive(config, robot, *known, sensing.unpack_reading(row), error)
+
+    def observe_(robot, command, anchor, tick, yaw, rows, contacts, floor, foot_of_geom):
+        count = substeps(config)
+        times = tick + (1 + jnp.arange(count)) / count
+        readings = sensing.unpack_reading(rows)
+        before = jax.tree.map(lambda x: x[:-1], readings)
+        after = jax.tree.map(lambda x: x[1:], readings)
+        one = partial(observe, config, robot, command, anchor)
+        return jax.vmap(one, in_axes=(0, None, 0, 0, 0, None, None))(
+            times, yaw, before, contacts, after, floor, foot_of_geom
+        )
+
+    return _Programs(
+        begin=jax.jit(begin),
+        decide={slots: jax.jit(partial(decide_, slots)) for slots in (1, 2)},
+        drive=jax.jit(drive_),
+        observe=jax.jit(observe_),
+    )
+
+
+def walk(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    imperfections: Imperfections,
+    seconds: float = 4.0,
+    seed: int = 0,
+    start_tick: int = 0,
+    path: Path | None = None,
+    on_sample: Callable[[World, mujoco.MjData], None] | None = None,
+) -> Trajectory:
+    """Walk once in MuJoCo C.
+
+    Args:
+        config: the controller.
+        robot: its nominal body.
+        weights: of the MPC.
+        command: what to walk.
+        imperfections: the plant.
+        seconds: length from t = 0, start-up apart.
+        seed: of the estimator's errors.
+        start_tick: gait tick of t = 0, for other start phases.
+        path: the plant's XML, hector.xml by default.
+        on_sample: called after each millisecond, start-up included.
+
+    Returns:
+        Samples of 1 ms from t = 0 (numpy). After a fall they are held and `fallen`.
+
+    Raises:
+        ValueError: the plant's file or numbers are wrong, or the length is no positive
+            number of ticks.
+    """
+    count = substeps(config)
+    ticks = round(seconds / config.gait.tick)
+    if ticks < 1:
+        raise ValueError(f"a walk needs at least one tick of {config.gait.tick} s, got {seconds} s")
+    world = build_world(imperfections, path)
+    model, data = world.model, mujoco.MjData(world.model)
+    data.qpos[:] = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
+
+    programs = _programs(config)
+    fixed = jax.device_put((robot, weights, command, imperfections))
+    device_robot, device_weights, device_command, device_imperfections = fixed
+    place = jax.device_put((np.array(world.floor), world.foot_of_geom))
+    begin = first_tick(config)
+    lead = (start_tick - begin) * count
+    errors = sensing.draw_errors(imperfections.estimator, seed, lead, ticks * count)
+    anchor = jax.device_put(standing_anchor(robot, start_tick))
+    substep_numbers = [jax.device_put(np.array(i, np.int32)) for i in range(count)]
+
+    rows, where = np.zeros((count + 1, sensing.READING)), sensing.coordinates(world)
+    nothing = np.zeros(1)
+    np.concatenate([data.qpos, data.qvel, nothing]).take(where, out=rows[0])
+    contacts = sensing.empty_contacts(count)
+    memory, motors, yaw = programs.begin(device_robot, rows[0]), init_actuators(), jnp.zeros(())
+    told: list[tuple[Plan, Observed]] = []
+    for tick in range(begin, start_tick + ticks):
+        if tick == start_tick:
+            last = jax.tree.map(lambda x: x[-1], told[-1][1].state)
+            anchor = jax.device_put(anchor_at(robot, last, start_tick))
+        error = errors[(tick - begin) * count :]
+        now, yaw_before = np.array(tick, np.int32), yaw
+        plan_now = programs.decide[slots_needed(config, tick)]
+        memory, plan = plan_now(
+            device_robot,
+            device_weights,
+            device_command,
+            anchor,
+            now,
+            memory,
+            yaw,
+            rows[0],
+            error[0],
+        )
+        for i in range(count):
+            motors, yaw, torque = programs.drive(
+                device_robot,
+                device_imperfections,
+                memory,
+                plan,
+                motors,
+                yaw,
+                substep_numbers[i],
+                rows[i],
+                error[i],
+            )
+            data.ctrl[world.actuator] = torque
+            mujoco.mj_step(model, data)
+            np.concatenate([data.qpos, data.qvel, nothing]).take(where, out=rows[i + 1])
+            sensing.read_contacts(world, data, contacts, i)
+            if on_sample is not None:
+                on_sample(world, data)
+        seen = programs.observe(
+            device_robot, device_command, anchor, now, yaw_before, rows, contacts, *place
+        )
+        told.append((plan, seen))
+        if np.asarray(seen.fallen).any() or data.warning.number.any():
+            break
+        rows[0] = rows[-1]
+    return _trajectory(told, count, lead, ticks * count, bool(data.warning.number.any()))
+
+
+def _trajectory(
+    told: Sequence[tuple[Plan, Observed]], count: int, lead: int, length: int, broken: bool
+) -> Trajectory:
+    """The samples from t = 0 on; the last good one is held from a fall on."""
+    plans, seen = (
+        jax.tree.map(lambda *x: np.stack(x), *trees) for trees in zip(*told, strict=True)
+    )
+    seen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), seen)
+    fell = np.flatnonzero(seen.fallen)
+    good = len(seen.fallen) - 1
+    if len(fell):
+        good = max(fell[0] - 1, 0)
+    elif broken:  # MuJoCo warned within the last tick and the state does not show it
+        good = max(len(seen.fallen) - count - 1, 0)
+    wanted = lead + np.arange(length)
+    held = np.minimum(wanted, good)
+    sample = jax.tree.map(lambda x: x[held], seen)
+    planned = jax.tree.map(lambda x: x[held // count], plans)
+    return Trajectory(
+        period=np.array(TIME_STEP),
+        initial=jax.tree.map(lambda x: x[min(lead - 1, good)], seen.state),
+        state=sample.state,
+        reference=sample.reference,
+        command=planned.wrench,
+        effect=sample.effect,
+        contact=planned.contact,
+        feet=sample.feet,
+        joints=sample.joints,
+        fallen=wanted > good,
+        residual=planned.residual,
+    )
+
+
+def walk_job(config: WalkConfig, robot: Robot, job: Job, path: Path | None = None) -> Trajectory:
+    """`walk` for a job."""
+    return walk(config, robot, *job, path=path)
+
+
+def _start_worker() -> None:
+    # One walk keeps one core busy; the threads of several processes would only fight for them.
+    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
+    setup_jax()
+
+
+def walk_parallel(
+    config: WalkConfig,
+    robot: Robot,
+    jobs: Sequence[Job],
+    processes: int = 2,
+    progress: Progress | None = None,
+    path: Path | None = None,
+) -> list[Trajectory]:
+    """Walk all jobs on several processes; the results in the order of the jobs.
+
+    The caller's own script has to be importable (`if __name__ == "__main__"`), because the
+    processes are spawned.
+    """
+    jobs = [jax.tree.map(np.asarray, job) for job in jobs]
+    robot = jax.tree.map(np.asarray, robot)
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=_start_worker)
+    with pool:
+        futures = [pool.submit(walk_job, config, robot, job, path) for job in jobs]
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                future.result()
+                if progress is not None:
+                    progress(done, len(jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return [future.result() for future in futures]

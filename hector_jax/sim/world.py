@@ -1,0 +1,285 @@
+"""The MuJoCo worlds: hector.xml and what is wrong with a plant's joints, ground and masses.
+
+Imperfections are numbers, so that a world is data: `ideal`, `hfs` (the high-fidelity simulator) and
+plants drawn around the hfs. What a number means is stated here; the motors' part of it (delay, lag,
+gain, linkage) lives in sim.actuators, the estimator's in sim.sensing, the rest becomes a field of
+the MuJoCo model. Backlash is a second hinge on the axis of each joint, free within +-b between
+motor and link; the encoder sits on the motor's side. Everything is looked up by name, so that
+nothing depends on how many joints there are.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from hector_jax.robot import JOINT_NAMES, MODEL_PATH, load_model
+
+TIME_STEP = 0.001  # [s] of plant, joint control and samples
+MAX_DELAY = 0.008  # [s] that the motors' memory can hold
+SLACK = "_backlash"  # ending of the names of backlash joints
+SLACK_DAMPING = 0.01  # [N m s/rad] of a backlash joint
+STOP_TIME = 0.004  # [s] solref of the backlash's end stops: gear teeth are hard
+
+# MuJoCo writes its warnings into a file of the working directory; the counters in MjData, which
+# every walk reads, tell the same.
+mujoco.set_mju_user_warning(lambda message: None)
+
+
+class Estimator(NamedTuple):
+    """Error of the state estimate: sigmas of white noise each millisecond, and a drift."""
+
+    position: Float[Array, "*batch"]  # [m]
+    velocity: Float[Array, "*batch"]  # [m/s]
+    angle: Float[Array, "*batch"]  # [rad]
+    ang_velocity: Float[Array, "*batch"]  # [rad/s]
+    joint: Float[Array, "*batch"]  # [rad] encoders
+    drift: Float[Array, "*batch"]  # [m] of a random walk, 4 s after t = 0, each horizontal axis
+    drift_yaw: Float[Array, "*batch"]  # [rad] likewise
+
+
+class Imperfections(NamedTuple):
+    """What a plant has that the controller does not know."""
+
+    joint_friction: Float[Array, "*batch"]  # [N m] dry, each joint
+    joint_damping: Float[Array, "*batch"]  # [N m s/rad]
+    armature: Float[Array, "*batch"]  # times that of hector.xml
+    backlash: Float[Array, "*batch"]  # [rad] half width b
+    delay: Float[Array, "*batch"]  # [s] of the torque command
+    lag: Float[Array, "*batch"]  # [s] first order, of the torque
+    torque_gain: Float[Array, "*batch 10"]
+    linkage: Float[Array, "*batch"]  # share of the ankle torque that is added at the knee
+    contact_time: Float[Array, "*batch"]  # [s] solref of the floor
+    floor_friction: Float[Array, "*batch"]
+    mass: Float[Array, "*batch"]  # times that of hector.xml, all links
+    trunk_com: Float[Array, "*batch 3"]  # [m] shift of the trunk's centre of mass
+    estimator: Estimator
+
+
+def truth() -> Estimator:
+    """The state is known exactly."""
+    return Estimator(*(np.zeros(()) for _ in Estimator._fields))
+
+
+def _numbers(estimator: Estimator | None = None, **values: object) -> Imperfections:
+    arrays = {name: np.asarray(value, float) for name, value in values.items()}
+    return Imperfections(**arrays, estimator=truth() if estimator is None else estimator)
+
+
+def ideal() -> Imperfections:
+    """For checking the controller: firm ground, joint damping 0.1, nothing else."""
+    return _numbers(
+        joint_friction=0.0,
+        joint_damping=0.1,
+        armature=1.0,
+        backlash=0.0,
+        delay=0.0,
+        lag=0.0,
+        torque_gain=np.ones(10),
+        linkage=0.0,
+        contact_time=0.01,
+        floor_friction=0.8,
+        mass=1.0,
+        trunk_com=np.zeros(3),
+    )
+
+
+def hfs() -> Imperfections:
+    """The high-fidelity simulator: friction, backlash, delay, lag and linkage as in the paper's."""
+    return _numbers(
+        joint_friction=0.3,
+        joint_damping=0.3,
+        armature=1.0,
+        backlash=0.005,
+        delay=0.002,
+        lag=0.004,
+        torque_gain=np.ones(10),
+        linkage=0.5,
+        contact_time=0.01,
+        floor_friction=0.8,
+        mass=1.0,
+        trunk_com=np.zeros(3),
+    )
+
+
+def hfs_drawn(seed: int, share: float = 0.2) -> Imperfections:
+    """A plant around the hfs: each number drawn uniformly within +-`share` of its own.
+
+    Of mass, whose number is known better, a tenth of the share; the trunk's centre of mass
+    moves by up to 2.5 cm times the share. The floor keeps a friction of at least 0.6 (the MPC
+    plans with 0.5 and no plant below that can be walked on), and no motor gives
+    more than it is told to: a gain falls short of 1 by up to a quarter of the share.
+
+    Args:
+        seed: which plant.
+        share: 0.2 for collection, 0.4 for `hfs-varied`.
+    """
+    base, rng = hfs(), np.random.default_rng([0x4F5, round(1000 * share), seed])
+    within = lambda value, part: np.asarray(value * rng.uniform(1 - part, 1 + part))  # noqa: E731
+    names = (
+        "joint_friction",
+        "joint_damping",
+        "armature",
+        "backlash",
+        "delay",
+        "lag",
+        "linkage",
+        "contact_time",
+        "floor_friction",
+    )
+    drawn = base._replace(**{name: within(getattr(base, name), share) for name in names})
+    return drawn._replace(
+        floor_friction=np.maximum(drawn.floor_friction, 0.6),
+        torque_gain=rng.uniform(1 - share / 4, 1.0, 10),
+        mass=within(base.mass, share / 10),
+        trunk_com=rng.uniform(-1.0, 1.0, 3) * share * 0.025,
+    )
+
+
+def hfs_varied(seed: int) -> Imperfections:
+    """One of the 20 plants around the hfs by which we choose between variants of ours."""
+    return hfs_drawn(seed, 0.4)
+
+
+WORLDS = ("ideal", "hfs", "hfs-varied")
+
+
+def named_world(name: str, seed: int = 0) -> Imperfections:
+    """Imperfections of a world with a name; the seed chooses the plant where there are several.
+
+    Raises:
+        ValueError: the name is none of WORLDS.
+    """
+    if name not in WORLDS:
+        raise ValueError(f"unknown world {name!r}; there are: {', '.join(WORLDS)}")
+    return {"ideal": ideal, "hfs": hfs, "hfs-varied": lambda: hfs_varied(seed)}[name]()
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A MuJoCo model and where the robot's parts are in it."""
+
+    model: mujoco.MjModel
+    joint_qpos: np.ndarray  # (10,) motor side, left leg then right
+    joint_dof: np.ndarray  # (10,)
+    slack: np.ndarray  # (10,) backlash joints; empty where there are none
+    slack_qpos: np.ndarray  # (10,) likewise
+    actuator: np.ndarray  # (10,)
+    foot_of_geom: np.ndarray  # (ngeom,) 0 left, 1 right, -1 no foot
+    floor: int  # geom
+
+
+def _check(imperfections: Imperfections) -> None:
+    flat = {**imperfections._asdict(), **imperfections.estimator._asdict()}
+    del flat["estimator"]
+    for name, value in flat.items():
+        signed = name == "trunk_com"
+        if not np.all(np.isfinite(value)) or (not signed and np.any(np.asarray(value) < 0.0)):
+            raise ValueError(f"Imperfections.{name} must be finite and >= 0, got {value}")
+    for name in ("armature", "contact_time", "mass", "torque_gain"):
+        if np.any(np.asarray(flat[name]) <= 0.0):
+            raise ValueError(f"Imperfections.{name} must be positive, got {flat[name]}")
+    if imperfections.delay > MAX_DELAY:
+        raise ValueError(f"Imperfections.delay is at most {MAX_DELAY} s, got {imperfections.delay}")
+
+
+def _model_with_backlash(path: Path) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_file(str(path))
+    for name in JOINT_NAMES:
+        motor = spec.joint(name)
+        motor.parent.add_joint(
+            name=name + SLACK,
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=motor.axis,
+            pos=motor.pos,
+            limited=True,
+            range=[-1.0, 1.0],  # of the plant, set later
+            solref_limit=[STOP_TIME, 1.0],
+            armature=0.0,
+            damping=[SLACK_DAMPING, 0.0, 0.0],
+            frictionloss=0.0,
+            stiffness=[0.0, 0.0, 0.0],
+        )
+    for key in list(spec.keys):  # their length is that of the joints
+        spec.delete(key)
+    return spec.compile()
+
+
+def _compile(path: Path, slack: bool) -> World:
+    model = load_model(path)
+    if slack:
+        model = _model_with_backlash(path)
+    floors = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
+    if len(floors) != 1:
+        raise ValueError(f"{path}: expected one floor that collides, got {len(floors)}")
+    joints = [model.joint(name) for name in JOINT_NAMES]
+    slacks = [model.joint(name + SLACK) for name in JOINT_NAMES] if slack else []
+    of_joint = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
+    feet = [joint.bodyid[0] for joint in joints[4::5]]
+    return World(
+        model=model,
+        joint_qpos=np.array([joint.qposadr[0] for joint in joints]),
+        joint_dof=np.array([joint.dofadr[0] for joint in joints]),
+        slack=np.array([joint.id for joint in slacks], int),
+        slack_qpos=np.array([joint.qposadr[0] for joint in slacks], int),
+        actuator=np.array([of_joint[joint.id] for joint in joints]),
+        foot_of_geom=np.array([feet.index(b) if b in feet else -1 for b in model.geom_bodyid]),
+        floor=floors[0],
+    )
+
+
+def _with_numbers(world: World, imperfections: Imperfections) -> World:
+    model, dof = copy(world.model), world.joint_dof
+    model.opt.timestep = TIME_STEP
+    # A blown-up state must stay blown up: a reset to the initial pose would pass for a fresh start.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    model.dof_frictionloss[dof] = imperfections.joint_friction
+    model.dof_damping[dof] = imperfections.joint_damping
+    model.dof_armature[dof] *= imperfections.armature
+    model.jnt_range[world.slack] = imperfections.backlash * np.array([-1.0, 1.0])
+    # The floor alone decides these: in hector.xml the robot's geoms have less friction and no
+    # share in the mix.
+    model.geom_friction[world.floor, 0] = imperfections.floor_friction
+    model.geom_solref[world.floor] = imperfections.contact_time, 1.0
+    model.body_mass *= imperfections.mass
+    model.body_inertia *= imperfections.mass
+    model.body_ipos[model.jnt_bodyid[0]] += imperfections.trunk_com
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return replace(world, model=model)
+
+
+def build_worlds(imperfections: Sequence[Imperfections], path: Path | None = None) -> list[World]:
+    """The MuJoCo models of several plants.
+
+    Args:
+        imperfections: what is wrong with each; `backlash` above zero adds ten joints.
+        path: the robot, hector.xml by default.
+
+    Raises:
+        ValueError: the file is not the robot, or a number is out of its range.
+    """
+    for plant in imperfections:
+        _check(plant)
+    slack = [bool(plant.backlash > 0.0) for plant in imperfections]
+    blank = {kind: _compile(path or MODEL_PATH, kind) for kind in set(slack)}
+    return [_with_numbers(blank[s], p) for s, p in zip(slack, imperfections, strict=True)]
+
+
+def build_world(imperfections: Imperfections, path: Path | None = None) -> World:
+    """The MuJoCo model of one plant; see `build_worlds`."""
+    return build_worlds([imperfections], path)[0]
+
+
+def standing_qpos(
+    world: World, joints: Float[np.ndarray, "10"], height: float
+) -> Float[np.ndarray, " nq"]:
+    """Coordinates of a robot standing at the origin: trunk at `height` [m], `joints` [rad]."""
+    qpos = np.zeros(world.model.nq)
+    qpos[2], qpos[3] = height, 1.0
+    qpos[world.joint_qpos] = joints
+    return qpos

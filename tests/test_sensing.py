@@ -1,0 +1,184 @@
+"""What is sensed: base state, ground wrench, falls and the estimator's errors, against MuJoCo."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hector_jax.robot import load_robot
+
+from hector_jax.sim import sensing
+from hector_jax.sim.standin import standin
+from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos, truth
+from hector_jax.trajectory import State
+
+ROBOT = load_robot()
+
+
+@jax.jit
+def sensed(robot, row, contacts, floor, foot_of_geom):
+    reading = sensing.unpack_reading(row)
+    foot, touches = sensing.foot_contacts(contacts, floor, foot_of_geom)
+    points = sensing.foot_points(robot, reading)
+    wrench = sensing.ground_wrench(contacts, foot, floor, points)
+    return sensing.base_state(robot, reading, jnp.zeros(())), wrench, points, touches
+
+
+def flat_reading(world, data):
+    return np.concatenate([data.qpos, data.qvel, [0.0]])[sensing.coordinates(world)]
+
+
+def sense(world, data, row):
+    """State, wrench, foot points and touch of the last step, which started at `row`."""
+    contacts = sensing.empty_contacts(1)
+    sensing.read_contacts(world, data, contacts, 0)
+    one = jax.tree.map(lambda x: x[0], contacts)
+    return sensed(ROBOT, row, one, world.floor, world.foot_of_geom)
+
+
+def stand(plant, height=0.0, steps=1500):
+    """A robot held in its standing pose by a joint PD, let go `height` [m] above the floor."""
+    world = build_world(plant)
+    data = mujoco.MjData(world.model)
+    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, float(ROBOT.trunk_height) + height)
+    row = flat_reading(world, data)
+    for _ in range(steps):
+        row = flat_reading(world, data)
+        error = ROBOT.standing_joints - data.qpos[world.joint_qpos]
+        data.ctrl[world.actuator] = 400.0 * error - 6.0 * data.qvel[world.joint_dof]
+        mujoco.mj_step(world.model, data)
+    return world, data, row
+
+
+@pytest.mark.parametrize("plant", [ideal(), hfs()], ids=["ideal", "hfs"])
+def test_at_rest_the_ground_carries_the_weight_inside_the_feet(plant):
+    world, data, row = stand(plant)
+    _, wrench, _, touches = sense(world, data, row)
+    force, moment = np.asarray(wrench.force), np.asarray(wrench.moment)
+    weight = world.model.body_mass.sum() * 9.81
+    assert force[:, 2].sum() == pytest.approx(weight, rel=0.005)
+    assert np.abs(force[:, :2].sum(axis=0)).max() < 0.02 * weight  # the loose robot still sways
+    ahead, aside = -moment[:, 1] / force[:, 2], moment[:, 0] / force[:, 2]
+    assert (-ROBOT.heel <= ahead).all()
+    assert (ahead <= ROBOT.toe).all()
+    assert np.abs(aside).max() < 1e-3
+    assert not touches
+
+
+def test_in_flight_there_is_no_wrench():
+    world, data, row = stand(ideal(), height=0.5, steps=3)
+    _, wrench, _, _ = sense(world, data, row)
+    assert not np.any(wrench.force)
+    assert not np.any(wrench.moment)
+
+
+def test_the_wrench_is_the_sum_of_mujocos_contact_forces():
+    world, data, row = stand(ideal(), height=0.01, steps=60)
+    assert data.ncon > 0
+    force, moment, out = np.zeros((2, 3)), np.zeros((2, 3)), np.zeros(6)
+    _, wrench, points, _ = sense(world, data, row)
+    for i in range(data.ncon):
+        contact = data.contact[i]
+        mujoco.mj_contactForce(world.model, data, i, out)
+        foot = world.foot_of_geom[[g for g in contact.geom if g != world.floor][0]]
+        pushed = contact.frame.reshape(3, 3).T @ out[:3]
+        force[foot] += pushed
+        moment[foot] += np.cross(contact.pos - np.asarray(points)[foot], pushed)
+    np.testing.assert_allclose(wrench.force, force, atol=1e-9)
+    np.testing.assert_allclose(wrench.moment, moment, atol=1e-9)
+
+
+def test_base_state_is_that_of_a_point_fixed_to_the_trunk():
+    world = build_world(ideal())
+    data = mujoco.MjData(world.model)
+    rng = np.random.default_rng(3)
+    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
+    data.qpos[3:7] = rng.normal(size=4)
+    data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+    data.qvel[:6] = rng.normal(size=6)
+    state, *_ = sense(world, data, flat_reading(world, data))
+    mujoco.mj_forward(world.model, data)
+    velocity = np.zeros(6)
+    mujoco.mj_objectVelocity(world.model, data, mujoco.mjtObj.mjOBJ_XBODY, 1, velocity, 0)
+    R_wb = data.xmat[1].reshape(3, 3)
+    offset = R_wb @ ROBOT.com_offset
+    np.testing.assert_allclose(state.position, data.subtree_com[0], atol=1e-4)
+    np.testing.assert_allclose(state.position, data.xpos[1] + offset, atol=1e-9)
+    np.testing.assert_allclose(state.ang_velocity, velocity[:3], atol=1e-9)
+    np.testing.assert_allclose(
+        state.velocity, velocity[3:] + np.cross(velocity[:3], offset), atol=1e-9
+    )
+
+
+def test_foot_points_and_joints_count_the_backlash():
+    world = build_world(hfs())
+    data = mujoco.MjData(world.model)
+    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
+    data.qpos[world.slack_qpos] = np.linspace(-0.005, 0.005, 10)
+    mujoco.mj_kinematics(world.model, data)
+    reading = sensing.unpack_reading(jnp.asarray(flat_reading(world, data)))
+    points = sensing.foot_points(ROBOT, reading)
+    np.testing.assert_array_equal(reading.slack, np.linspace(-0.005, 0.005, 10))
+    for foot, ankle in enumerate(world.joint_dof[[4, 9]]):
+        body = world.model.dof_bodyid[ankle]
+        expected = data.xpos[body] + data.xmat[body].reshape(3, 3) @ ROBOT.foot_point[foot]
+        np.testing.assert_allclose(points[foot], expected, atol=1e-9)
+
+
+def test_yaw_goes_on_past_half_a_turn():
+    row = np.zeros(sensing.READING)
+    yaws = np.linspace(0.0, 9.0, 40)
+    before = jnp.zeros(())
+    for yaw in yaws:
+        row[3:7] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+        before = sensing.base_state(ROBOT, sensing.unpack_reading(jnp.asarray(row)), before).euler[
+            2
+        ]
+        assert before == pytest.approx(yaw, abs=1e-9)
+
+
+def upright(**change):
+    zero = jnp.zeros(3)
+    state = State(zero, jnp.array([0.0, 0.0, 0.41]), zero, zero)
+    return state._replace(**{k: jnp.asarray(v) for k, v in change.items()})
+
+
+def test_a_fall_is_a_fall():
+    no, yes = jnp.array(False), jnp.array(True)
+    assert not sensing.is_fallen(upright(), no)
+    assert not sensing.is_fallen(upright(euler=[0.7, -0.7, 3.0]), no)
+    assert sensing.is_fallen(upright(), yes)
+    assert sensing.is_fallen(upright(position=[0.0, 0.0, 0.24]), no)
+    assert sensing.is_fallen(upright(euler=[0.0, -0.81, 0.0]), no)
+    assert sensing.is_fallen(upright(euler=[0.81, 0.0, 0.0]), no)
+    assert sensing.is_fallen(upright(velocity=[0.0, np.nan, 0.0]), no)
+
+
+def test_a_knee_on_the_floor_is_no_foot():
+    world = build_world(ideal())
+    data = mujoco.MjData(world.model)
+    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 0.2)
+    mujoco.mj_forward(world.model, data)
+    assert sense(world, data, flat_reading(world, data))[3]
+
+
+def test_a_known_state_has_no_errors():
+    assert not sensing.draw_errors(truth(), 0, 10, 20).any()
+
+
+def test_errors_have_their_stated_sizes():
+    estimator = standin(0).estimator
+    runs = np.stack([sensing.draw_errors(estimator, seed, 100, 4000) for seed in range(60)])
+    start = runs[:, :100]
+    sizes = np.repeat([0.005, 0.003, 0.03, 0.03, 0.001], [3, 3, 3, 3, 10])
+    np.testing.assert_allclose(start.std(axis=(0, 1)), sizes, rtol=0.1)
+    end = runs[:, -100:].mean(axis=1)  # the noise averages out, the drift stays
+    np.testing.assert_allclose(end[:, [2, 3, 4]].std(axis=0), 0.01, rtol=0.3)
+    assert np.abs(end[:, [0, 1, 5]]).max() < 0.003
+
+
+def test_a_seed_gives_the_same_errors():
+    estimator = standin(0).estimator
+    first, same, other = (sensing.draw_errors(estimator, s, 10, 50) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, same)
+    assert (first != other).any()

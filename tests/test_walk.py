@@ -1,0 +1,175 @@
+"""The closed loop in MuJoCo C."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from hector_jax.robot import load_robot
+
+from hector_jax.control.reference import COMMANDS, named_command
+from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import expert, nominal
+from hector_jax.sim.standin import standin
+from hector_jax.sim.walk import Job, walk, walk_parallel
+from hector_jax.sim.world import build_world, hfs, ideal
+from hector_jax.tuning.loss import LossConfig, losses, total
+
+CONFIG, ROBOT = WalkConfig(), load_robot()
+
+
+@pytest.fixture(scope="module")
+def short():
+    """Half a second of the straight line in `ideal`."""
+    return walk(CONFIG, ROBOT, expert(), named_command("straight"), ideal(), seconds=0.5)
+
+
+def rms(error):
+    return np.sqrt(np.mean(np.asarray(error) ** 2, axis=0))
+
+
+def test_a_walk_has_a_sample_each_millisecond(short):
+    assert short.period == 0.001
+    assert all(
+        leaf.shape[:1] == (500,)
+        for leaf in jax.tree.leaves(short._replace(period=None, initial=None))
+    )
+    assert not short.fallen.any()
+
+
+def test_the_robot_walks_ahead_upright(short):
+    assert np.abs(short.state.position - short.reference.position).max() < 0.08
+    assert np.abs(short.state.euler - short.reference.euler).max() < 0.1
+    assert short.state.position[-1, 0] - short.initial.position[0] > 0.15
+
+
+def test_the_reference_starts_where_the_robot_truly_is(short):
+    start = short.reference.position[0] - 0.001 * short.reference.velocity[0]
+    np.testing.assert_allclose(start[:2], short.initial.position[:2], atol=1e-9)
+    assert start[2] == pytest.approx(float(ROBOT.standing_height))
+
+
+def test_stance_follows_the_gait(short):
+    left, right = short.contact.T
+    np.testing.assert_array_equal(left, np.arange(500) % 400 < 200)
+    np.testing.assert_array_equal(right, ~left)
+
+
+def test_a_foot_in_the_air_is_told_nothing(short):
+    assert not np.any(short.command.force[~short.contact])
+    assert not np.any(short.command.moment[~short.contact])
+
+
+def test_the_ground_carries_the_robot(short):
+    weight = float(ROBOT.mass) * 9.81
+    acceleration = (short.state.velocity[-1, 2] - short.initial.velocity[2]) / 0.5
+    assert short.effect.force[:, :, 2].sum(axis=1).mean() == pytest.approx(
+        weight * (1 + acceleration / 9.81), rel=0.03
+    )
+
+
+def test_the_realised_pressure_stays_inside_the_foot(short):
+    force, moment = short.effect.force, short.effect.moment
+    loaded = force[..., 2] > 5.0
+    ahead = -moment[..., 1][loaded] / force[..., 2][loaded]
+    assert ahead.min() > -float(ROBOT.heel) - 0.01
+    assert ahead.max() < float(ROBOT.toe) + 0.01
+
+
+def test_plans_were_solved(short):
+    assert short.residual.max() < 1e-6
+
+
+def test_a_seed_gives_the_same_bytes():
+    plant, command = standin(1), named_command("s")
+    runs = [walk(CONFIG, ROBOT, expert(), command, plant, 0.1, seed) for seed in (5, 5, 6)]
+    first, same, other = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(r)]) for r in runs)
+    assert first.tobytes() == same.tobytes()
+    assert first.tobytes() != other.tobytes()
+
+
+def test_a_fall_is_held_and_marked():
+    ice = ideal()._replace(floor_friction=np.array(0.11))
+    fall = walk(CONFIG, ROBOT, expert(), named_command("s"), ice, seconds=3.0)
+    assert fall.fallen[-1]
+    first = int(np.argmax(fall.fallen))
+    assert fall.fallen[first:].all()
+    for leaf in jax.tree.leaves(fall._replace(period=None, initial=None, fallen=None)):
+        assert np.isfinite(leaf).all()
+        assert (leaf[first:] == leaf[max(first - 1, 0)]).all()
+
+
+def test_every_sample_can_be_watched():
+    times = []
+    walk(
+        CONFIG,
+        ROBOT,
+        expert(),
+        named_command("c"),
+        ideal(),
+        seconds=0.01,
+        on_sample=lambda world, data: times.append(data.time),
+    )
+    np.testing.assert_allclose(times, 0.001 * np.arange(1, len(times) + 1))
+    assert len(times) == 1100 + 10
+
+
+def test_a_walk_shorter_than_a_tick_is_refused():
+    with pytest.raises(ValueError, match="at least one tick"):
+        walk(CONFIG, ROBOT, expert(), named_command("c"), ideal(), seconds=0.0)
+
+
+@pytest.mark.slow
+def test_processes_walk_as_one_does():
+    jobs = [Job(nominal(), named_command(name), hfs(), 0.2) for name in ("straight", "s")]
+    told = []
+    walked = walk_parallel(CONFIG, ROBOT, jobs, progress=lambda *count: told.append(count))
+    assert told == [(1, 2), (2, 2)]
+    for job, trajectory in zip(jobs, walked, strict=True):
+        alone = walk(CONFIG, ROBOT, *job)
+        for one, other in zip(jax.tree.leaves(trajectory), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_expert_weights_walk_far_in_ideal(name):
+    seconds = 8.0 if name == "s" else 12.0
+    walked = walk(CONFIG, ROBOT, expert(), named_command(name), ideal(), seconds)
+    assert not walked.fallen.any()
+    assert rms(walked.state.position - walked.reference.position).max() <= 0.06
+    assert np.rad2deg(rms(walked.state.euler - walked.reference.euler)).max() <= 3.0
+    four = jax.tree.map(lambda x: x[:4000] if np.ndim(x) and len(x) > 4000 else x, walked)
+    assert total(LossConfig(), losses(four)) <= 4e6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_expert_weights_walk_in_hfs(name):
+    assert not walk(CONFIG, ROBOT, expert(), named_command(name), hfs()).fallen.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
+def test_expert_weights_walk_on_the_standin(seed):
+    for name in COMMANDS:
+        trajectory = walk(CONFIG, ROBOT, expert(), named_command(name), standin(seed), seed=seed)
+        assert not trajectory.fallen.any(), name
+
+
+@pytest.mark.slow
+def test_the_ground_wrench_explains_the_whole_robots_motion():
+    """M (a + g) of the robot's own centre of mass is the force of the ground."""
+    momentum = []
+
+    def record(world, data):
+        mujoco.mj_subtreeVel(world.model, data)
+        momentum.append(data.subtree_linvel[0] * world.model.body_subtreemass[0])
+
+    walked = walk(
+        CONFIG, ROBOT, expert(), named_command("straight"), ideal(), 1.0, on_sample=record
+    )
+    # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
+    gained = np.diff(np.array(momentum), axis=0)[1100:] / 0.001
+    weight = build_world(ideal()).model.body_mass.sum() * 9.81
+    felt = walked.effect.force.sum(axis=1)[: len(gained)] - [0.0, 0.0, weight]
+    assert np.abs(gained - felt).mean() < 0.05 * weight
