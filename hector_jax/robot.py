@@ -1,9 +1,12 @@
-"""The robot as numbers: what hector.xml says about mass, lengths and limits, read once and stated nowhere else.
+"""The robot as numbers: mass, lengths and limits, read from hector.xml and stated nowhere else.
 
-`load_model` compiles a robot description and checks that it is a biped this package can walk: a free trunk, two mirrored legs
-with hip yaw, hip roll, hip pitch, knee and ankle, one motor per joint, and line feet that touch at a toe and a heel. `load_robot`
-reads a `Robot` off the compiled model. Frames: the trunk's is at the trunk body's origin, x ahead, y left, z up; a link's frame
-sits in the joint that moves it, parallel to the trunk's when all joints are zero.
+`load_model` compiles a robot description and checks that it is a biped this package can walk: a
+free trunk, two mirrored legs with hip yaw, hip roll, hip pitch, knee and ankle, one motor per
+joint, and line feet that touch at a toe and a heel. `load_robot` reads a `Robot` off the compiled
+model.
+
+Frames: the trunk's is at the trunk body's origin, x ahead, y left, z up; a link's frame sits in the
+joint that moves it, parallel to the trunk's when all joints are zero.
 """
 
 import difflib
@@ -24,7 +27,6 @@ MODEL_PATH = _INSTALLED if _INSTALLED.exists() else _PACKAGE.parent / "assets" /
 SIDES = ("left", "right")
 LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
 JOINT_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in LEG_JOINTS)
-BASE_JOINT = "base"
 FOOT_POINTS = tuple(f"{side}_foot_point" for side in SIDES)
 TOES = tuple(f"{side}_toe" for side in SIDES)
 HEELS = tuple(f"{side}_heel" for side in SIDES)
@@ -36,7 +38,7 @@ _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
 
 
 class Robot(NamedTuple):
-    """The robot's constants; a pytree of 64-bit arrays on the host, handed to jitted functions as an argument."""
+    """The robot's constants: a pytree of 64-bit host arrays, an argument of jitted functions."""
 
     mass: Float[np.ndarray, ""]  # whole robot [kg]
     inertia: Float[
@@ -88,7 +90,7 @@ def load_robot(path: Path | None = None) -> Robot:
         mass=model.body_subtreemass[trunk].copy(),
         inertia=R_wb.T @ _composite_inertia(model, data, com) @ R_wb,
         com_offset=R_wb.T @ (com - data.xpos[trunk]),
-        gravity=-model.opt.gravity,
+        gravity=0.0 - model.opt.gravity,
         joint_origin=model.body_pos[link].reshape(2, 5, 3),
         joint_axis=model.jnt_axis[joint[:5]],
         foot_point=foot_point,
@@ -112,8 +114,9 @@ def load_model(path: Path | None = None) -> mujoco.MjModel:
         path: MJCF file; None takes the packaged hector.xml.
 
     Raises:
-        ValueError: one line saying what is wrong with the file, what was expected and what there is. The file must be one
-            self-contained XML of at most 1 MB, without DOCTYPE, that compiles to the biped of this module's docstring.
+        ValueError: one line saying what came, what was expected and what there is. The file must be
+            one self-contained XML of at most 1 MB, without DOCTYPE, that compiles to the biped of
+            this module's docstring.
     """
     path = MODEL_PATH if path is None else Path(path)
     text = _read(path)
@@ -155,7 +158,8 @@ def _read(path: Path) -> str:
     for element in root.iter():
         if element.tag == "include" or "file" in element.attrib:
             raise ValueError(
-                f"{path}: <{element.tag}> refers to {element.get('file')!r}, expected one self-contained file"
+                f"{path}: <{element.tag}> refers to {element.get('file')!r}, "
+                "expected one self-contained file"
             )
     return text
 
@@ -164,7 +168,8 @@ def _check_base(path: Path, model: mujoco.MjModel) -> None:
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     if len(free) != 1 or free[0] != 0:
         raise ValueError(
-            f"{path}: {len(free)} free joints, expected exactly one, the first; joints: {_listed(_joints(model))}"
+            f"{path}: {len(free)} free joints, expected exactly one, the first; "
+            f"joints: {_listed(_joints(model))}"
         )
 
 
@@ -175,11 +180,12 @@ def _check_joints(path: Path, model: mujoco.MjModel) -> None:
     got = [name for name in names if name in JOINT_NAMES]
     if got != list(JOINT_NAMES) or len(names) != 1 + len(JOINT_NAMES):
         raise ValueError(
-            f"{path}: joints are {_listed(names)}; expected a free joint, then {_listed(JOINT_NAMES)}"
+            f"{path}: joints are {_listed(names)}; "
+            f"expected a free joint, then {_listed(JOINT_NAMES)}"
         )
-    for side, name in enumerate(JOINT_NAMES):
+    for index, name in enumerate(JOINT_NAMES):
         joint = model.joint(name)
-        which = side % 5
+        which = index % 5
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
             raise ValueError(f"{path}: joint {name!r} is no hinge, expected a hinge")
         if not np.allclose(joint.axis, _LEG_AXES[which], atol=_SAME):
@@ -189,11 +195,12 @@ def _check_joints(path: Path, model: mujoco.MjModel) -> None:
         if not joint.limited[0]:
             raise ValueError(f"{path}: joint {name!r} has no range, expected limits in radians")
         body = joint.bodyid[0]
-        parent = _trunk(model) if which == 0 else model.joint(JOINT_NAMES[side - 1]).bodyid[0]
-        if model.body_parentid[body] != parent:
+        parent = model.body_parentid[body]
+        expected = _trunk(model) if which == 0 else model.joint(JOINT_NAMES[index - 1]).bodyid[0]
+        if parent != expected:
             raise ValueError(
-                f"{path}: joint {name!r} hangs on body {model.body(model.body_parentid[body]).name!r}, "
-                f"expected {model.body(parent).name!r}"
+                f"{path}: joint {name!r} hangs on body {model.body(parent).name!r}, "
+                f"expected {model.body(expected).name!r}"
             )
         if np.abs(joint.pos).max() > _SAME or abs(model.body_quat[body][0]) < 1 - _SAME:
             raise ValueError(
@@ -203,14 +210,16 @@ def _check_joints(path: Path, model: mujoco.MjModel) -> None:
         # Two parallel links in one plane: what the closed-form inverse kinematics solves.
         if which >= 3 and (model.body_pos[body][0] != 0.0 or model.body_pos[body][2] >= 0.0):
             raise ValueError(
-                f"{path}: body of joint {name!r} is at {model.body_pos[body]}, expected x = 0 and z < 0"
+                f"{path}: body of joint {name!r} is at {model.body_pos[body]}, "
+                "expected x = 0 and z < 0"
             )
 
 
 def _check_motors(path: Path, model: mujoco.MjModel) -> None:
     if model.nu != len(JOINT_NAMES):
         raise ValueError(
-            f"{path}: {model.nu} actuators, expected {len(JOINT_NAMES)}, one per joint: {_listed(JOINT_NAMES)}"
+            f"{path}: {model.nu} actuators, expected {len(JOINT_NAMES)}, "
+            f"one per joint: {_listed(JOINT_NAMES)}"
         )
     for index, name in enumerate(JOINT_NAMES):
         motor = model.actuator(index)
@@ -219,8 +228,8 @@ def _check_motors(path: Path, model: mujoco.MjModel) -> None:
             raise ValueError(f"{path}: actuator {index} drives joint {driven!r}, expected {name!r}")
         if not motor.ctrllimited[0] or motor.ctrlrange[1] <= 0 or motor.gear[0] != 1.0:
             raise ValueError(
-                f"{path}: actuator of joint {name!r} has ctrlrange {motor.ctrlrange} and gear {motor.gear[0]}, "
-                "expected a torque range and gear 1"
+                f"{path}: actuator of joint {name!r} has ctrlrange {motor.ctrlrange} and gear "
+                f"{motor.gear[0]}, expected a torque range and gear 1"
             )
 
 

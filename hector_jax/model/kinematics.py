@@ -1,12 +1,15 @@
 """Feet from joints and joints from feet, all in the trunk frame.
 
-A leg is a chain hip yaw (z), hip roll (x), hip pitch, knee, ankle (y). Behind yaw psi and roll phi the three pitch joints move
-in one plane, so that with the running pitches a = q_2, b = q_2 + q_3, theta = q_2 + q_3 + q_4
+A leg is a chain hip yaw (z), hip roll (x), hip pitch, knee, ankle (y). Behind yaw psi and roll phi
+the three pitch joints move in one plane. With the running pitches a = q_2, b = q_2 + q_3 and
+theta = q_2 + q_3 + q_4
 
-    foot point = o_yaw + Rz(psi) (o_roll + Rx(phi) (o_pitch + Ry(a) o_knee + Ry(b) o_ankle + Ry(theta) sole))
+    foot point = o_yaw + Rz(psi) (o_roll + Rx(phi) p)
+    p = o_pitch + Ry(a) o_knee + Ry(b) o_ankle + Ry(theta) sole
 
-and the way back is closed: yaw is given, roll turns the plane onto the target, the rest is a triangle of thigh and shin. The
-knee bends backwards (negative). `load_model` has checked the axes and that thigh and shin point down at zero.
+and the way back is closed: yaw is given, roll turns the plane onto the target, the rest is a
+triangle of thigh and shin. The knee bends backwards (negative). `load_model` has checked the axes
+and that thigh and shin point down at zero.
 """
 
 from typing import NamedTuple
@@ -51,8 +54,9 @@ def inverse_legs(
 ) -> Float[Array, "10"]:
     """Joint angles [rad] that put the foot points at `position`; the inverse of `foot_poses`.
 
-    Where a target is out of reach the leg points at it as far as the knee's limits let it; hip and ankle angles are not
-    limited. Finite with finite derivatives everywhere.
+    Where a target is out of reach the leg points at it as far as the knee's limits let it; hip and
+    ankle angles are not limited. Of the two solutions it takes the one with the foot point below
+    the hip roll axis. Finite, with finite derivatives, everywhere.
 
     Args:
         robot: leg lengths and knee limits.
@@ -83,7 +87,7 @@ def leg_gravity(
     """
     chain = _chain(robot, joints)
     mass = jnp.asarray(robot.link_mass)[..., None]
-    com = chain.origin + jnp.einsum("lbij,lbj->lbi", chain.frames, robot.link_com)
+    com = chain.origin + jnp.sum(chain.frames * jnp.asarray(robot.link_com)[:, :, None, :], axis=-1)
     # A joint carries the links from its own outwards.
     outer_mass = jnp.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
     outer_moment = jnp.cumsum((mass * com)[:, ::-1], axis=1)[:, ::-1]
