@@ -16,6 +16,7 @@ from hector_jax.tuning.rollout import RolloutConfig, rollout, standing_anchor
 
 SHORT, LONG = RolloutConfig(ticks=50), RolloutConfig(ticks=400)
 walk = jax.jit(rollout, static_argnums=0)
+propagate = jax.jit(sensitivity.propagate, static_argnums=0)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +123,7 @@ def check_gradient(config, robot, weights, command, anchor, effect, bar):
         for step in (1e-5, 5e-6)
     ]
     assert min(errors) <= bar, errors
-    trajectory, columns = sensitivity.propagate(config, robot, weights, command, anchor, effect)
+    trajectory, columns = propagate(config, robot, weights, command, anchor, effect)
     _, forward = sensitivity.gradient(LossConfig(), trajectory, columns)
     forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
     assert relative(forward, reverse) <= 1e-8

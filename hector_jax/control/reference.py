@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Real
 
 from hector_jax.trajectory import State
 
@@ -68,7 +68,7 @@ def _displacement(command: Command, time: Float[Array, ""]) -> tuple[Array, Arra
 
 
 def reference_at(
-    tick_length: float, command: Command, anchor: Anchor, tick: Float[Array, ""]
+    tick_length: float, command: Command, anchor: Anchor, tick: Real[Array, ""]
 ) -> State:
     """Reference state at a gait tick; before t = 0 it stands at the anchor.
 

@@ -38,7 +38,7 @@ class TuneConfig:
     beta_q: float = 0.05  # largest relative step of a weight in Q
     beta_r: float = 0.08  # and in R
     update: str = "relative"  # or "literal": the paper's theta - beta dL/dtheta
-    tie_feet: bool = False  # one R for both feet
+    tie_feet: bool = True  # one R for both feet, as the robot is its own mirror image
     iterations: int = 100  # at most
     patience: int = 10  # iterations over which the loss must fall
     gain: float = 5e-3  # by this share at least, or the tuning has converged

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hector_jax.trajectory import Trajectory, Wrench
 
@@ -42,7 +42,7 @@ class Losses(NamedTuple):
 
 
 def _charged(
-    error: Float[Array, " T"], fallen: Float[Array, " T"], least: float
+    error: Float[Array, " T"], fallen: Bool[Array, " T"], least: float
 ) -> Float[Array, " T"]:
     """Squared errors with those after the fall replaced by what a fall is charged."""
     before = jnp.where(fallen, 0.0, error)
@@ -50,7 +50,7 @@ def _charged(
     return jnp.where(fallen, jnp.maximum(before[last], least**2), before)
 
 
-def _squared_changes(command: Wrench, fallen: Float[Array, " T"]) -> Float[Array, " T-1"]:
+def _squared_changes(command: Wrench, fallen: Bool[Array, " T"]) -> Float[Array, " T-1"]:
     change = jnp.sum(jnp.diff(command.force, axis=0) ** 2, axis=(1, 2))
     change = change + jnp.sum(jnp.diff(command.moment, axis=0) ** 2, axis=(1, 2))
     return jnp.where(fallen[1:], 0.0, change)
