@@ -19,6 +19,7 @@ from hector_jax.grfm.dataset import (
     load_walks,
     make_dataset,
     split_by_walk,
+    with_mirror,
 )
 from hector_jax.model.effect import HISTORY
 from hector_jax.robot import load_robot
@@ -169,6 +170,25 @@ def test_samples_after_a_fall_are_dropped_and_counted(three):
     assert dropped == 10
     assert data.tick[data.walk == 2].max() == 29
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(data))
+
+
+def test_a_mirror_image_has_the_other_foot_s_turn_and_is_its_own_inverse(three):
+    data, _ = make_dataset(three)
+    n = len(data.walk)
+    both = with_mirror(data)
+    image = jax.tree.map(lambda x: x[n:], both)
+    np.testing.assert_array_equal(image.window.contact[:, 0], image.window.phase < 0.5)
+    np.testing.assert_array_equal(image.walk, data.walk)
+    np.testing.assert_allclose(image.label.force[:, 0], data.label.force[:, 1] * [1, -1, 1])
+    # the moment of a mirrored force about a mirrored point
+    lever, force = np.array([0.02, 0.03, 0.01]), np.array([5.0, -7.0, 90.0])
+    along, across = np.array([1, -1, 1]), np.array([-1, 1, -1])
+    np.testing.assert_allclose(
+        np.cross(lever * along, force * along), np.cross(lever, force) * across
+    )
+    np.testing.assert_allclose(image.label.moment[:, 1], data.label.moment[:, 0] * across)
+    again = jax.tree.map(lambda x: x[n:], with_mirror(image))
+    leaves_close(again, data, 1e-12)
 
 
 def test_no_walk_is_in_both_parts_of_a_split(three):

@@ -354,6 +354,35 @@ def _samples(
     return Dataset(window, label, before, jnp.full_like(tick, number), tick), usable
 
 
+def with_mirror(dataset: Dataset) -> Dataset:
+    """The samples and their mirror images, left for right: a symmetric robot has both.
+
+    The image of a sample belongs to the same walk, so that a split by walk stays one. What a plant
+    has on one side only, such as the gain of a motor, it then has on the other.
+    """
+    along, across = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
+
+    def flip(wrench: Wrench) -> Wrench:
+        return Wrench(wrench.force[..., ::-1, :] * along, wrench.moment[..., ::-1, :] * across)
+
+    window, state = dataset.window, dataset.state
+    image = dataset._replace(
+        window=window._replace(
+            commands=flip(window.commands),
+            contact=window.contact[:, ::-1],
+            phase=(window.phase + 0.5) % 1.0,
+        ),
+        label=flip(dataset.label),
+        state=State(
+            euler=state.euler * across,
+            position=state.position * along,
+            ang_velocity=state.ang_velocity * across,
+            velocity=state.velocity * along,
+        ),
+    )
+    return jax.tree.map(lambda *both: np.concatenate(both), dataset, image)
+
+
 def split_by_walk(
     dataset: Dataset, held_out: float = 0.2, seed: int = 0
 ) -> tuple[Dataset, Dataset]:
