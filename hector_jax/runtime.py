@@ -6,6 +6,10 @@ processes) call `setup_jax` once, before the first array.
 
 import os
 import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 
 
@@ -33,3 +37,30 @@ def setup_jax() -> None:
     jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def start_worker() -> None:
+    """Set up a worker process: one thread, because a closed loop is one long chain."""
+    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
+    setup_jax()
+
+
+@contextmanager
+def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Worker processes, each set up by `start_worker`; what still waits is dropped on an error.
+
+    The caller's own script has to be importable (`if __name__ == "__main__"`), because the
+    processes are spawned.
+
+    Raises:
+        ValueError: fewer than one.
+    """
+    if processes < 1:
+        raise ValueError(f"the number of processes must be at least 1, got {processes}")
+    with ProcessPoolExecutor(processes, get_context("spawn"), initializer=start_worker) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

@@ -4,13 +4,14 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from hector_jax.robot import load_robot
 
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
+from hector_jax.robot import load_robot
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk, walk_parallel
+from hector_jax.runtime import workers
+from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import build_world, hfs, ideal
 from hector_jax.tuning.loss import LossConfig, losses, total
 
@@ -121,9 +122,8 @@ def test_a_walk_shorter_than_a_tick_is_refused():
 @pytest.mark.slow
 def test_processes_walk_as_one_does():
     jobs = [Job(nominal(), named_command(name), hfs(), 0.2) for name in ("straight", "s")]
-    told = []
-    walked = walk_parallel(CONFIG, ROBOT, jobs, progress=lambda *count: told.append(count))
-    assert told == [(1, 2), (2, 2)]
+    with workers(2) as pool:
+        walked = list(walk_many(pool, CONFIG, ROBOT, jobs))
     for job, trajectory in zip(jobs, walked, strict=True):
         alone = walk(CONFIG, ROBOT, *job)
         for one, other in zip(jax.tree.leaves(trajectory), jax.tree.leaves(alone), strict=True):

@@ -8,12 +8,11 @@ plans and one observes, per millisecond one turns the plan into torques, and MuJ
 fall ends the walk: what is missing is held and marked, never started afresh.
 """
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache, partial
-from multiprocessing import get_context
+from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,14 +34,11 @@ from hector_jax.control.walking import (
 )
 from hector_jax.control.weights import Weights
 from hector_jax.robot import Robot
-from hector_jax.runtime import setup_jax
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.sensing import Contacts, Reading
 from hector_jax.sim.world import TIME_STEP, Imperfections, World, build_world, standing_qpos
 from hector_jax.trajectory import State, Trajectory, Wrench
-
-Progress = Callable[[int, int], None]  # told (done, all)
 
 
 class Job(NamedTuple):
@@ -169,9 +165,15 @@ def first_tick(config: WalkConfig) -> int:
 
 def standing_anchor(robot: Robot, start_tick: int) -> Anchor:
     """Where the robot stands until t = 0."""
-    offset = np.asarray(robot.com_offset)
-    position = np.array([offset[0], offset[1], robot.standing_height])
-    return Anchor(position, np.zeros(()), np.array(start_tick, np.int32))
+    place = jnp.asarray(robot.com_offset)[:2]
+    position = jnp.append(place, robot.standing_height)
+    return Anchor(position, jnp.zeros(()), jnp.asarray(start_tick, jnp.int32))
+
+
+def anchor_at(robot: Robot, state: State, start_tick: int) -> Anchor:
+    """Where the reference starts: the true place and heading of t = 0, at standing height."""
+    position = jnp.append(state.position[:2], robot.standing_height)
+    return Anchor(position, state.euler[2], jnp.asarray(start_tick, jnp.int32))
 
 
 def anchor_at(robot: Robot, state: State, start_tick: int) -> Anchor:
@@ -366,37 +368,14 @@ def walk_job(config: WalkConfig, robot: Robot, job: Job, path: Path | None = Non
     return walk(config, robot, *job, path=path)
 
 
-def _start_worker() -> None:
-    # One walk keeps one core busy; the threads of several processes would only fight for them.
-    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
-    setup_jax()
-
-
-def walk_parallel(
+def walk_many(
+    pool: Executor,
     config: WalkConfig,
     robot: Robot,
     jobs: Sequence[Job],
-    processes: int = 2,
-    progress: Progress | None = None,
     path: Path | None = None,
-) -> list[Trajectory]:
-    """Walk all jobs on several processes; the results in the order of the jobs.
-
-    The caller's own script has to be importable (`if __name__ == "__main__"`), because the
-    processes are spawned.
-    """
-    jobs = [jax.tree.map(np.asarray, job) for job in jobs]
-    robot = jax.tree.map(np.asarray, robot)
-    pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=_start_worker)
-    with pool:
-        futures = [pool.submit(walk_job, config, robot, job, path) for job in jobs]
-        try:
-            for done, future in enumerate(as_completed(futures), 1):
-                future.result()
-                if progress is not None:
-                    progress(done, len(jobs))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return [future.result() for future in futures]
+) -> Iterator[Trajectory]:
+    """Walk all jobs in a pool of processes (`runtime.workers`); gives the walks in order, as they come."""
+    host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
+    sent = [Job(host(w), host(c), host(plant), *rest) for w, c, plant, *rest in jobs]
+    yield from pool.map(walk_job, repeat(config), repeat(host(robot)), sent, repeat(path))

@@ -1,0 +1,61 @@
+"""What a person sees while waiting: one line or one bar on stderr; stdout carries results only."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+console = Console(stderr=True, highlight=False)
+
+Tell = Callable[[int, int, str], None]  # (done, all, remark)
+
+_QUIET = 15.0  # [s] between lines where there is no terminal to draw a bar on
+
+
+def say(text: str) -> None:
+    """One line to the person who waits."""
+    console.print(text, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def bar(title: str) -> Iterator[Tell]:
+    """A progress bar for anything longer than two seconds; plain lines where there is no terminal.
+
+    Yields:
+        Function to be told how many are done of how many, with a short remark.
+    """
+    if console.is_terminal:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[remark]}"),
+        )
+        with Progress(*columns, console=console) as progress:
+            task = progress.add_task(title, total=None, remark="")
+            yield lambda done, of, remark="": progress.update(
+                task, completed=done, total=of, remark=remark
+            )
+        return
+    start = last = time.monotonic()
+    say(f"{title} ...")
+
+    def tell(done: int, of: int, remark: str = "") -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= _QUIET:
+            say(f"  {done}/{of} after {now - start:.0f} s  {remark}".rstrip())
+            last = now
+
+    yield tell
+    say(f"{title}: done in {time.monotonic() - start:.0f} s")
+
+
+def fail(text: str) -> int:
+    """One line that says what is wrong, and the exit code for bad input."""
+    print(f"hector: {' '.join(str(text).split())}", file=sys.stderr)
+    return 2

@@ -1,0 +1,238 @@
+"""What the commands do, one step each: collect walks, train the net, tune, judge.
+
+Everything that is walked or tuned runs in worker processes, one core each, because a closed loop is
+one long chain of small operations. A step that finds its result on disk takes it.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import Manager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hector_jax.console import Tell, bar
+from hector_jax.control.reference import COMMANDS, Command, named_command
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
+from hector_jax.grfm import dataset, network, training
+from hector_jax.grfm.dataset import Dataset
+from hector_jax.grfm.network import LinearMap, NetParams
+from hector_jax.grfm.training import History, TrainConfig
+from hector_jax.model.effect import last_command
+from hector_jax.robot import Robot
+from hector_jax.sim.walk import Job, walk_many
+from hector_jax.sim.world import Imperfections
+from hector_jax.trajectory import Trajectory
+from hector_jax.tuning import difftune
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.rollout import standing_anchor
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Walks on the hfs to learn the ground from."""
+
+    walks: int = 64
+    seconds: float = 4.0  # of each
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.walks < 2 or not self.seconds > 0.0:
+            raise ValueError(
+                f"CollectConfig needs walks >= 2 and seconds > 0, got {self.walks}, {self.seconds}"
+            )
+
+
+class Learned(NamedTuple):
+    """A trained GRFM-Net with what there is to say about it."""
+
+    params: NetParams
+    linear: LinearMap  # the baseline, fitted to the same samples
+    errors: dict[str, Any]  # held-out errors of raw command, linear map and net
+    course: History
+
+
+def _tune_job(
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    params: NetParams | None,
+    name: str,
+    tell: Any,
+) -> Tuning:
+    """One tuning in a worker; the queue `tell` hears of each iteration."""
+    effect = last_command if params is None else network.as_effect(params)
+    return difftune.tune(
+        config,
+        robot,
+        nominal(),
+        command,
+        standing_anchor(robot),
+        effect,
+        lambda iteration: tell.put((name, iteration)),
+    )
+
+
+def tune_many(
+    pool: ProcessPoolExecutor,
+    config: TuneConfig,
+    robot: Robot,
+    problems: Mapping[str, tuple[Command, NetParams | None]],
+    title: str,
+    on_iteration: Callable[[str, Iteration], None] = lambda name, iteration: None,
+) -> dict[str, Tuning]:
+    """Tune several problems side by side from the nominal weights.
+
+    Args:
+        pool: worker processes.
+        config: how.
+        robot: the body.
+        problems: by name, the command and the net to tune through (None: the plain rigid body).
+        title: for the person who waits.
+        on_iteration: called with name and iteration as they happen.
+    """
+    with Manager() as manager, bar(title) as tell:
+        heard = manager.Queue()
+        running: dict[str, Future[Tuning]] = {
+            name: pool.submit(_tune_job, config, robot, command, params, name, heard)
+            for name, (command, params) in problems.items()
+        }
+        tell(0, config.iterations * len(problems), "compiling")
+        done = 0
+        while not (over := all(future.done() for future in running.values())) or not heard.empty():
+            if heard.empty():
+                wait(running.values(), timeout=0.1)
+                continue
+            name, iteration = heard.get()
+            done += iteration.iteration > 0
+            loss = float(iteration.evaluation.loss) / 1e6
+            tell(done, config.iterations * len(problems), f"{name}: L {loss:.3f}e6")
+            on_iteration(name, iteration)
+        return {name: future.result() for name, future in running.items()}
+
+
+def tuning_paths(pool: ProcessPoolExecutor, config: TuneConfig, robot: Robot) -> list[Weights]:
+    """Weights that plain tunings of the three trajectories pass through, stacked; data is to cover them."""
+    problems = {name: (named_command(name), None) for name in COMMANDS}
+    tunings = tune_many(
+        pool, config, robot, problems, "tuning paths on the rigid body, for the data"
+    )
+    stacked = []
+    for name in COMMANDS:
+        passed = [i.weights for i in tunings[name].history if i.accepted]
+        stacked.append(jax.tree.map(lambda *w: np.stack(w), *passed))
+    return stacked
+
+
+def collect(
+    pool: ProcessPoolExecutor, config: CollectConfig, tune: TuneConfig, robot: Robot, folder: Path
+) -> None:
+    """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there."""
+    jobs = dataset.draw_jobs(
+        config.seed, config.walks, tuning_paths(pool, tune, robot), config.seconds
+    )
+    with bar(f"collecting {config.walks} walks on the high-fidelity simulator") as tell:
+        dataset.collect(
+            folder,
+            jobs,
+            lambda missing: walk_many(pool, tune.rollout.walk, robot, missing),
+            robot=robot,
+            progress=tell,
+        )
+
+
+def _samples(robot: Robot, folder: Path) -> tuple[Dataset, Dataset, int]:
+    """Training and held-out samples of the walks under `folder`, and how many a fall cost."""
+    walks = dataset.load_walks(folder, robot)
+    samples, dropped = dataset.make_dataset(walks.trajectory, walks.job.start_tick)
+    return *dataset.split_by_walk(samples), dropped
+
+
+def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
+    """Train the GRFM-Net on the walks under `folder` and keep it at `path`."""
+    seen, held_out, dropped = _samples(robot, folder)
+    with bar(f"training GRFM-Net on {len(seen.walk)} samples") as tell:
+        tell(0, config.epochs, "compiling")
+        params, course = training.train(
+            config, seen, held_out, lambda epoch, _: tell(epoch, config.epochs)
+        )
+    linear = network.fit_linear(seen)
+    effects = {
+        "raw": last_command,
+        "linear": network.linear_effect(linear),
+        "net": network.as_effect(params),
+    }
+    about = {
+        "samples": {"training": len(seen.walk), "held_out": len(held_out.walk), "fallen": dropped},
+        "errors": training.report(effects, held_out),
+        "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
+    }
+    network.save_net(path, params, robot=robot, about=about)
+    return Learned(params, linear, about["errors"], course)
+
+
+def learned(robot: Robot, folder: Path, path: Path) -> Learned:
+    """The net kept at `path` and what its card says, with the linear map of its data.
+
+    Raises:
+        ValueError: one line naming the file that is damaged or of another robot.
+    """
+    params, _, card = network.load_net(path, robot)
+    about = card["about"]
+    course = History(*(np.array(about["course"][name]) for name in History._fields))
+    return Learned(params, network.fit_linear(_samples(robot, folder)[0]), about["errors"], course)
+
+
+def judge(
+    pool: ProcessPoolExecutor,
+    config: TuneConfig,
+    robot: Robot,
+    sets: Mapping[str, Weights],
+    command: Command,
+    plants: Sequence[Imperfections],
+    seeds: Sequence[int],
+    title: str,
+) -> dict[str, list[Trajectory]]:
+    """Walk every weight set on every plant, four seconds each; by set, in the order of the plants."""
+    jobs = [
+        Job(weights, command, plant, seed=seed)
+        for weights in sets.values()
+        for plant, seed in zip(plants, seeds, strict=True)
+    ]
+    with bar(title) as tell:
+        walks = list(_told(walk_many(pool, config.rollout.walk, robot, jobs), len(jobs), tell))
+    each = len(plants)
+    return {name: walks[i * each : (i + 1) * each] for i, name in enumerate(sets)}
+
+
+def _told(walks: Iterable[Trajectory], count: int, tell: Tell) -> Iterator[Trajectory]:
+    for done, walk in enumerate(walks, 1):
+        yield walk
+        tell(done, count)
+
+
+def as_line(name: str, iteration: Iteration) -> str:
+    """A line of metrics.jsonl."""
+    found = iteration.evaluation
+    gradient = jax.tree.map(np.multiply, found.gradient, iteration.weights)
+    vector = lambda tree: np.asarray(weights_to_vector(tree)).tolist()  # noqa: E731
+    row = {
+        "set": name,
+        "iteration": iteration.iteration,
+        "accepted": iteration.accepted,
+        "reason": iteration.reason,
+        "step": iteration.step,
+        "L": float(found.loss),
+        "L_Eul": float(found.parts.euler),
+        "L_pos": float(found.parts.position),
+        "L_ctrl": float(found.parts.control),
+        "fallen": float(found.fallen),
+        "residual": float(found.residual),
+        "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
+        "gradient_log": dict(zip(WEIGHT_NAMES, vector(gradient), strict=True)),
+    }
+    return json.dumps(row) + "\n"
