@@ -1,0 +1,298 @@
+"""The robot description: what it says, that both engines load it, and that wrong ones are told."""
+
+import contextlib
+import io
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from hector_jax.robot import (
+    FOOT_POINTS,
+    JOINT_NAMES,
+    MODEL_PATH,
+    load_model,
+    load_robot,
+)
+
+TEXT = MODEL_PATH.read_text()
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model()
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot()
+
+
+def standing(model):
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("standing").id)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def body_pairs(model, data):
+    """Pairs of body names in contact."""
+    bodies = model.geom_bodyid[data.contact.geom]
+    return [tuple(model.body(b).name for b in pair) for pair in bodies]
+
+
+# What the file says
+
+
+def test_robot_weighs_twelve_kilograms_and_has_sixteen_degrees_of_freedom(model, robot):
+    assert robot.mass == pytest.approx(12.0, abs=0.05)
+    assert (model.nv, model.nu) == (16, 10)
+
+
+def test_knees_have_67_newton_metres_and_the_others_half(robot):
+    np.testing.assert_array_equal(robot.torque_limit, [33.5, 33.5, 33.5, 67.0, 33.5] * 2)
+
+
+def test_joint_limits_are_those_of_the_facts_sheet(robot):
+    np.testing.assert_array_equal(robot.joint_lower, [-0.70, -0.60, -0.6, -2.38, -1.4] * 2)
+    np.testing.assert_array_equal(robot.joint_upper, [0.70, 0.60, 1.9, -0.10, 1.4] * 2)
+
+
+def test_actuators_and_joints_come_left_leg_then_right(model):
+    assert [model.actuator(i).name for i in range(model.nu)] == list(JOINT_NAMES)
+    assert list(model.actuator_trnid[:, 0]) == list(range(1, 11))
+
+
+def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor(model, robot):
+    data = standing(model)
+    assert robot.trunk_height == pytest.approx(0.548, abs=1e-3)
+    for foot, side in zip(FOOT_POINTS, (1, -1), strict=True):
+        np.testing.assert_allclose(
+            data.site(foot).xpos, [-0.0135, side * 0.0942, 0.0], rtol=0, atol=1e-6
+        )
+    np.testing.assert_allclose(np.rad2deg(robot.standing_joints), [0, 0, 45, -90, 45] * 2)
+
+
+def test_line_foot_reaches_nine_centimetres_ahead_and_six_behind(model, robot):
+    assert (robot.toe, robot.heel) == pytest.approx((0.09, 0.06), abs=1e-12)
+    data = standing(model)
+    for side in ("left", "right"):
+        for end in ("toe", "heel"):
+            ball = model.geom(f"{side}_{end}")
+            assert data.geom(ball.name).xpos[2] - ball.size[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_composite_body_is_that_of_the_facts_sheet(robot):
+    np.testing.assert_allclose(robot.com_offset, [-0.011, 0.0, -0.125], atol=1e-3)
+    np.testing.assert_allclose(np.diag(robot.inertia), [0.321, 0.268, 0.120], atol=1e-3)
+    assert robot.inertia[0, 2] == pytest.approx(-0.027, abs=1e-3)
+    assert robot.standing_height == pytest.approx(0.548 - 0.125, abs=1e-3)
+
+
+def test_composite_inertia_is_the_base_block_of_the_mass_matrix(model, robot):
+    """MuJoCo's H, moved from the trunk's origin to the CoM; armature sits on joints only."""
+    data = standing(model)
+    H = np.zeros((16, 16))
+    mujoco.mj_fullM(model, data, H)
+    S = np.cross(robot.com_offset, np.eye(3)).T  # S(c) w = c x w
+    np.testing.assert_allclose(H[:3, :3], robot.mass * np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(H[:3, 3:6], -robot.mass * S, atol=1e-12)
+    np.testing.assert_allclose(H[3:6, 3:6], robot.inertia - robot.mass * S @ S, atol=1e-12)
+
+
+def test_robot_is_its_own_mirror_image(robot):
+    mirror = np.array([1.0, -1.0, 1.0])
+    for field in ("joint_origin", "foot_point", "link_com"):
+        left, right = getattr(robot, field)
+        np.testing.assert_array_equal(right, left * mirror)
+    np.testing.assert_array_equal(*robot.link_mass)
+    np.testing.assert_allclose(robot.com_offset[1], 0.0, atol=1e-15)
+    np.testing.assert_allclose(robot.inertia[[0, 1], [1, 2]], 0.0, atol=1e-15)
+
+
+def test_ideal_world_has_the_plant_numbers_of_the_design(model):
+    names = [model.joint(i).name for i in range(1, 11)]
+    knee = np.array(["knee" in name for name in names])
+    np.testing.assert_array_equal(model.dof_armature[6:], np.where(knee, 0.016, 0.008))
+    np.testing.assert_array_equal(model.dof_damping[6:], 0.1)
+    np.testing.assert_array_equal(model.dof_frictionloss, 0.0)
+    data = standing(model)
+    data.qpos[2] -= 0.002
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 4
+    assert set(data.contact.dim) == {3}
+    np.testing.assert_array_equal(data.contact.friction[:, :2], 0.8)
+    np.testing.assert_array_equal(data.contact.solref, [[0.01, 1.0]] * 4)
+
+
+# What touches what
+
+
+def test_crossed_legs_collide(model):
+    data = standing(model)
+    data.qpos[2] = 1.0
+    data.qpos[[8, 13]] = [-0.3, 0.3]  # both feet roll inwards
+    mujoco.mj_forward(model, data)
+    pairs = body_pairs(model, data)
+    assert pairs
+    assert all({a.split("_")[0], b.split("_")[0]} == {"left", "right"} for a, b in pairs)
+
+
+def test_robot_in_the_air_touches_only_leg_against_leg(model, robot):
+    rng = np.random.default_rng(0)
+    data = mujoco.MjData(model)
+    touched = 0
+    for joints in rng.uniform(robot.joint_lower, robot.joint_upper, size=(300, 10)):
+        data.qpos[:] = [0, 0, 2, 1, 0, 0, 0, *joints]
+        mujoco.mj_forward(model, data)
+        touched += data.ncon
+        for a, b in body_pairs(model, data):
+            assert {a.split("_")[0], b.split("_")[0]} == {"left", "right"}
+    assert touched > 0
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "height"), [((0.7, 0.7, 0, 0), 0.08), ((0.7, 0, 0.7, 0), 0.05)]
+)
+def test_lying_robot_touches_the_floor_with_more_than_its_feet(model, quaternion, height):
+    data = standing(model)
+    data.qpos[2:7] = [height, *quaternion]
+    mujoco.mj_forward(model, data)
+    touching = {body for pair in body_pairs(model, data) for body in pair}
+    assert "trunk" in touching
+
+
+def test_mjx_takes_the_model_unchanged(model):
+    with contextlib.redirect_stdout(io.StringIO()):  # mjx tells the world that it has no warp
+        from mujoco import mjx
+    device_model = mjx.put_model(model)
+    assert (device_model.nv, device_model.nu) == (16, 10)
+    contacts = mjx.make_data(model)._impl.contact.dist.shape[0]
+    assert contacts <= 40  # MJX pays for every pair that could touch
+
+
+# What is refused
+
+
+def refusal(tmp_path, text):
+    path = tmp_path / "robot.xml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"robot\.xml") as caught:
+        load_robot(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def drop_line(text, *marks):
+    return "\n".join(line for line in text.split("\n") if not any(mark in line for mark in marks))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        pytest.param(lambda t: t[: len(t) // 2], ["malformed XML", "line"], id="cut in half"),
+        pytest.param(lambda t: "", ["malformed XML"], id="empty"),
+        pytest.param(lambda t: "<robot/>", ["<robot>", "expected <mujoco>"], id="other root"),
+        pytest.param(lambda t: t + " " * 1_000_001, ["1.0 MB", "at most 1 MB"], id="too big"),
+        pytest.param(
+            lambda t: '<!DOCTYPE mujoco [<!ENTITY a "b">]>' + t, ["DOCTYPE"], id="doctype"
+        ),
+        pytest.param(
+            lambda t: t.replace("<asset>", '<include file="/etc/passwd"/><asset>'),
+            ["<include>", "/etc/passwd", "self-contained"],
+            id="include",
+        ),
+        pytest.param(
+            lambda t: t.replace('mass="5.512"', 'mass="-5.512"'),
+            ["MuJoCo refuses", "mass"],
+            id="negative mass",
+        ),
+        pytest.param(
+            lambda t: drop_line(t, "<freejoint", "<key "),
+            ["0 free joints", "expected exactly one", "left_hip_yaw"],
+            id="no free joint",
+        ),
+        pytest.param(
+            lambda t: drop_line(t, '<motor name="right_ankle"'),
+            ["9 actuators", "expected 10", "right_ankle"],
+            id="nine actuators",
+        ),
+        pytest.param(
+            lambda t: t.replace('"left_foot_point"', '"left_foot_pt"'),
+            ["no site 'left_foot_point'", "did you mean 'left_foot_pt'", "right_foot_point"],
+            id="renamed foot site",
+        ),
+        pytest.param(
+            lambda t: t.replace('name="right_toe"', 'name="right_tip"'),
+            ["no geom 'right_toe'", "right_heel"],
+            id="renamed toe",
+        ),
+        pytest.param(
+            lambda t: t.replace("left_knee", "left_kneee"),
+            ["no joint 'left_knee'", "did you mean 'left_kneee'", "left_ankle"],
+            id="renamed joint",
+        ),
+        pytest.param(
+            lambda t: t.replace("left_", "?_").replace("right_", "left_").replace("?_", "right_"),
+            ["joints are base, right_hip_yaw", "then left_hip_yaw"],
+            id="legs swapped",
+        ),
+        pytest.param(
+            lambda t: (
+                t.replace("left_knee", "?")
+                .replace("left_ankle", "left_knee")
+                .replace("?", "left_ankle")
+            ).replace("<left_ankle", "<?"),
+            ["joints are", "expected a free joint, then"],
+            id="knee and ankle swapped",
+        ),
+        pytest.param(
+            lambda t: t.replace('axis="0 1 0" range="-2.38', 'axis="0 -1 0" range="-2.38'),
+            ["axis of joint 'left_knee'", "expected [0. 1. 0.]"],
+            id="knee axis reversed",
+        ),
+        pytest.param(
+            lambda t: t.replace('name="standing"', 'name="stand"'),
+            ["no keyframe 'standing'", "stand"],
+            id="renamed keyframe",
+        ),
+        pytest.param(
+            lambda t: t.replace(
+                'class="contact" pos="0.09 0 -0.03"', 'class="contact" pos="0.09 0 0"'
+            ),
+            ["left_toe", "left_foot_point", "same sole"],
+            id="toe off the sole",
+        ),
+    ],
+)
+def test_wrong_description_is_refused_in_one_line(tmp_path, change, words):
+    message = refusal(tmp_path, change(TEXT))
+    for word in words:
+        assert word in message
+
+
+def test_missing_file_and_folder_are_refused_in_one_line(tmp_path):
+    for path in (tmp_path / "nothing.xml", tmp_path):
+        with pytest.raises(ValueError, match="cannot read the robot description") as caught:
+            load_robot(path)
+        assert str(path) in str(caught.value)
+
+
+def test_binary_file_is_refused(tmp_path):
+    path = tmp_path / "robot.xml"
+    path.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(ValueError, match="not a text file"):
+        load_robot(path)
+
+
+def test_loading_the_robot_prints_nothing():
+    done = subprocess.run(
+        [sys.executable, "-c", "from hector_jax.robot import load_robot; load_robot()"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert (done.stdout, done.stderr) == ("", "")
