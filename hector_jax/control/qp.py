@@ -25,7 +25,7 @@ W_side = ((z + e) / (s + e))^2 from multiplier z and slack s of a side: infinite
 zero on the others. The square is that of the central path: a row barely active (z = s = 0), where
 the true derivative has one value on either side, gets one between. W is capped in the matrix that
 is factorised, and a second pass takes the cap's bias off; degenerate vertices stay regular.
-Solutions without status SOLVED have derivative zero.
+The derivative is zero without status SOLVED, and where the minimiser is not unique.
 """
 
 from dataclasses import dataclass
@@ -70,10 +70,11 @@ class Solution(NamedTuple):
     """Minimiser and multipliers with their own evidence.
 
     Residuals are those of (x, y) in the normalised problem (module docstring), so they have no unit
-    and compare between problems: `primal_residual` is the largest violation of a row over 1 +
-    largest |A x|, `dual_residual` the largest entry of P x + q + A'y over 1 + largest entry of its
-    terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over 1 + its largest term. With BAD_DATA or l > u,
-    x and y are zero and the residuals infinite.
+    and compare between problems: `primal_residual` is the largest violation of a row over the
+    largest entry of A x and the bounds, `dual_residual` the largest entry of P x + q + A'y over the
+    largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (all
+    plus 0.001, so that a solution of zeros has residuals too). With BAD_DATA or l > u, x and y are
+    zero and the residuals infinite.
     """
 
     x: Float[Array, " n"]
@@ -130,7 +131,7 @@ class _Floors(NamedTuple):
 
 def _floors(config: QpConfig, dtype: jnp.dtype) -> _Floors:
     if jnp.finfo(dtype).bits == 64:
-        floors = _Floors(1e-8, 1e-11, 1e-10, 1e7, 1e-12, 1e-11, 1e-8)
+        floors = _Floors(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-8)
     else:
         floors = _Floors(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4)
     tolerance = config.tolerance or floors.tolerance
@@ -240,6 +241,7 @@ class _Normal(NamedTuple):
     size: Array
 
 
+_SMALL = 1e-3  # keeps relative residuals meaningful where the solution is zero
 _SIGN = np.array([[1.0], [-1.0]])  # a side holds where sign * (A v - bound) <= 0
 
 
@@ -313,6 +315,7 @@ class _Guess(NamedTuple):
     active: Array  # (2, m) bool
     best: _Point
     proof: Array  # evidence of the best point
+    rho: Array
     iterations: Array
     going: Array
 
@@ -328,11 +331,11 @@ def _active_set(
     dtype = qp.q.dtype
     sign = jnp.asarray(_SIGN, dtype)
     always = jnp.zeros_like(qp.side).at[0].set(qp.equality)
-    P = qp.P + floors.proximal * jnp.eye(len(qp.q), dtype=dtype)
+    eye = jnp.eye(len(qp.q), dtype=dtype)
 
     def improve(state: _Guess) -> _Guess:
         weight = jnp.where(state.active, jnp.asarray(floors.cap, dtype), 0.0)
-        factor = _cholesky(_plus_gram(P, qp.A, weight[0] + weight[1]))
+        factor = _cholesky(_plus_gram(qp.P + state.rho * eye, qp.A, weight[0] + weight[1]))
         x, z = state.point.x, jnp.where(state.active, state.point.z, 0.0)
         for _ in range(2):  # method of multipliers: a pass takes six digits off
             z = z + weight * _violation(qp, x)
@@ -346,15 +349,21 @@ def _active_set(
         proof = _evidence(qp, point)
         better = jnp.max(proof) < jnp.max(state.proof)
         best, proof = _choose(better, (point, proof), (state.best, state.proof))
+        # a factorisation that fails is tried again with a larger rho
+        fine = jnp.isfinite(jnp.sum(x) + jnp.sum(z))
+        point = _choose(fine, _Point(x, z), state.point)
+        active = _choose(fine, state.active ^ wrong, state.active)
+        rho = jnp.where(fine, state.rho, 100.0 * state.rho)
         iterations = state.iterations + 1
-        going = jnp.any(wrong) & jnp.isfinite(jnp.sum(x)) & (iterations < limit)
-        return _Guess(_Point(x, z), state.active ^ wrong, best, proof, iterations, going)
+        going = (~fine | jnp.any(wrong)) & (rho < 1.0) & (iterations < limit)
+        return _Guess(point, active, best, proof, rho, iterations, going)
 
     first = _Guess(
         start,
         (active & qp.side) | always,
         start,
         jnp.full(3, jnp.inf, dtype),
+        jnp.asarray(floors.proximal, dtype),
         jnp.zeros((), jnp.int32),
         wanted,
     )
@@ -431,12 +440,7 @@ def _interior_point(
         fine = jnp.isfinite(jnp.sum(new[0].x) + jnp.sum(new[0].z) + jnp.sum(new[1]))
         point, slack = _choose(fine, new, (state.point, state.slack))
         rho = jnp.where(fine, jnp.maximum(0.1 * state.rho, floors.proximal), 100.0 * state.rho)
-        dual, primal, mu = residuals(point, slack)
-        done = (
-            (_largest(dual) <= floors.target * (1.0 + _largest(point.z)))
-            & (_largest(primal) <= floors.target * (1.0 + _largest(slack)))
-            & (mu <= floors.target)
-        )
+        done = jnp.max(_evidence(qp, point)) <= floors.target
         infeasible, unbounded = _certificates(floors, qp, point)
         iterations = state.iterations + 1
         going = ~done & ~infeasible & ~unbounded & (rho < 1.0)
@@ -497,13 +501,20 @@ def _evidence(qp: _Normal, point: _Point) -> Array:
     x, y = point.x, _multiplier(point.z)
     rows, pull, price = _rows(qp.A, x), _columns(qp.A, y), qp.P @ x
     outside = jnp.where(qp.given, jnp.asarray(_SIGN, x.dtype) * (rows - qp.bound), 0.0)
-    primal = jnp.max(outside, initial=0.0) / (1.0 + _largest(rows))
-    size = jnp.maximum(jnp.maximum(_largest(price), _largest(pull)), _largest(qp.q))
-    dual = _largest(price + qp.q + pull) / (1.0 + size)
     terms = jnp.stack([jnp.dot(x, price), jnp.dot(qp.q, x), _support(qp, y)])
-    gap = jnp.abs(jnp.sum(terms)) / (1.0 + _largest(terms))
+    moved = jnp.maximum(_largest(rows), _largest(qp.bound))
+    pushed = jnp.maximum(jnp.maximum(_largest(price), _largest(pull)), _largest(qp.q))
+    primal = jnp.max(outside, initial=0.0) / (_SMALL + moved)
+    dual = _largest(price + qp.q + pull) / (_SMALL + pushed)
+    gap = jnp.abs(jnp.sum(terms)) / (_SMALL + _largest(terms))
     proof = jnp.stack([primal, dual, gap])
     return jnp.where(jnp.isfinite(jnp.sum(proof)), proof, jnp.inf)
+
+
+def _where_sane(sane: Array, qp: QP) -> QP:
+    """The QP, or a plain one in its place, so that nothing that follows meets a NaN."""
+    plain = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
+    return _choose(sane, qp, plain)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -515,16 +526,13 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
     numbers = jnp.isfinite(jnp.sum(jnp.abs(qp.P)) + _largest(qp.q) + jnp.sum(jnp.abs(qp.A)))
     numbers &= ~jnp.any(no_bound)
     crossed = jnp.any(qp.l > qp.u)
-    # a problem that means nothing is replaced by one that does: nothing below meets a NaN
     sane = numbers & ~crossed
-    plain = QP(jnp.eye(n, dtype=dtype), *(jnp.zeros_like(v) for v in qp[1:]))
-    safe = QP(*(jnp.where(sane, v, p) for v, p in zip(qp, plain, strict=True)))
-    normal = _normalise(safe)
+    normal = _normalise(_where_sane(sane, qp))
     idle = normal.given & ~normal.side & ~normal.equality  # rows of zeros
     unmet = jnp.any(idle & (jnp.asarray(_SIGN, dtype) * normal.bound < 0))
     factor = _cholesky(normal.P + floors.proximal * jnp.eye(n, dtype=dtype))
     convex = jnp.isfinite(factor[-1, -1])
-    sane &= convex
+    sane &= convex & ~unmet
 
     nothing = jnp.zeros(normal.side.shape, dtype)
     loose = _Point(-cho_solve((factor, True), normal.q), nothing)
@@ -540,7 +548,9 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
         near, slack, steps = _box_osqp(config, floors, normal)
     infeasible, unbounded = _certificates(floors, normal, near)
     hopeful = sane & ~settled & ~infeasible & ~unbounded
-    exact, exact_proof, last = _active_set(floors, normal, near, near.z > slack, hopeful, tries)
+    # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
+    pushes = near.z * _largest(normal.bound) > slack * _largest(near.z)
+    exact, exact_proof, last = _active_set(floors, normal, near, pushes, hopeful, tries)
     point = quick
     for other, its_proof in ((near, _evidence(normal, near)), (exact, exact_proof)):
         better = ~settled & (jnp.max(its_proof) < jnp.max(proof))
@@ -574,21 +584,24 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
 def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple:
     (qp,), (d,) = primals, tangents
     solution, ratio = _solve(config, qp)
+    solved = solution.status == Status.SOLVED
+    qp = _where_sane(solved, qp)
     dtype = qp.q.dtype
     floors = _floors(config, dtype)
-    solved = solution.status == Status.SOLVED
     column, row = _scales(qp)
     A = _scale_rows_and_columns(qp.A, row, column)
     both = ratio[0] + ratio[1]
     firm = both >= floors.cap
+    P = column[:, None] * qp.P * column
     eye = jnp.eye(len(qp.q), dtype=dtype)
-    # what is not solved gets the unit matrix and no right-hand side: zero, whatever the data are
-    P = jnp.where(solved, column[:, None] * qp.P * column, eye)
-    factor = _cholesky(_plus_gram(P + floors.proximal * eye, A, jnp.where(solved, both, 0.0)))
-
+    factor = _cholesky(_plus_gram(P + floors.proximal * eye, A, both))
+    # a pivot of the size of rho: other minimisers lie beside this one, and it has no derivative
+    unique = jnp.min(jnp.diagonal(factor)) ** 2 > 10.0 * floors.proximal
+    sound = solved & unique
+    factor = jnp.where(unique, factor, eye)
     pull = column * (d.P @ solution.x + d.q + _columns(d.A, solution.y))
     shift = row * (both * _rows(d.A, solution.x) - ratio[0] * d.u - ratio[1] * d.l)
-    pull, shift = jnp.where(solved, pull, 0.0), jnp.where(solved, shift, 0.0)
+    pull, shift = jnp.where(sound, pull, 0.0), jnp.where(sound, shift, 0.0)
     dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
     for _ in range(2):  # as in `_active_set`: later passes take off what cap and rho did
         known = jnp.where(firm, dz, 0.0) + both * _rows(A, dv) + shift
