@@ -122,7 +122,7 @@ def load_model(path: Path | None = None) -> mujoco.MjModel:
     text = _read(path)
     try:
         model = mujoco.MjModel.from_xml_string(text)
-    except ValueError as error:
+    except (ValueError, mujoco.FatalError) as error:
         raise ValueError(f"{path}: MuJoCo refuses it: {_one_line(error)}") from None
     _check_base(path, model)
     _check_joints(path, model)

@@ -86,12 +86,11 @@ def leg_gravity(
         up: gravity pointing up, in the trunk frame [m/s^2].
     """
     chain = _chain(robot, joints)
-    mass = jnp.asarray(robot.link_mass)[..., None]
     com = chain.origin + jnp.sum(chain.frames * jnp.asarray(robot.link_com)[:, :, None, :], axis=-1)
-    # A joint carries the links from its own outwards.
-    outer_mass = jnp.cumsum(mass[:, ::-1], axis=1)[:, ::-1]
-    outer_moment = jnp.cumsum((mass * com)[:, ::-1], axis=1)[:, ::-1]
-    moment = jnp.cross(outer_moment - outer_mass * chain.origin, up)
+    # a joint carries the links from its own outwards: row of the joint, column of the link
+    mass = jnp.triu(jnp.broadcast_to(jnp.asarray(robot.link_mass)[:, None, :], (2, 5, 5)))
+    lever = jnp.sum(mass[..., None] * (com[:, None] - chain.origin[:, :, None]), axis=2)
+    moment = jnp.cross(lever, up)
     return jnp.sum(chain.axis * moment, axis=-1).reshape(10)
 
 
