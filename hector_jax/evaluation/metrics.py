@@ -157,16 +157,16 @@ def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
     return Comparison(change, float(np.mean(ours.L < theirs.L)), bool(gap < FALL_MARGIN - 1e-12))
 
 
-def as_result(verdict: Verdict) -> dict[str, Any]:
+def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
     """The verdict as JSON values: the content of result.json.
 
-    `sets.<name>.standin.<part>.{mean,low,high}`, `.falls`, `.seeds`, `.L_ctrl_switching` and
-    `.rms`, and `sets.<name>.standin.change.<baseline>.{median,low,high,wins,counts}` in %, of L,
+    `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls`, `.seeds`, `.L_ctrl_switching` and
+    `.rms`, and `sets.<name>.<world>.change.<baseline>.{median,low,high,wins,counts}` in %, of L,
     with those of the other parts under `.parts`.
     """
     return {
         "alpha": {"euler": verdict.alpha.euler, "position": verdict.alpha.position},
-        "sets": {name: {"standin": _set_result(verdict, name)} for name in verdict.scores},
+        "sets": {name: {world: _set_result(verdict, name)} for name in verdict.scores},
     }
 
 

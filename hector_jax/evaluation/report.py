@@ -1,0 +1,461 @@
+"""What a person reads in the end: one table on the terminal, and report.md in the run folder.
+
+Both are told from the same rows. The stand-in for the robot is called "hardware stand-in" wherever
+it is named, and a comparison that falls make void is shown with a mark, never left out.
+"""
+
+import json
+import math
+import os
+import platform
+import re
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, bounds, weights_to_vector
+from hector_jax.evaluation.metrics import (
+    BASELINES,
+    PARTS,
+    Comparison,
+    Interval,
+    Verdict,
+    compare,
+    falls,
+    mean,
+    rms,
+)
+from hector_jax.storage import versions, write_file
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning, aligned
+from hector_jax.tuning.loss import LossConfig, Losses
+
+WORLDS = {"standin": "hardware stand-in"}  # what worlds are called where it is not their name
+
+STAND_IN = (
+    "The verdict is given on the **hardware stand-in**: a family of simulated plants, one per "
+    "seed, that differ from the simulator the net learned from in masses, friction, ground, "
+    "motors, backlash and delay, and that show the controller only what a drifting, noisy state "
+    "estimator sees. It is not hardware. No training, tuning or choice has read it."
+)
+
+_AXES = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
+_UNITS = {"L": "", "L_Eul": "rad^2", "L_pos": "m^2", "L_ctrl": "N^2, (N m)^2"}
+_VOID = "*"
+
+
+class Picture(NamedTuple):
+    """A file of the run folder with its caption."""
+
+    file: str
+    caption: str
+
+
+class Report(NamedTuple):
+    """All that report.md tells."""
+
+    trajectory: str
+    verdict: Verdict
+    tunings: Mapping[str, Tuning]  # `without` and `with`
+    norms: Mapping[str, Losses]  # of the parts' gradients in log-weights at nominal, by model
+    errors: Mapping[str, Mapping[str, Any]]  # held-out, of `raw`, `linear`, `net`: training.report
+    pictures: Sequence[Picture]
+    film: Picture | str  # or why there is none
+    config: Mapping[str, Any]  # resolved, as JSON values
+    environment: Mapping[str, str]
+    command: str  # that makes this run again
+
+
+def environment() -> dict[str, str]:
+    """What the numbers were made with: versions, platform, device and, if known, the commit."""
+    found = versions() | {
+        "platform": f"{platform.system()} {platform.machine()}",
+        "cores": str(os.cpu_count()),
+        "device": jax.default_backend(),
+        "precision": str(jnp.asarray(0.0).dtype),
+    }
+    commit = _commit(Path(__file__).parents[2])
+    return found | ({"commit": commit} if commit else {})
+
+
+def _commit(folder: Path) -> str:
+    """Commit of the checkout in `folder`, marked where files differ from it; empty elsewhere."""
+    if not (folder / ".git").exists():  # an installed package may lie inside some other checkout
+        return ""
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        changed = " with changes" if git("status", "--porcelain", "--untracked-files=no") else ""
+        return git("rev-parse", "HEAD") + changed
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _scale(largest: float) -> int:
+    """Power of ten, in threes, that leaves one to four digits before the point."""
+    if not largest > 0.0 or 0.1 <= largest < 1e3:
+        return 0
+    return 3 * math.floor(math.log10(largest) / 3)
+
+
+def _columns(verdict: Verdict) -> dict[str, tuple[int, Callable[[float], str]]]:
+    """By part: the power of ten of its column and how its numbers are written."""
+    columns = {}
+    for part in PARTS:
+        largest = max(mean(verdict, name, part).value for name in verdict.scores)
+        power = _scale(largest)
+        lead = math.floor(math.log10(largest / 10.0**power)) if largest > 0.0 else 0
+        digits = max(0, 2 - lead)
+        columns[part] = (
+            power,
+            lambda x, power=power, digits=digits: f"{x / 10.0**power:.{digits}f}",
+        )
+    return columns
+
+
+def _percent(x: float) -> str:
+    return f"{x:+.1f}" if abs(x) < 9.95 else f"{x:+.0f}"
+
+
+def _change(change: Interval) -> str:
+    return f"{_percent(change.value)} [{_percent(change.low)}, {_percent(change.high)}]"
+
+
+def _compared(verdict: Verdict, name: str, baseline: str) -> Comparison | None:
+    known = baseline in verdict.scores and baseline != name
+    return compare(verdict, name, baseline) if known else None
+
+
+def _seeds(verdict: Verdict) -> str:
+    seeds = verdict.seeds
+    if len(seeds) > 1 and np.array_equal(seeds, np.arange(seeds[0], seeds[0] + len(seeds))):
+        return f"{seeds[0]}-{seeds[-1]}"
+    return ", ".join(map(str, seeds))
+
+
+def _formula(alpha: LossConfig) -> str:
+    return f"L = {_power(alpha.euler)} L_Eul + {_power(alpha.position)} L_pos + L_ctrl"
+
+
+def _power(x: float) -> str:
+    return f"{x:.0e}".replace("e+0", "e") if x >= 1e3 else f"{x:g}"
+
+
+def _legend(verdict: Verdict) -> list[str]:
+    count = len(verdict.seeds)
+    lines = [
+        f"{_formula(verdict.alpha)}; means over {count} plants (seeds {_seeds(verdict)}).",
+        "Change of L in %, median over plants of the paired ratio [95 % bootstrap interval]; "
+        "below zero is better.",
+    ]
+    if _void(verdict):
+        lines.append(f"{_VOID} does not count: one of the two falls more often than the other.")
+    return lines
+
+
+def _void(verdict: Verdict) -> bool:
+    pairs = [(name, baseline) for name in verdict.scores for baseline in BASELINES]
+    return any((c := _compared(verdict, *pair)) is not None and not c.counts for pair in pairs)
+
+
+def print_table(
+    verdict: Verdict, title: str = "", world: str = "standin", console: Console | None = None
+) -> None:
+    """The verdict as one table on the terminal, plain where there is none.
+
+    Args:
+        verdict: what to tell.
+        title: what was walked.
+        world: where.
+        console: where to print; None takes stdout.
+    """
+    console = console or Console(highlight=False)
+    if not console.is_terminal:
+        # a file has no width: no cell is to be cut or wrapped there
+        console = Console(file=console.file, highlight=False, width=160, color_system=None)
+    where = WORLDS.get(world, world)
+    console.print(Text(f"{title} on the {where}" if title else f"On the {where}", style="bold"))
+    console.print(_terminal_table(verdict, padding=1 if console.width >= 90 else 0))
+    for line in _legend(verdict):
+        console.print(Text(line, style="dim"))
+
+
+def _terminal_table(verdict: Verdict, padding: int) -> Table:
+    columns = _columns(verdict)
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, padding, 0, 0), pad_edge=False, show_edge=False)
+    table.add_column("set\n", no_wrap=True)
+    order = ("L_Eul", "L_pos", "L_ctrl", "L")
+    for part in order:
+        power = columns[part][0]
+        table.add_column(part + (f"\nx1e{power}" if power else "\n"), justify="right", no_wrap=True)
+    table.add_column("falls\n", justify="right", no_wrap=True)
+    for baseline in BASELINES:
+        table.add_column(f"against {baseline}\n[%]", justify="right", no_wrap=True)
+    for name in verdict.scores:
+        means = [columns[part][1](mean(verdict, name, part).value) for part in order]
+        fell = Text(str(falls(verdict, name)), style="red" if falls(verdict, name) else "")
+        changes = [_terminal_change(_compared(verdict, name, b)) for b in BASELINES]
+        table.add_row(name, *means, fell, *changes)
+    return table
+
+
+def _terminal_change(comparison: Comparison | None) -> Text:
+    if comparison is None:
+        return Text("-", style="dim")
+    change = comparison.change["L"]
+    if not comparison.counts:
+        return Text(_change(change) + _VOID, style="yellow")
+    style = "green" if change.high < 0.0 else "red" if change.low > 0.0 else ""
+    return Text(_change(change), style=style)
+
+
+def write_report(folder: Path, report: Report) -> Path:
+    """Write report.md into the run folder, whole or not at all.
+
+    Args:
+        folder: where the pictures are.
+        report: what to tell.
+
+    Returns:
+        The file.
+    """
+    sections = [
+        f"# Tuned weights for walking: {report.trajectory}",
+        _summary(report.verdict),
+        "## Verdict",
+        STAND_IN,
+        _verdict_table(report.verdict),
+        *(line.replace(_VOID, "\\" + _VOID) for line in _legend(report.verdict)),
+        _parts_table(report.verdict),
+        _errors_of_tracking(report.verdict),
+        _switching(report.verdict),
+        "## Tuning",
+        *(_tuning(name, tuning) for name, tuning in report.tunings.items()),
+        "### Gradients of the three parts",
+        _norms(report.verdict.alpha, report.norms),
+        "## GRFM-Net on held-out walks",
+        _net_errors(report.errors),
+        "## Pictures",
+        *(f"![{p.caption}]({p.file})\n\n*{p.caption}*" for p in report.pictures),
+        _film(report.film),
+        "## What was run",
+        _table(("what", "version"), list(report.environment.items())),
+        "```json\n" + json.dumps(report.config, indent=2) + "\n```",
+        "## How to reproduce",
+        _reproduce(report),
+    ]
+    path = folder / "report.md"
+    write_file(path, ("\n\n".join(sections) + "\n").encode())
+    return path
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown; the first column to the left, the others to the right."""
+    line = lambda cells: "| " + " | ".join(cells) + " |"  # noqa: E731
+    rule = "|" + "|".join([" :--- "] + [" ---: "] * (len(head) - 1)) + "|"
+    return "\n".join([line(head), rule, *map(line, rows)])
+
+
+def _summary(verdict: Verdict) -> str:
+    """What came out, in two sentences, whatever it is."""
+    told = []
+    for name in ("with", "without"):
+        if name not in verdict.scores:
+            continue
+        clauses = [
+            _clause(comparison, baseline)
+            for baseline in BASELINES
+            if (comparison := _compared(verdict, name, baseline)) is not None
+        ]
+        fell = f"the robot fell on {falls(verdict, name)} of {len(verdict.seeds)} plants"
+        net = "through the net" if name == "with" else "without the net"
+        told.append(f"Tuned {net} (`{name}`), the loss is {' and '.join(clauses)}; {fell}.")
+    return " ".join(told)
+
+
+def _clause(comparison: Comparison, baseline: str) -> str:
+    change = comparison.change["L"]
+    side = "below" if change.value < 0.0 else "above"
+    size = f"{abs(change.value):.1f} % {side} {baseline}"
+    if not comparison.counts:
+        return f"{size} (void: the falls differ)"
+    clear = change.high < 0.0 or change.low > 0.0
+    return size if clear else f"{size} (the interval holds zero)"
+
+
+def _verdict_table(verdict: Verdict) -> str:
+    columns = _columns(verdict)
+    head = ["set", "L_Eul", "L_pos", "L_ctrl", "L", "falls"]
+    head = [h + (f" x1e{columns[h][0]}" if h in columns and columns[h][0] else "") for h in head]
+    for baseline in BASELINES:
+        head += [f"against {baseline} [%]", "wins"]
+    rows = []
+    for name in verdict.scores:
+        row = [f"**{name}**"]
+        for part in ("L_Eul", "L_pos", "L_ctrl"):
+            row.append(columns[part][1](mean(verdict, name, part).value))
+        value, low, high = (columns["L"][1](x) for x in mean(verdict, name))
+        row += [f"{value} [{low}, {high}]", f"{falls(verdict, name)} / {len(verdict.seeds)}"]
+        for baseline in BASELINES:
+            row += _verdict_cells(_compared(verdict, name, baseline), len(verdict.seeds))
+        rows.append(row)
+    return _table(head, rows)
+
+
+def _verdict_cells(comparison: Comparison | None, seeds: int) -> list[str]:
+    if comparison is None:
+        return ["", ""]
+    mark = "" if comparison.counts else " \\" + _VOID
+    return [
+        _change(comparison.change["L"]) + mark,
+        f"{round(comparison.wins * seeds)} / {seeds}",
+    ]
+
+
+def _parts_table(verdict: Verdict) -> str:
+    """Changes of the parts against each baseline."""
+    rows = []
+    for name in verdict.scores:
+        for baseline in BASELINES:
+            comparison = _compared(verdict, name, baseline)
+            if comparison is not None:
+                cells = [_change(comparison.change[p]) for p in ("L_Eul", "L_pos", "L_ctrl")]
+                rows.append([f"{name} against {baseline}", *cells])
+    head = ("change in % of", *(f"{p} [{_UNITS[p]}]" for p in ("L_Eul", "L_pos", "L_ctrl")))
+    return _table(head, rows)
+
+
+def _errors_of_tracking(verdict: Verdict) -> str:
+    head = ("RMS error", "roll [deg]", "pitch [deg]", "yaw [deg]", "x [cm]", "y [cm]", "z [cm]")
+    rows = []
+    for name in verdict.scores:
+        euler, position = rms(verdict, name)
+        values = [*np.rad2deg(euler), *(100 * position)]
+        rows.append([name, *(f"{v:.2f}" for v in values)])
+    return _table(head, rows) + "\n\nOver all plants, up to a fall where there is one."
+
+
+def _switching(verdict: Verdict) -> str:
+    power, write = _columns(verdict)["L_ctrl"]
+    head = [f"L_ctrl{f' x1e{power}' if power else ''}", "whole", "at switches", "between them"]
+    rows = []
+    for name, score in verdict.scores.items():
+        whole, owed = float(score.L_ctrl.mean()), float(score.switching.mean())
+        rows.append([name, write(whole), write(owed), write(whole - owed)])
+    return (
+        _table(head, rows)
+        + "\n\nWhere the stance switches, one foot lets go of the weight and the other takes it: "
+        "about 2 (m g)^2 per switch is owed whatever the weights."
+    )
+
+
+def _tuning(name: str, tuning: Tuning) -> str:
+    history = tuning.history
+    refused = [i for i in history if not i.accepted]
+    accepted = [i for i in history if i.accepted]
+    early = [i for i in accepted if i.iteration <= PAPER_ITERATIONS]
+    loss = lambda i: f"{float(i.evaluation.loss) / 1e6:.3f}e6"  # noqa: E731
+    lines = [
+        f"### {name}",
+        f"- {len(history) - 1} iterations, {len(refused)} refused{_reasons(refused)}",
+        f"- ended because: {tuning.stop}",
+        f"- L on the model: {loss(history[0])} at the start, {loss(early[-1])} after "
+        f"{PAPER_ITERATIONS} iterations, {loss(accepted[-1])} at the end",
+        f"- at a bound of the box after {PAPER_ITERATIONS}: {_at_bounds(tuning.ten)}; "
+        f"at the end: {_at_bounds(tuning.converged)}",
+        f"- worst QP residual of an accepted step: "
+        f"{max(float(i.evaluation.residual) for i in accepted):.1e}",
+    ]
+    return "\n".join([lines[0], "", *lines[1:]])
+
+
+def _reasons(refused: Sequence[Iteration]) -> str:
+    """Why steps were refused, and which."""
+    steps: dict[str, list[str]] = {}
+    for i in refused:
+        steps.setdefault(re.sub(r" \d.*", "", i.reason), []).append(str(i.iteration))
+    told = [f"{reason} (iteration {', '.join(which)})" for reason, which in steps.items()]
+    return ": " + "; ".join(told) if told else ""
+
+
+def _at_bounds(weights: Weights) -> str:
+    lower, upper = (np.asarray(weights_to_vector(bound)) for bound in bounds())
+    vector = np.asarray(weights_to_vector(weights))
+    close = np.isclose(vector, lower, rtol=1e-9) | np.isclose(vector, upper, rtol=1e-9)
+    names = [f"`{name}`" for name, hit in zip(WEIGHT_NAMES, close, strict=True) if hit]
+    return ", ".join(names) or "none"
+
+
+def _norms(alpha: LossConfig, norms: Mapping[str, Losses]) -> str:
+    rows = []
+    for name, norm in norms.items():
+        auto = aligned(alpha, norm)
+        rows.append(
+            [
+                name,
+                *(f"{float(x):.3g}" for x in norm),
+                f"{alpha.euler * float(norm.euler):.3g}",
+                f"{alpha.position * float(norm.position):.3g}",
+                f"{_power(auto.euler)}, {_power(auto.position)}",
+            ]
+        )
+    head = ("model", "L_Eul", "L_pos", "L_ctrl", "alpha_1 L_Eul", "alpha_2 L_pos", "auto")
+    return (
+        "Norms of the gradients in log-weights at the nominal weights. The paper's footnote "
+        "chooses alpha so that the three have one order of magnitude; `auto` is what "
+        "`--alpha auto` takes for alpha_1, alpha_2. This run: "
+        f"{_power(alpha.euler)}, {_power(alpha.position)}.\n\n" + _table(head, rows)
+    )
+
+
+def _net_errors(errors: Mapping[str, Mapping[str, Any]]) -> str:
+    """Mean square errors per axis, of feet that stand and that swing."""
+    names = ("raw", "linear", "net")
+    rows = []
+    for kind, unit in (("force", "N^2"), ("moment", "(N m)^2")):
+        rows.append([f"{kind}, all [{unit}]", *_error_cells([errors[n][kind] for n in names])])
+    for phase in ("stance", "swing"):
+        for i, axis in enumerate(_AXES):
+            unit = "N^2" if axis[0] == "F" else "(N m)^2"
+            cells = _error_cells([errors[n][phase][i] for n in names])
+            rows.append([f"{axis}, {phase} [{unit}]", *cells])
+    return (
+        "Mean square errors on walks that the net has not seen, beside the raw command (what the "
+        "plain rigid body believes) and a linear map of the same inputs.\n\n"
+        + _table(("", "raw command", "linear map", "GRFM-Net", "net / raw", "net / linear"), rows)
+    )
+
+
+def _error_cells(values: Sequence[float]) -> list[str]:
+    raw, linear, net = values
+    ratio = lambda a, b: f"{a / b:.2f}" if b > 0.0 else "-"  # noqa: E731
+    return [*(f"{v:.3g}" for v in values), ratio(net, raw), ratio(net, linear)]
+
+
+def _film(film: Picture | str) -> str:
+    if isinstance(film, str):
+        return f"No film: {film.removeprefix('no film: ')}"
+    return f"[{film.caption}]({film.file})"
+
+
+def _reproduce(report: Report) -> str:
+    commit = report.environment.get("commit", "")
+    at = f" at commit `{commit}`" if commit else ""
+    return (
+        f"In a checkout{at}:\n\n```\n{report.command}\n```\n\n"
+        "On a CPU the same command, seeds and versions give the same weights and losses. "
+        "`metrics.jsonl` holds every iteration, `result.json` the verdict."
+    )

@@ -1,0 +1,147 @@
+"""The table on the terminal and report.md: both tell all, and the same."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from pretend import pretend_history, pretend_verdict
+from rich.console import Console
+
+from hector_jax.control.weights import bounds
+from hector_jax.evaluation import report
+from hector_jax.evaluation.metrics import SETS, Verdict
+from hector_jax.evaluation.report import Picture, Report, print_table, write_report
+from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.loss import LossConfig, Losses
+
+
+def _printed(verdict, **options):
+    out = io.StringIO()
+    print_table(verdict, "straight", console=Console(file=out, **options))
+    return out.getvalue()
+
+
+def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device)"):
+    history = pretend_history(14, refused=(3, 12))
+    history[12] = history[12]._replace(reason="QP residual 2.0e-05 above 1e-06")
+    tuning = Tuning(history, history[10].weights, bounds()[1], "the step became too small to gain")
+    errors = {
+        name: {"force": x, "moment": x / 200, "stance": [x] * 6, "swing": [x] * 5 + [0.0]}
+        for name, x in {"raw": 275.0, "linear": 119.0, "net": 73.0}.items()
+    }
+    return Report(
+        trajectory="straight",
+        verdict=verdict or pretend_verdict(),
+        tunings={"without": tuning, "with": tuning},
+        norms={"without": Losses(*np.array([12.0, 7.0, 8e5]))},
+        errors=errors,
+        pictures=[Picture("loss.png", "Loss by iteration.")],
+        film=film,
+        config={"traj": "straight", "seeds": 8},
+        environment=report.environment(),
+        command="make tune TRAJ=straight",
+    )
+
+
+def test_the_table_has_a_row_for_each_set_and_its_scales_in_the_header():
+    text = _printed(pretend_verdict())
+    head, *rows = [line for line in text.splitlines() if line.strip()][1:]
+    assert head.split()[:6] == ["set", "L_Eul", "L_pos", "L_ctrl", "L", "falls"]
+    assert "x1e6" in rows[0]
+    assert [row.split()[0] for row in rows[2:8]] == list(SETS)
+    assert "hardware stand-in" in text
+
+
+def test_the_table_is_plain_and_uncut_where_there_is_no_terminal():
+    text = _printed(pretend_verdict())
+    assert "\x1b" not in text
+    assert "…" not in text
+
+
+def test_the_table_fits_a_terminal_of_80_columns():
+    text = _printed(pretend_verdict(fallen={("without", 0)}), force_terminal=True, width=80)
+    assert "…" not in text
+    assert "without_ten" in text
+
+
+def test_a_comparison_that_falls_make_void_is_shown_with_a_mark():
+    assert "does not count" not in _printed(pretend_verdict())
+    text = _printed(pretend_verdict(fallen={("without", 0)}))
+    row = next(line for line in text.splitlines() if line.startswith("without "))
+    assert row.count("*") == 2
+    assert "does not count" in text
+
+
+def test_the_table_goes_without_baselines_that_were_not_walked():
+    whole = pretend_verdict(2)
+    text = _printed(Verdict(whole.seeds, {"mine.json": whole.scores["with"]}, LossConfig()))
+    row = next(line for line in text.splitlines() if line.startswith("mine.json"))
+    assert row.split()[-2:] == ["-", "-"]
+
+
+@pytest.mark.parametrize(
+    ("largest", "power"), [(0.0, 0), (0.5, 0), (12.0, 0), (7e5, 3), (2e6, 6), (0.02, -3)]
+)
+def test_scales_are_powers_of_a_thousand(largest, power):
+    assert report._scale(largest) == power
+
+
+def test_the_report_tells_everything_that_was_promised(tmp_path):
+    path = write_report(tmp_path, _report())
+    text = path.read_text()
+    assert path == tmp_path / "report.md"
+    for section in ("Verdict", "Tuning", "GRFM-Net on held-out", "Pictures", "What was run"):
+        assert f"## {section}" in text
+    for words in (
+        "hardware stand-in",
+        "![Loss by iteration.](loss.png)",
+        "No film: MuJoCo cannot draw here (egl: no device)",
+        "14 iterations, 2 refused: loss or gradient not finite (iteration 3); "
+        "QP residual (iteration 12)",
+        "ended because: the step became too small to gain",
+        "`Q_roll`",
+        "2 (m g)^2",
+        "make tune TRAJ=straight",
+        "the paper's footnote".capitalize(),
+    ):
+        assert words in text, words
+
+
+def test_every_table_of_the_report_is_well_formed(tmp_path):
+    text = write_report(tmp_path, _report(pretend_verdict(fallen={("with", 1)}))).read_text()
+    for block in text.split("\n\n"):
+        rows = [row for row in block.splitlines() if row.startswith("|")]
+        assert len({row.count("|") for row in rows}) <= 1, block
+    assert "void: the falls differ" in text
+    assert "\n*" not in text.replace("\n*Loss", "")
+
+
+def test_the_report_says_below_only_where_the_loss_is_below(tmp_path):
+    verdict = pretend_verdict()
+    swapped = {"nominal": "with", "with": "nominal"}
+    scores = {name: verdict.scores[swapped.get(name, name)] for name in SETS}
+    text = write_report(tmp_path, _report(verdict._replace(scores=scores))).read_text()
+    assert "(`with`), the loss is 176" in text
+    assert "% above nominal" in text
+
+
+def test_the_film_is_linked_where_there_is_one(tmp_path):
+    text = write_report(
+        tmp_path, _report(film=Picture("film.mp4", "Before and after."))
+    ).read_text()
+    assert "[Before and after.](film.mp4)" in text
+
+
+def test_the_environment_is_plain_words_without_folders():
+    found = report.environment()
+    assert json.loads(json.dumps(found)) == found
+    assert {"python", "jax", "mujoco", "platform", "device"} <= found.keys()
+    assert found["precision"] == "float64"
+    assert not any("/" in value for value in found.values())
+
+
+def test_a_folder_that_is_no_checkout_has_no_commit(tmp_path):
+    assert report._commit(tmp_path) == ""
+    (tmp_path / ".git").mkdir()
+    assert report._commit(tmp_path) == ""
