@@ -217,6 +217,10 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
         stands = np.asarray(last.contact)
         landed = stands & ~np.roll(stands, 1, axis=0)
         landed[0] = stands[0]
+        for name, walk in walks.items():
+            kept = _standing(walk, np.asarray(walk.state.position))
+            axes.plot(kept[:, 0], kept[:, 1], **_LOOK[name], label=_named(name))
+        axes.plot(*np.asarray(reference)[:, :2].T, **_LOOK["reference"], label="reference")
         for foot, marker in enumerate((4, 5)):
             spots = np.asarray(last.feet)[landed[:, foot] & ~np.asarray(last.fallen), foot]
             side = ("left", "right")[foot]
@@ -226,12 +230,9 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
                 marker=marker,
                 color="0.6",
                 markersize=6,
+                zorder=1,
                 label=f"{side} foot set down",
             )
-        for name, walk in walks.items():
-            kept = _standing(walk, np.asarray(walk.state.position))
-            axes.plot(kept[:, 0], kept[:, 1], **_LOOK[name], label=_named(name))
-        axes.plot(*np.asarray(reference)[:, :2].T, **_LOOK["reference"], label="reference")
         axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         axes.margins(0.05)
         figure.legend(loc="outside upper center", ncols=4)
