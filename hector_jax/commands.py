@@ -3,33 +3,46 @@
 import dataclasses
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from datetime import datetime
 from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hector_jax import pipeline
 from hector_jax.console import say
-from hector_jax.control import weights as named_sets
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
-from hector_jax.control.weights import Weights, nominal
-from hector_jax.evaluation import metrics
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
+from hector_jax.evaluation import metrics, plots
+from hector_jax.evaluation.metrics import Verdict
+from hector_jax.evaluation.report import (
+    Picture,
+    Report,
+    environment,
+    print_table,
+    write_report,
+)
 from hector_jax.evaluation.video import VideoUnavailable, write_video
-from hector_jax.flags import Collect, Doctor, Train, Walk
-from hector_jax.grfm.training import TrainConfig
+from hector_jax.flags import Collect, Doctor, Evaluate, Train, Tune, Walk
+from hector_jax.grfm.dataset import at_interval, make_dataset
+from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import cache_folder, workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
-from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import load_weights, save_tree, versions
+from hector_jax.sim.world import Imperfections, hfs, named_world
+from hector_jax.storage import load_weights, save_tree, save_weights, versions, write_file
 from hector_jax.trajectory import Trajectory
-from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.difftune import TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.rollout import RolloutConfig, rollout, standing_anchor
 
@@ -46,7 +59,7 @@ def run(args: Any) -> None:
 
 def _weights(text: str) -> Weights:
     """A weight set by its name, or from a file."""
-    named = {"nominal": named_sets.nominal, "expert": named_sets.expert}
+    named = {"nominal": nominal, "expert": expert}
     return named[text]() if text in named else load_weights(Path(text))
 
 
@@ -79,6 +92,177 @@ def _train(args: Train) -> None:
             "   (held-out walks)"
         )
     say(f"the net is in {args.out}")
+
+
+def _new_folder(args: Tune) -> Path:
+    """The run's folder, made here; an existing one is never written into."""
+    folder = args.run or args.runs / args.traj / f"{datetime.now():%Y%m%d-%H%M%S}"
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        raise ValueError(
+            f"run folder {folder} exists; name another by --run, nothing was touched"
+        ) from None
+    return folder
+
+
+def _net(pool: Executor, args: Tune, robot: Robot) -> pipeline.Learned:
+    """GRFM-Net, from disk or made now, with its walks."""
+    folder, path = args.data / "walks", args.data / "grfm.npz"
+    if path.exists():
+        return pipeline.learned(robot, folder, path)
+    pipeline.collect(pool, pipeline.CollectConfig(), TuneConfig(), robot, folder)
+    return pipeline.train(TrainConfig(), robot, folder, path)
+
+
+@run.register
+def _tune(args: Tune) -> None:
+    command, robot = named_command(args.traj), load_robot()
+    if args.alpha not in ("paper", "auto"):
+        raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
+    if args.seeds < 1:
+        raise ValueError(f"--seeds must be at least 1, got {args.seeds}")
+    config = TuneConfig(iterations=args.iterations)
+    folder = _new_folder(args)
+    say(f"results go to {folder}")
+    with workers(args.processes) as pool:
+        net = _net(pool, args, robot)
+        problems = {"without": (command, None), "with": (command, net.params)}
+        norms = pipeline.gradient_norms(pool, config, robot, problems)
+        if args.alpha == "auto":
+            config = replace(config, loss=aligned(config.loss, norms["with"]))
+            say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
+        resolved = {"flags": _as_json(args), "tune": dataclasses.asdict(config)}
+        write_file(folder / "config.json", _json_bytes(resolved))
+        write_file(folder / "versions.json", _json_bytes(environment()))
+        with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
+            tunings = pipeline.tune_many(
+                pool,
+                config,
+                robot,
+                problems,
+                f"tuning {args.traj} without and with GRFM-Net",
+                lambda name, iteration: (
+                    metrics_file.write(pipeline.as_line(name, iteration)) and None
+                ),
+            )
+        sets = {
+            "nominal": nominal(),
+            "expert": expert(),
+            **{f"{name}_ten": tuning.ten for name, tuning in tunings.items()},
+            **{name: tuning.converged for name, tuning in tunings.items()},
+        }
+        (folder / "weights").mkdir()
+        for name, weights in sets.items():
+            save_weights(folder / "weights" / f"{name}.json", weights)
+        seeds = range(args.seeds)
+        walks = pipeline.judge(
+            pool,
+            config,
+            robot,
+            sets,
+            command,
+            _plants("standin", seeds),
+            seeds,
+            f"judging on {args.seeds} stand-in plants",
+        )
+        on_hfs = pipeline.judge(
+            pool, config, robot, sets, command, [hfs()], [0], "walking on the simulator of the data"
+        )
+    verdict = _verdict(config.loss, seeds, walks)
+    result = metrics.as_result(verdict)
+    for name, found in metrics.as_result(_verdict(config.loss, [0], on_hfs), "hfs")["sets"].items():
+        result["sets"][name] |= found
+    write_file(folder / "result.json", _json_bytes(result))
+    pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
+    film: Picture | str = "left out (--no-video)"
+    if args.video:
+        say("drawing the film")
+        pair = {"nominal": walks["nominal"][0], "tuned with net": walks["with"][0]}
+        caption = "Nominal and tuned weights on the first stand-in plant."
+        film = _film(folder / "film.mp4", robot, pair, folder / "film.png") or Picture(
+            "film.mp4", caption
+        )
+    told = write_report(
+        folder,
+        Report(
+            trajectory=args.traj,
+            verdict=verdict,
+            tunings=tunings,
+            norms=norms,
+            errors=net.errors,
+            pictures=pictures,
+            film=film,
+            config=resolved,
+            environment=environment(),
+            command=f"hector tune --traj {args.traj} --seeds {args.seeds} --alpha {args.alpha}",
+        ),
+    )
+    print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")
+    say(f"the whole story, with pictures: {told}")
+
+
+def _verdict(
+    loss: LossConfig, seeds: Sequence[int], walks: Mapping[str, Sequence[Trajectory]]
+) -> Verdict:
+    scores = {name: [metrics.score(loss, walk) for walk in each] for name, each in walks.items()}
+    return metrics.judge(loss, seeds, scores)
+
+
+def _draw(
+    folder: Path,
+    config: TuneConfig,
+    robot: Robot,
+    net: pipeline.Learned,
+    sets: Mapping[str, Weights],
+    tunings: Mapping[str, Tuning],
+    walks: Mapping[str, Sequence[Trajectory]],
+    on_hfs: Trajectory,
+) -> list[Picture]:
+    """All pictures of a run, in the order of the report."""
+    four = {name: walks[name][0] for name in ("nominal", "expert", "without", "with")}
+    flat = {name: np.asarray(weights_to_vector(sets[name])) for name in four}
+    histories = {name: tuning.history for name, tuning in tunings.items()}
+    sampled = at_interval(on_hfs, config.rollout.walk.gait.tick)
+    samples, _ = make_dataset(jax.tree.map(lambda x: np.asarray(x)[None], sampled))
+    window = jax.tree.map(jnp.asarray, samples.window)
+    curves = {
+        "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
+        "linear": predict(linear_effect(net.linear), window),
+        "predicted": predict(as_effect(net.params), window),
+        "measured": samples.label,
+    }
+    path = folder / "pictures"
+    path.mkdir()
+    captions = {
+        "tracking": plots.tracking(path / "tracking.png", four),
+        "path": plots.path_from_above(path / "path.png", four),
+        "losses": plots.losses(path / "losses.png", config.loss, histories),
+        "weights": plots.weights(path / "weights.png", WEIGHT_NAMES, flat),
+        "wrenches": plots.wrenches(path / "wrenches.png", config.rollout.walk.gait.tick, curves),
+        "training": plots.training(path / "training.png", net.course),
+    }
+    return [Picture(f"pictures/{name}.png", caption) for name, caption in captions.items()]
+
+
+def _json_bytes(value: Any) -> bytes:
+    return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
+
+
+@run.register
+def _evaluate(args: Evaluate) -> None:
+    command, robot = named_command(args.traj), load_robot()
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
+    sets = {text: _weights(text) for text in args.weights}
+    plants = _plants(args.world, seeds)
+    with workers(args.processes) as pool:
+        title = f"judging on {args.seeds} {args.world} plants"
+        walks = pipeline.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title)
+    verdict = _verdict(LossConfig(), seeds, walks)
+    if args.json:
+        print(json.dumps(metrics.as_result(verdict, args.world), allow_nan=False))
+    else:
+        print_table(verdict, f"{args.traj}, {args.seeds} plants", args.world)
 
 
 @run.register
@@ -127,14 +311,14 @@ def _rigid_body(robot: Robot, weights: Weights, command: Any, seconds: float) ->
 
 def _film(
     path: Path, robot: Robot, walks: Mapping[str, Trajectory], strip: Path | None = None
-) -> bool:
-    """Film two walks; a missing back end costs one line, not the run."""
+) -> str:
+    """Film two walks. A missing back end costs one line, not the run; returns why there is none."""
     try:
         write_video(path, robot, walks, strip)
     except VideoUnavailable as error:
         say(str(error))
-        return False
-    return True
+        return str(error)
+    return ""
 
 
 @run.register

@@ -6,9 +6,9 @@ one long chain of small operations. A step that finds its result on disk takes i
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass
-from multiprocessing import Manager
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ from hector_jax.sim.world import Imperfections
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.loss import Losses
 from hector_jax.tuning.rollout import standing_anchor
 
 
@@ -78,7 +79,7 @@ def _tune_job(
 
 
 def tune_many(
-    pool: ProcessPoolExecutor,
+    pool: Executor,
     config: TuneConfig,
     robot: Robot,
     problems: Mapping[str, tuple[Command, NetParams | None]],
@@ -95,7 +96,7 @@ def tune_many(
         title: for the person who waits.
         on_iteration: called with name and iteration as they happen.
     """
-    with Manager() as manager, bar(title) as tell:
+    with get_context("spawn").Manager() as manager, bar(title) as tell:
         heard = manager.Queue()
         running: dict[str, Future[Tuning]] = {
             name: pool.submit(_tune_job, config, robot, command, params, name, heard)
@@ -103,7 +104,7 @@ def tune_many(
         }
         tell(0, config.iterations * len(problems), "compiling")
         done = 0
-        while not (over := all(future.done() for future in running.values())) or not heard.empty():
+        while not all(future.done() for future in running.values()) or not heard.empty():
             if heard.empty():
                 wait(running.values(), timeout=0.1)
                 continue
@@ -115,8 +116,32 @@ def tune_many(
         return {name: future.result() for name, future in running.items()}
 
 
-def tuning_paths(pool: ProcessPoolExecutor, config: TuneConfig, robot: Robot) -> list[Weights]:
-    """Weights that plain tunings of the three trajectories pass through, stacked; data is to cover them."""
+def _norms_job(
+    config: TuneConfig, robot: Robot, command: Command, params: NetParams | None
+) -> Losses:
+    effect = last_command if params is None else network.as_effect(params)
+    anchor = standing_anchor(robot)
+    return difftune.gradient_norms(config, robot, nominal(), command, anchor, effect)
+
+
+def gradient_norms(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    problems: Mapping[str, tuple[Command, NetParams | None]],
+) -> dict[str, Losses]:
+    """Norms of the gradients of the loss's parts at the nominal weights, by problem."""
+    with bar("norms of the gradients") as tell:
+        running = {
+            name: pool.submit(_norms_job, config, robot, command, params)
+            for name, (command, params) in problems.items()
+        }
+        tell(0, len(problems), "compiling")
+        return {name: future.result() for name, future in running.items()}
+
+
+def tuning_paths(pool: Executor, config: TuneConfig, robot: Robot) -> list[Weights]:
+    """Weights that plain tunings of the trajectories pass through, stacked: data covers them."""
     problems = {name: (named_command(name), None) for name in COMMANDS}
     tunings = tune_many(
         pool, config, robot, problems, "tuning paths on the rigid body, for the data"
@@ -129,7 +154,7 @@ def tuning_paths(pool: ProcessPoolExecutor, config: TuneConfig, robot: Robot) ->
 
 
 def collect(
-    pool: ProcessPoolExecutor, config: CollectConfig, tune: TuneConfig, robot: Robot, folder: Path
+    pool: Executor, config: CollectConfig, tune: TuneConfig, robot: Robot, folder: Path
 ) -> None:
     """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there."""
     jobs = dataset.draw_jobs(
@@ -141,6 +166,7 @@ def collect(
             jobs,
             lambda missing: walk_many(pool, tune.rollout.walk, robot, missing),
             robot=robot,
+            about={"controller": repr(tune.rollout.walk)},
             progress=tell,
         )
 
@@ -149,7 +175,8 @@ def _samples(robot: Robot, folder: Path) -> tuple[Dataset, Dataset, int]:
     """Training and held-out samples of the walks under `folder`, and how many a fall cost."""
     walks = dataset.load_walks(folder, robot)
     samples, dropped = dataset.make_dataset(walks.trajectory, walks.job.start_tick)
-    return *dataset.split_by_walk(samples), dropped
+    seen, held_out = dataset.split_by_walk(samples)
+    return seen, held_out, dropped
 
 
 def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
@@ -183,12 +210,12 @@ def learned(robot: Robot, folder: Path, path: Path) -> Learned:
     """
     params, _, card = network.load_net(path, robot)
     about = card["about"]
-    course = History(*(np.array(about["course"][name]) for name in History._fields))
+    course = History(**{name: np.array(about["course"][name]) for name in History._fields})
     return Learned(params, network.fit_linear(_samples(robot, folder)[0]), about["errors"], course)
 
 
 def judge(
-    pool: ProcessPoolExecutor,
+    pool: Executor,
     config: TuneConfig,
     robot: Robot,
     sets: Mapping[str, Weights],
@@ -197,7 +224,7 @@ def judge(
     seeds: Sequence[int],
     title: str,
 ) -> dict[str, list[Trajectory]]:
-    """Walk every weight set on every plant, four seconds each; by set, in the order of the plants."""
+    """Walk every weight set on every plant, four seconds each; by set, in order of the plants."""
     jobs = [
         Job(weights, command, plant, seed=seed)
         for weights in sets.values()

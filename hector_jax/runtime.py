@@ -5,6 +5,7 @@ processes) call `setup_jax` once, before the first array.
 """
 
 import os
+import signal
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -42,6 +43,7 @@ def setup_jax() -> None:
 def start_worker() -> None:
     """Set up a worker process: one thread, because a closed loop is one long chain."""
     flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
     setup_jax()
 
