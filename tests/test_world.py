@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from hector_jax.robot import load_robot
 
+from hector_jax.robot import load_robot
 from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import (

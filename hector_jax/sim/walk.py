@@ -172,12 +172,6 @@ def standing_anchor(robot: Robot, start_tick: int) -> Anchor:
 
 def anchor_at(robot: Robot, state: State, start_tick: int) -> Anchor:
     """Where the reference starts: the true place and heading of t = 0, at standing height."""
-    position = jnp.append(state.position[:2], robot.standing_height)
-    return Anchor(position, state.euler[2], jnp.asarray(start_tick, jnp.int32))
-
-
-def anchor_at(robot: Robot, state: State, start_tick: int) -> Anchor:
-    """Where the reference starts: the true place and heading of t = 0, at standing height."""
     height = jnp.asarray(robot.standing_height)
     position = jnp.concatenate([state.position[:2], height[None]])
     return Anchor(position, state.euler[2], np.array(start_tick, np.int32))
@@ -375,7 +369,7 @@ def walk_many(
     jobs: Sequence[Job],
     path: Path | None = None,
 ) -> Iterator[Trajectory]:
-    """Walk all jobs in a pool of processes (`runtime.workers`); gives the walks in order, as they come."""
+    """Walk all jobs in a pool (`runtime.workers`); gives the walks in order, as they come."""
     host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
     sent = [Job(host(w), host(c), host(plant), *rest) for w, c, plant, *rest in jobs]
     yield from pool.map(walk_job, repeat(config), repeat(host(robot)), sent, repeat(path))
