@@ -121,7 +121,8 @@ def _norms_job(
 ) -> Losses:
     effect = last_command if params is None else network.as_effect(params)
     anchor = standing_anchor(robot)
-    return difftune.gradient_norms(config, robot, nominal(), command, anchor, effect)
+    norms = difftune.gradient_norms(config, robot, nominal(), command, anchor, effect)
+    return jax.device_get(norms)
 
 
 def gradient_norms(

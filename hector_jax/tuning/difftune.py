@@ -12,6 +12,7 @@ Two results come out of one run: the weights after the paper's `ten` iterations,
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -234,6 +235,7 @@ def tune(
     return Tuning(history, ten, best.weights, stop)
 
 
+@partial(jax.jit, static_argnums=0)
 def gradient_norms(
     config: TuneConfig,
     robot: Robot,
@@ -244,16 +246,14 @@ def gradient_norms(
 ) -> Losses:
     """Norms of the parts' gradients in log-weights, which the paper's footnote aligns."""
 
-    def parts(log_weights: Weights) -> Losses:
-        weights = jax.tree.map(jnp.exp, log_weights)
+    def parts(weights: Weights) -> Losses:
         return losses(rollout(config.rollout, robot, weights, command, anchor, effect))
 
-    jacobian = _jacobian(parts, jax.tree.map(jnp.log, weights))
-    norm = lambda tree: jnp.sqrt(sum(jnp.sum(g**2) for g in jax.tree.leaves(tree)))  # noqa: E731
-    return Losses(*(np.asarray(norm(tree)) for tree in jacobian))
+    def norm(gradient: Weights) -> Float[Array, ""]:
+        logs = jax.tree.map(lambda g, w: g * w, gradient, weights)
+        return jnp.sqrt(sum(jnp.sum(g**2) for g in jax.tree.leaves(logs)))
 
-
-_jacobian = jax.jit(jax.jacrev, static_argnums=0)
+    return Losses(*(norm(gradient) for gradient in jax.jacrev(parts)(weights)))
 
 
 def aligned(config: LossConfig, norms: Losses) -> LossConfig:
