@@ -12,7 +12,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -108,7 +108,7 @@ def mjx_contacts(data: mjx.Data) -> Contacts:
     )
 
 
-def _where(fallen: Array, held: object, new: object) -> object:
+def _where(fallen: Array, held: Any, new: Any) -> Any:
     return jax.tree.map(lambda h, n: jnp.where(fallen, h, n), held, new)
 
 

@@ -194,13 +194,14 @@ def _programs(config: WalkConfig) -> _Programs:
         no_error = jnp.zeros(sensing.ERRORS)
         return init_memory(robot, sensing.measure(robot, reading, jnp.zeros(()), no_error)[0])
 
-    def decide_(slots: int, robot: Robot, *args) -> tuple[Memory, Plan]:
-        *known, row, error = args
-        return decide(config, robot, *known, sensing.unpack_reading(row), error, slots=slots)
+    def decide_(slots, robot, weights, command, anchor, tick, memory, yaw, row, error):
+        reading = sensing.unpack_reading(row)
+        known = (config, robot, weights, command, anchor, tick, memory, yaw)
+        return decide(*known, reading, error, slots=slots)
 
-    def drive_(robot: Robot, *args) -> tuple[Motors, Array, Array]:
-        *known, row, error = args
-        return drive(config, robot, *known, sensing.unpack_reading(row), error)
+    def drive_(robot, plant, memory, plan, motors, yaw, substep, row, error):
+        reading = sensing.unpack_reading(row)
+        return drive(config, robot, plant, memory, plan, motors, yaw, substep, reading, error)
 
     def observe_(robot, command, anchor, tick, yaw, rows, contacts, floor, foot_of_geom):
         count = substeps(config)
