@@ -34,7 +34,7 @@ from hector_jax.flags import Collect, Doctor, Evaluate, Train, Tune, Walk
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
-from hector_jax.model.effect import last_command
+from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import cache_folder, workers
 from hector_jax.sim.standin import standin
@@ -66,7 +66,10 @@ def _weights(text: str) -> Weights:
 def _plants(world: str, seeds: range) -> list[Imperfections]:
     if world == "standin":
         return [standin(seed) for seed in seeds]
-    return [named_world(world, seed) for seed in seeds]
+    try:
+        return [named_world(world, seed) for seed in seeds]
+    except ValueError as error:
+        raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
 
 
 def _as_json(flags: Any) -> dict[str, Any]:
@@ -231,6 +234,11 @@ def _draw(
         "linear": predict(linear_effect(net.linear), window),
         "predicted": predict(as_effect(net.params), window),
         "measured": samples.label,
+    }
+    unknown = ((HISTORY - 1, 0), (0, 0), (0, 0))  # the first ticks have no full window
+    curves = {
+        name: jax.tree.map(lambda w: np.pad(w, unknown, constant_values=np.nan), wrench)
+        for name, wrench in curves.items()
     }
     path = folder / "pictures"
     path.mkdir()

@@ -1,0 +1,168 @@
+"""The console script as a person meets it: plain words, exit codes, one line for bad input."""
+
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from hector_jax import commands
+from hector_jax.cli import main
+from hector_jax.control.weights import expert
+from hector_jax.pipeline import CollectConfig
+from hector_jax.robot import MODEL_PATH, load_robot
+from hector_jax.storage import save_weights
+
+
+def call(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["hector", *map(str, arguments)])
+    return main()
+
+
+def refused(monkeypatch, capsys, *arguments):
+    """Runs a command that must be refused; its one line."""
+    assert call(monkeypatch, *arguments) == 2
+    out, err = capsys.readouterr()
+    lines = [line for line in err.splitlines() if line.startswith("hector:")]
+    assert len(lines) == 1, err
+    assert "Traceback" not in out + err
+    return lines[0]
+
+
+def test_help_names_the_commands():
+    shown = subprocess.run(
+        [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
+    )
+    assert shown.returncode == 0
+    for name in ("collect", "train", "tune", "evaluate", "walk", "doctor"):
+        assert name in shown.stdout
+    assert shown.stderr == ""
+
+
+def test_importing_everything_prints_nothing_and_leaves_no_file(tmp_path):
+    shown = subprocess.run(
+        [sys.executable, "-c", "import hector_jax.commands, hector_jax.sim.parallel"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert (shown.returncode, shown.stdout, shown.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_walking_on_the_rigid_body_prints_json(monkeypatch, capsys):
+    assert call(monkeypatch, "walk", "--world", "srbm", "--seconds", "0.2", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["seconds"] == pytest.approx(0.2)
+    assert not found["fell"]
+
+
+@pytest.mark.parametrize("command", ["walk", "tune", "evaluate"])
+def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
+    monkeypatch.chdir(tmp_path)
+    line = refused(monkeypatch, capsys, command, "--traj", "circle")
+    assert "circle" in line
+    assert "straight, c, s" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_world(monkeypatch, capsys):
+    line = refused(monkeypatch, capsys, "walk", "--world", "moon")
+    assert "moon" in line
+    assert "standin" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda tree: tree["Q"].pop("euler"), "euler"),
+        (lambda tree: tree["R"]["force"][1].__setitem__(2, -1.0), "R.force"),
+        (lambda tree: tree["Q"]["position"].__setitem__(0, float("nan")), "Q.position"),
+        (lambda tree: tree.__setitem__("S", 1), "S"),
+    ],
+)
+def test_wrong_weights_files(monkeypatch, capsys, tmp_path, change, expected):
+    path = tmp_path / "weights.json"
+    save_weights(path, expert())
+    tree = json.loads(path.read_text())
+    change(tree)
+    path.write_text(json.dumps(tree))
+    line = refused(monkeypatch, capsys, "walk", "--weights", path)
+    assert str(path) in line
+    assert expected in line
+
+
+def test_missing_weights_file(monkeypatch, capsys, tmp_path):
+    line = refused(monkeypatch, capsys, "walk", "--weights", tmp_path / "none.json")
+    assert "none.json" in line
+
+
+def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "kept").write_text("mine")
+    line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", "--data", tmp_path)
+    assert "exists" in line
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["kept"]
+
+
+def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    line = refused(monkeypatch, capsys, "tune", "--runs", tmp_path / "file")
+    assert "file" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (
+            lambda text: re.sub("<keyframe>.*</keyframe>", "", text, flags=re.DOTALL).replace(
+                '<freejoint name="base"/>', ""
+            ),
+            "free joint",
+        ),
+        (lambda text: text[: len(text) // 2], "hector.xml"),
+        (lambda text: text.replace("left_foot_point", "left_fot_point"), "left_foot_point"),
+        (
+            lambda text: "".join(
+                line for line in text.splitlines(True) if '<motor name="right_ankle"' not in line
+            ),
+            "10",
+        ),
+    ],
+)
+def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
+    path = tmp_path / "hector.xml"
+    path.write_text(change(MODEL_PATH.read_text()))
+    monkeypatch.setattr(commands, "load_robot", lambda: load_robot(path))
+    line = refused(monkeypatch, capsys, "walk")
+    assert "hector.xml" in line
+    assert expected in line
+
+
+@pytest.mark.slow
+def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
+    """From nothing to a verdict, small: data, net, two tunings, judges, report."""
+    monkeypatch.chdir(tmp_path)
+    small = CollectConfig(walks=6, seconds=1.0)
+    monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
+    assert call(monkeypatch, "tune", "--seeds", "2", "--iterations", "11", "--run", "run") == 0
+    out = capsys.readouterr().out
+    run = tmp_path / "run"
+    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with"]
+    for name in names:
+        assert name in out
+        assert (run / "weights" / f"{name}.json").exists()
+    result = json.loads((run / "result.json").read_text())
+    assert list(result["sets"]) == names
+    for name in names:
+        standin = result["sets"][name]["standin"]
+        assert standin["seeds"] == [0, 1]
+        assert standin["falls"] == 0
+        for part in ("L", "L_Eul", "L_pos", "L_ctrl"):
+            assert standin[part]["low"] <= standin[part]["mean"] <= standin[part]["high"]
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert {line["set"] for line in lines} == {"without", "with"}
+    assert "hardware stand-in" in (run / "report.md").read_text()
+    for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
+        assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
