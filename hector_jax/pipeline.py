@@ -168,7 +168,7 @@ def collect(
             lambda missing: walk_many(pool, tune.rollout.walk, robot, missing),
             robot=robot,
             about={"controller": repr(tune.rollout.walk)},
-            progress=tell,
+            progress=lambda done, of: tell(done, of, ""),
         )
 
 
@@ -186,7 +186,7 @@ def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learne
     with bar(f"training GRFM-Net on {len(seen.walk)} samples") as tell:
         tell(0, config.epochs, "compiling")
         params, course = training.train(
-            config, seen, held_out, lambda epoch, _: tell(epoch, config.epochs)
+            config, seen, held_out, lambda epoch, _: tell(epoch, config.epochs, "")
         )
     linear = network.fit_linear(seen)
     effects = {
@@ -240,7 +240,7 @@ def judge(
 def _told(walks: Iterable[Trajectory], count: int, tell: Tell) -> Iterator[Trajectory]:
     for done, walk in enumerate(walks, 1):
         yield walk
-        tell(done, count)
+        tell(done, count, "")
 
 
 def as_line(name: str, iteration: Iteration) -> str:

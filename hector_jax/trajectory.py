@@ -51,7 +51,7 @@ class Trajectory(NamedTuple):
 
 
 def pack_state(state: State, gravity: Float[Array, "3"]) -> Float[Array, "15"]:
-    """x = [e; p; omega; v; g] of Eq. 3."""
+    """The paper's x = [e; p; omega; v; g] (Eq. 3)."""
     return jnp.concatenate([*state, gravity])
 
 
@@ -61,7 +61,7 @@ def unpack_state(x: Float[Array, "15"]) -> State:
 
 
 def pack_wrench(wrench: Wrench) -> Float[Array, "12"]:
-    """u = [F_0; F_1; M_0; M_1] of Eq. 3."""
+    """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3)."""
     return jnp.concatenate([wrench.force.reshape(6), wrench.moment.reshape(6)])
 
 

@@ -16,7 +16,9 @@ FLOORS = [
     ["tuning", "sim"],
     ["grfm"],
     ["evaluation"],
-    ["flags", "pipeline"], ["commands"], ["cli"],
+    ["flags", "pipeline"],
+    ["commands"],
+    ["cli"],
 ]
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hector_jax.robot import load_robot
 
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.model.effect import last_command
+from hector_jax.robot import load_robot
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune_step
 from hector_jax.tuning.loss import LossConfig, losses, total

@@ -2,10 +2,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hector_jax.robot import load_robot
 
 from hector_jax.geometry import euler_from_rotation, rot_z, rotation_from_euler, skew
 from hector_jax.model import srbm
+from hector_jax.robot import load_robot
 from hector_jax.trajectory import State, Wrench, pack_state, pack_wrench, unpack_state, zero_wrench
 
 

@@ -78,9 +78,7 @@ def _slot_feet(contact: Bool[Array, "2"], slots: int) -> Float[Array, "slots 2"]
     return (chosen * jnp.array([1.0, 1.0 - chosen[0]]))[None]
 
 
-def _input_map(
-    feet: Float[Array, "slots 2"], foot_yaw: Float[Array, "2"]
-) -> Float[Array, "12 b"]:
+def _input_map(feet: Float[Array, "slots 2"], foot_yaw: Float[Array, "2"]) -> Float[Array, "12 b"]:
     """G with u = G v: the slots' inputs (F_x, F_y, F_z, M_y, M_z) to the paper's u."""
     moment_axes = jax.vmap(lambda yaw: rot_z(yaw)[:, 1:])(foot_yaw)  # (2, 3, 2)
     force = jnp.einsum("sf,xi->fxsi", feet, jnp.eye(3))
@@ -96,7 +94,15 @@ def _rows(config: MpcConfig, robot: Robot, yaw: Float[Array, ""]) -> Float[Array
     zero = jnp.zeros_like(yaw)
     fx, fy, fz, my, mz = jnp.eye(5)
     side = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw), zero, zero, zero])  # force across the foot
-    rows = [fx - mu * fz, fx + mu * fz, fy - mu * fz, fy + mu * fz, fz, my + toe * fz, my - heel * fz]
+    rows = [
+        fx - mu * fz,
+        fx + mu * fz,
+        fy - mu * fz,
+        fy + mu * fz,
+        fz,
+        my + toe * fz,
+        my - heel * fz,
+    ]
     if config.line_friction:
         at_toe, load = mz + heel * side, heel * fz - my
         at_heel, rest = toe * side - mz, toe * fz + my

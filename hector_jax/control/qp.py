@@ -72,9 +72,9 @@ class Solution(NamedTuple):
     Residuals are those of (x, y) in the normalised problem (module docstring), so they have no unit
     and compare between problems: `primal_residual` is the largest violation of a row over the
     largest entry of A x and the bounds, `dual_residual` the largest entry of P x + q + A'y over the
-    largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (all
-    plus 0.001, so that a solution of zeros has residuals too). With BAD_DATA or l > u, x and y are
-    zero and the residuals infinite.
+    largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (and a
+    little, so that a solution of zeros has residuals too). Where nothing was tried (BAD_DATA, l >
+    u, a row of zeros that cannot hold), x and y are zero and the residuals infinite.
     """
 
     x: Float[Array, " n"]
@@ -239,6 +239,7 @@ class _Normal(NamedTuple):
     column: Array  # (n,)
     row: Array  # (m,)
     size: Array
+    reach: Array  # largest finite bound, the size of A v; 1 where all are zero
 
 
 _SMALL = 1e-3  # keeps relative residuals meaningful where the solution is zero
@@ -290,6 +291,7 @@ def _normalise(qp: QP) -> _Normal:
         column,
         row,
         size,
+        jnp.where(_largest(bound) > 0, _largest(bound), 1.0),
     )
 
 
@@ -344,7 +346,8 @@ def _active_set(
             x = x + dx
             z = z + weight * sign * _rows(qp.A, dx)
         outside = _violation(qp, x)
-        wrong = jnp.where(state.active, z < -floors.rounding, outside > floors.rounding) & ~always
+        pulls, leaves = z < -floors.rounding, outside > floors.rounding * qp.reach
+        wrong = jnp.where(state.active, pulls, leaves) & ~always
         point = _Point(x, jnp.where(always, z, jnp.maximum(z, 0.0)))
         proof = _evidence(qp, point)
         better = jnp.max(proof) < jnp.max(state.proof)
@@ -389,7 +392,8 @@ def _interior_point(
 ) -> tuple[_Point, Array, Array]:
     """Mehrotra's proximal method, cold; last finite point, its slacks, iterations."""
     dtype = qp.q.dtype
-    delta = jnp.asarray(floors.proximal, dtype)
+    # soft enough for the factorisation, stiff enough for the size of the rows
+    delta = jnp.clip(0.01 * qp.reach, 0.01 / floors.cap, 1.0 / floors.cap)
     sign = jnp.asarray(_SIGN, dtype)
     free = jnp.zeros_like(qp.side).at[0].set(qp.equality)  # sides whose multiplier has no sign
     held = qp.side | free
@@ -449,8 +453,8 @@ def _interior_point(
 
     start = _Loop(
         _Point(jnp.zeros_like(qp.q), qp.side.astype(dtype)),
-        jnp.where(qp.side, jnp.maximum(sign * qp.bound, 1.0), 1.0),
-        delta,
+        jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0),
+        jnp.asarray(floors.proximal, dtype),
         jnp.zeros((), jnp.int32),
         wanted,
     )
@@ -502,11 +506,10 @@ def _evidence(qp: _Normal, point: _Point) -> Array:
     rows, pull, price = _rows(qp.A, x), _columns(qp.A, y), qp.P @ x
     outside = jnp.where(qp.given, jnp.asarray(_SIGN, x.dtype) * (rows - qp.bound), 0.0)
     terms = jnp.stack([jnp.dot(x, price), jnp.dot(qp.q, x), _support(qp, y)])
-    moved = jnp.maximum(_largest(rows), _largest(qp.bound))
     pushed = jnp.maximum(jnp.maximum(_largest(price), _largest(pull)), _largest(qp.q))
-    primal = jnp.max(outside, initial=0.0) / (_SMALL + moved)
+    primal = jnp.max(outside, initial=0.0) / jnp.maximum(_largest(rows), qp.reach)
     dual = _largest(price + qp.q + pull) / (_SMALL + pushed)
-    gap = jnp.abs(jnp.sum(terms)) / (_SMALL + _largest(terms))
+    gap = jnp.abs(jnp.sum(terms)) / (_SMALL * qp.reach + _largest(terms))
     proof = jnp.stack([primal, dual, gap])
     return jnp.where(jnp.isfinite(jnp.sum(proof)), proof, jnp.inf)
 
@@ -549,7 +552,7 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
     infeasible, unbounded = _certificates(floors, normal, near)
     hopeful = sane & ~settled & ~infeasible & ~unbounded
     # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
-    pushes = near.z * _largest(normal.bound) > slack * _largest(near.z)
+    pushes = near.z * normal.reach > slack * _largest(near.z)
     exact, exact_proof, last = _active_set(floors, normal, near, pushes, hopeful, tries)
     point = quick
     for other, its_proof in ((near, _evidence(normal, near)), (exact, exact_proof)):
@@ -574,7 +577,7 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
         status,
     )
     slack = jnp.maximum(-_violation(normal, point.x), 0.0)
-    ratio = ((point.z + floors.kink) / (slack + floors.kink)) ** 2
+    ratio = ((point.z + floors.kink) / (slack / normal.reach + floors.kink)) ** 2
     ratio = jnp.where(normal.side, jnp.minimum(ratio, floors.cap), 0.0)
     # an equality moves with both of its bounds, half with each
     return solution, jnp.where(normal.equality, 0.5 * floors.cap, ratio)
