@@ -114,6 +114,15 @@ def test_every_sample_can_be_watched():
     assert len(times) == 1100 + 10
 
 
+def test_a_walk_may_start_at_another_phase():
+    late = walk(CONFIG, ROBOT, expert(), named_command("c"), ideal(), 0.2, start_tick=10)
+    np.testing.assert_array_equal(late.contact[:, 0], np.arange(200) < 100)
+    start = late.reference.position[0] - 0.001 * late.reference.velocity[0]
+    np.testing.assert_allclose(start[:2], late.initial.position[:2], atol=1e-6)
+    with pytest.raises(ValueError, match="start_tick -110 is not later"):
+        walk(CONFIG, ROBOT, expert(), named_command("c"), ideal(), start_tick=-110)
+
+
 def test_a_walk_shorter_than_a_tick_is_refused():
     with pytest.raises(ValueError, match="at least one tick"):
         walk(CONFIG, ROBOT, expert(), named_command("c"), ideal(), seconds=0.0)

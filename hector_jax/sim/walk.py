@@ -259,6 +259,11 @@ def walk(
     ticks = round(seconds / config.gait.tick)
     if ticks < 1:
         raise ValueError(f"a walk needs at least one tick of {config.gait.tick} s, got {seconds} s")
+    begin = first_tick(config)
+    if start_tick <= begin:
+        raise ValueError(
+            f"a walk stands from tick {begin} on; start_tick {start_tick} is not later"
+        )
     world = build_world(imperfections, path)
     model, data = world.model, mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
@@ -267,7 +272,6 @@ def walk(
     fixed = jax.device_put((robot, weights, command, imperfections))
     device_robot, device_weights, device_command, device_imperfections = fixed
     place = jax.device_put((np.array(world.floor), world.foot_of_geom))
-    begin = first_tick(config)
     lead = (start_tick - begin) * count
     errors = sensing.draw_errors(imperfections.estimator, seed, lead, ticks * count)
     anchor = jax.device_put(standing_anchor(robot, start_tick))
