@@ -198,7 +198,8 @@ def _tune(args: Tune) -> None:
             film=film,
             config=resolved,
             environment=environment(),
-            command=f"hector tune --traj {args.traj} --seeds {args.seeds} --alpha {args.alpha}",
+            command=f"hector tune --traj {args.traj} --seeds {args.seeds} "
+            f"--iterations {args.iterations} --alpha {args.alpha}",
         ),
     )
     print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")

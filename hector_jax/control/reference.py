@@ -1,8 +1,8 @@
 """Where the robot should be: a velocity command, integrated open loop from t = 0 (Eq. 14-16).
 
 The reference does not follow the robot: what the MPC tracks is what the loss measures. Yaw is
-    integrated first and the velocity turned by it; on each piece of constant yaw rate the path is
-    an exact arc. Height, roll and pitch are constant.
+integrated first and the velocity turned by it; on each piece of constant yaw rate the path is an
+exact arc. Height, roll and pitch are constant.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""phi: what the ground really returns for what was commanded (design of Eq. 12).
+"""phi: what the ground really returns for what was commanded (Eq. 13).
 
 An effect is a function `Window -> Effect`, a pytree that can be called (`jax.tree_util.Partial`),
 so that a rollout takes new network parameters without a new compilation. Wrenches enter and leave

@@ -1,4 +1,4 @@
-"""DiffTune: step the weights down the gradient of the closed loop, inside the box (Eq. 7, 8).
+"""DiffTune: step the weights down the gradient of the closed loop, inside the box (P, Eq. 9).
 
 theta <- P_Theta(theta - beta theta g), with g the gradient in log-weights, divided by its largest
 magnitude inside Q and inside R: a weight moves by at most beta_Q or beta_R of itself, whatever the
@@ -6,8 +6,8 @@ size of the loss. A step that ends in a fall, a bad solve or a number that is no
 the weights go back, the step is halved and the refusal is told.
 
 Two results come out of one run: the weights after the paper's `ten` iterations, each accepted
-    unless it is refused, and the `converged` ones, for which steps that raise the loss are halved
-    too until nothing is gained any more.
+unless it is refused, and the `converged` ones, for which steps that raise the loss are halved too
+until nothing is gained any more.
 """
 
 from collections.abc import Callable
@@ -96,7 +96,7 @@ def evaluate(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> Evaluation:
-    """Loss of a weight set on the model and its gradient, in one program. Source: Eq. 7, 11."""
+    """Loss of a weight set on the model and its gradient, in one program. Source: Eq. 9, 11."""
 
     def objective(weights: Weights) -> tuple[Array, tuple]:
         trajectory = rollout(config.rollout, robot, weights, command, anchor, effect)
@@ -148,7 +148,7 @@ def _tied(gradient: Weights) -> Weights:
 
 
 def step_weights(config: TuneConfig, weights: Weights, gradient: Weights, share: float) -> Weights:
-    """Weights after `share` of a full step downhill, projected onto the box. Source: Eq. 7."""
+    """Weights after `share` of a full step downhill, projected onto the box."""
     if config.tie_feet:
         gradient = _tied(gradient)
     optimiser = _optimiser(config)
@@ -190,7 +190,7 @@ def tune(
     Raises:
         ValueError: the starting weights fall or cannot be solved on the model.
 
-    Source: Eq. 7, 8 and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
+    Source: problem P and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
     """
     history: list[Iteration] = []
 

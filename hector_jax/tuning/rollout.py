@@ -32,10 +32,13 @@ class RolloutConfig:
 
     walk: WalkConfig = WalkConfig()
     ticks: int = 400  # T; 4 s
+    lead: int = 0  # ticks in place before t = 0, outside the loss
 
     def __post_init__(self) -> None:
         if self.ticks < 2:
             raise ValueError(f"RolloutConfig.ticks must be at least 2, got {self.ticks}")
+        if self.lead < 0:
+            raise ValueError(f"RolloutConfig.lead must be at least 0 ticks, got {self.lead}")
 
 
 class Carry(NamedTuple):
@@ -44,6 +47,7 @@ class Carry(NamedTuple):
     state: State
     feet: Feet
     commands: Wrench  # (HISTORY, 2, 3) each, world frame, newest first
+    anchor: Anchor  # taken anew at t = 0
     fallen: Bool[Array, ""]
 
 
@@ -62,7 +66,7 @@ def standing_anchor(robot: Robot, start_tick: int = 0) -> Anchor:
     return Anchor(jnp.stack([zero, zero, height]), zero, jnp.asarray(start_tick))
 
 
-def init_carry(robot: Robot) -> Carry:
+def init_carry(robot: Robot, anchor: Anchor) -> Carry:
     """A robot that stands still at the origin, its feet commanded to share the weight."""
     zero = jnp.zeros(3)
     position = zero.at[2].set(robot.standing_height)
@@ -73,8 +77,16 @@ def init_carry(robot: Robot) -> Carry:
         state=State(zero, position, zero, zero),
         feet=Feet(position + local - robot.com_offset, jnp.zeros(2)),
         commands=Wrench(standing, jnp.zeros_like(standing)),
+        anchor=anchor,
         fallen=jnp.asarray(False),
     )
+
+
+def _anchor_at(robot: Robot, carry: Carry, tick: Int[Array, ""]) -> Anchor:
+    """The anchor in force: at t = 0 where the robot is, at the height at which it stands."""
+    here = carry.state.position.at[2].set(robot.standing_height)
+    now = Anchor(here, carry.state.euler[2], carry.anchor.tick)
+    return jax.tree.map(lambda new, old: jnp.where(tick == now.tick, new, old), now, carry.anchor)
 
 
 def step_carry(
@@ -82,7 +94,6 @@ def step_carry(
     robot: Robot,
     weights: Weights,
     command: Command,
-    anchor: Anchor,
     effect: jax.tree_util.Partial,
     carry: Carry,
     tick: Int[Array, ""],
@@ -94,6 +105,7 @@ def step_carry(
     """
     walk, ticks = config.walk, config.walk.gait
     state, feet = carry.state, carry.feet
+    anchor = _anchor_at(robot, carry, tick)
     decided = plan(
         walk, robot, weights, command, anchor, tick, state, feet, slots=slots_needed(walk, 0)
     )
@@ -128,7 +140,19 @@ def step_carry(
         fallen=fallen,
         residual=decided.residual,
     )
-    return Carry(moved, feet, commands, fallen), sample
+    return Carry(moved, feet, commands, anchor, fallen), sample
+
+
+def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
+    """Gait ticks of a rollout, those before t = 0 included."""
+    return anchor.tick - config.lead + jnp.arange(config.lead + config.ticks)
+
+
+def from_start(config: RolloutConfig, samples: Trajectory) -> Trajectory:
+    """Trajectory from t = 0 on, of the samples of all ticks."""
+    initial = jax.tree.map(lambda x: x[config.lead], samples.initial)
+    later = jax.tree.map(lambda x: x[config.lead :], samples)
+    return later._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
 
 
 def rollout(
@@ -139,24 +163,26 @@ def rollout(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> Trajectory:
-    """Walk `config.ticks` ticks on the single rigid body, from standing at gait tick `anchor.tick`.
+    """Walk on the single rigid body: `lead` ticks in place from standing, then the command.
 
     Args:
-        config, robot: what is compiled, and the body.
+        config: what is compiled.
+        robot: the body.
         weights: theta; the gradient is taken with respect to these.
-        command, anchor: what to walk, see `standing_anchor`.
+        command: what to walk.
+        anchor: where it stands and the gait tick of t = 0, see `standing_anchor`.
         effect: phi, `Window -> Effect`.
 
     Returns:
-        Trajectory of T samples. Nothing raises: read `fallen` and `residual` before believing it.
+        Trajectory of T samples from t = 0. Nothing raises: read `fallen` and `residual` before
+        believing it.
 
     Source: Eq. 12, 13.
     """
-    carry = init_carry(robot)
 
     @jax.checkpoint
     def tick(carry: Carry, j: Int[Array, ""]) -> tuple[Carry, Trajectory]:
-        return step_carry(config, robot, weights, command, anchor, effect, carry, anchor.tick + j)
+        return step_carry(config, robot, weights, command, effect, carry, j)
 
-    _, samples = jax.lax.scan(tick, carry, jnp.arange(config.ticks))
-    return samples._replace(initial=carry.state, period=jnp.asarray(config.walk.gait.tick))
+    _, samples = jax.lax.scan(tick, init_carry(robot, anchor), walked_ticks(config, anchor))
+    return from_start(config, samples)

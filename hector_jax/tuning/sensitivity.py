@@ -1,4 +1,4 @@
-"""The paper's own way to the gradient: sensitivities carried forward (Eq. 8-10).
+"""The paper's own way to the gradient: sensitivities carried forward (Eq. 9, 10).
 
 The recursion needs no memory in T and no reverse mode; the 24 columns of the sensitivity are 24
 tangents of one tick, so that each QP is solved and factorised once. With a network in the loop the
@@ -17,7 +17,14 @@ from hector_jax.control.weights import Weights, vector_to_weights, weights_to_ve
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.loss import LossConfig, losses, total
-from hector_jax.tuning.rollout import Carry, RolloutConfig, init_carry, step_carry
+from hector_jax.tuning.rollout import (
+    Carry,
+    RolloutConfig,
+    from_start,
+    init_carry,
+    step_carry,
+    walked_ticks,
+)
 
 
 class Sensitivities(NamedTuple):
@@ -35,28 +42,22 @@ def propagate(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> tuple[Trajectory, Sensitivities]:
-    """Rollout and its sensitivities by forward recursion. Source: Eq. 9, 10."""
+    """Rollout and its sensitivities by forward recursion. Source: Eq. 10."""
     theta = weights_to_vector(weights)
     directions = jnp.eye(theta.size)
 
     def split(carry: Carry) -> tuple:
-        return carry.state, carry.feet, carry.commands
+        place = carry.anchor.position, carry.anchor.yaw
+        return carry.state, carry.feet, carry.commands, place
 
     def tick(carried, j):
         carry, tangents = carried
 
         def move(parts: tuple, theta: Float[Array, "24"]) -> tuple:
-            now = Carry(*parts, fallen=carry.fallen)
-            then, sample = step_carry(
-                config,
-                robot,
-                vector_to_weights(theta),
-                command,
-                anchor,
-                effect,
-                now,
-                anchor.tick + j,
-            )
+            *moving, place = parts
+            now = Carry(*moving, anchor=Anchor(*place, anchor.tick), fallen=carry.fallen)
+            weights = vector_to_weights(theta)
+            then, sample = step_carry(config, robot, weights, command, effect, now, j)
             return (split(then), sample.state, sample.command), (then, sample)
 
         def along(tangent: tuple, direction: Float[Array, "24"]):
@@ -67,19 +68,20 @@ def propagate(
         )
         return (then, tangents), (sample, Sensitivities(state, wrench))
 
-    carry = init_carry(robot)
+    carry = init_carry(robot, anchor)
     still = jax.tree.map(
         lambda x: jnp.zeros((theta.size, *x.shape), x.dtype), split(carry)
     )  # dx_0 / dtheta = 0
-    _, (samples, sensitivities) = jax.lax.scan(tick, (carry, still), jnp.arange(config.ticks))
-    trajectory = samples._replace(initial=carry.state, period=jnp.asarray(config.walk.gait.tick))
-    return trajectory, jax.tree.map(lambda s: jnp.swapaxes(s, 0, 1), sensitivities)
+    ticks = walked_ticks(config, anchor)
+    _, (samples, sensitivities) = jax.lax.scan(tick, (carry, still), ticks)
+    later = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), sensitivities)
+    return from_start(config, samples), later
 
 
 def gradient(
     loss: LossConfig, trajectory: Trajectory, sensitivities: Sensitivities
 ) -> tuple[Float[Array, ""], Weights]:
-    """Loss and its gradient from the sensitivities. Source: Eq. 8."""
+    """Loss and its gradient from the sensitivities. Source: Eq. 9."""
 
     def objective(state: State, command: Wrench) -> Float[Array, ""]:
         return total(loss, losses(trajectory._replace(state=state, command=command)))
