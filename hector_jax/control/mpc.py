@@ -3,8 +3,8 @@ r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stanc
     minimise    sum_{k=1}^{N} |x_k - x_ref,k|^2_Q + sum_{k=0}^{N-1} |u_k|^2_R
     subject to  x_{k+1} = A_k x_k + B_k u_k                                  dynamics
                 |F_x|, |F_y| <= mu F_z,   0 <= F_z <= F_max                  each stance foot
-                M_x = 0,   -l_t F_z <= M_y <= l_h F_z                        line foot, its yaw frame
-                |F_y| at toe and heel <= mu F_z there                        line foot, its yaw frame
+                M_x = 0,   -l_t F_z <= M_y <= l_h F_z                       line foot, its yaw frame
+                |F_y| at toe and heel <= mu F_z there                       line foot, its yaw frame
                 F = M = 0                                                    each foot in the air
 
 States are condensed away, a foot in the air has no variables and M_x is eliminated, so that a
@@ -13,8 +13,8 @@ frame. `slots` is the number of feet that may stand at once; an empty slot has z
 unit Hessian, so that shapes stay static.
 
 Where this leaves the paper: x_1..x_N are priced instead of x_0..x_{N-1}, because x_0 is given; toe
-and heel of the line foot are in their physical places (pressure at the toe gives M_y = -l_t F_z; the
-paper prints them swapped); a foot in the air has no M_z; toe and heel hold by friction each, or the
+and heel of the line foot are in their physical places (pressure at the toe gives M_y = -l_t F_z;
+the paper prints them swapped); a foot in the air has no M_z; toe and heel hold by friction each, or the
 foot would turn on the spot when the pressure is all at one end.
 """
 
