@@ -1,0 +1,322 @@
+"""DiffTune: how far it steps, what it refuses, when it stops; on a toy and on the rigid body."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import (
+    bounds,
+    expert,
+    nominal,
+    vector_to_weights,
+    weights_to_vector,
+)
+from hector_jax.model.effect import last_command
+from hector_jax.robot import load_robot
+from hector_jax.tuning import difftune, sensitivity
+from hector_jax.tuning.difftune import (
+    Evaluation,
+    TuneConfig,
+    aligned,
+    gradient_norms,
+    refusal,
+    relative_step,
+    step_weights,
+    tune,
+    tune_step,
+)
+from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.rollout import RolloutConfig
+
+ROBOT = load_robot()
+ANCHOR = standing_anchor(ROBOT)
+STRAIGHT = named_command("straight")
+propagate = jax.jit(sensitivity.propagate, static_argnums=0)
+
+
+def vector(weights):
+    return np.asarray(weights_to_vector(weights))
+
+
+def random_tree(seed, scale=1.0):
+    return vector_to_weights(jnp.asarray(scale * np.random.default_rng(seed).normal(size=24)))
+
+
+def evaluation(loss=1.0, gradient=None, fallen=0.0, residual=1e-12):
+    gradient = random_tree(0) if gradient is None else gradient
+    loss, fallen, residual = (np.asarray(x, float) for x in (loss, fallen, residual))
+    return Evaluation(loss, Losses(loss, loss, loss), gradient, fallen, residual)
+
+
+# One step
+
+
+def test_the_largest_move_is_beta_of_the_weight_itself():
+    weights, gradient = expert(), random_tree(1)
+    update = relative_step(0.05, 0.08)
+    moves, _ = update.update(gradient, update.init(weights), weights)
+    share = vector(moves) / vector(weights)
+    assert np.abs(share[:12]).max() == pytest.approx(0.05)
+    assert np.abs(share[12:]).max() == pytest.approx(0.08)
+    np.testing.assert_array_equal(np.sign(share), -np.sign(vector(gradient)))
+    # inside Q and inside R the moves are in the ratio of the gradient in log-weights
+    logs = vector(gradient) * vector(weights)
+    np.testing.assert_allclose(share[:12] / share[0], logs[:12] / logs[0])
+    np.testing.assert_allclose(share[12:] / share[12], logs[12:] / logs[12])
+
+
+def test_the_size_of_the_loss_does_not_matter():
+    one, other = (
+        step_weights(TuneConfig(), nominal(), random_tree(2, scale), 1.0) for scale in (1.0, 1e9)
+    )
+    np.testing.assert_allclose(vector(one), vector(other), rtol=1e-12)
+
+
+def test_a_zero_gradient_moves_nothing():
+    still = step_weights(TuneConfig(), nominal(), random_tree(0, 0.0), 1.0)
+    np.testing.assert_array_equal(vector(still), vector(nominal()))
+
+
+def test_a_share_of_the_step_is_that_share_of_the_move():
+    full, half = (
+        vector(step_weights(TuneConfig(), nominal(), random_tree(3), share)) - vector(nominal())
+        for share in (1.0, 0.5)
+    )
+    np.testing.assert_allclose(half, full / 2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_step_out_of_the_box_ends_on_its_wall(side):
+    edge = bounds()[side]
+    gradient = jax.tree.map(lambda w: np.full_like(w, 1.0 if side == 0 else -1.0), edge)
+    there = step_weights(TuneConfig(), edge, gradient, 1.0)
+    np.testing.assert_array_equal(vector(there), vector(edge))
+    back = step_weights(TuneConfig(), edge, jax.tree.map(np.negative, gradient), 1.0)
+    assert (vector(back) != vector(edge)).all()
+
+
+def test_both_feet_keep_the_same_weights_unless_untied():
+    for tie in (True, False):
+        weights = nominal()
+        for seed in range(3):
+            weights = step_weights(TuneConfig(tie_feet=tie), weights, random_tree(seed), 1.0)
+        assert all(np.array_equal(w[0], w[1]) for w in weights.R) == tie
+
+
+def test_the_tied_step_is_that_of_the_mean_gradient():
+    gradient = random_tree(4)
+    mean = gradient._replace(R=jax.tree.map(lambda g: jnp.stack([g.mean(axis=0)] * 2), gradient.R))
+    tied = step_weights(TuneConfig(), nominal(), gradient, 1.0)
+    expected = step_weights(TuneConfig(tie_feet=False), nominal(), mean, 1.0)
+    np.testing.assert_allclose(vector(tied), vector(expected), rtol=1e-12)
+
+
+def test_the_literal_update_is_the_papers():
+    config = TuneConfig(update="literal", tie_feet=False)
+    gradient = random_tree(5, 1e-4)
+    moved = step_weights(config, nominal(), gradient, 1.0)
+    beta = np.repeat([0.05, 0.08], 12)
+    expected = vector(nominal()) - beta * vector(gradient)
+    np.testing.assert_allclose(vector(moved), np.clip(expected, *map(vector, bounds())))
+
+
+def test_the_relative_step_asks_for_the_weights():
+    update = relative_step(0.1, 0.1)
+    with pytest.raises(ValueError, match="needs the weights"):
+        update.update(random_tree(0), optax.EmptyState())
+
+
+# Refusals
+
+
+def test_a_sound_evaluation_is_believed():
+    assert refusal(TuneConfig(), evaluation()) == ""
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"loss": np.nan}, "not finite"),
+        ({"gradient": random_tree(0, np.inf)}, "not finite"),
+        ({"fallen": 0.01}, "the robot fell"),
+        ({"residual": 2e-3}, r"QP residual 2.0e-03 above 1e-06"),
+        ({"residual": np.nan}, "QP residual nan"),
+    ],
+)
+def test_what_cannot_be_believed_is_refused_and_told(wrong, told):
+    assert told in refusal(TuneConfig(), evaluation(**wrong))
+
+
+def test_a_gradient_with_one_nan_is_refused():
+    gradient = vector_to_weights(jnp.ones(24).at[17].set(jnp.nan))
+    assert "not finite" in refusal(TuneConfig(), evaluation(gradient=gradient))
+
+
+# The loop, on a quadratic in log-weights whose optimum is known
+
+OPTIMUM = vector(nominal()) * np.exp(
+    np.r_[np.linspace(-0.7, 0.9, 12), np.tile([0.3, -0.5, 0.8], 2), np.tile([0.2, 0.6, -0.4], 2)]
+)
+
+
+def quadratic(fixed=0.0, optimum=OPTIMUM, falls=lambda weights: False):
+    def toy(config, robot, weights, command, anchor, effect):
+        away = np.log(vector(weights) / optimum)
+        gradient = vector_to_weights(jnp.asarray(2e6 * away / vector(weights)))
+        return evaluation(fixed + 1e6 * away @ away, gradient, float(falls(weights)))
+
+    return toy
+
+
+def tune_toy(monkeypatch, toy, config=TuneConfig(), start=None, **more):  # noqa: B008
+    monkeypatch.setattr(difftune, "tune_step", toy)
+    start = nominal() if start is None else start
+    return tune(config, ROBOT, start, STRAIGHT, ANCHOR, last_command, **more)
+
+
+def distance(weights):
+    return np.abs(np.log(vector(weights) / OPTIMUM)).max()
+
+
+def test_a_quadratic_is_tuned_to_its_optimum(monkeypatch):
+    found = tune_toy(monkeypatch, quadratic())
+    assert distance(found.converged) < 0.01
+    assert distance(found.converged) < distance(found.ten) < distance(nominal())
+    assert found.stop == "the step became too small to gain"
+
+
+def test_ten_are_the_weights_after_the_papers_ten_iterations(monkeypatch):
+    found = tune_toy(monkeypatch, quadratic())
+    np.testing.assert_array_equal(vector(found.ten), vector(found.history[10].weights))
+    steps = [vector(i.weights) for i in found.history[:11]]
+    share = np.abs(np.diff(np.log(steps), axis=0)).max(axis=1)
+    assert ((share > 0.04) & (share < 0.09)).all()
+    only = tune_toy(monkeypatch, quadratic(), TuneConfig(iterations=10))
+    assert only.stop == "10 iterations"
+    np.testing.assert_array_equal(vector(only.ten), vector(only.converged))
+    np.testing.assert_array_equal(vector(only.ten), vector(found.ten))
+
+
+def test_the_papers_ten_steps_are_taken_uphill_too_and_later_ones_are_not(monkeypatch):
+    found = tune_toy(monkeypatch, quadratic(), start=vector_to_weights(jnp.asarray(OPTIMUM * 1.01)))
+    losses = [float(i.evaluation.loss) for i in found.history]
+    assert all(i.accepted for i in found.history[:11])
+    assert (np.diff(losses[:11]) > 0).any()
+    late = found.history[11:]
+    assert any(i.reason == "the loss rose" for i in late)
+    kept = [losses[10]] + [float(i.evaluation.loss) for i in late if i.accepted]
+    assert (np.diff(kept) < 0).all()
+
+
+def test_it_stops_where_nothing_is_gained(monkeypatch):
+    config = TuneConfig(patience=5, gain=5e-3)
+    found = tune_toy(monkeypatch, quadratic(fixed=1e9), config)
+    assert found.stop == "the loss fell by less than 0.5% in 5 iterations"
+    assert len(found.history) - 1 == 11
+
+
+def test_a_fall_halves_the_step_goes_back_and_is_told(monkeypatch):
+    wall = 1.12 * nominal().Q.velocity[2]
+    toy = quadratic(falls=lambda weights: weights.Q.velocity[2] > wall)
+    seen = []
+    found = tune_toy(monkeypatch, toy, TuneConfig(iterations=30), on_iteration=seen.append)
+    refused = [i for i in found.history if not i.accepted]
+    assert seen == found.history
+    assert refused
+    assert {i.reason for i in refused} <= {"the robot fell", "the loss rose"}
+    assert any(i.reason == "the robot fell" for i in refused)
+    best = found.history[0]
+    for before, now in zip(found.history, found.history[1:], strict=False):
+        best = before if before.accepted else best
+        expected = step_weights(TuneConfig(), best.weights, best.evaluation.gradient, now.step)
+        np.testing.assert_array_equal(vector(now.weights), vector(expected))
+        if before.step:
+            wanted = min(1.0, 1.5 * before.step) if before.accepted else before.step / 2
+            assert now.step == wanted
+    for weights in (found.ten, found.converged):
+        assert weights.Q.velocity[2] <= wall
+
+
+def test_each_iteration_is_numbered_and_the_first_is_the_start(monkeypatch):
+    found = tune_toy(monkeypatch, quadratic(), TuneConfig(iterations=12))
+    assert [i.iteration for i in found.history] == list(range(len(found.history)))
+    np.testing.assert_array_equal(vector(found.history[0].weights), vector(nominal()))
+    assert found.history[0].step == 0.0
+
+
+def test_a_start_that_falls_is_refused(monkeypatch):
+    with pytest.raises(ValueError, match="the starting weights cannot be tuned from: the robot"):
+        tune_toy(monkeypatch, quadratic(falls=lambda weights: True))
+
+
+def test_an_optimum_outside_the_box_ends_on_its_wall(monkeypatch):
+    outside = OPTIMUM.copy()
+    outside[3] = 1e6
+    start = vector_to_weights(jnp.asarray(OPTIMUM).at[3].set(9e3))
+    found = tune_toy(monkeypatch, quadratic(optimum=outside), start=start)
+    assert found.converged.Q.position[0] == 1e4
+    assert max(i.weights.Q.position[0] for i in found.history) == 1e4
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"update": "adam"}, {"beta_q": 0.0}, {"beta_r": -1.0}, {"iterations": 0}, {"patience": 0}],
+)
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        TuneConfig(**wrong)
+
+
+# On the rigid body
+
+SHORT = TuneConfig(rollout=RolloutConfig(ticks=50))  # as in test_rollout, compiled once
+
+
+@pytest.mark.slow  # half a minute of compilation
+def test_gradient_norms_are_those_of_the_parts():
+    arguments = SHORT.rollout, ROBOT, nominal(), STRAIGHT, ANCHOR, last_command
+    norms = gradient_norms(SHORT, *arguments[1:])
+    trajectory, columns = propagate(*arguments)
+
+    def gradient(euler, position):
+        _, found = sensitivity.gradient(LossConfig(euler, position), trajectory, columns)
+        return vector(found) * vector(nominal())
+
+    control = gradient(0.0, 0.0)
+    expected = gradient(1e6, 0.0) - control, gradient(0.0, 1e6) - control, 1e6 * control
+    np.testing.assert_allclose(norms, 1e-6 * np.linalg.norm(expected, axis=1), rtol=1e-6)
+
+
+def test_the_loss_is_that_of_its_parts():
+    found = tune_step(SHORT, ROBOT, nominal(), STRAIGHT, ANCHOR, last_command)
+    expected = 1e5 * found.parts.euler + 2e5 * found.parts.position + found.parts.control
+    assert found.loss == pytest.approx(float(expected))
+    assert refusal(SHORT, jax.tree.map(np.asarray, found)) == ""
+
+
+def test_aligned_loss_weights_are_powers_of_ten_that_level_the_gradients():
+    config = aligned(LossConfig(), Losses(*map(jnp.asarray, (0.3, 4e-3, 2e4))))
+    assert config == LossConfig(euler=1e5, position=1e7)
+    for gradient, alpha in ((0.3, config.euler), (4e-3, config.position)):
+        assert 10**-0.5 <= alpha * gradient / 2e4 <= 10**0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "least"), [("straight", 0.15), ("c", 0.20), ("s", 0.20)])
+def test_ten_iterations_from_nominal_lower_the_loss_inside_the_box(name, least):
+    # The straight walk has less to gain: over a third of its loss is the change of stance, which
+    # no weights alter.
+    command = named_command(name)
+    found = tune(TuneConfig(iterations=10), ROBOT, nominal(), command, ANCHOR, last_command)
+    losses = [float(i.evaluation.loss) for i in found.history]
+    drop = 1.0 - losses[-1] / losses[0]
+    print(f"{name}: L {losses[0]:.4g} -> {losses[-1]:.4g}, {drop:.1%} down")
+    assert drop >= least
+    assert len(found.history) == 11
+    lower, upper = map(vector, bounds())
+    for iteration in found.history:
+        assert iteration.accepted
+        assert ((lower <= vector(iteration.weights)) & (vector(iteration.weights) <= upper)).all()

@@ -1,0 +1,114 @@
+"""Where the feet come down: both rules, by hand and by symmetry."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.footstep import FootstepConfig, touchdown_points
+from hector_jax.geometry import rot_z
+from hector_jax.robot import load_robot
+from hector_jax.trajectory import State
+
+RAIBERT, PAPER = FootstepConfig(), FootstepConfig(rule="paper")
+ROBOT = load_robot()
+STANCE = SWING = 0.2
+WAIT = jnp.array([0.3, 0.1])  # the left foot stands for another 0.1 s and then swings
+touchdown = jax.jit(touchdown_points, static_argnums=(0, 5, 6))
+
+
+def state(position=(0.0, 0.0, 0.5), velocity=(0.0, 0.0, 0.0), yaw=0.0, yaw_rate=0.0):
+    rows = (0.0, 0.0, yaw), position, (0.0, 0.0, yaw_rate), velocity
+    return State(*(jnp.array(row, float) for row in rows))
+
+
+def feet(now, reference, config=RAIBERT, wait=WAIT):
+    return touchdown(config, ROBOT, now, reference, wait, STANCE, SWING)
+
+
+def test_the_papers_rule_is_half_a_swing_ahead_of_the_centre_of_mass():
+    now = state((1.0, -2.0, 0.5), (0.4, 0.1, 0.3), yaw=0.6)
+    points, yaw = feet(now, state(), PAPER)
+    np.testing.assert_allclose(points, [[1.04, -1.99, 0.0]] * 2)
+    np.testing.assert_allclose(yaw, 0.6)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.5])
+def test_a_robot_that_stands_still_puts_its_feet_under_its_hips(yaw):
+    now = state((0.3, 0.2, 0.5), yaw=yaw)
+    points, heading = feet(now, now)
+    side = 0.08 * np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+    np.testing.assert_allclose(points, np.array([0.3, 0.2, 0.0]) + [side, -side], atol=1e-12)
+    np.testing.assert_allclose(heading, yaw)
+
+
+def test_at_the_commanded_speed_a_foot_lands_half_a_stance_ahead():
+    now = state(velocity=(0.5, 0.0, 0.0))
+    points, _ = feet(now, now)
+    np.testing.assert_allclose(points[:, 0], 0.5 * (WAIT + STANCE / 2))
+    np.testing.assert_allclose(points[:, 1], [0.08, -0.08])
+
+
+def test_too_fast_steps_further_by_the_feedback():
+    now, wanted = state(velocity=(0.5, 0.2, 0.0)), state(velocity=(0.3, 0.2, 0.0))
+    ahead = FootstepConfig(feedback=0.2)
+    points, more = feet(now, wanted)[0], feet(now, wanted, ahead)[0]
+    np.testing.assert_allclose(more - points, [[0.08 * 0.2, 0.0, 0.0]] * 2, atol=1e-12)
+
+
+def test_the_sway_of_this_moment_carries_one_swing_at_most():
+    swaying = state(velocity=(0.0, 0.3, 0.0))
+    far, near = (
+        feet(swaying, state(), wait=jnp.array([wait, 0.1]))[0][0, 1] for wait in (0.39, 0.21)
+    )
+    assert far == pytest.approx(near)
+    closer, close = (
+        feet(swaying, state(), wait=jnp.array([wait, 0.1]))[0][0, 1] for wait in (0.15, 0.05)
+    )
+    assert closer - close == pytest.approx(0.03)
+
+
+def test_in_a_turn_the_feet_land_on_the_outside():
+    now = state(velocity=(0.5, 0.0, 0.0), yaw_rate=1.0)
+    points, straight = feet(now, now)[0], feet(now, now, FootstepConfig(turn=0.0))[0]
+    lean = 0.5 * 0.5 * 0.5 / ROBOT.gravity[2]
+    np.testing.assert_allclose(points - straight, [[0.0, -lean, 0.0]] * 2, atol=1e-12)
+
+
+def test_a_foot_points_to_the_heading_of_the_middle_of_its_stance():
+    _, yaw = feet(state(yaw=0.2), state(yaw_rate=2.0))
+    np.testing.assert_allclose(yaw, 0.2 + 2.0 * (np.asarray(WAIT) + STANCE / 2))
+
+
+@pytest.mark.parametrize("config", [RAIBERT, PAPER])
+def test_a_mirrored_robot_steps_to_the_mirrored_points(config):
+    def mirrored(s):
+        flip, turn = jnp.array([1.0, -1.0, 1.0]), jnp.array([-1.0, 1.0, -1.0])
+        return State(s.euler * turn, s.position * flip, s.ang_velocity * turn, s.velocity * flip)
+
+    now = state((0.3, 0.1, 0.5), (0.4, 0.2, 0.1), yaw=0.4)
+    wanted = state((0.2, 0.0, 0.5), (0.5, 0.1, 0.0), yaw=0.3, yaw_rate=1.2)
+    points, yaw = feet(now, wanted, config)
+    other, other_yaw = feet(mirrored(now), mirrored(wanted), config, WAIT[::-1])
+    np.testing.assert_allclose(other, points[::-1] * np.array([1.0, -1.0, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(other_yaw, -yaw[::-1])
+
+
+@pytest.mark.parametrize("config", [RAIBERT, PAPER])
+def test_a_yawed_robot_steps_to_the_yawed_points(config):
+    R = rot_z(jnp.array(1.1))
+
+    def turned(s):
+        return State(s.euler.at[2].add(1.1), R @ s.position, s.ang_velocity, R @ s.velocity)
+
+    now = state((0.3, 0.1, 0.5), (0.4, 0.2, 0.1), yaw=0.4)
+    wanted = state((0.2, 0.0, 0.5), (0.5, 0.1, 0.0), yaw=0.3, yaw_rate=1.2)
+    points, yaw = feet(now, wanted, config)
+    other, other_yaw = feet(turned(now), turned(wanted), config)
+    np.testing.assert_allclose(other, points @ R.T, atol=1e-12)
+    np.testing.assert_allclose(other_yaw, yaw + 1.1)
+
+
+def test_an_unknown_rule_is_refused():
+    with pytest.raises(ValueError, match="'raibert' or 'paper', got 'guess'"):
+        FootstepConfig(rule="guess")

@@ -1,0 +1,245 @@
+"""Torques and swing paths: virtual work, MuJoCo's statics, derivatives."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from hector_jax.control.legs import (
+    LegConfig,
+    joint_torques,
+    stance_torques,
+    swing_joints,
+    swing_path,
+    trunk_position,
+)
+from hector_jax.geometry import rotation_from_euler
+from hector_jax.model.kinematics import foot_poses, leg_gravity
+from hector_jax.robot import FOOT_POINTS, STANDING, load_model, load_robot
+from hector_jax.trajectory import State, Wrench, zero_wrench
+
+CONFIG = LegConfig()
+ROBOT = load_robot()
+SWING = 0.2
+WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
+STANDS = jnp.asarray(ROBOT.standing_joints)
+
+stance = jax.jit(lambda state, joints, wrench: stance_torques(ROBOT, state, joints, wrench))
+path = jax.jit(lambda start, end, s: swing_path(CONFIG, start, end, s))
+targets = jax.jit(
+    lambda state, start, start_yaw, end, end_yaw, elapsed: swing_joints(
+        CONFIG, ROBOT, state, start, start_yaw, end, end_yaw, elapsed, SWING
+    )
+)
+torques = jax.jit(
+    lambda config, *arguments: joint_torques(config, ROBOT, *arguments), static_argnums=0
+)
+poses = jax.jit(lambda joints: foot_poses(ROBOT, joints))
+
+
+def base(euler=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0)):
+    height = [0.0, 0.0, float(ROBOT.standing_height)]
+    return State(*(jnp.array(row, float) for row in (euler, height, (0, 0, 0), velocity)))
+
+
+def world_feet(state, joints):
+    """Foot points and foot axes in the world."""
+    R_wb, local = rotation_from_euler(state.euler), poses(joints)
+    return trunk_position(ROBOT, state) + local.position @ R_wb.T, R_wb @ local.rotation
+
+
+START, _ = world_feet(base(), STANDS)
+END = START + jnp.array([[0.15, 0.02, 0.0], [0.1, -0.03, 0.0]])
+
+
+# Stance
+
+
+def test_stance_torques_and_ground_do_no_work_together_at_the_hip():
+    state = base((0.1, -0.2, 0.7))
+    rng = np.random.default_rng(0)
+    joints = STANDS + 0.2 * rng.normal(size=10)
+    wrench = Wrench(jnp.asarray(50 * rng.normal(size=(2, 3))), jnp.asarray(rng.normal(size=(2, 3))))
+    torque = stance(state, joints, wrench)
+    for rates in np.eye(10):
+        (_, R), (v, dR) = jax.jvp(lambda q: world_feet(state, q), (joints,), (jnp.asarray(rates),))
+        spin = np.einsum("fij,fkj->fik", dR, R)  # the skew matrix of each foot's omega
+        omega = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+        power = np.sum(wrench.force * v) + np.sum(wrench.moment * omega)
+        # the ground's power on the feet is what the joints give way by, trunk at rest
+        assert float(torque @ rates) == pytest.approx(-float(power), abs=1e-10)
+
+
+def statics(share):
+    """MuJoCo's joint torques of the standing pose when the left foot carries `share` of it."""
+    model = load_model()
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key(STANDING).id)
+    mujoco.mj_forward(model, data)
+    feet = np.array([data.site(name).xpos for name in FOOT_POINTS])
+    com = data.subtree_com[1]
+    force = WEIGHT * np.array([[0.0, 0.0, share], [0.0, 0.0, 1.0 - share]])
+    # moments that bring the centre of pressure under the centre of mass
+    moment = np.cross(com - feet, force)
+    need = data.qfrc_bias.copy()
+    for foot, name in enumerate(FOOT_POINTS):
+        J_v, J_w = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, J_v, J_w, model.site(name).id)
+        need -= J_v.T @ force[foot] + J_w.T @ moment[foot]
+    np.testing.assert_allclose(need[:6], 0.0, atol=1e-9)  # the trunk needs no help
+    return need[6:], Wrench(jnp.asarray(force), jnp.asarray(moment))
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(share):
+    need, wrench = statics(share)
+    weight = leg_gravity(ROBOT, STANDS, jnp.asarray(ROBOT.gravity))
+    np.testing.assert_allclose(stance(base(), STANDS, wrench) + weight, need, atol=1e-8)
+
+
+def test_the_knee_of_a_single_stance_leg_holds_about_17_newton_metres():
+    _, wrench = statics(1.0)
+    knee = float(stance(base(), STANDS, wrench)[3])
+    # without its sign the leg would fold; the knee bends backwards, so the torque is positive
+    assert knee == pytest.approx(17.5, abs=1.5)
+    assert knee < 0.5 * ROBOT.torque_limit[3]
+
+
+# Swing
+
+
+def test_a_swing_foot_leaves_the_ground_and_lands_where_it_should():
+    np.testing.assert_allclose(path(START, END, jnp.zeros(2)), START, atol=1e-12)
+    landed = END + jnp.array([0.0, 0.0, CONFIG.landing])
+    np.testing.assert_allclose(path(START, END, jnp.ones(2)), landed, atol=1e-12)
+
+
+def test_the_apex_is_in_the_middle():
+    middle = path(START, END, jnp.full(2, 0.5))
+    np.testing.assert_allclose(middle[:, 2], CONFIG.height, atol=1e-6)
+    np.testing.assert_allclose(middle[:, :2], (START + END)[:, :2] / 2)
+    heights = jax.vmap(lambda s: path(START, END, jnp.full(2, s))[:, 2])(jnp.linspace(0, 1, 41))
+    assert heights.max() == pytest.approx(CONFIG.height)
+    rising = np.diff(heights, axis=0)
+    assert (rising[:20] > 0).all()
+    assert (rising[20:] < 0).all()
+
+
+@pytest.mark.parametrize("s", [0.0, 0.5, 1.0])
+def test_the_foot_is_slow_at_both_ends_and_nowhere_jumps(s):
+    step = 1e-4
+    speed = (path(START, END, jnp.full(2, s + step)) - path(START, END, jnp.full(2, s - step))) / (
+        2 * step
+    )
+    if s == 0.5:
+        np.testing.assert_allclose(speed[:, :2], 1.5 * (END - START)[:, :2], rtol=1e-6)
+        np.testing.assert_allclose(speed[:, 2], 0.0, atol=1e-3)
+    else:
+        np.testing.assert_allclose(speed, 0.0, atol=1e-3)
+
+
+def test_a_step_up_clears_the_higher_end():
+    high = END + jnp.array([0.0, 0.0, 0.05])
+    assert path(START, high, jnp.full(2, 0.5))[0, 2] == pytest.approx(0.05 + CONFIG.height)
+
+
+def swing(elapsed, state=None, turn=0.3):
+    state = base((0.0, 0.05, 0.1), (0.4, 0.1, 0.02)) if state is None else state
+    start_yaw = state.euler[2] + jnp.array([0.05, -0.1])
+    return targets(state, START, start_yaw, END, start_yaw + turn, jnp.asarray(elapsed, float))
+
+
+@pytest.mark.parametrize("elapsed", [0.04, 0.13])
+def test_swing_joints_put_the_feet_on_the_path(elapsed):
+    state = base((0.0, 0.05, 0.1))
+    joints, _ = swing([elapsed] * 2, state)
+    position, R = world_feet(state, joints)
+    s = elapsed / SWING
+    np.testing.assert_allclose(position, path(START, END, jnp.full(2, s)), atol=1e-9)
+    assert np.abs(R[:, 2, 0]).max() < 0.02  # the sole stays level, toe to heel
+    turned = 0.1 + np.array([0.05, -0.1]) + 0.3 * s * s * (3 - 2 * s)
+    np.testing.assert_allclose(np.arctan2(R[:, 1, 0], R[:, 0, 0]), turned, atol=0.02)
+
+
+def test_swing_rates_are_the_derivative_of_the_angles_under_a_moving_trunk():
+    state, step = base((0.0, 0.05, 0.1), (0.4, 0.1, 0.02)), 1e-5
+
+    def at(time):
+        moved = state._replace(position=state.position + time * state.velocity)
+        return np.asarray(swing([0.08 + time] * 2, moved)[0])
+
+    _, rates = swing([0.08] * 2, state)
+    np.testing.assert_allclose(rates, (at(step) - at(-step)) / (2 * step), atol=1e-6)
+    assert np.abs(rates).max() > 1.0
+
+
+def test_an_overdue_foot_waits_where_it_should_have_landed():
+    state = base()
+    for elapsed in (SWING + 0.01, 2 * SWING):
+        position, _ = world_feet(state, swing([elapsed] * 2, state, turn=0.0)[0])
+        np.testing.assert_allclose(position[:, :2], END[:, :2], atol=1e-9)
+
+
+def test_a_swing_across_half_a_turn_takes_the_short_way():
+    state = base((0.0, 0.0, np.pi))
+    start_yaw, end_yaw = jnp.full(2, np.pi - 0.1), jnp.full(2, -np.pi + 0.1)
+    turned = START * jnp.array([-1.0, -1.0, 1.0])
+    joints, _ = targets(state, turned, start_yaw, turned, end_yaw, jnp.full(2, SWING))
+    np.testing.assert_allclose(np.asarray(joints)[::5], 0.1, atol=1e-9)
+
+
+# Torques
+
+
+def test_stance_legs_push_and_swing_legs_follow():
+    state = base()
+    wrench = Wrench(jnp.array([[1.0, 2.0, WEIGHT], [0.0, 0.0, 0.0]]), jnp.zeros((2, 3)))
+    joints, rates = STANDS, jnp.zeros(10)
+    target, target_rates = STANDS + 0.05, jnp.full(10, 0.2)
+    found = torques(
+        CONFIG, state, joints, rates, jnp.array([True, False]), wrench, target, target_rates
+    )
+    np.testing.assert_allclose(found[:5], stance(state, joints, wrench)[:5], atol=1e-9)
+    weight = leg_gravity(ROBOT, joints, jnp.asarray(ROBOT.gravity))
+    pull = 0.05 * np.array(CONFIG.kp) + 0.2 * np.array(CONFIG.kd)
+    np.testing.assert_allclose(found[5:], pull + weight[5:], atol=1e-9)
+
+
+def test_a_swing_leg_on_its_target_carries_its_own_weight():
+    state, joints = base((0.1, 0.2, 0.3)), STANDS + 0.1
+    rates = jnp.linspace(-1, 1, 10)
+    hangs = jnp.zeros(2, bool)
+    found = torques(CONFIG, state, joints, rates, hangs, zero_wrench(), joints, rates)
+    up = jnp.asarray(ROBOT.gravity) @ rotation_from_euler(state.euler)
+    np.testing.assert_allclose(found, leg_gravity(ROBOT, joints, up), atol=1e-9)
+
+
+def test_the_weight_of_a_stance_leg_is_added_on_request():
+    _, wrench = statics(0.5)
+    still, stands = jnp.zeros(10), jnp.ones(2, bool)
+    plain, loaded = (
+        torques(LegConfig(stance_weight=w), base(), STANDS, still, stands, wrench, STANDS, still)
+        for w in (False, True)
+    )
+    weight = leg_gravity(ROBOT, STANDS, jnp.asarray(ROBOT.gravity))
+    np.testing.assert_allclose(loaded - plain, weight, atol=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_torques_stay_within_their_limits(sign):
+    still = jnp.zeros(10)
+    for stands in (True, False):
+        huge = Wrench(jnp.full((2, 3), 1e5 * sign), jnp.zeros((2, 3)))
+        found = torques(
+            CONFIG, base(), STANDS, still, jnp.full(2, stands), huge, STANDS + 9.0 * sign, still
+        )
+        assert (np.abs(found) <= ROBOT.torque_limit).all()
+        assert (np.abs(found) == ROBOT.torque_limit).any()
+    np.testing.assert_array_equal(found, sign * ROBOT.torque_limit)
+
+
+@pytest.mark.parametrize("wrong", [{"kp": (1.0,) * 4}, {"kd": (1.0, 1.0, -1.0, 1.0, 1.0)}])
+def test_impossible_gains_are_refused(wrong):
+    with pytest.raises(ValueError, match=f"LegConfig.{next(iter(wrong))} needs five gains"):
+        LegConfig(**wrong)

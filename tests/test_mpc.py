@@ -1,0 +1,333 @@
+"""The condensed MPC against Eq. 3-4 written out: its cost, its constraints, its symmetries."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from oracles import exact_solution
+
+from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc, write_qp
+from hector_jax.control.qp import QP, Status
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.geometry import rot_z
+from hector_jax.model import srbm
+from hector_jax.robot import load_robot
+from hector_jax.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
+
+ROBOT = load_robot()
+CONFIG = MpcConfig()
+N, DT = CONFIG.horizon, 0.03
+WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
+FLIP, TURN = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of vectors, of axial ones
+
+solve = jax.jit(solve_mpc, static_argnums=(0, 5, 6))
+write = jax.jit(write_qp, static_argnums=(0, 5, 6))
+linearise = jax.jit(jax.vmap(lambda e, r: srbm.linearise(ROBOT, e, r, DT)))
+
+
+def random_weights(seed):
+    draws = np.random.default_rng(seed).uniform(-1, 1, 24)
+    return vector_to_weights(weights_to_vector(expert()) * 3.0**draws)
+
+
+def problem(seed, push=1.0, contact=None, yaw=0.5):
+    """A state some way off a walking reference, and a horizon that changes feet at step 4."""
+    rng = np.random.default_rng(seed)
+    spread = np.array([[0.05], [0.02], [0.3], [0.2]])
+    off = push * spread * rng.normal(size=(4, 3))
+    heading = yaw + 0.02 * np.arange(1, N + 1)
+    zero = np.zeros((N, 3))
+    euler, position, velocity, spin = (zero.copy() for _ in range(4))
+    euler[:, 2], spin[:, 2] = heading, 0.02 / DT
+    velocity[:, 0], velocity[:, 1] = 0.4 * np.cos(heading), 0.4 * np.sin(heading)
+    position[:] = [0.0, 0.0, 0.5]
+    position += np.cumsum(velocity, axis=0) * DT
+    reference = State(euler, position, spin, velocity)
+    state = State(
+        np.array([0.0, 0.0, yaw]) + off[0],
+        np.array([0.0, 0.0, 0.5]) + off[1],
+        off[2],
+        velocity[0] + off[3],
+    )
+    side = np.array([[0.0, 0.08, -0.5], [0.0, -0.08, -0.5]])
+    lever = (side + 0.02 * rng.normal(size=(N, 2, 3)) * [1, 1, 0]) @ np.asarray(
+        rot_z(jnp.array(yaw))
+    ).T
+    if contact is None:
+        left = np.arange(N) < 4
+        contact = np.stack([left, ~left], axis=1)
+    about = np.stack([0 * heading, 0 * heading, heading - 0.02], axis=1)
+    horizon = Horizon(
+        reference, about, lever, yaw + 0.1 * rng.normal(size=(N, 2)), np.asarray(contact)
+    )
+    return jax.tree.map(jnp.asarray, (state, horizon))
+
+
+BOTH = np.ones((N, 2), bool)
+
+
+def inputs(horizon, v, slots=1):
+    """The paper's u_k (N, 12), from the QP's variables, one foot at a time."""
+    u = np.zeros((N, 2, 2, 3))  # step, force or moment, foot, axis
+    v = np.asarray(v).reshape(N, slots, 5)
+    for k in range(N):
+        for foot in np.flatnonzero(horizon.contact[k]):
+            fx, fy, fz, my, mz = v[k, foot if slots == 2 else 0]
+            u[k, 0, foot] = fx, fy, fz
+            u[k, 1, foot] = np.asarray(rot_z(horizon.foot_yaw[k, foot])) @ [0.0, my, mz]
+    return u.reshape(N, 12)
+
+
+def cost(weights, state, horizon, u, about=0.0):
+    """Eq. 3 by rolling u out through A_k, B_k of Eq. 4a, gravity among the 15 states."""
+    A, B = linearise(horizon.euler, horizon.lever)
+    x, total = np.asarray(pack_state(state, jnp.asarray(ROBOT.gravity))), 0.0
+    Q, R = np.concatenate(weights.Q), np.asarray(pack_wrench(weights.R))
+    wanted = np.concatenate(horizon.reference, axis=1)
+    for k in range(N):
+        x = np.asarray(A[k]) @ x + np.asarray(B[k]) @ u[k]
+        total += Q @ (x[:12] - wanted[k]) ** 2 + R @ (u[k] - about) ** 2
+    assert (x[12:] == ROBOT.gravity).all()
+    return total
+
+
+def sparse_problem(weights, state, horizon):
+    """Eq. 3-4 with states, twelve inputs and every constraint; toe and heel as two contacts."""
+    A, B = (np.asarray(M) for M in linearise(horizon.euler, horizon.lever))
+    Q, R = np.concatenate(weights.Q), np.asarray(pack_wrench(weights.R))
+    wanted = np.concatenate(horizon.reference, axis=1)
+    P = scipy.linalg.block_diag(*[np.diag(2 * Q)] * N, *[np.diag(2 * R)] * N)
+    q = np.concatenate([*(-2 * Q * wanted), np.zeros(12 * N)])
+    rows, lower, upper = [], [], []
+
+    def add(k, on_input, low, high):
+        row = np.zeros((len(on_input), 24 * N))
+        row[:, 12 * (N + k) : 12 * (N + k + 1)] = on_input
+        rows.append(row)
+        lower.append(np.full(len(row), low))
+        upper.append(np.full(len(row), high))
+
+    x = np.asarray(pack_state(state, jnp.asarray(ROBOT.gravity)))
+    toe, heel, mu = ROBOT.toe, ROBOT.heel, CONFIG.friction
+    for k in range(N):
+        row = np.zeros((12, 24 * N))
+        row[:, 12 * k : 12 * k + 12] = np.eye(12)
+        known = A[k, :12, 12:] @ ROBOT.gravity
+        if k:
+            row[:, 12 * (k - 1) : 12 * k] = -A[k, :12, :12]
+        else:
+            known = known + A[k, :12, :12] @ x[:12]
+        row[:, 12 * (N + k) : 12 * (N + k + 1)] = -B[k, :12]
+        rows.append(row)
+        lower.append(known)
+        upper.append(known)
+        for foot in (0, 1):
+            force = np.eye(12)[3 * foot : 3 * foot + 3]
+            moment = np.eye(12)[6 + 3 * foot : 9 + 3 * foot]
+            if not horizon.contact[k, foot]:
+                add(k, np.concatenate([force, moment]), 0.0, 0.0)
+                continue
+            R_foot = np.asarray(rot_z(horizon.foot_yaw[k, foot]))
+            moment, side = R_foot.T @ moment, R_foot[:, 1] @ force
+            add(k, moment[:1], 0.0, 0.0)
+            add(k, force[:2] - mu * force[2], -np.inf, 0.0)
+            add(k, force[:2] + mu * force[2], 0.0, np.inf)
+            add(k, force[2:], 0.0, CONFIG.max_force)
+            # loads and side forces at toe and heel that amount to F_z, M_y and to side force, M_z
+            load = np.linalg.inv([[1, 1], [-toe, heel]]) @ np.stack([force[2], moment[1]])
+            across = np.linalg.inv([[1, 1], [toe, -heel]]) @ np.stack([side, moment[2]])
+            add(k, load, 0.0, np.inf)
+            add(k, across - mu * load, -np.inf, 0.0)
+            add(k, across + mu * load, 0.0, np.inf)
+    return QP(P, q, *map(np.concatenate, (rows, lower, upper)))
+
+
+@pytest.mark.parametrize(("slots", "about"), [(1, "zero"), (2, "zero"), (2, "weight")])
+def test_the_condensed_cost_is_that_of_the_rolled_out_states(slots, about):
+    config = MpcConfig(effort_about=about)
+    weights, (state, horizon) = random_weights(1), problem(1, contact=BOTH if slots == 2 else None)
+    qp, _ = write(config, ROBOT, weights, state, horizon, DT, slots)
+    rng = np.random.default_rng(2)
+    share = np.tile([0.0, 0.0, WEIGHT / 2], 4)
+    share[6:] = 0.0
+
+    def both(v):
+        found = 0.5 * v @ qp.P @ v + qp.q @ v
+        u = inputs(horizon, v, slots)
+        return found - cost(weights, state, horizon, u, share if about == "weight" else 0.0)
+
+    vs = rng.normal(size=(4, len(qp.q))) * np.tile([20, 20, 100, 3, 3], N * slots)
+    gaps = np.array([both(v) for v in vs])  # the same constant for every v
+    np.testing.assert_allclose(gaps, gaps[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_answer_is_that_of_the_sparse_problem(seed):
+    weights, (state, horizon) = random_weights(seed), problem(seed, push=1.0 + seed)
+    wrench, solution = solve(CONFIG, ROBOT, weights, state, horizon, DT, 1)
+    assert solution.status == Status.SOLVED
+    exact, _ = exact_solution(sparse_problem(weights, state, horizon))
+    u = exact[12 * N :].reshape(N, 12)
+    np.testing.assert_allclose(pack_wrench(wrench), u[0], atol=1e-5)
+    np.testing.assert_allclose(inputs(horizon, solution.x), u, atol=1e-4)
+    least = cost(weights, state, horizon, u)
+    assert cost(weights, state, horizon, inputs(horizon, solution.x)) == pytest.approx(least)
+
+
+def test_every_constraint_holds_and_each_kind_binds_somewhere():
+    bound = np.zeros(7, int)
+    for seed in range(12):
+        state, horizon = problem(seed, push=4.0)
+        if seed == 0:  # a hard landing asks for more than the greatest force
+            state = state._replace(velocity=state.velocity.at[2].set(-3.0))
+        _, solution = solve(CONFIG, ROBOT, random_weights(seed), state, horizon, DT, 1)
+        assert solution.status == Status.SOLVED
+        for k, u in enumerate(inputs(horizon, solution.x).reshape(N, 2, 2, 3)):
+            foot = int(np.argmax(horizon.contact[k]))
+            assert not u[:, 1 - foot].any()
+            R = np.asarray(rot_z(horizon.foot_yaw[k, foot]))
+            force, moment, side = u[0, foot], R.T @ u[1, foot], R[:, 1] @ u[0, foot]
+            toe, heel, mu = ROBOT.toe, ROBOT.heel, CONFIG.friction
+            at_toe = (heel * force[2] - moment[1]) / (toe + heel)
+            at_heel = (toe * force[2] + moment[1]) / (toe + heel)
+            across_toe = (heel * side + moment[2]) / (toe + heel)
+            across_heel = (toe * side - moment[2]) / (toe + heel)
+            assert moment[0] == pytest.approx(0.0, abs=1e-12)
+            room = [
+                mu * force[2] - abs(force[0]),
+                mu * force[2] - abs(force[1]),
+                CONFIG.max_force - force[2],
+                at_toe,
+                at_heel,
+                mu * at_toe - abs(across_toe),
+                mu * at_heel - abs(across_heel),
+            ]
+            assert min(room) > -1e-5
+            assert force[2] > -1e-5
+            bound += (np.array(room) < 1e-5) & (force[2] > 1.0)
+    assert (bound > 0).all(), bound
+
+
+def test_line_friction_can_be_left_to_the_pyramid():
+    config = MpcConfig(line_friction=False)
+    state, horizon = problem(5, push=4.0)
+    qp, _ = write(config, ROBOT, nominal(), state, horizon, DT, 1)
+    full, _ = write(CONFIG, ROBOT, nominal(), state, horizon, DT, 1)
+    assert qp.A.shape == (N, 7, 5)
+    assert full.A.shape == (N, 11, 5)
+    np.testing.assert_array_equal(full.A[:, :7], qp.A)
+
+
+def test_room_for_two_feet_changes_nothing_while_one_stands():
+    state, horizon = problem(3, push=2.0)
+    one, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
+    two, solution = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 2)
+    np.testing.assert_allclose(pack_wrench(two), pack_wrench(one), atol=1e-6)
+    empty = np.asarray(solution.x).reshape(N, 2, 5)[~np.asarray(horizon.contact)]
+    np.testing.assert_allclose(empty, 0.0, atol=1e-9)
+    assert not np.asarray(one.force[1]).any()  # of the foot in the air
+    assert not np.asarray(one.moment[1]).any()
+
+
+def standing():
+    still = np.tile([0.0, 0.0, 0.5], (N, 1))
+    zero = np.zeros((N, 3))
+    lever = np.tile([[0.0, 0.08, -0.5], [0.0, -0.08, -0.5]], (N, 1, 1))
+    horizon = Horizon(State(zero, still, zero, zero), zero, lever, np.zeros((N, 2)), BOTH)
+    state = State(*(np.array(row[0]) for row in horizon.reference))
+    return jax.tree.map(jnp.asarray, (state, horizon))
+
+
+def test_standing_feet_share_the_weight():
+    state, horizon = standing()
+    wrench, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 2)
+    np.testing.assert_allclose(wrench.force[0], wrench.force[1], atol=1e-6)
+    # effort is priced and the horizon ends: near the weight only
+    assert wrench.force[:, 2].sum() == pytest.approx(WEIGHT, rel=0.15)
+    np.testing.assert_allclose(wrench.force[:, :2], 0.0, atol=1e-6)
+
+
+def test_effort_about_the_weight_stands_with_exactly_the_weight():
+    state, horizon = standing()
+    config = MpcConfig(effort_about="weight")
+    wrench, _ = solve(config, ROBOT, expert(), state, horizon, DT, 2)
+    np.testing.assert_allclose(wrench.force, [[0.0, 0.0, WEIGHT / 2]] * 2, atol=1e-6)
+    np.testing.assert_allclose(wrench.moment, 0.0, atol=1e-6)
+
+
+def test_only_the_ratio_of_weights_matters():
+    state, horizon = problem(6, push=2.0)
+    one, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
+    tenfold = jax.tree.map(lambda w: 10.0 * w, expert())
+    other, _ = solve(CONFIG, ROBOT, tenfold, state, horizon, DT, 1)
+    np.testing.assert_allclose(pack_wrench(other), pack_wrench(one), atol=1e-6)
+
+
+@pytest.mark.parametrize("push", [0.5, 4.0])
+def test_a_mirrored_problem_has_the_mirrored_answer(push):
+    def mirrored(s):
+        return State(s.euler * TURN, s.position * FLIP, s.ang_velocity * TURN, s.velocity * FLIP)
+
+    state, horizon = problem(7, push)
+    weights = random_weights(7)
+    other = Horizon(
+        mirrored(horizon.reference),
+        horizon.euler * TURN,
+        horizon.lever[:, ::-1] * FLIP,
+        -horizon.foot_yaw[:, ::-1],
+        horizon.contact[:, ::-1],
+    )
+    swapped = weights._replace(R=Wrench(*(w[::-1] for w in weights.R)))
+    one, _ = solve(CONFIG, ROBOT, weights, state, horizon, DT, 1)
+    two, _ = solve(CONFIG, ROBOT, swapped, mirrored(state), other, DT, 1)
+    np.testing.assert_allclose(two.force, one.force[::-1] * FLIP, atol=1e-6)
+    np.testing.assert_allclose(two.moment, one.moment[::-1] * TURN, atol=1e-6)
+
+
+def test_a_yawed_problem_has_the_yawed_answer():
+    # Nominal weights know no direction; the friction pyramid does, so that it must not bind.
+    state, horizon = problem(8, push=0.05)
+    R = rot_z(jnp.array(0.9))
+
+    def turned(s):
+        return State(s.euler + jnp.array([0.0, 0.0, 0.9]), *(v @ R.T for v in s[1:]))
+
+    other = Horizon(
+        turned(horizon.reference),
+        horizon.euler + jnp.array([0.0, 0.0, 0.9]),
+        horizon.lever @ R.T,
+        horizon.foot_yaw + 0.9,
+        horizon.contact,
+    )
+    one, solution = solve(CONFIG, ROBOT, nominal(), state, horizon, DT, 1)
+    force = np.asarray(solution.x).reshape(N, 5)[:, :3]
+    assert (np.abs(force[:, :2]) < 0.99 * CONFIG.friction / 2**0.5 * force[:, 2:]).all()
+    two, _ = solve(CONFIG, ROBOT, nominal(), turned(state), other, DT, 1)
+    np.testing.assert_allclose(two.force, one.force @ R.T, atol=1e-6)
+    np.testing.assert_allclose(two.moment, one.moment @ R.T, atol=1e-6)
+
+
+def test_a_batch_is_a_loop():
+    cases = [problem(seed, push=2.0) for seed in range(3)]
+    stacked = jax.tree.map(lambda *rows: jnp.stack(rows), *cases)
+    batch = jax.vmap(lambda s, h: solve(CONFIG, ROBOT, expert(), s, h, DT, 1)[0])(*stacked)
+    for i, (state, horizon) in enumerate(cases):
+        one, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
+        np.testing.assert_allclose(batch.force[i], one.force, atol=1e-7)
+
+
+def test_u_is_packed_forces_first():
+    state, horizon = problem(3)
+    _, first = write(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
+    wrench = unpack_wrench(first @ jnp.array([1.0, 2.0, 3.0, 0.0, 5.0]))
+    np.testing.assert_allclose(wrench.force, [[1, 2, 3], [0, 0, 0]])
+    np.testing.assert_allclose(wrench.moment, [[0, 0, 5], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"horizon": 0}, {"step_ticks": 0}, {"effort_about": "something"}]
+)
+def test_impossible_problems_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        MpcConfig(**wrong)

@@ -1,0 +1,61 @@
+"""The set-up of a process: where the cache lies, who turns on 64 bits, what a worker is."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+
+from hector_jax import runtime
+
+
+def test_the_cache_lies_in_the_users_cache_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    folder = runtime.cache_folder()
+    assert folder.is_dir()
+    assert folder.is_relative_to(tmp_path)
+    assert not any(folder.iterdir())  # the probe is gone
+
+
+def test_a_home_that_cannot_be_written_has_its_cache_elsewhere(monkeypatch, tmp_path):
+    wall, elsewhere = tmp_path / "wall", tmp_path / "elsewhere"
+    wall.write_text("a file, where a folder is wanted")
+    elsewhere.mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(wall))
+    monkeypatch.setattr(runtime.tempfile, "gettempdir", lambda: str(elsewhere))
+    folder = runtime.cache_folder()
+    assert folder.is_dir()
+    assert folder.is_relative_to(elsewhere)
+
+
+def test_importing_the_library_leaves_jax_alone_and_computes_nothing():
+    told = (
+        "import jax, hector_jax.tuning.difftune, hector_jax.runtime\n"
+        "from jax._src import xla_bridge\n"
+        "print(jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir,"
+        " xla_bridge.backends_are_initialized())"
+    )
+    root = Path(runtime.__file__).parents[1]
+    ran = subprocess.run(
+        [sys.executable, "-c", told], cwd=root, capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.split() == ["False", "None", "False"]
+    assert ran.stderr == ""
+
+
+def test_a_worker_computes_in_64_bits():
+    with runtime.workers(1) as pool:
+        assert pool.submit(jnp.zeros, 3).result(timeout=60).dtype == jnp.float64
+
+
+def test_a_failing_caller_ends_the_workers():
+    with pytest.raises(KeyError), runtime.workers(1) as pool:
+        raise KeyError
+    with pytest.raises(RuntimeError, match="shutdown"):
+        pool.submit(abs, 1)
+
+
+def test_fewer_than_one_worker_is_refused():
+    with pytest.raises(ValueError, match="at least 1, got 0"), runtime.workers(0):
+        pass

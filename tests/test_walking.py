@@ -1,0 +1,200 @@
+"""The controller as a whole: what it measures, remembers, plans and asks of the joints."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.legs import stance_torques, trunk_position
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.qp import Status
+from hector_jax.control.reference import Anchor, named_command
+from hector_jax.control.walking import (
+    Measurement,
+    WalkConfig,
+    actuate,
+    init_memory,
+    measured_feet,
+    plan,
+    slots_needed,
+    step_plan,
+)
+from hector_jax.control.weights import expert
+from hector_jax.geometry import rot_z
+from hector_jax.model.kinematics import foot_poses
+from hector_jax.robot import load_robot
+from hector_jax.trajectory import State
+
+CONFIG = WalkConfig()
+ROBOT = load_robot()
+WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
+HEIGHT = float(ROBOT.standing_height)
+STRAIGHT = named_command("straight")
+ANCHOR = Anchor(jnp.array([0.0, 0.0, HEIGHT]), jnp.array(0.0), jnp.array(0))
+
+feet_of = jax.jit(lambda measurement: measured_feet(ROBOT, measurement))
+
+
+@partial(jax.jit, static_argnames="slots")
+def planned(tick, memory, measurement, slots=1):
+    return step_plan(
+        CONFIG, ROBOT, expert(), STRAIGHT, ANCHOR, tick, memory, measurement, slots=slots
+    )
+
+
+@jax.jit
+def commanded(decided, memory, substep, measurement):
+    return actuate(CONFIG, ROBOT, decided, memory, substep, measurement)
+
+
+def standing(yaw=0.0, x=0.0, lift=0.0):
+    """A robot in the standing pose somewhere; `lift` bends the left knee."""
+    joints = jnp.asarray(ROBOT.standing_joints).at[3].add(-lift)
+    zero = jnp.zeros(3)
+    state = State(jnp.array([0.0, 0.0, yaw]), jnp.array([x, 0.0, HEIGHT]), zero, zero)
+    return Measurement(state, joints, jnp.zeros(10))
+
+
+def at(tick, measurement=None, memory=None, slots=1):
+    measurement = standing() if measurement is None else measurement
+    memory = init_memory(ROBOT, measurement) if memory is None else memory
+    return planned(jnp.array(tick), memory, measurement, slots=slots)
+
+
+# What it measures
+
+
+def test_the_feet_of_a_standing_robot_are_on_the_floor_below_its_hips():
+    feet = feet_of(standing())
+    np.testing.assert_allclose(feet.position[:, 2], 0.0, atol=1e-6)
+    np.testing.assert_allclose(feet.position[0] * np.array([1, -1, 1]), feet.position[1], atol=1e-6)
+    assert 0.05 < feet.position[0, 1] < 0.12
+    np.testing.assert_allclose(feet.yaw, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw", [0.4, 3.5, -9.0])
+def test_a_turned_robot_has_turned_feet_whose_yaw_is_as_continuous_as_its_own(yaw):
+    still, turned = feet_of(standing()), feet_of(standing(yaw, x=0.3))
+    R = rot_z(jnp.array(yaw))
+    expected = still.position @ R.T + np.array([0.3, 0.0, 0.0])
+    np.testing.assert_allclose(turned.position, expected, atol=1e-9)
+    np.testing.assert_allclose(turned.yaw, yaw, atol=1e-9)
+
+
+def test_a_turned_hip_turns_its_foot():
+    measurement = standing(yaw=1.0)
+    joints = measurement.joints.at[5].add(0.3)
+    feet = feet_of(measurement._replace(joints=joints))
+    np.testing.assert_allclose(feet.yaw, [1.0, 1.3], atol=1e-9)
+
+
+def test_a_tilted_robot_has_its_feet_where_kinematics_puts_them():
+    state = standing().state._replace(euler=jnp.array([0.1, -0.2, 0.3]))
+    measurement = standing()._replace(state=state)
+    local = foot_poses(ROBOT, measurement.joints).position
+    below = feet_of(measurement).position - trunk_position(ROBOT, state)
+    np.testing.assert_allclose(np.linalg.norm(below, axis=1), np.linalg.norm(local, axis=1))
+
+
+# What it remembers
+
+
+def test_a_standing_foot_is_remembered_and_a_flying_one_is_not():
+    old = init_memory(ROBOT, standing())
+    now = standing(x=0.2)
+    memory, decided = at(5, now, old)
+    assert decided.contact.tolist() == [True, False]
+    feet = feet_of(now)
+    np.testing.assert_allclose(memory.liftoff.position[0], feet.position[0])
+    np.testing.assert_allclose(memory.liftoff.position[1], old.liftoff.position[1])
+    later, _ = at(25, standing(x=0.4), memory)
+    np.testing.assert_allclose(later.liftoff.position[0], feet.position[0])
+    np.testing.assert_allclose(later.liftoff.position[1, 0] - memory.liftoff.position[1, 0], 0.4)
+
+
+# What it plans
+
+
+def test_step_plan_is_plan_with_the_measured_feet():
+    measurement = standing(yaw=0.05, x=-0.02)
+    _, decided = at(3, measurement)
+    direct = jax.jit(
+        lambda state, feet: plan(
+            CONFIG, ROBOT, expert(), STRAIGHT, ANCHOR, jnp.array(3), state, feet
+        )
+    )(measurement.state, feet_of(measurement))
+    np.testing.assert_allclose(decided.wrench.force, direct.wrench.force, atol=1e-6)
+    np.testing.assert_allclose(decided.touchdown.position, direct.touchdown.position)
+
+
+def test_before_the_gait_both_feet_share_the_weight():
+    _, decided = at(-110, slots=2)
+    assert decided.contact.tolist() == [True, True]
+    assert decided.swing_ticks.tolist() == [0, 0]
+    np.testing.assert_allclose(decided.wrench.force[:, 2], WEIGHT / 2, rtol=0.2)
+    np.testing.assert_allclose(decided.wrench.force[0, 2], decided.wrench.force[1, 2], rtol=1e-3)
+
+
+@pytest.mark.parametrize(("tick", "foot"), [(0, 0), (19, 0), (20, 1), (39, 1), (-61, 0)])
+def test_the_stance_foot_carries_the_robot_and_the_other_nothing(tick, foot):
+    _, decided = at(tick)
+    assert decided.status == Status.SOLVED
+    assert decided.residual < 1e-8
+    assert bool(decided.contact[foot])
+    assert 0.5 * WEIGHT < decided.wrench.force[foot, 2] < 2 * WEIGHT
+    assert not np.asarray(decided.wrench.force[1 - foot]).any()
+    assert not np.asarray(decided.wrench.moment[1 - foot]).any()
+
+
+def test_being_behind_pushes_ahead():
+    push = [float(at(2, standing(x=x))[1].wrench.force[0, 0]) for x in (-0.03, 0.0, 0.03)]
+    assert push[0] > push[1] > push[2]
+
+
+def test_the_swing_clock_starts_at_lift_off():
+    assert [at(t)[1].swing_ticks.tolist() for t in (20, 21, 39)] == [[0, 0], [1, 0], [19, 0]]
+
+
+def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():
+    assert [slots_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
+    double = WalkConfig(gait=GaitConfig(stance=24, swing=16))
+    assert slots_needed(double, 0) == 2
+
+
+# What it asks of the joints
+
+
+def test_a_stance_leg_pushes_what_was_planned():
+    measurement = standing()
+    memory, decided = at(3, measurement)
+    torque = commanded(decided, memory, jnp.array(4), measurement)
+    expected = stance_torques(ROBOT, measurement.state, measurement.joints, decided.wrench)
+    np.testing.assert_allclose(torque[:5], expected[:5], atol=1e-9)
+    assert torque[3] > 5.0  # the knee holds the weight
+    assert (np.abs(torque) <= ROBOT.torque_limit).all()
+
+
+def test_a_swing_leg_is_pulled_on_as_time_goes_by():
+    measurement = standing()
+    memory, decided = at(22, measurement)
+    now, later = (commanded(decided, memory, jnp.array(ms), measurement) for ms in (0, 9))
+    np.testing.assert_allclose(now[5:], later[5:], atol=1e-9)  # stance: held over the tick
+    assert later[3] < now[3] - 0.5  # swing: the knee bends more and more
+
+
+def test_the_last_millisecond_of_a_tick_is_the_first_of_the_next():
+    measurement = standing()
+    memory, decided = at(25, measurement)
+    next_tick = decided._replace(swing_ticks=decided.swing_ticks + jnp.array([1, 0]))
+    one = commanded(decided, memory, jnp.array(10), measurement)
+    other = commanded(next_tick, memory, jnp.array(0), measurement)
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_plan_intervals_that_are_too_coarse_are_refused():
+    with pytest.raises(ValueError, match="at most half the MPC step, got tick 0.01 s"):
+        WalkConfig(mpc=MpcConfig(step_ticks=1))
+    assert WalkConfig(mpc=MpcConfig(step_ticks=2)).mpc_step == pytest.approx(0.02)

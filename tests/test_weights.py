@@ -1,0 +1,63 @@
+"""The 24 weights: their order, their box and the sets with a name."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.weights import (
+    WEIGHT_NAMES,
+    bounds,
+    expert,
+    nominal,
+    vector_to_weights,
+    weights_to_vector,
+)
+
+
+def test_each_name_stands_where_its_weight_is():
+    numbers = dict(zip(WEIGHT_NAMES, range(24), strict=True))
+    weights = vector_to_weights(jnp.arange(24.0))
+    assert weights.Q.euler[2] == numbers["Q_yaw"]
+    assert weights.Q.position[0] == numbers["Q_x"]
+    assert weights.Q.ang_velocity[1] == numbers["Q_wy"]
+    assert weights.Q.velocity[2] == numbers["Q_vz"]
+    assert weights.R.force[0, 2] == numbers["R_Fz_left"]
+    assert weights.R.force[1, 0] == numbers["R_Fx_right"]
+    assert weights.R.moment[1, 1] == numbers["R_My_right"]
+    assert len(set(WEIGHT_NAMES)) == 24
+
+
+@pytest.mark.parametrize("shape", [(24,), (3, 24), (2, 5, 24)])
+def test_vector_and_weights_are_the_same_numbers(shape):
+    vector = np.random.default_rng(0).uniform(size=shape)
+    weights = vector_to_weights(jnp.asarray(vector))
+    assert weights.R.force.shape == (*shape[:-1], 2, 3)
+    np.testing.assert_array_equal(weights_to_vector(weights), vector)
+
+
+def test_the_vector_keeps_the_dtype():
+    vector = jnp.ones(24, jnp.float32)
+    assert weights_to_vector(vector_to_weights(vector)).dtype == jnp.float32
+
+
+@pytest.mark.parametrize("weights", [nominal, expert])
+def test_named_weights_lie_inside_the_box_and_treat_both_feet_alike(weights):
+    lower, upper = bounds()
+    for w, low, high in zip(*map(jax.tree.leaves, (weights(), lower, upper)), strict=True):
+        assert ((low < w) & (w < high)).all()
+    for kind in weights().R:
+        np.testing.assert_array_equal(kind[0], kind[1])
+
+
+def test_the_expert_is_stricter_than_nominal_on_pose_and_dearer_in_effort():
+    ratio = np.asarray(weights_to_vector(expert()) / weights_to_vector(nominal()))
+    np.testing.assert_allclose(ratio[:6], [2, 2, 5, 4, 4, 6])
+    np.testing.assert_allclose(ratio[6:12], 1.0)
+    np.testing.assert_allclose(ratio[12:18], [1, 1, 5] * 2)
+    np.testing.assert_allclose(ratio[18:], 10.0)
+
+
+def test_named_weights_are_fresh_each_time():
+    nominal().Q.euler[0] = -1.0
+    assert nominal().Q.euler[0] > 0.0
