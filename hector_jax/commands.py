@@ -17,7 +17,7 @@ import numpy as np
 
 from hector_jax import pipeline
 from hector_jax.console import say
-from hector_jax.control.reference import named_command
+from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
 from hector_jax.evaluation import metrics, plots
@@ -44,7 +44,7 @@ from hector_jax.storage import load_weights, save_tree, save_weights, versions, 
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
-from hector_jax.tuning.rollout import RolloutConfig, rollout, standing_anchor
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 
 @singledispatch

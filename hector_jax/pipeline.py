@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from hector_jax.console import Tell, bar
-from hector_jax.control.reference import COMMANDS, Command, named_command
+from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset
@@ -30,7 +30,6 @@ from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import Losses
-from hector_jax.tuning.rollout import standing_anchor
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 LEFT, RIGHT = 0, 1
+MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it the robot has fallen
+MAX_TILT = 0.8  # [rad] of roll or pitch; beyond it too
 
 
 class State(NamedTuple):
@@ -48,6 +50,14 @@ class Trajectory(NamedTuple):
     joints: Float[Array, "*batch T 10"]  # [rad] hip yaw, roll, pitch, knee, ankle; left, right
     fallen: Bool[Array, "*batch T"]  # true from the sample of the fall on
     residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
+
+
+def has_fallen(state: State) -> Bool[Array, "*batch"]:
+    """Whether a base state is that of a fallen robot: too low, too tilted, or not finite."""
+    low = state.position[..., 2] < MIN_HEIGHT
+    tilted = jnp.any(jnp.abs(state.euler[..., :2]) > MAX_TILT, axis=-1)
+    finite = jnp.all(jnp.stack([jnp.isfinite(x).all(axis=-1) for x in state]), axis=0)
+    return low | tilted | ~finite
 
 
 def pack_state(state: State, gravity: Float[Array, "3"]) -> Float[Array, "15"]:

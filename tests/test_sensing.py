@@ -10,7 +10,6 @@ from hector_jax.robot import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos, truth
-from hector_jax.trajectory import State
 
 ROBOT = load_robot()
 
@@ -135,23 +134,6 @@ def test_yaw_goes_on_past_half_a_turn():
             2
         ]
         assert before == pytest.approx(yaw, abs=1e-9)
-
-
-def upright(**change):
-    zero = jnp.zeros(3)
-    state = State(zero, jnp.array([0.0, 0.0, 0.41]), zero, zero)
-    return state._replace(**{k: jnp.asarray(v) for k, v in change.items()})
-
-
-def test_a_fall_is_a_fall():
-    no, yes = jnp.array(False), jnp.array(True)
-    assert not sensing.is_fallen(upright(), no)
-    assert not sensing.is_fallen(upright(euler=[0.7, -0.7, 3.0]), no)
-    assert sensing.is_fallen(upright(), yes)
-    assert sensing.is_fallen(upright(position=[0.0, 0.0, 0.24]), no)
-    assert sensing.is_fallen(upright(euler=[0.0, -0.81, 0.0]), no)
-    assert sensing.is_fallen(upright(euler=[0.81, 0.0, 0.0]), no)
-    assert sensing.is_fallen(upright(velocity=[0.0, np.nan, 0.0]), no)
 
 
 def test_a_knee_on_the_floor_is_no_foot():

@@ -14,8 +14,8 @@ unit Hessian, so that shapes stay static.
 
 Where this leaves the paper: x_1..x_N are priced instead of x_0..x_{N-1}, because x_0 is given; toe
 and heel of the line foot are in their physical places (pressure at the toe gives M_y = -l_t F_z;
-the paper prints them swapped); a foot in the air has no M_z; toe and heel hold by friction each, or the
-foot would turn on the spot when the pressure is all at one end.
+the paper prints them swapped); a foot in the air has no M_z; toe and heel hold by friction each, or
+the foot would turn on the spot when the pressure is all at one end.
 """
 
 from dataclasses import dataclass

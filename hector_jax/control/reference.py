@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
+from hector_jax.robot import Robot
 from hector_jax.trajectory import State
 
 
@@ -28,6 +29,18 @@ class Anchor(NamedTuple):
     position: Float[Array, "*batch 3"]  # of the centre of mass [m]
     yaw: Float[Array, "*batch"]  # [rad]
     tick: Int[Array, "*batch"]
+
+
+def standing_anchor(robot: Robot, start_tick: int = 0) -> Anchor:
+    """Reference of a robot that stands with its trunk above the origin until `start_tick`."""
+    position = jnp.append(jnp.asarray(robot.com_offset)[:2], robot.standing_height)
+    return Anchor(position, jnp.zeros_like(position[0]), jnp.asarray(start_tick, jnp.int32))
+
+
+def anchor_at(robot: Robot, state: State, start_tick: Int[Array, ""] | int) -> Anchor:
+    """Reference from where the robot is at t = 0, at the height at which it stands."""
+    position = jnp.append(state.position[:2], robot.standing_height)
+    return Anchor(position, state.euler[2], jnp.asarray(start_tick, jnp.int32))
 
 
 COMMANDS = ("straight", "c", "s")

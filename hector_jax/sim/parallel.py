@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hector_jax.control.reference import Anchor, Command
+from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import Memory, Plan, WalkConfig, init_memory
 from hector_jax.control.weights import Weights
 from hector_jax.robot import Robot
@@ -28,12 +28,10 @@ from hector_jax.sim.actuators import Motors, init_actuators
 from hector_jax.sim.sensing import Contacts
 from hector_jax.sim.walk import (
     Observed,
-    anchor_at,
     decide,
     drive,
     first_tick,
     observe,
-    standing_anchor,
     substeps,
 )
 from hector_jax.sim.world import Imperfections, World, build_worlds, standing_qpos

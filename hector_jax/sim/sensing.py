@@ -20,8 +20,6 @@ from hector_jax.robot import Robot
 from hector_jax.sim.world import TIME_STEP, Estimator, World
 from hector_jax.trajectory import State, Wrench
 
-MAX_TILT = 0.8  # [rad] roll or pitch of a fall
-MIN_HEIGHT = 0.25  # [m] centre of mass of a fall
 CONTACTS = 16  # contacts kept of a millisecond in MuJoCo C
 READING = 43  # entries of a flat reading
 ERRORS = 22  # entries of an error: those of a State in its order, then ten joints
@@ -118,14 +116,6 @@ def ground_wrench(
     lever = contacts.position - points[:, None]
     at_foot = jnp.where(mine, force, 0.0)
     return Wrench(at_foot.sum(axis=1), jnp.cross(lever, at_foot).sum(axis=1))
-
-
-def is_fallen(state: State, touches: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether it has fallen: too low, too tilted, on something but its feet, or not finite."""
-    low = state.position[2] < MIN_HEIGHT
-    tilted = jnp.abs(state.euler[:2]).max() > MAX_TILT
-    finite = jnp.isfinite(jnp.concatenate(list(state))).all()
-    return low | tilted | touches | ~finite
 
 
 def read_contacts(world: World, data: mujoco.MjData, out: Contacts, row: int) -> None:

@@ -22,7 +22,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.reference import (
+    Anchor,
+    Command,
+    anchor_at,
+    reference_at,
+    standing_anchor,
+)
 from hector_jax.control.walking import (
     Memory,
     Plan,
@@ -38,7 +44,7 @@ from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.sensing import Contacts, Reading
 from hector_jax.sim.world import TIME_STEP, Imperfections, World, build_world, standing_qpos
-from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
 
 
 class Job(NamedTuple):
@@ -140,7 +146,7 @@ def observe(
         effect=sensing.ground_wrench(contacts, foot, floor, points),
         feet=sensing.foot_points(robot, after),
         joints=after.joints + after.slack,
-        fallen=sensing.is_fallen(state, touches),
+        fallen=has_fallen(state) | touches,
     )
 
 
@@ -161,20 +167,6 @@ def substeps(config: WalkConfig) -> int:
 def first_tick(config: WalkConfig) -> int:
     """Tick at which a walk in MuJoCo begins, standing."""
     return config.gait.first_tick - config.gait.stand
-
-
-def standing_anchor(robot: Robot, start_tick: int) -> Anchor:
-    """Where the robot stands until t = 0."""
-    place = jnp.asarray(robot.com_offset)[:2]
-    position = jnp.append(place, robot.standing_height)
-    return Anchor(position, jnp.zeros(()), jnp.asarray(start_tick, jnp.int32))
-
-
-def anchor_at(robot: Robot, state: State, start_tick: int) -> Anchor:
-    """Where the reference starts: the true place and heading of t = 0, at standing height."""
-    height = jnp.asarray(robot.standing_height)
-    position = jnp.concatenate([state.position[:2], height[None]])
-    return Anchor(position, state.euler[2], np.array(start_tick, np.int32))
 
 
 @dataclass(frozen=True)

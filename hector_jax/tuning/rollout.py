@@ -13,17 +13,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from hector_jax.control import gait
-from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, turn
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Trajectory, Wrench
-
-MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it the robot has fallen
-MAX_TILT = 0.8  # [rad] of roll or pitch
+from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
 
 
 @dataclass(frozen=True)
@@ -51,42 +48,20 @@ class Carry(NamedTuple):
     fallen: Bool[Array, ""]
 
 
-def has_fallen(state: State) -> Bool[Array, "*batch"]:
-    """Whether a base state is that of a fallen robot: too low, too tilted, or not finite."""
-    low = state.position[..., 2] < MIN_HEIGHT
-    tilted = jnp.any(jnp.abs(state.euler[..., :2]) > MAX_TILT, axis=-1)
-    finite = jnp.all(jnp.array([jnp.isfinite(x).all(axis=-1) for x in state]), axis=0)
-    return low | tilted | ~finite
-
-
-def standing_anchor(robot: Robot, start_tick: int = 0) -> Anchor:
-    """Reference that starts under a robot standing at the origin, at gait tick `start_tick`."""
-    height = jnp.asarray(robot.standing_height)
-    zero = jnp.zeros_like(height)
-    return Anchor(jnp.stack([zero, zero, height]), zero, jnp.asarray(start_tick))
-
-
 def init_carry(robot: Robot, anchor: Anchor) -> Carry:
-    """A robot that stands still at the origin, its feet commanded to share the weight."""
+    """A robot that stands still at its standing anchor, its feet commanded to share the weight."""
     zero = jnp.zeros(3)
-    position = zero.at[2].set(robot.standing_height)
+    trunk = anchor.position - robot.com_offset
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
     half = 0.5 * robot.mass * jnp.asarray(robot.gravity)
     standing = jnp.broadcast_to(half, (HISTORY, 2, 3))
     return Carry(
-        state=State(zero, position, zero, zero),
-        feet=Feet(position + local - robot.com_offset, jnp.zeros(2)),
+        state=State(zero, anchor.position, zero, zero),
+        feet=Feet(trunk + local, jnp.zeros(2)),
         commands=Wrench(standing, jnp.zeros_like(standing)),
         anchor=anchor,
         fallen=jnp.asarray(False),
     )
-
-
-def _anchor_at(robot: Robot, carry: Carry, tick: Int[Array, ""]) -> Anchor:
-    """The anchor in force: at t = 0 where the robot is, at the height at which it stands."""
-    here = carry.state.position.at[2].set(robot.standing_height)
-    now = Anchor(here, carry.state.euler[2], carry.anchor.tick)
-    return jax.tree.map(lambda new, old: jnp.where(tick == now.tick, new, old), now, carry.anchor)
 
 
 def step_carry(
@@ -105,7 +80,8 @@ def step_carry(
     """
     walk, ticks = config.walk, config.walk.gait
     state, feet = carry.state, carry.feet
-    anchor = _anchor_at(robot, carry, tick)
+    here = anchor_at(robot, state, carry.anchor.tick)
+    anchor = jax.tree.map(lambda x, y: jnp.where(tick == here.tick, x, y), here, carry.anchor)
     decided = plan(
         walk, robot, weights, command, anchor, tick, state, feet, slots=slots_needed(walk, 0)
     )
@@ -170,7 +146,7 @@ def rollout(
         robot: the body.
         weights: theta; the gradient is taken with respect to these.
         command: what to walk.
-        anchor: where it stands and the gait tick of t = 0, see `standing_anchor`.
+        anchor: where it stands and the gait tick of t = 0, see `reference.standing_anchor`.
         effect: phi, `Window -> Effect`.
 
     Returns:

@@ -54,8 +54,9 @@ def propagate(
         carry, tangents = carried
 
         def move(parts: tuple, theta: Float[Array, "24"]) -> tuple:
-            *moving, place = parts
-            now = Carry(*moving, anchor=Anchor(*place, anchor.tick), fallen=carry.fallen)
+            state, feet, commands, (position, yaw) = parts
+            place = Anchor(position, yaw, anchor.tick)
+            now = Carry(state, feet, commands, place, carry.fallen)
             weights = vector_to_weights(theta)
             then, sample = step_carry(config, robot, weights, command, effect, now, j)
             return (split(then), sample.state, sample.command), (then, sample)
