@@ -41,10 +41,8 @@ def setup_jax() -> None:
 
 
 def start_worker() -> None:
-    """Set up a worker process: one thread, because a closed loop is one long chain."""
-    flags = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it and ends the pool
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
+    """Set up a worker process as its parent is, with interrupts left to the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     setup_jax()
 
 

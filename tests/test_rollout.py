@@ -4,15 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import synthetic_walk
 
-from hector_jax.control.reference import COMMANDS, named_command
+from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
-from hector_jax.model.effect import last_command
+from hector_jax.grfm.dataset import at_interval, make_dataset
+from hector_jax.grfm.network import as_effect, init_params
+from hector_jax.model.effect import Effect, last_command
 from hector_jax.robot import load_robot
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune_step
 from hector_jax.tuning.loss import LossConfig, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, rollout, standing_anchor
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 SHORT, LONG = RolloutConfig(ticks=50), RolloutConfig(ticks=400)
 walk = jax.jit(rollout, static_argnums=0)
@@ -114,18 +117,36 @@ def relative(found, expected):
     return float(jnp.linalg.norm(found - expected) / jnp.linalg.norm(expected))
 
 
+def _mixed(params, window):
+    net, command = as_effect(params)(window).wrench, last_command(window).wrench
+    wrench = jax.tree.map(lambda n, c: 0.1 * n + 0.9 * c, net, command)
+    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench))
+
+
+@pytest.fixture(scope="module")
+def net():
+    """An untrained GRFM-Net that is part of the answer, so that the robot stays on its feet."""
+    walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
+    dataset, _ = make_dataset(jax.tree.map(lambda *x: np.stack(x), *walks))
+    return jax.tree_util.Partial(_mixed, init_params(jax.random.key(0), dataset))
+
+
 def check_gradient(config, robot, weights, command, anchor, effect, bar):
     evaluation = tune_step(TuneConfig(rollout=config), robot, weights, command, anchor, effect)
     reverse = weights_to_vector(jax.tree.map(jnp.multiply, evaluation.gradient, weights))
     # Halving the step tells a change of the active set inside it from a wrong derivative.
-    errors = [
-        relative(reverse, differences(config, robot, weights, command, anchor, effect, step))
-        for step in (1e-5, 5e-6)
-    ]
-    assert min(errors) <= bar, errors
+    errors = []
+    for step in (1e-5, 5e-6, 2.5e-6):
+        expected = differences(config, robot, weights, command, anchor, effect, step)
+        errors.append(relative(reverse, expected))
+        if errors[-1] <= bar:
+            break
+    print(f"error against differences {errors}", end=" ")
+    assert errors[-1] <= bar, errors
     trajectory, columns = propagate(config, robot, weights, command, anchor, effect)
     _, forward = sensitivity.gradient(LossConfig(), trajectory, columns)
     forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
+    print(f"forward against reverse {relative(forward, reverse):.1e}")
     assert relative(forward, reverse) <= 1e-8
 
 
@@ -133,6 +154,22 @@ def check_gradient(config, robot, weights, command, anchor, effect, bar):
 def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor, seed):
     command = named_command(COMMANDS[seed % 3])
     check_gradient(SHORT, robot, random_weights(seed), command, anchor, last_command, 1e-6)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_gradient_over_50_ticks_with_a_net_is_that_of_differences(robot, anchor, net, seed):
+    command = named_command(COMMANDS[seed])
+    check_gradient(SHORT, robot, random_weights(seed), command, anchor, net, 1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_net", [False, True])
+@pytest.mark.parametrize("seed", range(5))
+def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, net, seed, with_net):
+    effect, weights = net if with_net else last_command, random_weights(seed)
+    command = named_command(COMMANDS[seed % 3])
+    assert not walk(LONG, robot, weights, command, anchor, effect).fallen.any()
+    check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4)
 
 
 def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
