@@ -572,7 +572,9 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
     solution = Solution(
         normal.size * normal.column * point.x,
         normal.size * normal.row * _multiplier(point.z),
-        *told,
+        told[0],
+        told[1],
+        told[2],
         first + steps + last,
         status,
     )
