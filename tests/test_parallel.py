@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hector_jax.robot import load_robot
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
+from hector_jax.robot import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.parallel import batched_model, mjx, mjx_contacts, walk_batch
 from hector_jax.sim.standin import standin
