@@ -1,0 +1,94 @@
+"""Run the sections, print one table, and write it as JSON to runs/bench/<time>.json.
+
+python -m benchmarks                     everything that this machine can run
+python -m benchmarks qp_layer realtime   some sections
+python -m benchmarks --quick             small sizes, to see that everything runs
+"""
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+from benchmarks.measuring import Check, Report, child
+from hector_jax.console import say
+
+SECTIONS = ("qp_layer", "closed_loop", "realtime", "throughput")
+QUICK = {
+    "qp_layer": ["--problems=20", "--timed=10", "--slow=2", "--rounds=2"],
+    "closed_loop": ["--lengths", "40", "200", "--batches", "2", "4"],
+    "realtime": ["0.5"],
+    "throughput": ["--batches", "16", "64", "--rollouts=4", "--rounds=2"],
+}
+
+
+def _has_accelerator() -> bool:
+    return child("benchmarks.device")["platform"] != "cpu"
+
+
+def _print_report(report: Report) -> None:
+    cells = [list(report.columns), *report.rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(report.columns))]
+    print(f"\n{report.title}")
+    for row in cells:
+        first, *others = (cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+        print("  " + "  ".join([row[0].ljust(widths[0]), *others]))
+    for check in (Check(*values) for values in report.checks):
+        verdict = ""
+        if check.bar is not None:
+            verdict = f"{'meets' if check.value <= check.bar else 'MISSES'} {check.bar:.3g}"
+        print(f"  {check.what:<58} {check.value:>10.3g} {check.unit:<5} {verdict}".rstrip())
+    for note in report.notes:
+        print(f"  ({note})")
+
+
+def main(arguments: list[str]) -> int:
+    """Run sections by name; a section that cannot run is told and skipped. 1 if one failed."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("sections", nargs="*", help=f"of {', '.join(SECTIONS)}; all by default")
+    parser.add_argument("--quick", action="store_true", help="small sizes, for a trial")
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"), help="folder of the JSON")
+    chosen = parser.parse_args(arguments)
+    unknown = [name for name in chosen.sections if name not in SECTIONS]
+    if unknown:
+        parser.error(f"unknown section {unknown[0]!r}; there are: {', '.join(SECTIONS)}")
+    names = chosen.sections or list(SECTIONS)
+    if "throughput" in names and not chosen.sections and not _has_accelerator():
+        say("throughput: no accelerator here, left out")
+        names.remove("throughput")
+
+    machine = {
+        "time": time.strftime("%Y-%m-%dT%H:%M:%S"),
+        "platform": platform.platform(),
+        "cores": os.cpu_count(),
+        "load": list(os.getloadavg()),
+        "python": platform.python_version(),
+        "jax": version("jax"),
+    }
+    load = machine["load"][0]
+    print(f"{machine['cores']} cores, load {load:.1f}, jax {machine['jax']}")
+    reports, failed = {}, False
+    for name in names:
+        say(f"{name} ...")
+        try:
+            found = child(f"benchmarks.{name}", *(QUICK[name] if chosen.quick else []))
+        except RuntimeError as error:
+            say(str(error))
+            failed = True
+            continue
+        reports[name] = found
+        _print_report(Report(**found))
+        sys.stdout.flush()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    path = chosen.out / f"{machine['time'].replace(':', '-')}.json"
+    path.write_text(json.dumps({"machine": machine, "sections": reports}, indent=1))
+    say(f"written to {path}")
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,87 @@
+"""How the benchmarks measure, and what they report.
+
+Every section is a program of its own, so that threads, precision and memory of one leave the others
+alone. Contenders take turns, so that what else the machine does hits all alike, and on a pinned
+core CPU time is read instead of the clock on the wall: waiting for one's turn is not counted.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+
+class Check(NamedTuple):
+    """A figure that is held against a bar; a bar of None means it is only told."""
+
+    what: str
+    value: float
+    unit: str = ""
+    bar: float | None = None
+
+
+class Report(NamedTuple):
+    """What a section found: a table for people, checks, and remarks."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    checks: Sequence[Check]
+    notes: Sequence[str] = ()
+
+
+def pin_one_core() -> None:
+    """Keep this process on one CPU core and XLA on one thread; call before jax is imported."""
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {ONE_THREAD}"
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+
+
+def take_turns(
+    contenders: Mapping[str, Callable[[], object]],
+    rounds: int,
+    clock: Callable[[], float] = time.process_time,
+) -> dict[str, np.ndarray]:
+    """Seconds (rounds,) that each contender took; all run once before the first round."""
+    for run in contenders.values():
+        run()
+    spent: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(rounds):
+        for name, run in contenders.items():
+            start = clock()
+            run()
+            spent[name].append(clock() - start)
+    return {name: np.array(values) for name, values in spent.items()}
+
+
+def show(report: Report) -> None:
+    """Hand a section's report to the program that started it."""
+    print(json.dumps(report._asdict()))
+
+
+def child(module: str, *arguments: str, **environment: str) -> dict:
+    """What `python -m module arguments` prints as JSON in its last line.
+
+    Raises:
+        RuntimeError: it failed; tells its last lines.
+    """
+    ran = subprocess.run(
+        [sys.executable, "-m", module, *arguments],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+    )
+    if ran.returncode:
+        last = " | ".join(ran.stderr.strip().splitlines()[-3:])
+        raise RuntimeError(f"{module} {' '.join(arguments)} ended with {ran.returncode}: {last}")
+    return json.loads(ran.stdout.strip().splitlines()[-1])
