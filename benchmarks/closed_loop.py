@@ -28,13 +28,13 @@ def one(ticks: int, batch: int, repeats: int) -> dict[str, float]:
     import jax
     import numpy as np
 
-    from hector_jax.control.reference import named_command
+    from hector_jax.control.reference import named_command, standing_anchor
     from hector_jax.control.weights import nominal
     from hector_jax.model.effect import last_command
     from hector_jax.robot import load_robot
     from hector_jax.runtime import setup_jax
     from hector_jax.tuning.difftune import TuneConfig, evaluate
-    from hector_jax.tuning.rollout import RolloutConfig, standing_anchor
+    from hector_jax.tuning.rollout import RolloutConfig
 
     setup_jax()
     robot, command = load_robot(), named_command("straight")
@@ -107,7 +107,6 @@ def measure(lengths: list[int], batches: list[int]) -> Report:
             note(f"1 rollout, {ticks} ticks, warm cache", warm)
         many = {}
         for batch in batches:
-            ask(400, batch, cache, repeats=0) if batch == batches[0] else None
             many[batch] = ask(400, batch, cache)
             note(f"{batch} rollouts at once, 400 ticks", many[batch])
 

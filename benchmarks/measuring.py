@@ -73,7 +73,7 @@ def child(module: str, *arguments: str, **environment: str) -> dict:
     """What `python -m module arguments` prints as JSON in its last line.
 
     Raises:
-        RuntimeError: it failed; tells its last lines.
+        RuntimeError: it failed; tells its last line.
     """
     ran = subprocess.run(
         [sys.executable, "-m", module, *arguments],
@@ -82,6 +82,6 @@ def child(module: str, *arguments: str, **environment: str) -> dict:
         text=True,
     )
     if ran.returncode:
-        last = " | ".join(ran.stderr.strip().splitlines()[-3:])
+        last = (ran.stderr.strip().splitlines() or ["nothing on stderr"])[-1]
         raise RuntimeError(f"{module} {' '.join(arguments)} ended with {ran.returncode}: {last}")
     return json.loads(ran.stdout.strip().splitlines()[-1])

@@ -16,13 +16,13 @@ if __name__ == "__main__":
 import jax
 import numpy as np
 
-from hector_jax.control.reference import named_command
+from hector_jax.control.reference import anchor_at, named_command
 from hector_jax.control.walking import WalkConfig, actuate, init_memory, step_plan
 from hector_jax.control.weights import expert
 from hector_jax.robot import load_robot
 from hector_jax.runtime import setup_jax
 from hector_jax.sim import sensing
-from hector_jax.sim.walk import anchor_at, substeps, walk
+from hector_jax.sim.walk import substeps, walk
 from hector_jax.sim.world import ideal
 
 SECONDS = 10.0
