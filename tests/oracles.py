@@ -1,6 +1,7 @@
 """Independent answers for the tests: QPs of known kind, an exact solver, and its differences."""
 
 import daqp
+import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
@@ -23,7 +24,7 @@ def walking_qp(seed: int, horizon: int = 10) -> QP:
     usual = np.array([100, 100, 250, 200, 200, 300] + [1] * 6)
     Q = usual * 10 ** rng.uniform(-1, 1, 12)
     R = np.array([1e-4, 1e-4, 5e-4, 1e-2, 1e-2]) * 10 ** rng.uniform(-1, 1, 5)
-    turn = np.asarray(rot_z(np.float64(rng.uniform(-1, 1))))
+    turn = np.asarray(rot_z(jnp.asarray(rng.uniform(-1, 1))))
     spread = np.array([0.1, 0.1, 0.1, 0.03, 0.03, 0.03, 0.5, 0.5, 0.5, 0.3, 0.3, 0.2])
     state = rng.normal(size=12) * spread * (2.5 if seed % 4 == 0 else 1.0)
 
@@ -37,7 +38,7 @@ def walking_qp(seed: int, horizon: int = 10) -> QP:
         side = 1.0 if ((k + seed) // 5) % 2 else -1.0
         lever = turn @ np.array([0.05 * rng.normal(), 0.07 * side, -0.5])
         B = np.zeros((12, 5))
-        B[6:9, :3] = dt * inverse @ np.asarray(skew(lever))
+        B[6:9, :3] = dt * inverse @ np.asarray(skew(jnp.asarray(lever)))
         B[6:9, 3:] = dt * inverse @ turn[:, 1:]
         B[9:, :3] = dt / mass * np.eye(3)
         response = A @ response

@@ -131,7 +131,7 @@ class _Floors(NamedTuple):
 
 def _floors(config: QpConfig, dtype: jnp.dtype) -> _Floors:
     if jnp.finfo(dtype).bits == 64:
-        floors = _Floors(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-8)
+        floors = _Floors(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-7)
     else:
         floors = _Floors(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4)
     tolerance = config.tolerance or floors.tolerance

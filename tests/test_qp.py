@@ -1,0 +1,246 @@
+"""The QP door against independent answers: solutions, statuses, derivatives."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import (
+    central_difference,
+    dense_rows,
+    exact_solution,
+    general_qp,
+    kkt_residual,
+    walking_qp,
+)
+
+from hector_jax.control.qp import QP, QpConfig, Status, check_solved, solve_qp
+
+WALKING = 500
+SHAPES = [(1, 4), (2, 6), (5, 12), (12, 30), (30, 40), (60, 90), (120, 100)]
+EACH = 143  # of a shape: 1001 general QPs
+
+
+def stack(qps):
+    return QP(*(np.stack(parts) for parts in zip(*qps, strict=True)))
+
+
+@partial(jax.jit, static_argnums=1)
+def solve_all(qps, config=QpConfig()):  # noqa: B008
+    return jax.lax.map(partial(solve_qp, config=config), qps)
+
+
+solve = jax.jit(solve_qp, static_argnums=1)
+
+
+@jax.jit
+def along(qp, tangent):
+    """Solution's x moved along a tangent of the data, and its solution."""
+    solution, moved = jax.jvp(solve_qp, (qp,), (tangent,))
+    return solution, moved.x
+
+
+@pytest.fixture(scope="module")
+def walking():
+    return [walking_qp(seed) for seed in range(WALKING)]
+
+
+def test_walking_qps_are_solved_to_the_first_newton(walking):
+    found = solve_all(stack(walking))
+    check_solved(found)
+    exact = np.stack([exact_solution(qp)[0] for qp in walking])
+    error = np.abs(np.asarray(found.x) - exact)[:, :5].max(axis=1)
+    assert np.median(error) <= 1e-8
+    assert error.max() <= 1e-4
+    assert found.iterations.max() <= 20
+
+
+def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking):
+    some = walking[::5]
+    found = solve_all(stack([QP(*(np.float32(part) for part in qp)) for qp in some]))
+    assert found.x.dtype == jnp.float32
+    error = np.array(
+        [np.abs(x - exact_solution(qp)[0])[:5].max() for x, qp in zip(found.x, some, strict=True)]
+    )
+    solved = np.asarray(found.status) == Status.SOLVED
+    assert (error <= 0.1).mean() >= 0.99
+    assert (error[solved] <= 1.0).all()
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES)
+def test_general_qps_are_right_or_say_that_they_are_not(n, m):
+    made = [general_qp(seed, n, m) for seed in range(EACH)]
+    found = solve_all(stack([qp for qp, _, _ in made]))
+    solved = np.asarray(found.status) == Status.SOLVED
+    assert (~solved).sum() <= 1
+    for i in np.flatnonzero(solved):
+        qp, x, cond = made[i]
+        residual = kkt_residual(qp, np.asarray(found.x[i]), np.asarray(found.y[i]))
+        assert residual <= (1e-8 if cond <= 1e4 else 1e-6), (i, residual, cond)
+        if cond <= 1e4:
+            np.testing.assert_allclose(found.x[i], x, atol=1e-4 * np.abs(x).max())
+
+
+INF = np.inf
+
+
+def small(P=((2.0, 0.0), (0.0, 2.0)), q=(-2.0, -5.0), A=((1.0, 0.0),), l=(-INF,), u=(INF,)):  # noqa: E741
+    return QP(*(np.array(part, float) for part in (P, q, A, l, u)))
+
+
+@pytest.mark.parametrize(
+    ("qp", "status"),
+    [
+        (small(l=(2.0,), u=(1.0,)), Status.INFEASIBLE),
+        (small(A=((1.0, 1.0), (1.0, 1.0)), l=(1.0, -INF), u=(INF, 0.0)), Status.INFEASIBLE),
+        (small(A=((0.0, 0.0),), l=(1.0,), u=(2.0,)), Status.INFEASIBLE),
+        (small(P=((2.0, 0.0), (0.0, 0.0)), q=(0.0, -1.0)), Status.UNBOUNDED),
+        (small(P=((0.0, 0.0), (0.0, 0.0)), q=(0.0, 1.0)), Status.UNBOUNDED),
+        (small(P=((2.0, 0.0), (0.0, -1.0))), Status.BAD_DATA),
+        (small(q=(np.nan, 0.0)), Status.BAD_DATA),
+        (small(q=(INF, 0.0)), Status.BAD_DATA),
+        (small(P=((np.nan, 0.0), (0.0, 1.0))), Status.BAD_DATA),
+        (small(A=((INF, 0.0),)), Status.BAD_DATA),
+        (small(u=(np.nan,)), Status.BAD_DATA),
+    ],
+)
+def test_a_qp_without_a_solution_says_so(qp, status):
+    found = solve(qp)
+    assert Status(int(found.status)) == status
+    assert all(np.isfinite(part).all() for part in (found.x, found.y))
+    _, moved = along(qp, jax.tree.map(jnp.ones_like, qp))
+    assert not np.asarray(moved).any()
+    with pytest.raises(ValueError, match=status.name):
+        check_solved(found)
+
+
+def test_small_cases_by_hand():
+    free = solve(small())
+    np.testing.assert_allclose(free.x, [1.0, 2.5], atol=1e-9)
+    pressed = solve(small(u=(0.5,)))
+    np.testing.assert_allclose(pressed.x, [0.5, 2.5], atol=1e-9)
+    np.testing.assert_allclose(pressed.y, [1.0], atol=1e-8)  # positive: the upper bound presses
+    held = solve(small(A=((1.0, 1.0),), l=(1.0,), u=(1.0,)))
+    np.testing.assert_allclose(held.x, [-0.25, 1.25], atol=1e-9)
+    line = solve(QP(*(np.array(v, float) for v in ([[3.0]], [-6.0], [[1.0]], [-1.0], [1.0]))))
+    np.testing.assert_allclose(line.x, [1.0], atol=1e-9)
+    for found in (free, pressed, held, line):
+        check_solved(found)
+
+
+def test_block_rows_are_those_of_the_dense_matrix(walking):
+    qp = walking[3]
+    block, dense = solve(qp), solve(qp._replace(A=dense_rows(qp.A)))
+    np.testing.assert_allclose(block.x, dense.x, atol=1e-8)
+    np.testing.assert_allclose(block.y, dense.y, atol=1e-8)
+
+
+def test_a_batch_is_a_loop(walking):
+    qps = stack(walking[:6])
+    batch, loop = jax.jit(jax.vmap(solve_qp))(qps), solve_all(qps)
+    np.testing.assert_allclose(batch.x, loop.x, atol=1e-8)
+    np.testing.assert_array_equal(batch.status, loop.status)
+
+
+def test_the_problem_may_be_measured_in_any_unit(walking):
+    qp = walking[7]
+    plain = solve(qp)
+    unit = np.logspace(-3, 3, qp.q.size)
+    scaled = qp._replace(
+        P=1e4 * qp.P * np.outer(unit, unit),
+        q=1e4 * qp.q * unit,
+        A=qp.A * unit.reshape(len(qp.A), 1, -1),
+    )
+    np.testing.assert_allclose(unit * solve(scaled).x, plain.x, atol=1e-6)
+
+
+def test_jaxopt_is_a_second_solver_behind_the_door(walking):
+    config = QpConfig(solver="jaxopt")
+    some = stack(walking[:4])
+    ours, theirs = solve_all(some), solve_all(some, config)
+    check_solved(theirs)
+    np.testing.assert_allclose(theirs.x, ours.x, atol=1e-6)
+    tangent = jax.tree.map(jnp.zeros_like, walking[1])._replace(q=jnp.ones(50))
+    mine = jax.jvp(solve_qp, (walking[1],), (tangent,))[1].x
+    other = jax.jvp(partial(solve_qp, config=config), (walking[1],), (tangent,))[1].x
+    np.testing.assert_allclose(other, mine, atol=1e-6 * np.abs(mine).max())
+
+
+def tangents(seed, qp):
+    rng = np.random.default_rng(seed)
+    like = jax.tree.map(lambda v: rng.normal(size=v.shape) * np.abs(np.where(v == INF, 0, v)), qp)
+    P = 0.5 * (like.P + like.P.T)
+    zero = lambda v: np.where(np.isfinite(v), 0.0, 0.0)  # noqa: E731
+    return [
+        like._replace(P=zero(P), A=zero(like.A), l=zero(like.l), u=zero(like.u)),
+        QP(1e-2 * P, zero(like.q), 1e-2 * like.A, zero(like.l), zero(like.u)),
+    ]
+
+
+def test_derivative_is_that_of_an_exact_solver(walking):
+    errors = []
+    for seed in range(60):
+        qp = walking[seed]
+        for tangent in tangents(seed, qp):
+            _, moved = along(qp, tangent)
+            # A change of the active set inside the step shows in the larger one only.
+            found = [central_difference(qp, tangent, step) for step in (1e-5, 1e-6)]
+            size = np.linalg.norm(found[1])
+            errors.append(min(np.linalg.norm(moved - f) for f in found) / size)
+    assert np.median(errors) <= 1e-7, np.median(errors)
+    assert np.quantile(errors, 0.95) <= 1e-6, np.quantile(errors, 0.95)
+    assert np.max(errors) <= 1e-3, np.max(errors)
+
+
+def test_forward_and_reverse_are_one_derivative(walking):
+    pull = jax.jit(lambda qp, seed: jax.vjp(lambda qp: solve_qp(qp).x, qp)[1](seed)[0])
+    for seed in range(10):
+        qp, rng = walking[seed], np.random.default_rng(seed)
+        cotangent = jnp.asarray(rng.normal(size=50))
+        back = pull(qp, cotangent)
+        for tangent in tangents(seed, qp):
+            _, moved = along(qp, tangent)
+            reverse = sum(float(jnp.vdot(b, t)) for b, t in zip(back, tangent, strict=True))
+            scale = np.linalg.norm(moved) * np.linalg.norm(cotangent)
+            assert abs(float(moved @ cotangent) - reverse) <= 1e-9 * scale
+
+
+def test_bounds_move_the_solution():
+    qp = small(u=(0.5,))
+    zero = jax.tree.map(jnp.zeros_like, qp)
+    _, moved = along(qp, zero._replace(l=jnp.zeros(1), u=jnp.ones(1)))
+    np.testing.assert_allclose(moved, [1.0, 0.0], atol=1e-8)
+
+
+def test_derivative_is_finite_where_it_is_one_sided():
+    weak = small(u=(1.0,))  # the row passes through the free minimiser: active without force
+    zero = jax.tree.map(jnp.zeros_like, weak)._replace(l=jnp.zeros(1), u=jnp.zeros(1))
+    _, moved = along(weak, zero._replace(q=jnp.array([-1.0, 0.0])))
+    assert 0.0 <= moved[0] <= 0.5  # between that of the row held and that of the row free
+    apex = small(
+        P=np.eye(2),
+        q=(0.0, 1.0),
+        A=((1.0, -0.5), (1.0, 0.5), (0.0, 1.0)),
+        l=(-INF, 0, 0),
+        u=(0, INF, INF),
+    )
+    found, moved = along(apex, jax.tree.map(jnp.ones_like, apex))
+    check_solved(found)
+    np.testing.assert_allclose(found.x, 0.0, atol=1e-8)
+    assert np.isfinite(moved).all()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"q": np.zeros(3)}, {"A": np.zeros((1, 3))}, {"u": np.zeros(2)}, {"P": np.zeros((3, 3))}],
+)
+def test_shapes_that_do_not_fit_are_refused(change):
+    with pytest.raises(ValueError, match="QP shapes"):
+        solve_qp(small()._replace(**change))
+
+
+@pytest.mark.parametrize("wrong", [{"solver": "osqp"}, {"tolerance": 0.0}, {"max_iterations": -1}])
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match="QpConfig"):
+        QpConfig(**wrong)
