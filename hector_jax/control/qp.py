@@ -122,7 +122,7 @@ class _Floors(NamedTuple):
 
     tolerance: float  # residuals of a solved problem
     target: float  # residuals and complementarity at which the iterations stop
-    proximal: float  # rho and delta of the interior point; rho of the active set
+    proximal: float  # rho of the active set; the interior point starts from ten times it
     cap: float  # largest W in a factorised matrix
     rounding: float  # a multiplier or violation this small has no sign
     kink: float  # e of the derivative
@@ -382,7 +382,7 @@ def _choose(first: Array, a, b):
 class _Loop(NamedTuple):
     point: _Point
     slack: Array  # (2, m), positive; 1 on sides that are not there
-    rho: Array
+    proximal: Array  # (2,) rho and delta
     iterations: Array
     going: Array
 
@@ -392,8 +392,7 @@ def _interior_point(
 ) -> tuple[_Point, Array, Array]:
     """Mehrotra's proximal method, cold; last finite point, its slacks, iterations."""
     dtype = qp.q.dtype
-    # soft enough for the factorisation, stiff enough for the size of the rows
-    delta = jnp.clip(0.01 * qp.reach, 0.01 / floors.cap, 1.0 / floors.cap)
+    least = jnp.array([10.0 * floors.proximal, 50.0 * jnp.finfo(dtype).eps], dtype)
     sign = jnp.asarray(_SIGN, dtype)
     free = jnp.zeros_like(qp.side).at[0].set(qp.equality)  # sides whose multiplier has no sign
     held = qp.side | free
@@ -410,14 +409,16 @@ def _interior_point(
     def advance(state: _Loop) -> _Loop:
         (x, z), slack = state.point, state.slack
         dual, primal, mu = residuals(state.point, slack)
-        inverse = jnp.where(held, 1.0 / jnp.where(free, delta, slack + delta * z), 0.0)
+        rho, delta = state.proximal
+        softness = jnp.where(free, 0.1 / floors.cap, slack + delta * z)
+        inverse = jnp.where(held, 1.0 / softness, 0.0)
         weight = inverse * jnp.where(free, 1.0, z)
-        factor = _cholesky(_plus_gram(qp.P + state.rho * eye, qp.A, weight[0] + weight[1]))
+        factor = _cholesky(_plus_gram(qp.P + rho * eye, qp.A, weight[0] + weight[1]))
 
         def direction(product: Array) -> tuple[Array, Array, Array]:
             """Newton step that takes slack * z to slack * z + product."""
             dx, dz = jnp.zeros_like(x), inverse * product - weight * primal
-            for _ in range(2):  # the second pass takes off what rounding and rho did
+            for _ in range(3):  # later passes take off what rounding and rho did
                 step = -cho_solve(
                     (factor, True), dual + qp.P @ dx + _columns(qp.A, _multiplier(dz))
                 )
@@ -440,21 +441,22 @@ def _interior_point(
         dx, dz, dslack = direction(jnp.where(qp.side, product + centre - dslack * dz, 0.0))
         step = jnp.minimum(0.995 * longest(dz, dslack), 1.0)
         new = (_Point(x + step * dx, z + step * dz), slack + step * dslack)
-        # a factorisation that fails is tried again with a larger rho
+        # a factorisation that fails is tried again further from singular
         fine = jnp.isfinite(jnp.sum(new[0].x) + jnp.sum(new[0].z) + jnp.sum(new[1]))
         point, slack = _choose(fine, new, (state.point, state.slack))
-        rho = jnp.where(fine, jnp.maximum(0.1 * state.rho, floors.proximal), 100.0 * state.rho)
+        factors = jnp.where(fine, 0.1, jnp.array([10.0, 100.0], dtype))
+        proximal = jnp.maximum(factors * state.proximal, least)
         done = jnp.max(_evidence(qp, point)) <= floors.target
         infeasible, unbounded = _certificates(floors, qp, point)
         iterations = state.iterations + 1
-        going = ~done & ~infeasible & ~unbounded & (rho < 1.0)
+        going = ~done & ~infeasible & ~unbounded & (proximal[0] < 1.0)
         going &= iterations < config.max_iterations
-        return _Loop(point, slack, rho, iterations, going)
+        return _Loop(point, slack, proximal, iterations, going)
 
     start = _Loop(
         _Point(jnp.zeros_like(qp.q), qp.side.astype(dtype)),
         jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0),
-        jnp.asarray(floors.proximal, dtype),
+        least,
         jnp.zeros((), jnp.int32),
         wanted,
     )
