@@ -234,7 +234,7 @@ def test_a_fall_halves_the_step_goes_back_and_is_told(monkeypatch):
         expected = step_weights(TuneConfig(), best.weights, best.evaluation.gradient, now.step)
         np.testing.assert_array_equal(vector(now.weights), vector(expected))
         if before.step:
-            wanted = min(1.0, 1.5 * before.step) if before.accepted else before.step / 2
+            wanted = min(1.0, 2.0 * before.step) if before.accepted else before.step / 2
             assert now.step == wanted
     for weights in (found.ten, found.converged):
         assert weights.Q.velocity[2] <= wall

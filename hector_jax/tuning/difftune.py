@@ -43,7 +43,7 @@ class TuneConfig:
     iterations: int = 100  # at most
     patience: int = 10  # iterations over which the loss must fall
     gain: float = 5e-3  # by this share at least, or the tuning has converged
-    smallest_step: float = 1 / 16  # of the full step; below it the tuning has converged
+    smallest_step: float = 1 / 128  # of the full step; below it the tuning has converged
     residual: float = 1e-6  # worst relative KKT residual that is believed
 
     def __post_init__(self) -> None:
@@ -218,7 +218,7 @@ def tune(
             tried = tried._replace(accepted=False, reason="the loss rose")
         note(tried)
         if tried.accepted:
-            best, share = tried, min(1.0, 1.5 * share)
+            best, share = tried, min(1.0, 2.0 * share)
         else:
             share /= 2.0
         if count <= PAPER_ITERATIONS:
