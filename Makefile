@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	>/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: help setup tune test test-all check format lock
+.PHONY: help setup tune test test-all bench check format lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -31,6 +31,9 @@ test: $(STAMP) ## the fast suite (under 8 minutes on 2 cores)
 
 test-all: $(STAMP) ## the fast suite and the slow stories
 	@$(BIN)/pytest -q -n 2 -m "slow or not slow"
+
+bench: $(STAMP) ## benchmarks on this machine; peers come with pip install -e ".[bench]"
+	@$(BIN)/python -m benchmarks
 
 check: $(STAMP) ## format, lint and types
 	@$(BIN)/ruff format --check --quiet .
