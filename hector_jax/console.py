@@ -47,7 +47,9 @@ def bar(title: str) -> Iterator[Tell]:
     def tell(done: int, of: int, remark: str = "") -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last >= _QUIET:
+        if remark == "compiling":
+            say("  compiling")
+        elif now - last >= _QUIET:
             say(f"  {done}/{of} after {now - start:.0f} s  {remark}".rstrip())
             last = now
 

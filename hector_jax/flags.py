@@ -69,7 +69,7 @@ class Walk:
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say what this machine offers: versions, device, precision, cache; and test it."""
+    """Say what this machine offers: versions, device, precision, cache, video; and test it."""
 
 
 Command = Collect | Train | Tune | Evaluate | Walk | Doctor

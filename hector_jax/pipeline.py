@@ -231,6 +231,7 @@ def judge(
         for plant, seed in zip(plants, seeds, strict=True)
     ]
     with bar(title) as tell:
+        tell(0, len(jobs), "compiling")
         walks = list(_told(walk_many(pool, config.rollout.walk, robot, jobs), len(jobs), tell))
     each = len(plants)
     return {name: walks[i * each : (i + 1) * each] for i, name in enumerate(sets)}
@@ -262,4 +263,11 @@ def as_line(name: str, iteration: Iteration) -> str:
         "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
         "gradient_log": dict(zip(WEIGHT_NAMES, vector(gradient), strict=True)),
     }
-    return json.dumps(row) + "\n"
+    return json.dumps(_finite(row), allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN and no infinity: null in their place."""
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    return None if isinstance(value, float) and not np.isfinite(value) else value

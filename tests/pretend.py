@@ -74,6 +74,7 @@ def pretend_score(loss, fallen=False):
         rms_euler=np.array([0.02, 0.03, 0.01]),
         rms_position=np.array([0.02, 0.01, 0.005]),
         fallen=np.array(fallen),
+        residual=np.array(1e-14),
     )
 
 

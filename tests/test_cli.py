@@ -166,3 +166,12 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    "wrong", [("--processes", "0"), ("--iterations", "3"), ("--seeds", "0"), ("--alpha", "both")]
+)
+def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
+    line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)
+    assert wrong[0] in line
+    assert not (tmp_path / "run").exists()

@@ -142,7 +142,7 @@ def test_a_sound_evaluation_is_believed():
         ({"loss": np.nan}, "not finite"),
         ({"gradient": random_tree(0, np.inf)}, "not finite"),
         ({"fallen": 0.01}, "the robot fell"),
-        ({"residual": 2e-3}, r"QP residual 2.0e-03 above 1e-06"),
+        ({"residual": 2e-3}, r"QP residual 2.0e-03 above 1e-08"),
         ({"residual": np.nan}, "QP residual nan"),
     ],
 )

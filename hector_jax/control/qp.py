@@ -358,7 +358,9 @@ def _active_set(
         active = _choose(fine, state.active ^ wrong, state.active)
         rho = jnp.where(fine, state.rho, 100.0 * state.rho)
         iterations = state.iterations + 1
-        going = (~fine | jnp.any(wrong)) & (rho < 1.0) & (iterations < limit)
+        # a flat P makes more passes worth their while though the guess stays
+        going = ~fine | jnp.any(wrong) | (jnp.max(proof) > floors.target)
+        going &= (rho < 1.0) & (iterations < limit)
         return _Guess(point, active, best, proof, rho, iterations, going)
 
     first = _Guess(

@@ -42,6 +42,7 @@ class Score(NamedTuple):
     rms_euler: Float[np.ndarray, "*seeds 3"]  # roll, pitch, yaw [rad], up to a fall
     rms_position: Float[np.ndarray, "*seeds 3"]  # x, y, z [m], up to a fall
     fallen: Bool[np.ndarray, "*seeds"]
+    residual: Float[np.ndarray, "*seeds"]  # worst relative KKT residual of a plan
 
 
 class Interval(NamedTuple):
@@ -87,6 +88,7 @@ def score(config: LossConfig, walk: Trajectory) -> Score:
         rms_euler=_rms(np.asarray(walk.state.euler) - walk.reference.euler, fallen),
         rms_position=_rms(np.asarray(walk.state.position) - walk.reference.position, fallen),
         fallen=np.asarray(fallen.any()),
+        residual=np.asarray(walk.residual, float).max(),
     )
 
 
@@ -178,6 +180,7 @@ def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
     one = verdict.scores[name]
     found["falls"] = falls(verdict, name)
     found["seeds"] = verdict.seeds.tolist()
+    found["residual"] = float(one.residual.max())
     found["L_ctrl_switching"] = float(one.switching.mean())
     found["rms"] = {
         key: [x if np.isfinite(x) else None for x in values.tolist()]

@@ -47,6 +47,9 @@ _UNITS = {
 }
 
 
+SOLVED = 1e-6  # worst relative KKT residual of a command that is learned from
+
+
 class Walks(NamedTuple):
     """Walks with what was asked for, stacked; trajectories are sampled at the plan interval."""
 
@@ -309,8 +312,8 @@ def make_dataset(
         config: the gait that was walked.
 
     Returns:
-        The dataset, with numpy arrays, and how many samples were dropped because of a fall. The
-        first HISTORY - 1 ticks of a walk have no full history and are no samples.
+        The dataset, with numpy arrays, and how many samples were dropped because of a fall or an
+        unsolved QP. The first HISTORY - 1 ticks of a walk have no full history and are no samples.
     """
     config = config or GaitConfig()
     count = len(walks.fallen)
@@ -350,7 +353,8 @@ def _samples(
         jnp.isfinite(w).reshape(len(tick), -1).all(axis=1)
         for w in jax.tree.leaves((commands, label))
     ]
-    usable = jnp.stack([~walk.fallen[first:], *finite]).all(axis=0)
+    solved = walk.residual[first:] <= SOLVED
+    usable = jnp.stack([~walk.fallen[first:], solved, *finite]).all(axis=0)
     return Dataset(window, label, before, jnp.full_like(tick, number), tick), usable
 
 

@@ -44,7 +44,7 @@ class TuneConfig:
     patience: int = 10  # iterations over which the loss must fall
     gain: float = 5e-3  # by this share at least, or the tuning has converged
     smallest_step: float = 1 / 128  # of the full step; below it the tuning has converged
-    residual: float = 1e-6  # worst relative KKT residual that is believed
+    residual: float = 1e-8  # worst relative KKT residual that is believed: that of a solved QP
 
     def __post_init__(self) -> None:
         if self.update not in ("relative", "literal"):

@@ -36,6 +36,11 @@ class RolloutConfig:
             raise ValueError(f"RolloutConfig.ticks must be at least 2, got {self.ticks}")
         if self.lead < 0:
             raise ValueError(f"RolloutConfig.lead must be at least 0 ticks, got {self.lead}")
+        if self.lead > -self.walk.gait.first_tick:
+            raise ValueError(
+                "RolloutConfig.lead must not reach back before the gait starts "
+                f"({-self.walk.gait.first_tick} ticks), got {self.lead}"
+            )
 
 
 class Carry(NamedTuple):
