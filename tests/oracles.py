@@ -76,7 +76,9 @@ def general_qp(seed: int, n: int, m: int) -> tuple[QP, np.ndarray, float]:
     values = np.logspace(0, -np.log10(cond), n) if n > 1 else np.ones(1)
     values[n // 2 :] *= kind != "half rank"
     values *= kind != "zero"
-    basis = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    basis = np.eye(n)
+    for mirror in rng.normal(size=(4, n)):  # a QR is slow where other processes hold the cores
+        basis -= np.outer(2.0 * (basis @ mirror) / (mirror @ mirror), mirror)
     P = 10 ** rng.uniform(-3, 3) * (basis * values) @ basis.T
     scale = 10 ** rng.uniform(-1, 1, n) if kind == "scaled" else np.ones(n)
     P = 0.5 * (P + P.T) * np.outer(scale, scale)
