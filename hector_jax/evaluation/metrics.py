@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -78,13 +77,13 @@ def score(config: LossConfig, walk: Trajectory) -> Score:
 
     Source: Eq. 11.
     """
-    parts = losses(jax.tree.map(jnp.asarray, walk))
+    parts = losses(walk)
     fallen = np.asarray(walk.fallen)
     whole = jax.tree.map(lambda x: np.asarray(x, float), (total(config, parts), parts))
     return Score(
         whole[0],
         *whole[1],
-        switching=np.asarray(switch_loss(jax.tree.map(jnp.asarray, walk)), float),
+        switching=np.asarray(switch_loss(walk), float),
         rms_euler=_rms(np.asarray(walk.state.euler) - walk.reference.euler, fallen),
         rms_position=_rms(np.asarray(walk.state.position) - walk.reference.position, fallen),
         fallen=np.asarray(fallen.any()),

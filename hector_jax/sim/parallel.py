@@ -131,7 +131,7 @@ def _walk_one(
     def read(qpos: Array, qvel: Array) -> sensing.Reading:
         return sensing.unpack_reading(jnp.concatenate([qpos, qvel, jnp.zeros(1)])[where])
 
-    def millisecond(carry: _Carry, when: Array) -> tuple[_Carry, Observed]:
+    def millisecond(carry: _Carry, when: tuple[Array, Array]) -> tuple[_Carry, Observed]:
         tick, substep = when
         before = read(carry.qpos, carry.qvel)
         motors, yaw, torque = drive(

@@ -11,6 +11,7 @@ the larger of the last error and a fixed one, and smoothness stops.
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -58,6 +59,7 @@ def _squared_changes(command: Wrench, fallen: Bool[Array, " T"]) -> Float[Array,
 
 def losses(trajectory: Trajectory) -> Losses:
     """Parts of the loss of one walk. Source: Eq. 11."""
+    trajectory = jax.tree.map(jnp.asarray, trajectory)  # MuJoCo's walks come as numpy
     state, reference, fallen = trajectory.state, trajectory.reference, trajectory.fallen
     euler = jnp.sum((state.euler - reference.euler) ** 2, axis=-1)
     position = jnp.sum((state.position - reference.position) ** 2, axis=-1)
@@ -71,6 +73,7 @@ def losses(trajectory: Trajectory) -> Losses:
 
 def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
     """The part of L_ctrl at changes of stance: about 2 (m g)^2 each, whatever the weights."""
+    trajectory = jax.tree.map(jnp.asarray, trajectory)
     switched = jnp.any(trajectory.contact[1:] != trajectory.contact[:-1], axis=-1)
     return jnp.sum(jnp.where(switched, _squared_changes(trajectory.command, trajectory.fallen), 0))
 
