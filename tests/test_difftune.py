@@ -305,16 +305,28 @@ def test_aligned_loss_weights_are_powers_of_ten_that_level_the_gradients():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "least"), [("straight", 0.15), ("c", 0.20), ("s", 0.20)])
-def test_ten_iterations_from_nominal_lower_the_loss_inside_the_box(name, least):
-    # The straight walk has less to gain: over a third of its loss is the change of stance, which
-    # no weights alter.
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("straight", marks=pytest.mark.xfail(strict=True, reason="16.2 % is measured")),
+        "c",
+        "s",
+    ],
+)
+def test_ten_iterations_from_nominal_lower_the_loss_by_a_fifth(name):
     command = named_command(name)
     found = tune(TuneConfig(iterations=10), ROBOT, nominal(), command, ANCHOR, last_command)
     losses = [float(i.evaluation.loss) for i in found.history]
     drop = 1.0 - losses[-1] / losses[0]
     print(f"{name}: L {losses[0]:.4g} -> {losses[-1]:.4g}, {drop:.1%} down")
-    assert drop >= least
+    assert drop >= 0.20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["straight", "c", "s"])
+def test_ten_iterations_from_nominal_stay_inside_the_box_and_are_accepted(name):
+    command = named_command(name)
+    found = tune(TuneConfig(iterations=10), ROBOT, nominal(), command, ANCHOR, last_command)
     assert len(found.history) == 11
     lower, upper = map(vector, bounds())
     for iteration in found.history:
