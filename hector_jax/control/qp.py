@@ -559,6 +559,7 @@ def _where_sane(sane: Array, qp: QP) -> QP:
     return _choose(sane, qp, plain)
 
 
+@partial(jax.jit, static_argnums=0)
 def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     """Solution, the ratios W (2, m) of its derivative, and the problem they belong to."""
     floors = _floors(config, qp.q.dtype)

@@ -30,6 +30,7 @@ def centroidal_rates(
     return wrench.force.sum(axis=0) / robot.mass - robot.gravity, torque.sum(axis=0)
 
 
+@jax.jit  # traced once for the four stages of a step
 def rates(robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"]) -> State:
     """Time derivative of the state; `feet` are the foot points in the world [m]. Source: Eq. 2."""
     acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
