@@ -42,6 +42,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, Int
 
+from hector_jax.control import pivot
 
 SAVED = "qp"
 """Name of what `jax.checkpoint` is to keep of a solve, so that none is solved again backwards."""
@@ -340,7 +341,9 @@ def _worst(qp: _Normal, wrong: Array, active: Array, by: Array) -> Array:
     by = jnp.where(wrong, by, 0.0).reshape(blocks)
     active = active.reshape(blocks)
     largest = lambda v: jnp.max(v, axis=(0, 2), keepdims=True)  # noqa: E731
-    bar = jnp.where(active, largest(jnp.where(active, by, 0.0)), largest(jnp.where(active, 0.0, by)))
+    bar = jnp.where(
+        active, largest(jnp.where(active, by, 0.0)), largest(jnp.where(active, 0.0, by))
+    )
     return wrong & (by >= 0.9 * bar).reshape(wrong.shape)
 
 
@@ -409,6 +412,27 @@ def _active_set(
     )
     end = lax.while_loop(lambda state: state.going, improve, first)
     return end.best, end.proof, end.iterations
+
+
+def _first_guess(qp: _Normal, loose: _Point) -> tuple[_Point, Array]:
+    """Where the active set starts from, `loose` being the minimiser without rows."""
+
+    def violated(qp: _Normal) -> tuple[_Point, Array]:
+        outside = _violation(qp, loose.x)
+        return loose, _worst(qp, outside > 0, jnp.zeros_like(qp.side), outside)
+
+    def pivoted(qp: _Normal) -> tuple[_Point, Array]:
+        held = qp.side | qp.equality
+        upper, lower = jnp.where(held, qp.bound, jnp.asarray(_SIGN, qp.q.dtype) * jnp.inf)
+        x, y, side, settled = pivot.guess(qp.P, qp.q, _on_diagonal(qp.A), lower, upper)
+        z = jnp.maximum(jnp.asarray(_SIGN, y.dtype) * y, 0.0)
+        usable = (settled > 0) & jnp.isfinite(jnp.sum(x) + jnp.sum(y))
+        return _choose(usable, (_Point(x, z), jnp.stack([side > 0, side < 0])), violated(qp))
+
+    on_gpu = (
+        jax.default_backend() == "gpu" and qp.A.ndim == 3 and pivot.fits(len(qp.q), len(qp.row))
+    )
+    return lax.platform_dependent(qp, cuda=pivoted, default=violated) if on_gpu else violated(qp)
 
 
 def _choose(first: Array, a, b):
@@ -580,10 +604,8 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     loose = _Point(-cho_solve((factor, True), normal.q), nothing)
     tries = config.active_set_tries
     if config.solver == "interior_point":
-        outside = _violation(normal, loose.x)
-        nowhere = jnp.zeros_like(normal.side)
-        guess = _worst(normal, outside > 0, nowhere, outside)
-        quick, proof, first = _active_set(floors, normal, loose, guess, sane, tries)
+        start, guess = _first_guess(normal, loose)
+        quick, proof, first = _active_set(floors, normal, start, guess, sane, tries)
         settled = jnp.max(proof) <= floors.target
         near, slack, steps = _interior_point(config, floors, normal, sane & ~settled)
     else:
