@@ -65,17 +65,16 @@ def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking):
     )
     solved = np.asarray(found.status) == Status.SOLVED
     assert (error <= 0.1).mean() >= 0.99
-    assert (error[solved] <= 1.0).all()
+    assert (error[solved] <= 0.1).all()
 
 
 @pytest.mark.parametrize(("n", "m"), SHAPES)
-def test_general_qps_are_right_or_say_that_they_are_not(n, m):
+def test_general_qps_are_right(n, m):
     made = [general_qp(seed, n, m) for seed in range(EACH)]
     found = solve_all(stack([qp for qp, _, _ in made]))
     solved = np.asarray(found.status) == Status.SOLVED
-    assert (~solved).sum() <= 1
-    for i in np.flatnonzero(solved):
-        qp, x, cond = made[i]
+    assert solved.all()
+    for i, (qp, x, cond) in enumerate(made):
         residual = kkt_residual(qp, np.asarray(found.x[i]), np.asarray(found.y[i]))
         assert residual <= (1e-8 if cond <= 1e4 else 1e-6), (i, residual, cond)
         if cond <= 1e4:

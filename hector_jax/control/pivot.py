@@ -45,7 +45,7 @@ class _Softness(NamedTuple):
 def _softness(dtype: jnp.dtype) -> _Softness:
     if jnp.finfo(dtype).bits == 64:
         return _Softness(1e4, 1e-8, 1e-10, 1)
-    return _Softness(10.0, 1e-3, 3e-6, 3)  # a row let go divides by 1 / c: 32 bits bear little
+    return _Softness(30.0, 1e-3, 3e-6, 3)  # a row let go divides by 1 / c: 32 bits bear little
 
 
 def fits(variables: int, rows: int) -> bool:

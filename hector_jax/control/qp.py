@@ -525,6 +525,39 @@ def _interior_point(
     return end.point, end.slack, end.iterations
 
 
+def _approach(
+    config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
+) -> tuple[_Point, Array, Array]:
+    """The interior point, again in the sizes of what it found where it did not get near.
+
+    One size was taken for x and slope from q and the bounds. Where rows hold x far from where q
+    would have it they differ, and what regularises one is too coarse for the other.
+    """
+
+    def attempt(state: tuple) -> tuple:
+        point, slack, steps, (size, slope), _ = state
+        sized = qp._replace(
+            P=size / slope * qp.P, q=qp.q / slope, bound=qp.bound / size, reach=qp.reach / size
+        )
+        found, room, more = _interior_point(config, floors, sized, wanted)
+        found = _Point(size * found.x, slope * found.z)
+        first = steps == 0
+        better = first | (jnp.max(_evidence(qp, found)) < jnp.max(_evidence(qp, point)))
+        point, slack = _choose(better, (found, size * room), (point, slack))
+        near = jnp.max(_evidence(qp, point)) <= floors.target
+        proved = jnp.any(jnp.stack(_certificates(floors, qp, point)))
+        sizes = jnp.stack(
+            [_largest(point.x), jnp.maximum(_largest(qp.P @ point.x), _largest(qp.q))]
+        )
+        again = first & ~near & ~proved & jnp.all(sizes > 0.0)
+        return point, slack, steps + more, jnp.where(again, sizes, 1.0), again
+
+    nowhere = _Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
+    ones, none = jnp.ones(2, qp.q.dtype), jnp.zeros((), jnp.int32)
+    start = (nowhere, jnp.ones_like(qp.bound), none, ones, wanted)
+    return lax.while_loop(lambda state: state[-1], attempt, start)[:3]
+
+
 def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, Array, Array]:
     """BoxOSQP of jaxopt, its derivative left aside; returns what `_interior_point` does."""
     from jaxopt import BoxOSQP
@@ -607,7 +640,7 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
         start, guess = _first_guess(normal, loose)
         quick, proof, first = _active_set(floors, normal, start, guess, sane, tries)
         settled = jnp.max(proof) <= floors.target
-        near, slack, steps = _interior_point(config, floors, normal, sane & ~settled)
+        near, slack, steps = _approach(config, floors, normal, sane & ~settled)
     else:
         quick, proof = loose, jnp.full(3, jnp.inf, dtype)
         first, settled = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
@@ -616,7 +649,9 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     hopeful = sane & ~settled & ~infeasible & ~unbounded
     # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
     pushes = near.z * normal.reach > slack * _largest(near.z)
-    exact, exact_proof, last = _active_set(floors, normal, near, pushes, hopeful, tries)
+    exact, exact_proof, last = _active_set(
+        floors, normal, near, pushes, hopeful, config.max_iterations
+    )
     point = quick
     for other, its_proof in ((near, _evidence(normal, near)), (exact, exact_proof)):
         better = ~settled & (jnp.max(its_proof) < jnp.max(proof))
