@@ -31,6 +31,13 @@ class Wrench(NamedTuple):
     moment: Float[Array, "*batch 2 3"]  # [N m]
 
 
+class Push(NamedTuple):
+    """Force on the centre of mass and torque about it."""
+
+    force: Float[Array, "*batch 3"]  # [N]
+    torque: Float[Array, "*batch 3"]  # [N m]
+
+
 class Trajectory(NamedTuple):
     """One walk, sampled evenly; every world returns this and nothing else.
 
@@ -83,3 +90,8 @@ def unpack_wrench(u: Float[Array, "12"]) -> Wrench:
 def zero_wrench(shape: tuple[int, ...] = ()) -> Wrench:
     """No wrench on either foot, with leading axes `shape`."""
     return Wrench(jnp.zeros((*shape, 2, 3)), jnp.zeros((*shape, 2, 3)))
+
+
+def zero_push() -> Push:
+    """No push."""
+    return Push(jnp.zeros(3), jnp.zeros(3))
