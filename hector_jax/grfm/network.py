@@ -50,7 +50,7 @@ from hector_jax.trajectory import Wrench, zero_push
 HIDDEN = {"paper": (64, 64, 64), "residual": (32, 32)}  # widths of the layers, by variant
 MEMBERS = {"paper": 1, "residual": 4}  # nets of each kind that are trained side by side
 VARIANTS = tuple(HIDDEN)
-BOUND = 2.0  # most that a residual net adds, in units of what the linear part leaves
+BOUND = 1.0  # most that a residual net adds, in units of what the linear part leaves
 FAMILIAR = 0.99  # share of the training samples that are nearer than where trust is halved
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
 

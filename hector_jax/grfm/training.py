@@ -38,6 +38,8 @@ from hector_jax.grfm.network import (
 from hector_jax.model.effect import Window
 from hector_jax.trajectory import Wrench
 
+L2 = {"paper": 1e-3, "residual": 0.1}
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -47,7 +49,7 @@ class TrainConfig:
     epochs: int = 200
     batch: int = 512  # samples per step
     learning_rate: float = 1e-3
-    l2: float = 1e-3  # on kernels
+    l2: float | None = None  # on kernels; None takes L2 of the variant
     mirror: bool = True  # the paper's variant learns from the mirror image of each sample too
     seed: int = 0
 
@@ -61,7 +63,7 @@ class TrainConfig:
                 f"TrainConfig needs at least 1 epoch and 1 sample per step, "
                 f"got epochs {self.epochs}, batch {self.batch}"
             )
-        if not (self.learning_rate > 0.0 and self.l2 >= 0.0):
+        if not (self.learning_rate > 0.0 and (self.l2 is None or self.l2 >= 0.0)):
             raise ValueError(
                 f"TrainConfig needs learning_rate > 0 and l2 >= 0, "
                 f"got {self.learning_rate}, {self.l2}"
@@ -153,8 +155,9 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
     def kernels(nets: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", nets)
 
+    l2 = L2[config.variant] if config.l2 is None else config.l2
     return optax.chain(
-        optax.add_decayed_weights(config.l2, mask=kernels), optax.adam(config.learning_rate)
+        optax.add_decayed_weights(l2, mask=kernels), optax.adam(config.learning_rate)
     )
 
 
