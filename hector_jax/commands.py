@@ -24,6 +24,7 @@ from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, w
 from hector_jax.evaluation import fidelity, metrics, plots
 from hector_jax.evaluation.metrics import Verdict
 from hector_jax.evaluation.report import (
+    WORLDS,
     Picture,
     Report,
     environment,
@@ -128,11 +129,12 @@ def _grfm(args: Grfm) -> None:
             training.report(effects, samples), fidelity.by_phase(effects, samples), drifts[world]
         )
     curves = _curves(robot, worlds["hfs"].trajectory, effects)
+    wrenches = plots.wrenches(args.out / "wrenches.png", config.rollout.walk.gait.tick, curves)
     captions = {
-        "wrenches": plots.wrenches(
-            args.out / "wrenches.png", config.rollout.walk.gait.tick, curves
+        "wrenches": f"{wrenches} The first held-out walk.",
+        "open_loop": plots.open_loop(
+            args.out / "open_loop.png", {WORLDS.get(w, w): found for w, found in drifts.items()}
         ),
-        "open_loop": plots.open_loop(args.out / "open_loop.png", drifts),
         "training": plots.training(args.out / "training.png", net.course),
         "training_paper": plots.training(args.out / "training_paper.png", paper.course),
     }

@@ -90,8 +90,3 @@ def unpack_wrench(u: Float[Array, "12"]) -> Wrench:
 def zero_wrench(shape: tuple[int, ...] = ()) -> Wrench:
     """No wrench on either foot, with leading axes `shape`."""
     return Wrench(jnp.zeros((*shape, 2, 3)), jnp.zeros((*shape, 2, 3)))
-
-
-def zero_push() -> Push:
-    """No push."""
-    return Push(jnp.zeros(3), jnp.zeros(3))

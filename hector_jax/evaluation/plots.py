@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from hector_jax.evaluation.fidelity import Drift
 from hector_jax.grfm.training import History
@@ -57,7 +56,7 @@ _LOOK = {
     "paper": {"color": _ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "gated": {"color": _BLUE, "linestyle": (0, (5, 1.5))},
 }
-_LOOK |= {"raw": _LOOK["commanded"], "residual": _LOOK["predicted"]}
+_LOOK |= {"raw": _LOOK["commanded"], "residual": _LOOK["with"]}
 _MARKER = {"nominal": "o", "expert": "D", "without": "s", "with": "o"}
 _NAMES = {
     "without": "tuned without net",
@@ -364,13 +363,14 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
             panel.set_xlabel("time ahead [s]")
         _legend(figure, panels[0, 0], columns=3)
     return (
-        "How far a rigid body under recorded commands strays from the robot, RMS over starts. "
-        "`measured` moves it by the measured wrench itself."
+        "How far a rigid body under recorded commands strays from the robot, RMS over starts in "
+        "all phases of the step. `measured` moves it by the measured wrench itself, without what "
+        "the legs do."
     )
 
 
 def training(path: Path, course: History) -> str:
-    """Errors of the net by epoch, on the walks it learns from and on held-out ones.
+    """Errors of the net by epoch, on the walks it learns from and on those that choose the epoch.
 
     Args:
         path: file to write.
@@ -383,12 +383,14 @@ def training(path: Path, course: History) -> str:
             seen, held = (np.asarray(getattr(course, f"{p}_{kind}")) for p in ("train", "valid"))
             epochs = np.arange(1, len(seen) + 1)
             panel.plot(epochs, seen, **_LOOK["expert"], label="training walks")
-            panel.plot(epochs, held, color=_ORANGE, label="held-out walks")
+            panel.plot(epochs, held, color=_ORANGE, label="validation walks")
             best = int(np.argmin(held))
-            panel.plot(epochs[best], held[best], "o", color=_ORANGE, label="least of these")
-            panel.set(title=kind, xlabel="epoch", ylabel=label, yscale="log")
-            panel.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
-            panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-            panel.yaxis.set_minor_formatter(NullFormatter())
+            panel.plot(epochs[best], held[best], "o", color=_ORANGE, label="least")
+            # the first epochs of a fresh net may be far off: they need not be seen whole
+            top = 1.6 * np.percentile(np.concatenate([seen, held]), 90)
+            panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
         _legend(figure, panels[0])
-    return "Errors of GRFM-Net by epoch; the epoch with the least held-out error is kept."
+    return (
+        "Errors of GRFM-Net by epoch, mean over the members where it is an ensemble; of each net "
+        "the epoch with the least error on the validation walks is kept."
+    )

@@ -16,7 +16,7 @@ Changes of the command within 20 ms are too quick for that loop.
 Each foot sees the walk as if it were the left one, so a mirrored window has the mirrored effect.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +24,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset
-from hector_jax.model.effect import HISTORY, Effect, Window
+from hector_jax.model.effect import HISTORY, Effect, Window, sure
 from hector_jax.trajectory import Push, Wrench
 
 CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
 MOTION = 3  # of the base: yaw rate, forward and sideways velocity
 GATES = (0.0, 0.01, 0.03, 0.08, 0.19)  # [s] after a switch, where the terms of the legs may differ
 RIDGE, RIDGE_LEGS = 0.03, 1e-3  # penalty on standardised terms, relative to the number of samples
+_SIGNS = np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])])  # of force and moment, by foot
 _FLOOR = 0.05  # least scale of a change, relative to the largest of its kind
 
 
@@ -55,11 +56,20 @@ class GatedMap(NamedTuple):
     legs: Float[Array, "gates terms 6"]  # of motion, then changes
 
 
+def in_dtype_of(window: Window, tree: Any) -> Any:
+    """The floating-point leaves of a tree in the dtype of a window's commands."""
+    dtype = window.commands.force.dtype
+    return jax.tree.map(
+        lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+    )
+
+
 def views(window: Window) -> View:
     """What the left and the right foot see (leading axis 2) of one window."""
+    dtype = window.commands.force.dtype
 
     def own(foot: int) -> View:
-        along, across = (ALONG, ACROSS) if foot else (np.ones(3), np.ones(3))
+        along, across = (jnp.asarray(s if foot else np.ones(3), dtype) for s in (ALONG, ACROSS))
         both = [
             jnp.concatenate(
                 [window.commands.force[:, f] * along, window.commands.moment[:, f] * across], axis=1
@@ -88,8 +98,7 @@ def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[A
 
 def from_views(values: Float[Array, "2 6"]) -> Wrench:
     """Forces and moments as each foot sees them, back in the yaw frame."""
-    signs = np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])])
-    back = values * signs
+    back = values * jnp.asarray(_SIGNS, values.dtype)
     return Wrench(back[:, :3], back[:, 3:])
 
 
@@ -114,19 +123,16 @@ def gated_effect(gated: GatedMap) -> jax.tree_util.Partial:
 
 
 def _gated_effect(gated: GatedMap, window: Window) -> Effect:
-    dtype = window.commands.force.dtype
-    gated = jax.tree.map(lambda p: jnp.asarray(p, dtype), gated)
+    gated, window = in_dtype_of(window, gated), in_dtype_of(window, window)
     ground, legs = apply_gated(gated, window, views(window))
-    wrench = from_views(ground)
-    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench), legs)
+    return sure(from_views(ground))._replace(legs=legs)
 
 
 def seen_labels(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Wrench of the ground and push of the legs (n, 2, 6) each, as each foot sees them."""
-    signs = np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])])
     ground = np.concatenate([dataset.label.force, dataset.label.moment], axis=-1)
     legs = np.concatenate([dataset.legs.force, dataset.legs.torque], axis=-1)
-    return ground * signs, legs[:, None] * signs
+    return ground * _SIGNS, legs[:, None] * _SIGNS
 
 
 def fit_gated(dataset: Dataset) -> GatedMap:
@@ -135,7 +141,7 @@ def fit_gated(dataset: Dataset) -> GatedMap:
     seen = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
     tick, gate = (
-        np.repeat(np.asarray(hats(window.since_switch, knots))[:, None], 2, axis=1)
+        np.repeat(np.asarray(hats(window.since_switch, jnp.asarray(knots)))[:, None], 2, axis=1)
         for knots in (ticks, gates)
     )
     ground, legs = seen_labels(dataset)

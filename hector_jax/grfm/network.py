@@ -39,18 +39,19 @@ from hector_jax.grfm.gated import (
     fit_gated,
     from_views,
     hats,
+    in_dtype_of,
     seen_labels,
     views,
 )
-from hector_jax.model.effect import HISTORY, Effect, Window
+from hector_jax.model.effect import HISTORY, Effect, Window, sure
 from hector_jax.robot import Robot
 from hector_jax.storage import load_tree, read_card, save_tree
-from hector_jax.trajectory import Wrench, zero_push
+from hector_jax.trajectory import Wrench
 
 HIDDEN = {"paper": (64, 64, 64), "residual": (32, 32)}  # widths of the layers, by variant
 MEMBERS = {"paper": 1, "residual": 4}  # nets of each kind that are trained side by side
 VARIANTS = tuple(HIDDEN)
-BOUND = 1.0  # most that a residual net adds, in units of what the linear part leaves
+BOUND = 0.5  # most that a residual net adds, in units of what the linear part leaves
 FAMILIAR = 0.99  # share of the training samples that are nearer than where trust is halved
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
 
@@ -259,8 +260,7 @@ def as_effect(params: Params) -> jax.tree_util.Partial:
 
 
 def _residual_effect(params: ResidualParams, window: Window) -> Effect:
-    dtype = window.commands.force.dtype
-    params = jax.tree.map(lambda p: jnp.asarray(p, dtype), params)
+    params, window = in_dtype_of(window, params), in_dtype_of(window, window)
     seen = views(window)
     ground, legs = apply_gated(params.linear, window, seen)
     x, trust = residual_inputs(params, window, seen)
@@ -276,8 +276,7 @@ def _residual_effect(params: ResidualParams, window: Window) -> Effect:
 
 
 def _net_effect(params: NetParams, window: Window) -> Effect:
-    dtype = window.commands.force.dtype
-    params = jax.tree.map(lambda p: jnp.asarray(p, dtype), params)
+    params = in_dtype_of(window, params)
     x = features(params.inputs, window.commands)
     flat = Wrench(apply_net(params.force, x.force), apply_net(params.moment, x.moment))
     return _effect(params.outputs, flat)
@@ -285,7 +284,7 @@ def _net_effect(params: NetParams, window: Window) -> Effect:
 
 def _effect(scaling: Scaling, flat: Wrench) -> Effect:
     wrench = physical(scaling, jax.tree.map(lambda w: w.reshape(*w.shape[:-1], 2, 3), flat))
-    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench), zero_push())
+    return sure(wrench)
 
 
 def fit_linear(dataset: Dataset) -> LinearMap:
@@ -307,8 +306,7 @@ def linear_effect(linear: LinearMap) -> jax.tree_util.Partial:
 
 
 def _linear_effect(linear: LinearMap, window: Window) -> Effect:
-    dtype = window.commands.force.dtype
-    linear = jax.tree.map(lambda p: jnp.asarray(p, dtype), linear)
+    linear = in_dtype_of(window, linear)
     x = features(linear.inputs, window.commands)
     flat = Wrench(
         x.force @ linear.force[:-1] + linear.force[-1],

@@ -4,10 +4,10 @@ Both variants are trained the same way: the paper's on whole windows, the residu
 each foot sees them, with what the linear part leaves as its target. Minimised is, for forces and
 moments apart, the mean square of the standardised error plus l2/2 |kernels|^2, by Adam (the
 paper's: 1e-3, 1e-3, 200 epochs). Each axis counts alike, as each is divided by its own spread. Of
-each net the epoch with the least mean square error (N^2, (N m)^2) on held-out walks is kept. Mirror
-images of the samples are our addition: with 51 training walks they lowered the held-out force error
-of the paper's variant by 5 to 10 % and the moment error by 4 to 6 %; the residual variant has them
-by construction.
+each net the epoch with the least mean square error (N^2, (N m)^2) on validation walks is kept.
+Mirror images of the samples are our addition: with 51 training walks they lowered the held-out
+force error of the paper's variant by 5 to 10 % and the moment error by 4 to 6 %; the residual
+variant has them by construction.
 """
 
 from collections.abc import Callable, Mapping
@@ -38,8 +38,6 @@ from hector_jax.grfm.network import (
 from hector_jax.model.effect import Window
 from hector_jax.trajectory import Wrench
 
-L2 = {"paper": 1e-3, "residual": 0.1}
-
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -49,7 +47,7 @@ class TrainConfig:
     epochs: int = 200
     batch: int = 512  # samples per step
     learning_rate: float = 1e-3
-    l2: float | None = None  # on kernels; None takes L2 of the variant
+    l2: float = 1e-3  # on kernels
     mirror: bool = True  # the paper's variant learns from the mirror image of each sample too
     seed: int = 0
 
@@ -63,7 +61,7 @@ class TrainConfig:
                 f"TrainConfig needs at least 1 epoch and 1 sample per step, "
                 f"got epochs {self.epochs}, batch {self.batch}"
             )
-        if not (self.learning_rate > 0.0 and (self.l2 is None or self.l2 >= 0.0)):
+        if not (self.learning_rate > 0.0 and self.l2 >= 0.0):
             raise ValueError(
                 f"TrainConfig needs learning_rate > 0 and l2 >= 0, "
                 f"got {self.learning_rate}, {self.l2}"
@@ -100,14 +98,14 @@ class _Samples(NamedTuple):
 class _Carry(NamedTuple):
     nets: Wrench  # parameters of force and moment nets, members stacked, in a wrench's places
     optimiser: Any
-    best: Wrench  # of each member those of the epoch with the least held-out error
+    best: Wrench  # of each member those of the epoch with the least validation error
     least: Wrench  # that error, by member
 
 
 def train(
     config: TrainConfig,
     training: Dataset,
-    held_out: Dataset,
+    validation: Dataset,
     progress: Callable[[int, History], None] = lambda epoch, history: None,
 ) -> tuple[Params, History]:
     """Train both nets in 32 bits.
@@ -115,7 +113,7 @@ def train(
     Args:
         config: settings; the same ones and the same data give the same bytes on a CPU.
         training: samples to learn from; their statistics become part of the parameters.
-        held_out: samples of other walks, which choose the epoch.
+        validation: samples of other walks, which choose the epoch.
         progress: called after each epoch with its number, from 1, and the errors so far.
 
     Returns:
@@ -124,7 +122,7 @@ def train(
     Raises:
         ValueError: no samples, or the training came to nothing finite.
     """
-    for name, dataset in (("training", training), ("held-out", held_out)):
+    for name, dataset in (("training", training), ("validation", validation)):
         if len(dataset.walk) == 0:
             raise ValueError(f"the {name} set has no samples")
     if config.mirror and config.variant == "paper":
@@ -138,14 +136,14 @@ def train(
         lambda w: jnp.full(MEMBERS[config.variant], jnp.inf, jnp.float32), Wrench(0, 0)
     )
     carry = _Carry(nets, _optimiser(config).init(nets), nets, infinite)
-    seen, unseen = _prepare(params, training), _prepare(params, held_out)
+    seen, unseen = _prepare(params, training), _prepare(params, validation)
     rows, scale = [], _output_scale(params)
     for epoch, key in enumerate(jax.random.split(key_shuffle, config.epochs), start=1):
         carry, row = _train_epoch(config, scale, seen, unseen, carry, key)
         rows.append(jax.device_get(row))
         progress(epoch, History(*np.array(rows).T))
     if not all(np.isfinite(leaf).all() for leaf in carry.least):
-        raise ValueError("training diverged: no epoch has a finite held-out error")
+        raise ValueError("training diverged: no epoch has a finite validation error")
     best = jax.tree.map(lambda p: p[0], carry.best) if paper else carry.best
     best = params._replace(force=best.force, moment=best.moment)
     return jax.device_get(best), History(*np.array(rows).T)
@@ -155,9 +153,8 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
     def kernels(nets: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", nets)
 
-    l2 = L2[config.variant] if config.l2 is None else config.l2
     return optax.chain(
-        optax.add_decayed_weights(l2, mask=kernels), optax.adam(config.learning_rate)
+        optax.add_decayed_weights(config.l2, mask=kernels), optax.adam(config.learning_rate)
     )
 
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.geometry import rot_z
-from hector_jax.trajectory import Push, State, Wrench, zero_push
+from hector_jax.trajectory import Push, State, Wrench
 
 HISTORY = 3  # commands in a window: the current one and two before it
 
@@ -56,9 +56,14 @@ def from_yaw_frame(state: State) -> State:
     )
 
 
+def sure(wrench: Wrench) -> Effect:
+    """The effect of a wrench without spread, and of legs that do not push."""
+    nothing = jnp.zeros_like(wrench.force[0])
+    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench), Push(nothing, nothing))
+
+
 def _last_command(window: Window) -> Effect:
-    command = jax.tree.map(lambda w: w[0], window.commands)
-    return Effect(command, jax.tree.map(jnp.zeros_like, command), zero_push())
+    return sure(jax.tree.map(lambda w: w[0], window.commands))
 
 
 last_command = jax.tree_util.Partial(_last_command)
