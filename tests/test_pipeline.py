@@ -1,5 +1,7 @@
 """A net is reused only for the walks and the controller that it was made of."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import numpy as np
 import pytest
@@ -71,5 +73,6 @@ def test_the_variant_that_was_trained_is_the_one_that_is_used(tmp_path, robot):
 
 def test_walks_of_another_controller_are_refused(tmp_path, robot):
     gather(tmp_path / "walks", robot, controller="another")
+    pool = ThreadPoolExecutor(1)
     with pytest.raises(ValueError, match="walks: walked by another controller"):
-        pipeline.ground(None, TuneConfig(), robot, tmp_path)
+        pipeline.ground(pool, TuneConfig(), robot, tmp_path)
