@@ -5,25 +5,38 @@ the world; quaternions are w, x, y, z as in MuJoCo.
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+
+_CROSS = np.zeros((3, 3, 3))  # e_i x e_j = sum over k of _CROSS[i, k, j] e_k
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _CROSS[_i, _k, _j], _CROSS[_j, _k, _i] = 1.0, -1.0
+
+
+def _about(axis: int, angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    # by constant matrices: a rotation written entry by entry is twenty operations to compile
+    along = np.zeros((3, 3))
+    along[axis, axis] = 1.0
+    kept, plane, turned = (
+        np.asarray(M, jnp.result_type(angle)) for M in (along, np.eye(3) - along, _CROSS[axis])
+    )
+    return kept + jnp.cos(angle) * plane + jnp.sin(angle) * turned
 
 
 def rot_x(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Rotation by `angle` [rad] about x."""
-    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
-    return jnp.array([[one, zero, zero], [zero, c, -s], [zero, s, c]])
+    return _about(0, angle)
 
 
 def rot_y(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Rotation by `angle` [rad] about y."""
-    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
-    return jnp.array([[c, zero, s], [zero, one, zero], [-s, zero, c]])
+    return _about(1, angle)
 
 
 def rot_z(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Rotation by `angle` [rad] about z."""
-    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
-    return jnp.array([[c, -s, zero], [s, c, zero], [zero, zero, one]])
+    return _about(2, angle)
 
 
 def rotation_from_euler(euler: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -33,16 +46,17 @@ def rotation_from_euler(euler: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 def euler_rates(euler: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """T with d(euler)/dt = T omega, omega in the world frame; singular at |pitch| = 90 degrees."""
-    cp, tp = jnp.cos(euler[1]), jnp.tan(euler[1])
-    cy, sy = jnp.cos(euler[2]), jnp.sin(euler[2])
-    zero, one = jnp.zeros_like(cp), jnp.ones_like(cp)
-    return jnp.array([[cy / cp, sy / cp, zero], [-sy, cy, zero], [cy * tp, sy * tp, one]])
+    roll = np.zeros((3, 3))
+    roll[0, 0] = 1.0
+    yaw = np.roll(roll, 2, axis=0)
+    roll, yaw, rest = (np.asarray(M, jnp.result_type(euler)) for M in (roll, yaw, np.eye(3) - roll))
+    by_heading = roll / jnp.cos(euler[1]) + yaw * jnp.tan(euler[1]) + rest
+    return by_heading @ rot_z(euler[2]).T
 
 
 def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Matrix S(v) with S(v) w = v x w."""
-    zero = jnp.zeros_like(v[0])
-    return jnp.array([[zero, -v[2], v[1]], [v[2], zero, -v[0]], [-v[1], v[0], zero]])
+    return jnp.tensordot(v, np.asarray(_CROSS, jnp.result_type(v)), 1)
 
 
 def rotation_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:

@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.control.qp import QP, QpConfig, Solution, solve_qp
@@ -30,10 +31,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.geometry import rot_z
 from hector_jax.model import srbm
 from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
-
-NX = 12  # states that move; gravity stays what it is
-
+from hector_jax.trajectory import State, Wrench, pack_wrench, unpack_wrench
 
 @dataclass(frozen=True)
 class MpcConfig:
@@ -71,29 +69,34 @@ class Horizon(NamedTuple):
     contact: Bool[Array, "N 2"]
 
 
-def _slot_feet(contact: Bool[Array, "2"], slots: int) -> Float[Array, "slots 2"]:
+def _slot_feet(contact: Float[Array, "2"], slots: int) -> Float[Array, "slots 2"]:
     """Which foot each slot serves, as rows of a selection matrix; all zero for an empty slot."""
-    chosen = contact.astype(float)
     if slots == 2:
-        return jnp.diag(chosen)
-    return (chosen * jnp.array([1.0, 1.0 - chosen[0]]))[None]
+        return jnp.diag(contact)
+    return jnp.stack([contact[0], contact[1] * (1.0 - contact[0])])[None]
+
+
+def _double_integrator(N: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity and travel after step k by a unit of velocity gained in step j, (N, N) each."""
+    steps = np.arange(N)[:, None] - np.arange(N)
+    return np.where(steps >= 0, 1.0, 0.0), dt * np.maximum(steps, 0)
 
 
 def _input_map(feet: Float[Array, "slots 2"], foot_yaw: Float[Array, "2"]) -> Float[Array, "12 b"]:
     """G with u = G v: the slots' inputs (F_x, F_y, F_z, M_y, M_z) to the paper's u."""
-    moment_axes = jax.vmap(lambda yaw: rot_z(yaw)[:, 1:])(foot_yaw)  # (2, 3, 2)
-    force = jnp.einsum("sf,xi->fxsi", feet, jnp.eye(3))
-    moment = jnp.einsum("sf,fxi->fxsi", feet, moment_axes)
-    blocks = jnp.zeros((2, 2, 3, len(feet), 5))
-    blocks = blocks.at[0, :, :, :, :3].set(force).at[1, :, :, :, 3:].set(moment)
-    return blocks.reshape(12, -1)
+    axes = jax.vmap(lambda yaw: rot_z(yaw)[:, 1:])(foot_yaw)  # (2, 3, 2), of the moments
+    force = jnp.einsum("sf,xi->fxsi", feet, jnp.eye(3, dtype=feet.dtype))
+    moment = jnp.einsum("sf,fxi->fxsi", feet, axes)
+    upper = jnp.pad(force, ((0, 0), (0, 0), (0, 0), (0, 2)))
+    lower = jnp.pad(moment, ((0, 0), (0, 0), (0, 0), (3, 0)))
+    return jnp.stack([upper, lower]).reshape(12, -1)
 
 
 def _rows(config: MpcConfig, robot: Robot, yaw: Float[Array, ""]) -> Float[Array, "rows 5"]:
     """Constraint rows of a stance foot that points along `yaw`; their bounds are `_bounds`."""
     mu, toe, heel = config.friction, robot.toe, robot.heel
     zero = jnp.zeros_like(yaw)
-    fx, fy, fz, my, mz = jnp.eye(5)
+    fx, fy, fz, my, mz = jnp.eye(5, dtype=yaw.dtype)
     side = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw), zero, zero, zero])  # force across the foot
     rows = [
         fx - mu * fz,
@@ -111,14 +114,13 @@ def _rows(config: MpcConfig, robot: Robot, yaw: Float[Array, ""]) -> Float[Array
     return jnp.stack(rows)
 
 
-def _bounds(config: MpcConfig) -> tuple[Float[Array, " rows"], Float[Array, " rows"]]:
-    """Lower and upper bounds of `_rows`."""
-    below, above = (-jnp.inf, 0.0), (0.0, jnp.inf)
+def _bounds(config: MpcConfig) -> np.ndarray:
+    """Lower and upper bounds of `_rows`, (2, rows)."""
+    below, above = (-np.inf, 0.0), (0.0, np.inf)
     sides = [below, above, below, above, (0.0, config.max_force), above, below]
     if config.line_friction:
         sides += [below, above, below, above]
-    lower, upper = jnp.array(sides).T
-    return lower, upper
+    return np.array(sides).T
 
 
 def write_qp(
@@ -148,42 +150,56 @@ def write_qp(
     Source: Eq. 3, 4.
     """
     N, b = config.horizon, 5 * slots
+    dtype = jnp.result_type(*jax.tree.leaves((weights, state, horizon.lever)), jnp.float32)
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
-    feet = jax.vmap(lambda c: _slot_feet(c, slots))(horizon.contact)  # (N, slots, 2)
+    feet = jax.vmap(lambda c: _slot_feet(c.astype(dtype), slots))(horizon.contact)
     G = jax.vmap(_input_map)(feet, horizon.foot_yaw)
-    inputs = B @ G  # (N, 15, b)
+    # inputs turn the body and push it; rates and velocities are kept, angles and places add them up
+    turn, push = B[:, 6:9] @ G, B[:, 9:12] @ G  # (N, 3, b)
+    turned = jnp.cumsum(A[:, 0:3, 6:9], axis=0)  # of angles by a rate kept from the start on
+    later, travel = (jnp.asarray(table, dtype) for table in _double_integrator(N, dt))
+    # angles after step k by a rate that is there from the end of step j on
+    angles = later[:, :, None, None] * (turned[:, None] - turned)
 
-    def respond(carry, step):
-        free, forced = carry
-        k, A_k, B_k = step
-        free = A_k @ free
-        forced = A_k[:NX, :NX] @ forced
-        forced = jax.lax.dynamic_update_slice(forced, B_k[:NX], (0, k * b))
-        return (free, forced), (free[:NX], forced)
-
-    start = (pack_state(state, jnp.asarray(robot.gravity)), jnp.zeros((NX, N * b)))
-    _, (free, forced) = jax.lax.scan(respond, start, (jnp.arange(N), A, inputs))
-
-    Q = jnp.concatenate(list(weights.Q))
-    error = free - jnp.concatenate(list(horizon.reference), axis=-1)
-    R = pack_wrench(Wrench(*weights.R))
+    Q, R = weights.Q, pack_wrench(Wrench(*weights.R))
+    count = jnp.arange(1, N + 1, dtype=dtype)[:, None]
+    rate, speed = state.ang_velocity, state.velocity
+    fall = dt * count * jnp.asarray(robot.gravity, dtype)
+    free = State(
+        state.euler + turned @ rate,
+        state.position + dt * count * speed - dt * (count - 1) / 2 * fall,
+        jnp.broadcast_to(rate, (N, 3)),
+        speed - fall,
+    )
+    error = jax.tree.map(lambda x, wanted, price: price * (x - wanted), free, horizon.reference, Q)
     effort = jnp.einsum("kui,u,kuj->kij", G, R, G)
     empty = jnp.repeat(1.0 - feet.sum(-1), 5, axis=-1)
     effort = effort + jax.vmap(jnp.diag)(empty)
-    S = forced.reshape(N * NX, N * b)
-    weighted = (Q[:, None] * forced).reshape(N * NX, N * b)
-    effort_matrix = jnp.einsum("kij,kl->kilj", effort, jnp.eye(N)).reshape(N * b, N * b)
-    P = 2.0 * (S.T @ weighted + effort_matrix)
-    q = 2.0 * (weighted.T @ error.reshape(-1))
+
+    wide = jnp.swapaxes(angles, 1, 2).reshape(3 * N, 3 * N)  # rows: step and angle
+    turning = (wide.T @ (jnp.tile(Q.euler, N)[:, None] * wide)).reshape(N, 3, N, 3)
+    both = later.T @ later  # steps that feel both inputs
+    turning += jnp.einsum("ij,xy->ixjy", both, jnp.diag(Q.ang_velocity))
+    eyeN = jnp.eye(N, dtype=dtype)
+    Wd = (turn[:, :, None] * eyeN[:, None, :, None]).reshape(3 * N, N * b)
+    pushing = both[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
+    P = (Wd.T @ (turning.reshape(3 * N, 3 * N) @ Wd)).reshape(N, b, N, b)
+    P += jnp.einsum("ixa,ixjb->iajb", push, jnp.einsum("ijx,jxb->ixjb",pushing, push))
+    P = 2.0 * (P + jnp.einsum("kij,kl->kilj", effort, jnp.eye(N, dtype=dtype)))
+    P = P.reshape(N * b, N * b)
+    torque = jnp.einsum("kjxy,kx->jy", angles, error.euler) + later.T @ error.ang_velocity
+    force = travel.T @ error.position + later.T @ error.velocity
+    q = 2.0 * (jnp.einsum("jxb,jx->jb", turn, torque) + jnp.einsum("jxb,jx->jb", push, force))
+    q = q.reshape(-1)
     if config.effort_about == "weight":
         share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
-        weight = jnp.zeros((N, 12)).at[:, 2].set(share).at[:, 5].set(share)
+        weight = jnp.zeros((N, 12), dtype).at[:, 2].set(share).at[:, 5].set(share)
         q = q - 2.0 * jnp.einsum("kui,u,ku->ki", G, R, weight).reshape(-1)
 
     yaw = jnp.einsum("ksf,kf->ks", feet, horizon.foot_yaw)
     rows = jax.vmap(jax.vmap(lambda yaw: _rows(config, robot, yaw)))(yaw)
-    C = jnp.einsum("st,ksri->ksrti", jnp.eye(slots), rows).reshape(N, -1, b)
-    lower, upper = (jnp.tile(bound, N * slots) for bound in _bounds(config))
+    C = jnp.einsum("st,ksri->ksrti", jnp.eye(slots, dtype=dtype), rows).reshape(N, -1, b)
+    lower, upper = (jnp.asarray(np.tile(bound, N * slots), dtype) for bound in _bounds(config))
     return QP(P, q, C, lower, upper), G[0]
 
 

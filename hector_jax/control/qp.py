@@ -31,14 +31,20 @@ The derivative is zero without status SOLVED, and where the minimiser is not uni
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import SymbolicZero
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, Int
+
+
+SAVED = "qp"
+"""Name of what `jax.checkpoint` is to keep of a solve, so that none is solved again backwards."""
 
 
 class Status(IntEnum):
@@ -155,7 +161,7 @@ def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
     dtype = jnp.result_type(*qp, jnp.float32)
     P, q, A, lower, upper = (jnp.asarray(v, dtype) for v in qp)
     # only the symmetric part of P acts; taken here, the derivative is that of the same function
-    return _solve(config, QP(0.5 * (P + P.T), q, A, lower, upper))[0]
+    return _solve(config, QP(0.5 * (P + P.T), q, A, lower, upper))
 
 
 def check_solved(solution: Solution, what: str = "QP") -> None:
@@ -322,6 +328,22 @@ class _Guess(NamedTuple):
     going: Array
 
 
+def _worst(qp: _Normal, wrong: Array, active: Array, by: Array) -> Array:
+    """Of the wrong sides (2, m) those to change at once.
+
+    Rows of a block share its few variables: one correction mends or spoils the others. So a block
+    takes its worst of each kind, to let go and to take up, and the cycles of changing all are rare.
+    """
+    if qp.A.ndim == 2:
+        return wrong
+    blocks = (2, *qp.A.shape[:2])
+    by = jnp.where(wrong, by, 0.0).reshape(blocks)
+    active = active.reshape(blocks)
+    largest = lambda v: jnp.max(v, axis=(0, 2), keepdims=True)  # noqa: E731
+    bar = jnp.where(active, largest(jnp.where(active, by, 0.0)), largest(jnp.where(active, 0.0, by)))
+    return wrong & (by >= 0.9 * bar).reshape(wrong.shape)
+
+
 def _active_set(
     floors: _Floors, qp: _Normal, start: _Point, active: Array, wanted: Array, limit: int
 ) -> tuple[_Point, Array, Array]:
@@ -338,24 +360,37 @@ def _active_set(
     def improve(state: _Guess) -> _Guess:
         weight = jnp.where(state.active, jnp.asarray(floors.cap, dtype), 0.0)
         factor = _cholesky(_plus_gram(qp.P + state.rho * eye, qp.A, weight[0] + weight[1]))
-        x, z = state.point.x, jnp.where(state.active, state.point.z, 0.0)
-        for _ in range(2):  # method of multipliers: a pass takes six digits off
+
+        def closer(point: _Point) -> tuple[_Point, Array, Array]:
+            """A pass of the method of multipliers, which takes six digits off; what is wrong."""
+            x, z = point
             z = z + weight * _violation(qp, x)
-            slope = qp.P @ x + qp.q + _columns(qp.A, _multiplier(z))
-            dx = -cho_solve((factor, True), slope)
-            x = x + dx
-            z = z + weight * sign * _rows(qp.A, dx)
-        outside = _violation(qp, x)
-        pulls, leaves = z < -floors.rounding, outside > floors.rounding * qp.reach
-        wrong = jnp.where(state.active, pulls, leaves) & ~always
+            dx = -cho_solve((factor, True), qp.P @ x + qp.q + _columns(qp.A, _multiplier(z)))
+            x, z = x + dx, z + weight * sign * _rows(qp.A, dx)
+            outside = _violation(qp, x)
+            pulls, leaves = z < -floors.rounding, outside > floors.rounding * qp.reach
+            wrong = jnp.where(state.active, pulls, leaves) & ~always
+            return _Point(x, z), wrong, jnp.where(state.active, -z, outside)
+
+        def settle() -> tuple[tuple[_Point, Array, Array], Array]:
+            """Digits and evidence are for a guess that stays."""
+            done = closer(found[0])
+            z = done[0].z
+            point = done[0]._replace(z=jnp.where(always, z, jnp.maximum(z, 0.0)))
+            return done, _evidence(qp, point)
+
+        found = closer(_Point(state.point.x, jnp.where(state.active, state.point.z, 0.0)))
+        nothing = jnp.full(3, jnp.inf, dtype)
+        found, proof = lax.cond(jnp.any(found[1]), lambda: (found, nothing), settle)
+        (x, z), wrong, by = found
+        changed = _worst(qp, wrong, state.active, by)
         point = _Point(x, jnp.where(always, z, jnp.maximum(z, 0.0)))
-        proof = _evidence(qp, point)
         better = jnp.max(proof) < jnp.max(state.proof)
         best, proof = _choose(better, (point, proof), (state.best, state.proof))
         # a factorisation that fails is tried again with a larger rho
         fine = jnp.isfinite(jnp.sum(x) + jnp.sum(z))
         point = _choose(fine, _Point(x, z), state.point)
-        active = _choose(fine, state.active ^ wrong, state.active)
+        active = _choose(fine, state.active ^ changed, state.active)
         rho = jnp.where(fine, state.rho, 100.0 * state.rho)
         iterations = state.iterations + 1
         # a flat P makes more passes worth their while though the guess stays
@@ -524,9 +559,9 @@ def _where_sane(sane: Array, qp: QP) -> QP:
     return _choose(sane, qp, plain)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
-    """Solution, and the ratios W (2, m) of its derivative, normalised."""
+@partial(jax.jit, static_argnums=0)
+def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
+    """Solution, the ratios W (2, m) of its derivative, and the problem they belong to."""
     floors = _floors(config, qp.q.dtype)
     n, dtype = len(qp.q), qp.q.dtype
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l == jnp.inf) | (qp.u == -jnp.inf)
@@ -545,7 +580,9 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
     loose = _Point(-cho_solve((factor, True), normal.q), nothing)
     tries = config.active_set_tries
     if config.solver == "interior_point":
-        guess = _violation(normal, loose.x) > 0
+        outside = _violation(normal, loose.x)
+        nowhere = jnp.zeros_like(normal.side)
+        guess = _worst(normal, outside > 0, nowhere, outside)
         quick, proof, first = _active_set(floors, normal, loose, guess, sane, tries)
         settled = jnp.max(proof) <= floors.target
         near, slack, steps = _interior_point(config, floors, normal, sane & ~settled)
@@ -586,37 +623,51 @@ def _solve(config: QpConfig, qp: QP) -> tuple[Solution, Array]:
     ratio = ((point.z + floors.kink) / (slack / normal.reach + floors.kink)) ** 2
     ratio = jnp.where(normal.side, jnp.minimum(ratio, floors.cap), 0.0)
     # an equality moves with both of its bounds, half with each
-    return solution, jnp.where(normal.equality, 0.5 * floors.cap, ratio)
+    return solution, jnp.where(normal.equality, 0.5 * floors.cap, ratio), normal
 
 
-@_solve.defjvp
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _solve(config: QpConfig, qp: QP) -> Solution:
+    return _solve_normal(config, qp)[0]
+
+
+def _moves(tangent: Any) -> bool:
+    return not isinstance(tangent, SymbolicZero)
+
+
+@partial(_solve.defjvp, symbolic_zeros=True)
 def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple:
     (qp,), (d,) = primals, tangents
-    solution, ratio = _solve(config, qp)
-    solved = solution.status == Status.SOLVED
-    qp = _where_sane(solved, qp)
+    solution, ratio, normal = _solve_normal(config, qp)
+    solution, ratio = checkpoint_name((solution, ratio), SAVED)
     dtype = qp.q.dtype
     floors = _floors(config, dtype)
-    column, row = _scales(qp)
-    A = _scale_rows_and_columns(qp.A, row, column)
+    column, row = normal.column, normal.row
     both = ratio[0] + ratio[1]
     firm = both >= floors.cap
-    P = column[:, None] * qp.P * column
     eye = jnp.eye(len(qp.q), dtype=dtype)
-    factor = _cholesky(_plus_gram(P + floors.proximal * eye, A, both))
+    factor = _cholesky(_plus_gram(normal.P + floors.proximal * eye, normal.A, both))
     # a pivot of the size of rho: other minimisers lie beside this one, and it has no derivative
     unique = jnp.min(jnp.diagonal(factor)) ** 2 > 10.0 * floors.proximal
-    sound = solved & unique
+    sound = (solution.status == Status.SOLVED) & unique
     factor = jnp.where(unique, factor, eye)
-    pull = column * (d.P @ solution.x + d.q + _columns(d.A, solution.y))
-    shift = row * (both * _rows(d.A, solution.x) - ratio[0] * d.u - ratio[1] * d.l)
-    pull, shift = jnp.where(sound, pull, 0.0), jnp.where(sound, shift, 0.0)
+    pull, shift = jnp.zeros_like(solution.x), jnp.zeros_like(solution.y)
+    if _moves(d.P):
+        pull += d.P @ solution.x
+    if _moves(d.q):
+        pull += d.q
+    if _moves(d.A):
+        pull, shift = pull + _columns(d.A, solution.y), shift + both * _rows(d.A, solution.x)
+    if _moves(d.u):
+        shift -= ratio[0] * d.u
+    if _moves(d.l):
+        shift -= ratio[1] * d.l
+    pull, shift = jnp.where(sound, column * pull, 0.0), jnp.where(sound, row * shift, 0.0)
     dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
     for _ in range(2):  # as in `_active_set`: later passes take off what cap and rho did
-        known = jnp.where(firm, dz, 0.0) + both * _rows(A, dv) + shift
-        step = -cho_solve((factor, True), P @ dv + pull + _columns(A, known))
-        dv, dz = dv + step, known + both * _rows(A, step)
+        known = jnp.where(firm, dz, 0.0) + both * _rows(normal.A, dv) + shift
+        step = -cho_solve((factor, True), normal.P @ dv + pull + _columns(normal.A, known))
+        dv, dz = dv + step, known + both * _rows(normal.A, step)
     zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)
-    change = Solution(column * dv, row * dz, zero, zero, zero, none, none)
-    return (solution, ratio), (change, jnp.zeros_like(ratio))
+    return solution, Solution(column * dv, row * dz, zero, zero, zero, none, none)

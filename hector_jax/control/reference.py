@@ -63,8 +63,8 @@ def named_command(name: str) -> Command:
 
 
 def _turn(angle: Float[Array, "*batch"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-    c, s = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], axis=-1)
+    across = v @ np.array([[0.0, 1.0], [-1.0, 0.0]], jnp.result_type(v))
+    return jnp.cos(angle)[..., None] * v + jnp.sin(angle)[..., None] * across
 
 
 def _displacement(command: Command, time: Float[Array, ""]) -> tuple[Array, Array]:

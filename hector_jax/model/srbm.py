@@ -30,6 +30,7 @@ def centroidal_rates(
     return wrench.force.sum(axis=0) / robot.mass - robot.gravity, torque.sum(axis=0)
 
 
+@jax.jit  # traced once for the four stages of a step
 def rates(
     robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], push: Push | None = None
 ) -> State:
@@ -119,14 +120,25 @@ def linearise(
     """
     R_wb = rotation_from_euler(euler)
     inverse_inertia = R_wb @ jnp.linalg.inv(robot.inertia) @ R_wb.T
-    eye = jnp.eye(3)
-    A = jnp.eye(15)
-    A = A.at[0:3, 6:9].set(dt * euler_rates(euler))
-    A = A.at[3:6, 9:12].set(dt * eye)
-    A = A.at[9:12, 12:15].set(-dt * eye)
-    by_force = inverse_inertia @ jnp.concatenate([skew(lever[0]), skew(lever[1])], axis=1)
-    by_moment = jnp.concatenate([inverse_inertia, inverse_inertia], axis=1)
-    B = jnp.zeros((15, 12))
-    B = B.at[6:9, 0:6].set(dt * by_force).at[6:9, 6:12].set(dt * by_moment)
-    B = B.at[9:12, 0:6].set(dt / robot.mass * jnp.concatenate([eye, eye], axis=1))
+    eye, none = jnp.eye(3, dtype=R_wb.dtype), jnp.zeros((3, 3), R_wb.dtype)
+    A = jnp.block(
+        [
+            [eye, none, dt * euler_rates(euler), none, none],
+            [none, eye, none, dt * eye, none],
+            [none, none, eye, none, none],
+            [none, none, none, eye, -dt * eye],
+            [none, none, none, none, eye],
+        ]
+    )
+    turn = dt * inverse_inertia
+    push = dt / robot.mass * eye
+    B = jnp.block(
+        [
+            [none, none, none, none],
+            [none, none, none, none],
+            [turn @ skew(lever[0]), turn @ skew(lever[1]), turn, turn],
+            [push, push, none, none],
+            [none, none, none, none],
+        ]
+    )
     return A, B

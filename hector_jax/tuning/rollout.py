@@ -6,13 +6,14 @@ air is carried at its planned touchdown point, where an early touchdown that phi
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from hector_jax.control import gait
+from hector_jax.control import gait, qp
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
@@ -30,10 +31,13 @@ class RolloutConfig:
     walk: WalkConfig = WalkConfig()
     ticks: int = 400  # T; 4 s
     lead: int = 0  # ticks in place before t = 0, outside the loss
+    block: int = 500  # ticks whose solves are kept for the gradient; longer walks are walked twice
 
     def __post_init__(self) -> None:
         if self.ticks < 2:
             raise ValueError(f"RolloutConfig.ticks must be at least 2, got {self.ticks}")
+        if self.block < 1:
+            raise ValueError(f"RolloutConfig.block must be at least 1 tick, got {self.block}")
         if self.lead < 0:
             raise ValueError(f"RolloutConfig.lead must be at least 0 ticks, got {self.lead}")
         if self.lead > -self.walk.gait.first_tick:
@@ -163,9 +167,25 @@ def rollout(
     Source: Eq. 12, 13.
     """
 
-    @jax.checkpoint
+    @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
     def tick(carry: Carry, j: Int[Array, ""]) -> tuple[Carry, Trajectory]:
         return step_carry(config, robot, weights, command, effect, carry, j)
 
-    _, samples = jax.lax.scan(tick, init_carry(robot, anchor), walked_ticks(config, anchor))
+    def walk(carry: Carry, ticks: Int[Array, " block"]) -> tuple[Carry, Trajectory]:
+        return jax.lax.scan(tick, carry, ticks)
+
+    start, ticks = init_carry(robot, anchor), walked_ticks(config, anchor)
+    blocks = _blocks(config)
+    if blocks == 1:
+        _, samples = walk(start, ticks)
+    else:
+        _, samples = jax.lax.scan(jax.checkpoint(walk), start, ticks.reshape(blocks, -1))
+        samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     return from_start(config, samples)
+
+
+def _blocks(config: RolloutConfig) -> int:
+    """Equal parts, of at most `block` ticks, that a rollout is kept in."""
+    ticks = config.lead + config.ticks
+    fewest = -(-ticks // config.block)
+    return next(count for count in range(fewest, ticks + 1) if ticks % count == 0)
