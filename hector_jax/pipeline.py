@@ -42,9 +42,9 @@ class CollectConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.walks < 2 or not self.seconds > 0.0:
+        if self.walks < 3 or not self.seconds > 0.0:  # to learn from, to choose by, to judge by
             raise ValueError(
-                f"CollectConfig needs walks >= 2 and seconds > 0, got {self.walks}, {self.seconds}"
+                f"CollectConfig needs walks >= 3 and seconds > 0, got {self.walks}, {self.seconds}"
             )
 
 

@@ -33,6 +33,7 @@ from hector_jax.model import srbm
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench, pack_wrench, unpack_wrench
 
+
 @dataclass(frozen=True)
 class MpcConfig:
     """What the MPC is compiled for."""
@@ -184,7 +185,7 @@ def write_qp(
     Wd = (turn[:, :, None] * eyeN[:, None, :, None]).reshape(3 * N, N * b)
     pushing = both[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
     P = (Wd.T @ (turning.reshape(3 * N, 3 * N) @ Wd)).reshape(N, b, N, b)
-    P += jnp.einsum("ixa,ixjb->iajb", push, jnp.einsum("ijx,jxb->ixjb",pushing, push))
+    P += jnp.einsum("ixa,ixjb->iajb", push, jnp.einsum("ijx,jxb->ixjb", pushing, push))
     P = 2.0 * (P + jnp.einsum("kij,kl->kilj", effort, jnp.eye(N, dtype=dtype)))
     P = P.reshape(N * b, N * b)
     torque = jnp.einsum("kjxy,kx->jy", angles, error.euler) + later.T @ error.ang_velocity

@@ -340,7 +340,9 @@ def _worst(qp: _Normal, wrong: Array, active: Array, by: Array) -> Array:
     by = jnp.where(wrong, by, 0.0).reshape(blocks)
     active = active.reshape(blocks)
     largest = lambda v: jnp.max(v, axis=(0, 2), keepdims=True)  # noqa: E731
-    bar = jnp.where(active, largest(jnp.where(active, by, 0.0)), largest(jnp.where(active, 0.0, by)))
+    bar = jnp.where(
+        active, largest(jnp.where(active, by, 0.0)), largest(jnp.where(active, 0.0, by))
+    )
     return wrong & (by >= 0.9 * bar).reshape(wrong.shape)
 
 
