@@ -126,7 +126,9 @@ def drift(
     if not len(starts):
         raise ValueError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
 
-    def errors(walk: Trajectory, start_tick: Array, first: Array) -> tuple[Array, Array]:
+    def errors(
+        effect: jax.tree_util.Partial | None, walk: Trajectory, start_tick: Array, first: Array
+    ) -> tuple[Array, Array]:
         guess = _ahead(config, robot, effect, walk, start_tick, first, ticks)
         true = jax.tree.map(lambda s: jax.lax.dynamic_slice_in_dim(s, first, ticks), walk.state)
         return (
@@ -134,9 +136,9 @@ def drift(
             jnp.sum((guess.euler - true.euler) ** 2, axis=-1),
         )
 
-    over_starts = jax.vmap(errors, in_axes=(None, None, 0))
-    position, euler = jax.jit(jax.vmap(over_starts, in_axes=(0, 0, None)))(
-        jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
+    over_starts = jax.vmap(errors, in_axes=(None, None, None, 0))
+    position, euler = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
+        effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
     )
     whole = np.stack([~fallen[:, s : s + ticks].any(axis=1) for s in starts], axis=1)
     rms = lambda square: np.sqrt(np.asarray(square)[whole].mean(axis=0))  # noqa: E731

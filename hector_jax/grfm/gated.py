@@ -57,10 +57,10 @@ class GatedMap(NamedTuple):
 
 
 def in_dtype_of(window: Window, tree: Any) -> Any:
-    """The floating-point leaves of a tree in the dtype of a window's commands."""
+    """A tree on the device, its floating-point leaves in the dtype of a window's commands."""
     dtype = window.commands.force.dtype
     return jax.tree.map(
-        lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+        lambda x: jnp.asarray(x, dtype if jnp.issubdtype(x.dtype, jnp.floating) else None), tree
     )
 
 
