@@ -131,7 +131,7 @@ def _grfm(args: Grfm) -> None:
     curves = _curves(robot, worlds["hfs"].trajectory, effects)
     wrenches = plots.wrenches(args.out / "wrenches.png", config.rollout.walk.gait.tick, curves)
     captions = {
-        "wrenches": f"{wrenches} The first held-out walk.",
+        "wrenches": f"{wrenches} The first held-out walk, in the robot's yaw frame.",
         "open_loop": plots.open_loop(
             args.out / "open_loop.png", {WORLDS.get(w, w): found for w, found in drifts.items()}
         ),
