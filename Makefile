@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	>/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: help setup tune test test-all bench check format lock
+.PHONY: help setup tune grfm test test-all bench check format lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -25,6 +25,9 @@ $(STAMP): requirements.lock pyproject.toml
 
 tune: $(STAMP) ## tune one trajectory and judge it: make tune TRAJ=straight|c|s
 	@$(BIN)/hector tune --traj $(TRAJ)
+
+grfm: $(STAMP) ## how well the nets tell what the ground returns: runs/grfm/report.md
+	@$(BIN)/hector grfm
 
 test: $(STAMP) ## the fast suite (under 8 minutes on 2 cores)
 	@$(BIN)/pytest -q -n 2

@@ -1,9 +1,9 @@
 """Does the model's gradient point where the better simulator's does?
 
 Cosine between the gradient of L in log-weights on the rigid body (with the command itself, a linear
-map or GRFM-Net as phi) and central differences of L on the high-fidelity simulator (hfs), at the
-nominal weights; with all entries and without those of sag and float (Q_z, Q_vz, R_Fz). The feet
-share one R: 18 directions.
+map, the paper's GRFM-Net or the default one as phi) and central differences of L on the
+high-fidelity simulator (hfs), at the nominal weights; with all entries and without those of sag and
+float (Q_z, Q_vz, R_Fz). The feet share one R: 18 directions.
 
     python experiments/transfer.py [--data data] [--lead 0]
 """
@@ -96,13 +96,17 @@ def main() -> None:
     flags = tyro.cli(Flags)
     setup_jax()
     robot, (names, steps) = load_robot(), directions()
-    net = pipeline.learned(robot, flags.data / "walks", flags.data / "grfm.npz")
+    config = TuneConfig(rollout=RolloutConfig(lead=flags.lead))
+    with workers(flags.processes) as pool:
+        net, paper = (
+            pipeline.ground(pool, config, robot, flags.data, variant) for variant in (None, "paper")
+        )
     effects = {
         "command": last_command,
         "linear": linear_effect(net.linear),
+        "paper": as_effect(paper.params),
         "net": as_effect(net.params),
     }
-    config = TuneConfig(rollout=RolloutConfig(lead=flags.lead))
     kept = [i for i, name in enumerate(names) if name not in SAG]
     record = {}
     for name, truth in simulator_gradients(flags.processes).items():

@@ -18,31 +18,35 @@ import numpy as np
 
 from hector_jax import pipeline
 from hector_jax.console import say
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
-from hector_jax.evaluation import metrics, plots
+from hector_jax.evaluation import fidelity, metrics, plots
 from hector_jax.evaluation.metrics import Verdict
 from hector_jax.evaluation.report import (
+    WORLDS,
     Picture,
     Report,
     environment,
     print_table,
+    write_fidelity,
     write_report,
 )
 from hector_jax.evaluation.video import VideoUnavailable, write_video
-from hector_jax.flags import Collect, Doctor, Evaluate, Train, Tune, Walk
-from hector_jax.grfm.dataset import at_interval, make_dataset
-from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.flags import Collect, Doctor, Evaluate, Grfm, Train, Tune, Walk
+from hector_jax.grfm import training
+from hector_jax.grfm.dataset import Walks, at_interval, make_dataset
+from hector_jax.grfm.gated import gated_effect
+from hector_jax.grfm.network import ResidualParams, as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import cache_folder, workers
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk
+from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
 from hector_jax.storage import load_weights, save_tree, save_weights, versions, write_file
-from hector_jax.trajectory import Trajectory
+from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.rollout import RolloutConfig, rollout
@@ -90,7 +94,7 @@ def _collect(args: Collect) -> None:
 
 @run.register
 def _train(args: Train) -> None:
-    config = TrainConfig(epochs=args.epochs, seed=args.seed)
+    config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     found = pipeline.train(config, load_robot(), args.data, args.out)
     for name, errors in found.errors.items():
         print(
@@ -98,6 +102,83 @@ def _train(args: Train) -> None:
             "   (held-out walks)"
         )
     say(f"the net is in {args.out}")
+
+
+@run.register
+def _grfm(args: Grfm) -> None:
+    robot, config = load_robot(), TuneConfig()
+    if args.seeds < 0:
+        raise ValueError(f"--seeds must be at least 0, got {args.seeds}")
+    args.out.mkdir(parents=True, exist_ok=True)
+    with workers(args.processes) as pool:
+        net = pipeline.ground(pool, config, robot, args.data)
+        paper = pipeline.ground(pool, config, robot, args.data, "paper")
+        worlds = {"hfs": pipeline.held_out(robot, args.data / "walks")}
+        if args.seeds:
+            worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
+    effects = {"raw": last_command, "linear": linear_effect(net.linear)}
+    effects |= {"paper": as_effect(paper.params), "residual": as_effect(net.params)}
+    if isinstance(net.params, ResidualParams):
+        effects["gated"] = gated_effect(net.params.linear)
+    say("predicting")
+    found, drifts = {}, {}
+    for world, walks in worlds.items():
+        samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick)
+        drifts[world] = fidelity.drifts(robot, effects, walks.trajectory, walks.job.start_tick)
+        found[world] = fidelity.as_result(
+            training.report(effects, samples), fidelity.by_phase(effects, samples), drifts[world]
+        )
+    curves = _curves(robot, worlds["hfs"].trajectory, effects)
+    wrenches = plots.wrenches(args.out / "wrenches.png", config.rollout.walk.gait.tick, curves)
+    captions = {
+        "wrenches": f"{wrenches} The first held-out walk, in the robot's yaw frame.",
+        "open_loop": plots.open_loop(
+            args.out / "open_loop.png", {WORLDS.get(w, w): found for w, found in drifts.items()}
+        ),
+        "training": plots.training(args.out / "training.png", net.course),
+        "training_paper": plots.training(args.out / "training_paper.png", paper.course),
+    }
+    pictures = [Picture(f"{name}.png", caption) for name, caption in captions.items()]
+    told = write_fidelity(args.out, found, pictures)
+    for name, errors in found["hfs"]["errors"].items():
+        print(
+            f"{name:9s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
+        )
+    say(f"the whole story, with pictures: {told}")
+
+
+def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -> Walks:
+    """Walks of the three trajectories with nominal and expert weights, for information only."""
+    seeds = range(count)
+    jobs = [
+        Job(weights, named_command(name), standin(seed), seed=seed)
+        for weights in (nominal(), expert())
+        for name in COMMANDS
+        for seed in seeds
+    ]
+    return pipeline.walk_all(
+        pool, config, robot, jobs, f"walking on {count} stand-in plants, for information"
+    )
+
+
+def _curves(
+    robot: Robot, walks: Trajectory, effects: Mapping[str, jax.tree_util.Partial]
+) -> dict[str, Wrench]:
+    """Command, predictions and measurement of the first of some walks, yaw frame, from t = 0."""
+    one = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
+    samples, _ = make_dataset(robot, one)
+    window = jax.tree.map(jnp.asarray, samples.window)
+    names = {"linear": "linear", "paper": "paper", "residual": "predicted"}
+    curves = {
+        "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
+        "measured": samples.label,
+        **{names[n]: predict(effect, window) for n, effect in effects.items() if n in names},
+    }
+    unknown = ((HISTORY - 1, 0), (0, 0), (0, 0))  # the first ticks have no full window
+    return {
+        name: jax.tree.map(lambda w: np.pad(w, unknown, constant_values=np.nan), wrench)
+        for name, wrench in curves.items()
+    }
 
 
 def _new_folder(args: Tune) -> Path:
@@ -112,15 +193,6 @@ def _new_folder(args: Tune) -> Path:
     return folder
 
 
-def _net(pool: Executor, args: Tune, robot: Robot) -> pipeline.Learned:
-    """GRFM-Net, from disk or made now, with its walks."""
-    folder, path = args.data / "walks", args.data / "grfm.npz"
-    if path.exists():
-        return pipeline.learned(robot, folder, path)
-    pipeline.collect(pool, pipeline.CollectConfig(), TuneConfig(), robot, folder)
-    return pipeline.train(TrainConfig(), robot, folder, path)
-
-
 @run.register
 def _tune(args: Tune) -> None:
     command, robot = named_command(args.traj), load_robot()
@@ -133,7 +205,7 @@ def _tune(args: Tune) -> None:
     folder = _new_folder(args)
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = _net(pool, args, robot)
+        net = pipeline.ground(pool, config, robot, args.data)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
@@ -236,19 +308,8 @@ def _draw(
     flat = {name: np.asarray(weights_to_vector(sets[name])) for name in four}
     histories = {name: tuning.history for name, tuning in tunings.items()}
     sampled = at_interval(on_hfs, config.rollout.walk.gait.tick)
-    samples, _ = make_dataset(jax.tree.map(lambda x: np.asarray(x)[None], sampled))
-    window = jax.tree.map(jnp.asarray, samples.window)
-    curves = {
-        "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
-        "linear": predict(linear_effect(net.linear), window),
-        "predicted": predict(as_effect(net.params), window),
-        "measured": samples.label,
-    }
-    unknown = ((HISTORY - 1, 0), (0, 0), (0, 0))  # the first ticks have no full window
-    curves = {
-        name: jax.tree.map(lambda w: np.pad(w, unknown, constant_values=np.nan), wrench)
-        for name, wrench in curves.items()
-    }
+    effects = {"linear": linear_effect(net.linear), "residual": as_effect(net.params)}
+    curves = _curves(robot, jax.tree.map(lambda x: np.asarray(x)[None], sampled), effects)
     path = folder / "pictures"
     path.mkdir()
     captions = {

@@ -21,8 +21,19 @@ class Train:
 
     data: Path = Path("data/walks")  # folder of the walks
     out: Path = Path("data/grfm.npz")  # the net
+    variant: str = "residual"  # or paper
     epochs: int = 200
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class Grfm:
+    """Report how well the nets tell what the ground returns, on walks that they never saw."""
+
+    data: Path = Path("data")  # walks and nets; made where missing
+    out: Path = Path("runs/grfm")  # folder of the report
+    seeds: int = 2  # stand-in plants, told for information only; 0 leaves them out
+    processes: int = 2  # one core each
 
 
 @dataclass(frozen=True)
@@ -72,4 +83,4 @@ class Doctor:
     """Say what this machine offers: versions, device, precision, cache, video; and test it."""
 
 
-Command = Collect | Train | Tune | Evaluate | Walk | Doctor
+Command = Collect | Train | Grfm | Tune | Evaluate | Walk | Doctor

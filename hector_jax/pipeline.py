@@ -7,7 +7,7 @@ one long chain of small operations. A step that finds its result on disk takes i
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,13 +19,14 @@ from hector_jax.console import Tell, bar
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.grfm import dataset, network, training
-from hector_jax.grfm.dataset import Dataset
-from hector_jax.grfm.network import LinearMap, NetParams
+from hector_jax.grfm.dataset import Dataset, Walks
+from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import Imperfections
+from hector_jax.storage import read_card
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
@@ -41,18 +42,18 @@ class CollectConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.walks < 2 or not self.seconds > 0.0:
+        if self.walks < 3 or not self.seconds > 0.0:  # to learn from, to choose by, to judge by
             raise ValueError(
-                f"CollectConfig needs walks >= 2 and seconds > 0, got {self.walks}, {self.seconds}"
+                f"CollectConfig needs walks >= 3 and seconds > 0, got {self.walks}, {self.seconds}"
             )
 
 
 class Learned(NamedTuple):
     """A trained GRFM-Net with what there is to say about it."""
 
-    params: NetParams
+    params: Params
     linear: LinearMap  # the baseline, fitted to the same samples
-    errors: dict[str, Any]  # held-out errors of raw command, linear map and net
+    errors: dict[str, Any]  # of raw command, linear map and net on walks that no training saw
     course: History
 
 
@@ -60,7 +61,7 @@ def _tune_job(
     config: TuneConfig,
     robot: Robot,
     command: Command,
-    params: NetParams | None,
+    params: Params | None,
     name: str,
     tell: Any,
 ) -> Tuning:
@@ -81,7 +82,7 @@ def tune_many(
     pool: Executor,
     config: TuneConfig,
     robot: Robot,
-    problems: Mapping[str, tuple[Command, NetParams | None]],
+    problems: Mapping[str, tuple[Command, Params | None]],
     title: str,
     on_iteration: Callable[[str, Iteration], None] = lambda name, iteration: None,
 ) -> dict[str, Tuning]:
@@ -115,9 +116,7 @@ def tune_many(
         return {name: future.result() for name, future in running.items()}
 
 
-def _norms_job(
-    config: TuneConfig, robot: Robot, command: Command, params: NetParams | None
-) -> Losses:
+def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
     effect = last_command if params is None else network.as_effect(params)
     anchor = standing_anchor(robot)
     norms = difftune.gradient_norms(config, robot, nominal(), command, anchor, effect)
@@ -128,7 +127,7 @@ def gradient_norms(
     pool: Executor,
     config: TuneConfig,
     robot: Robot,
-    problems: Mapping[str, tuple[Command, NetParams | None]],
+    problems: Mapping[str, tuple[Command, Params | None]],
 ) -> dict[str, Losses]:
     """Norms of the gradients of the loss's parts at the nominal weights, by problem."""
     with bar("norms of the gradients") as tell:
@@ -171,47 +170,115 @@ def collect(
         )
 
 
-def _samples(robot: Robot, folder: Path) -> tuple[Dataset, Dataset, int]:
-    """Training and held-out samples of the walks under `folder`, and how many a fall cost."""
+class Samples(NamedTuple):
+    """The samples of a collection; no walk is in two of the parts."""
+
+    training: Dataset
+    validation: Dataset  # chooses the epoch of a net
+    held_out: Dataset  # is only looked at
+    dropped: int  # by a fall or an unsolved QP
+
+
+def samples(robot: Robot, folder: Path) -> Samples:
+    """Samples of the walks under `folder`: a fifth of the walks held out, of the rest another."""
     walks = dataset.load_walks(folder, robot)
-    samples, dropped = dataset.make_dataset(walks.trajectory, walks.job.start_tick)
-    seen, held_out = dataset.split_by_walk(samples)
-    return seen, held_out, dropped
+    found, dropped = dataset.make_dataset(robot, walks.trajectory, walks.job.start_tick)
+    rest, held_out = dataset.split_by_walk(found)
+    return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
+
+
+def held_out(robot: Robot, folder: Path) -> Walks:
+    """The walks under `folder` that no training sees."""
+    walks = dataset.load_walks(folder, robot)
+    chosen = np.unique(samples(robot, folder).held_out.walk)
+    return jax.tree.map(lambda x: x[chosen], walks)
+
+
+def walk_all(
+    pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
+) -> Walks:
+    """Walks of jobs whose commands are alike, at the plan interval."""
+    with bar(title) as tell:
+        tell(0, len(jobs), "compiling")
+        walked = _told(walk_many(pool, config.rollout.walk, robot, jobs), len(jobs), tell)
+        walks = [dataset.at_interval(walk, config.rollout.walk.gait.tick) for walk in walked]
+    stack = lambda trees: jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *trees)  # noqa: E731
+    return Walks(stack(jobs), stack(walks))
 
 
 def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
-    """Train the GRFM-Net on the walks under `folder` and keep it at `path`."""
-    seen, held_out, dropped = _samples(robot, folder)
-    with bar(f"training GRFM-Net on {len(seen.walk)} samples") as tell:
+    """Train a GRFM-Net on the walks under `folder` and keep it at `path`.
+
+    Its card tells the walks and the controller that it belongs to.
+    """
+    parts = samples(robot, folder)
+    with bar(f"training GRFM-Net ({config.variant}) on {len(parts.training.walk)} samples") as tell:
         tell(0, config.epochs, "compiling")
         params, course = training.train(
-            config, seen, held_out, lambda epoch, _: tell(epoch, config.epochs, "")
+            config,
+            parts.training,
+            parts.validation,
+            lambda epoch, _: tell(epoch, config.epochs, ""),
         )
-    linear = network.fit_linear(seen)
+    linear = network.fit_linear(parts.training)
     effects = {
         "raw": last_command,
         "linear": network.linear_effect(linear),
         "net": network.as_effect(params),
     }
+    sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
-        "samples": {"training": len(seen.walk), "held_out": len(held_out.walk), "fallen": dropped},
-        "errors": training.report(effects, held_out),
+        "made_of": dataset.walked_with(folder),
+        "settings": asdict(config),
+        "samples": {**sizes, "dropped": parts.dropped},
+        "errors": training.report(effects, parts.held_out),
         "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
     return Learned(params, linear, about["errors"], course)
 
 
-def learned(robot: Robot, folder: Path, path: Path) -> Learned:
-    """The net kept at `path` and what its card says, with the linear map of its data.
+def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
+    """The net kept at `path`, of whatever variant, trained anew where it is stale or missing.
+
+    Stale is a net of other walks or of another controller than those under `folder`.
 
     Raises:
         ValueError: one line naming the file that is damaged or of another robot.
     """
+    made_of = dataset.walked_with(folder)
+    if not path.exists() or read_card(path)["about"].get("made_of") != made_of:
+        return train(config, robot, folder, path)
     params, _, card = network.load_net(path, robot)
     about = card["about"]
     course = History(**{name: np.array(about["course"][name]) for name in History._fields})
-    return Learned(params, network.fit_linear(_samples(robot, folder)[0]), about["errors"], course)
+    linear = network.fit_linear(samples(robot, folder).training)
+    return Learned(params, linear, about["errors"], course)
+
+
+def ground(
+    pool: Executor, config: TuneConfig, robot: Robot, data: Path, variant: str | None = None
+) -> Learned:
+    """A GRFM-Net with its walks under `data`, from disk or made now.
+
+    Args:
+        pool: worker processes.
+        config: the controller that has to have walked.
+        robot: the body.
+        data: folder of `walks/` and `grfm.npz`, or `grfm-<variant>.npz`.
+        variant: a variant for comparison; None takes the net that tunings use.
+
+    Raises:
+        ValueError: the walks are of another controller or robot, or a file is damaged.
+    """
+    walks = data / "walks"
+    if not (walks / "card.json").exists():
+        collect(pool, CollectConfig(), config, robot, walks)
+    if dataset.walked_with(walks).get("controller") != repr(config.rollout.walk):
+        raise ValueError(f"{walks}: walked by another controller; choose another folder")
+    train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
+    name = "grfm.npz" if variant is None else f"grfm-{variant}.npz"
+    return learned(train_config, robot, walks, data / name)
 
 
 def judge(

@@ -31,6 +31,13 @@ class Wrench(NamedTuple):
     moment: Float[Array, "*batch 2 3"]  # [N m]
 
 
+class Push(NamedTuple):
+    """Force on the centre of mass and torque about it."""
+
+    force: Float[Array, "*batch 3"]  # [N]
+    torque: Float[Array, "*batch 3"]  # [N m]
+
+
 class Trajectory(NamedTuple):
     """One walk, sampled evenly; every world returns this and nothing else.
 

@@ -35,7 +35,7 @@ def test_help_names_the_commands():
         [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
     )
     assert shown.returncode == 0
-    for name in ("collect", "train", "tune", "evaluate", "walk", "doctor"):
+    for name in ("collect", "train", "grfm", "tune", "evaluate", "walk", "doctor"):
         assert name in shown.stdout
     assert shown.stderr == ""
 

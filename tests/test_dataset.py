@@ -19,9 +19,11 @@ from hector_jax.grfm.dataset import (
     load_walks,
     make_dataset,
     split_by_walk,
+    walked_with,
     with_mirror,
 )
-from hector_jax.model.effect import HISTORY
+from hector_jax.model import srbm
+from hector_jax.model.effect import HISTORY, turn
 from hector_jax.robot import load_robot
 
 TICKS = 40
@@ -119,8 +121,8 @@ def test_samples_that_do_not_fill_intervals_are_refused(interval):
 # --- samples ---
 
 
-def test_a_sample_is_the_newest_commands_and_the_effect_of_its_tick(three):
-    data, dropped = make_dataset(three)
+def test_a_sample_is_the_newest_commands_and_the_effect_of_its_tick(three, robot):
+    data, dropped = make_dataset(robot, three)
     assert dropped == 0
     assert len(data.walk) == 3 * (TICKS - HISTORY + 1)
     row = np.flatnonzero((data.walk == 1) & (data.tick == 7))[0]
@@ -142,38 +144,39 @@ def test_a_sample_is_the_newest_commands_and_the_effect_of_its_tick(three):
     np.testing.assert_allclose(data.window.since_switch, 0.01 * (data.tick % 20))
 
 
-def test_the_window_agrees_with_the_planned_contact(three):
-    data, _ = make_dataset(three)
+def test_the_window_agrees_with_the_planned_contact(three, robot):
+    data, _ = make_dataset(robot, three)
     np.testing.assert_array_equal(data.window.contact[:, 0], data.window.phase < 0.5)
 
 
-def test_the_gait_s_phase_counts_from_the_start_tick(three):
-    data, _ = make_dataset(three, start_tick=[0, 10, 30])
+def test_the_gait_s_phase_counts_from_the_start_tick(three, robot):
+    data, _ = make_dataset(robot, three, start_tick=[0, 10, 30])
     starts = np.array([0, 10, 30])[data.walk]
     np.testing.assert_allclose(data.window.phase, (data.tick + starts) % CYCLE / CYCLE)
 
 
-def test_a_walk_on_another_heading_makes_the_same_samples():
+def test_a_walk_on_another_heading_makes_the_same_samples(robot):
     walk = synthetic_walk(5, TICKS)
-    here, _ = make_dataset(walks_of(walk))
-    there, _ = make_dataset(walks_of(turn_walk(walk, 2.1)))
+    here, _ = make_dataset(robot, walks_of(walk))
+    there, _ = make_dataset(robot, walks_of(turn_walk(walk, 2.1)))
     leaves_close(here.window, there.window, 1e-10)
     leaves_close(here.label, there.label, 1e-10)
+    leaves_close(here.legs, there.legs, 1e-8)
 
 
-def test_samples_after_a_fall_are_dropped_and_counted(three):
+def test_samples_after_a_fall_are_dropped_and_counted(three, robot):
     fallen = three.fallen.copy()
     fallen[2, 30:] = True
     broken = three._replace(fallen=fallen)
     broken.effect.force[2, 35:] = np.nan
-    data, dropped = make_dataset(broken)
+    data, dropped = make_dataset(robot, broken)
     assert dropped == 10
     assert data.tick[data.walk == 2].max() == 29
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(data))
 
 
-def test_a_mirror_image_has_the_other_foot_s_turn_and_is_its_own_inverse(three):
-    data, _ = make_dataset(three)
+def test_a_mirror_image_has_the_other_foot_s_turn_and_is_its_own_inverse(three, robot):
+    data, _ = make_dataset(robot, three)
     n = len(data.walk)
     both = with_mirror(data)
     image = jax.tree.map(lambda x: x[n:], both)
@@ -191,8 +194,8 @@ def test_a_mirror_image_has_the_other_foot_s_turn_and_is_its_own_inverse(three):
     leaves_close(again, data, 1e-12)
 
 
-def test_no_walk_is_in_both_parts_of_a_split(three):
-    data, _ = make_dataset(three)
+def test_no_walk_is_in_both_parts_of_a_split(three, robot):
+    data, _ = make_dataset(robot, three)
     for share in (0.01, 0.4, 0.99):
         train, held = split_by_walk(data, share, seed=1)
         assert not set(train.walk) & set(held.walk)
@@ -200,8 +203,8 @@ def test_no_walk_is_in_both_parts_of_a_split(three):
         assert len(train.walk) + len(held.walk) == len(data.walk)
 
 
-def test_a_split_needs_two_walks():
-    data, _ = make_dataset(walks_of(synthetic_walk(0, TICKS)))
+def test_a_split_needs_two_walks(robot):
+    data, _ = make_dataset(robot, walks_of(synthetic_walk(0, TICKS)))
     with pytest.raises(ValueError, match="at least 2 walks, got 1"):
         split_by_walk(data)
 
@@ -275,3 +278,28 @@ def test_a_walk_that_did_not_come_is_told(tmp_path, robot):
         collect(
             tmp_path, draw_jobs(0, 4), lambda jobs: list(walker()(jobs))[:3], robot=robot, shard=2
         )
+
+
+def test_a_collection_is_known_by_its_walks_and_by_what_it_was_told(tmp_path, robot):
+    known = []
+    for i, (seed, ticks) in enumerate([(0, 4), (0, 4), (1, 4), (0, 5)]):
+        folder = tmp_path / str(i)
+        collect(folder, draw_jobs(seed, 2), walker(), robot=robot, about={"ticks": ticks})
+        known.append(walked_with(folder))
+    assert known[0] == known[1]
+    assert known[0]["walks"] != known[2]["walks"]
+    assert (known[0]["ticks"], known[3]["ticks"]) == (4, 5)
+    with pytest.raises(ValueError, match="no finished collection"):
+        walked_with(tmp_path / "none")
+
+
+def test_the_legs_get_what_the_wrench_does_not_explain(three, robot):
+    data, _ = make_dataset(robot, three)
+    row, walk, j = np.flatnonzero((data.walk == 1) & (data.tick == 7))[0], 1, 7
+    before, after = (
+        jax.tree.map(lambda s, t=t: jnp.asarray(s[walk, t]), three.state) for t in (j - 1, j)
+    )
+    wrench = jax.tree.map(lambda w: jnp.asarray(w[walk, j]), three.effect)
+    feet = jnp.asarray(three.feet[walk, j - 1 : j + 1].mean(axis=0))
+    push = srbm.unexplained(robot, before, after, wrench, feet, 0.01)
+    leaves_close(turn(push, -before.euler[2]), jax.tree.map(lambda x: x[row], data.legs), 1e-8)

@@ -7,6 +7,7 @@ from pretend import pretend_history, pretend_walk
 
 from hector_jax.control.weights import WEIGHT_NAMES
 from hector_jax.evaluation import plots
+from hector_jax.evaluation.fidelity import Drift
 from hector_jax.grfm.training import History
 from hector_jax.tuning.loss import LossConfig
 
@@ -71,6 +72,16 @@ def test_the_training_of_a_net_is_drawn(tmp_path):
         tmp_path / "net.png", History(falling, falling / 300, falling + 5, falling / 250)
     )
     assert _has_ink(tmp_path / "net.png")
+
+
+def test_open_loop_errors_are_drawn_for_each_world(tmp_path):
+    time = np.linspace(0.01, 0.4, 40)
+    names = ("raw", "linear", "paper", "residual", "gated", "measured")
+    found = {n: Drift(time, 0.1 * time**2 / i, time / i) for i, n in enumerate(names, 1)}
+    for worlds in ({"hfs": found}, {"hfs": found, "hardware stand-in": found}):
+        path = tmp_path / f"{len(worlds)}.png"
+        assert "RMS" in plots.open_loop(path, worlds)
+        assert _has_ink(path)
 
 
 @pytest.mark.parametrize("ending", ["png", "svg", "pdf"])

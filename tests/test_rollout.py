@@ -10,7 +10,7 @@ from hector_jax.control.reference import COMMANDS, named_command, standing_ancho
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, init_params
-from hector_jax.model.effect import Effect, last_command
+from hector_jax.model.effect import last_command, sure
 from hector_jax.robot import load_robot
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune_step
@@ -120,14 +120,14 @@ def relative(found, expected):
 def _mixed(params, window):
     net, command = as_effect(params)(window).wrench, last_command(window).wrench
     wrench = jax.tree.map(lambda n, c: 0.1 * n + 0.9 * c, net, command)
-    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench))
+    return sure(wrench)
 
 
 @pytest.fixture(scope="module")
 def net():
     """An untrained GRFM-Net that is part of the answer, so that the robot stays on its feet."""
     walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
-    dataset, _ = make_dataset(jax.tree.map(lambda *x: np.stack(x), *walks))
+    dataset, _ = make_dataset(load_robot(), jax.tree.map(lambda *x: np.stack(x), *walks))
     return jax.tree_util.Partial(_mixed, init_params(jax.random.key(0), dataset))
 
 

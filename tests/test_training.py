@@ -6,14 +6,16 @@ import pytest
 from synthetic import synthetic_walk
 
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk
+from hector_jax.grfm.gated import fit_gated, gated_effect
 from hector_jax.grfm.network import as_effect, fit_linear, linear_effect
 from hector_jax.grfm.training import TrainConfig, errors, report, train
 from hector_jax.model.effect import last_command
+from hector_jax.robot import load_robot
 
 
 def dataset(seeds, ticks=200, noise=0.3):
     walks = [at_interval(synthetic_walk(i, ticks, noise), 0.01) for i in seeds]
-    return make_dataset(jax.tree.map(lambda *x: np.stack(x), *walks))[0]
+    return make_dataset(load_robot(), jax.tree.map(lambda *x: np.stack(x), *walks))[0]
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +25,12 @@ def parts():
 
 @pytest.fixture(scope="module")
 def trained(parts):
-    return train(TrainConfig(epochs=60, batch=64, mirror=False), *parts)
+    return train(TrainConfig("paper", epochs=60, batch=64, mirror=False), *parts)
+
+
+@pytest.fixture(scope="module")
+def residual(parts):
+    return train(TrainConfig(epochs=20, batch=64), *parts)
 
 
 def test_the_net_beats_the_raw_command_and_the_linear_map_on_walks_it_never_saw(parts, trained):
@@ -40,6 +47,29 @@ def test_the_net_beats_the_raw_command_and_the_linear_map_on_walks_it_never_saw(
     assert told["net"]["force"] < 0.7 * told["linear"]["force"]
     assert told["net"]["moment"] < 0.8 * told["linear"]["moment"]
     assert told["linear"]["force"] < told["raw"]["force"]
+
+
+def test_the_residual_net_beats_its_linear_part_on_walks_it_never_saw(parts, residual):
+    params, history = residual
+    told = report(
+        {
+            "raw": last_command,
+            "gated": gated_effect(fit_gated(parts[0])),
+            "net": as_effect(params),
+        },
+        parts[1],
+    )
+    for kind in ("force", "moment"):
+        assert told["net"][kind] < 0.99 * told["gated"][kind]
+        assert told["gated"][kind] < 0.9 * told["raw"][kind]
+    # the mean of an ensemble is no worse than its members in the mean
+    assert told["net"]["force"] < 1.001 * history.valid_force.min()
+
+
+def test_members_of_an_ensemble_differ(residual):
+    kernels = residual[0].force["Dense_0"]["kernel"]
+    assert len(kernels) == 4
+    assert np.ptp(kernels, axis=0).min() > 0.0
 
 
 def test_the_errors_by_phase_and_axis_make_up_the_whole(parts):
@@ -60,16 +90,18 @@ def test_the_kept_nets_are_those_of_the_best_held_out_epochs(parts, trained):
 
 
 def test_the_same_seed_makes_the_same_bytes(parts):
-    config = TrainConfig(epochs=2, batch=64)
+    config = TrainConfig("paper", epochs=2, batch=64)
     one, other = train(config, *parts), train(config, *parts)
     jax.tree.map(np.testing.assert_array_equal, one, other)
-    third, _ = train(TrainConfig(epochs=2, batch=64, seed=1), *parts)
+    third, _ = train(TrainConfig("paper", epochs=2, batch=64, seed=1), *parts)
     assert not np.array_equal(third.force["Dense_0"]["kernel"], one[0].force["Dense_0"]["kernel"])
 
 
 def test_sixteen_samples_can_be_learned_by_heart():
     few = jax.tree.map(lambda x: x[20:36], dataset([0], 40))
-    params, history = train(TrainConfig(epochs=1500, batch=16, l2=0.0, mirror=False), few, few)
+    params, history = train(
+        TrainConfig("paper", epochs=1500, batch=16, l2=0.0, mirror=False), few, few
+    )
     spread = float(few.label.force.var(axis=0).mean())
     assert history.valid_force.min() < 1e-3 * spread
     assert errors(as_effect(params), few).force < 1e-3 * spread
@@ -100,10 +132,12 @@ def test_a_batch_larger_than_the_data_is_all_of_it():
 
 def test_no_samples_or_no_sense_are_refused(parts):
     none = jax.tree.map(lambda x: x[:0], parts[0])
-    with pytest.raises(ValueError, match="held-out set has no samples"):
+    with pytest.raises(ValueError, match="validation set has no samples"):
         train(TrainConfig(epochs=1), parts[0], none)
     with pytest.raises(ValueError, match="at least 1 epoch"):
         TrainConfig(epochs=0)
+    with pytest.raises(ValueError, match="variant must be one of paper, residual, got 'papier'"):
+        TrainConfig("papier")
     with pytest.raises(ValueError, match="learning_rate > 0"):
         TrainConfig(learning_rate=float("nan"))
     broken = parts[0]._replace(label=jax.tree.map(lambda w: w * np.nan, parts[0].label))

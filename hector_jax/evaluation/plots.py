@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
+from hector_jax.evaluation.fidelity import Drift
 from hector_jax.grfm.training import History
 from hector_jax.trajectory import LEFT, Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
@@ -53,13 +53,20 @@ _LOOK = {
     "measured": {"color": _GREY, "linestyle": "-", "linewidth": 2.2},
     "predicted": {"color": _GREEN, "linestyle": (0, (5, 1.2))},
     "linear": {"color": _PURPLE, "linestyle": (0, (1.2, 1.2))},
+    "paper": {"color": _ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
+    "gated": {"color": _BLUE, "linestyle": (0, (5, 1.5))},
 }
+_LOOK |= {"raw": _LOOK["commanded"], "residual": _LOOK["with"]}
 _MARKER = {"nominal": "o", "expert": "D", "without": "s", "with": "o"}
 _NAMES = {
     "without": "tuned without net",
     "with": "tuned with net",
     "predicted": "predicted by the net",
     "linear": "predicted by a linear map",
+    "paper": "predicted by the paper's net",
+    "raw": "commanded",
+    "gated": "gated linear part of the net",
+    "residual": "predicted by the net",
 }
 
 
@@ -78,10 +85,10 @@ def _figure(path: Path, width: float, height: float) -> Iterator[Figure]:
         figure.savefig(path, metadata=metadata.get(path.suffix.lower()))
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
+def _legend(figure: Figure, axes: Axes, columns: int = 6) -> None:
     """One legend above all panels, from the labels of one of them."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 6))
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), columns))
 
 
 def _named(name: str) -> str:
@@ -307,7 +314,7 @@ def wrenches(
     Args:
         path: file to write.
         period: [s] between samples.
-        curves: `commanded`, `predicted`, `linear`, `measured`, or some of them, one sample per
+        curves: `commanded`, `predicted`, `paper`, `linear`, `measured`, or some of them, one per
             period, (T, 2, 3) each; held over the period.
         foot: which.
         seconds: of the walk's beginning; two steps by default.
@@ -315,7 +322,8 @@ def wrenches(
     count = round(seconds / period)
     edges = period * np.arange(count + 1)
     labels = ["$F_x$ [N]", "$F_y$ [N]", "$F_z$ [N]", "$M_x$ [N m]", "$M_y$ [N m]", "$M_z$ [N m]"]
-    order = [name for name in ("measured", "commanded", "linear", "predicted") if name in curves]
+    order = ("measured", "commanded", "linear", "paper", "predicted")
+    order = [name for name in order if name in curves]
     side = ("left", "right")[foot]
     with _figure(path, 10.0, 4.4) as figure:
         panels = figure.subplots(2, 3, sharex=True)
@@ -336,8 +344,33 @@ def wrenches(
     )
 
 
+def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
+    """How far the rigid body strays from the robot, by time ahead.
+
+    Args:
+        path: file to write.
+        worlds: by the name of a world and of a phi.
+    """
+    with _figure(path, 7.0, 2.6 * len(worlds) + 0.3) as figure:
+        panels = figure.subplots(len(worlds), 2, squeeze=False, sharex=True)
+        for row, (world, found) in zip(panels, worlds.items(), strict=True):
+            for name, one in found.items():
+                row[0].plot(one.time, 100 * one.position, label=_named(name), **_LOOK[name])
+                row[1].plot(one.time, np.rad2deg(one.euler), **_LOOK[name])
+            row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
+            row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))
+        for panel in panels[-1]:
+            panel.set_xlabel("time ahead [s]")
+        _legend(figure, panels[0, 0], columns=3)
+    return (
+        "How far a rigid body under recorded commands strays from the robot, RMS over starts in "
+        "all phases of the step. `measured` moves it by the measured wrench itself, without what "
+        "the legs do."
+    )
+
+
 def training(path: Path, course: History) -> str:
-    """Errors of the net by epoch, on the walks it learns from and on held-out ones.
+    """Errors of the net by epoch, on the walks it learns from and on those that choose the epoch.
 
     Args:
         path: file to write.
@@ -350,12 +383,14 @@ def training(path: Path, course: History) -> str:
             seen, held = (np.asarray(getattr(course, f"{p}_{kind}")) for p in ("train", "valid"))
             epochs = np.arange(1, len(seen) + 1)
             panel.plot(epochs, seen, **_LOOK["expert"], label="training walks")
-            panel.plot(epochs, held, color=_ORANGE, label="held-out walks")
+            panel.plot(epochs, held, color=_ORANGE, label="validation walks")
             best = int(np.argmin(held))
-            panel.plot(epochs[best], held[best], "o", color=_ORANGE, label="kept epoch")
-            panel.set(title=kind, xlabel="epoch", ylabel=label, yscale="log")
-            panel.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
-            panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-            panel.yaxis.set_minor_formatter(NullFormatter())
+            panel.plot(epochs[best], held[best], "o", color=_ORANGE, label="least")
+            # the first epochs of a fresh net may be far off: they need not be seen whole
+            top = 1.6 * np.percentile(np.concatenate([seen, held]), 90)
+            panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
         _legend(figure, panels[0])
-    return "Errors of GRFM-Net by epoch; the epoch with the least held-out error is kept."
+    return (
+        "Errors of GRFM-Net by epoch, mean over the members where it is an ensemble; of each net "
+        "the epoch with the least error on the validation walks is kept."
+    )

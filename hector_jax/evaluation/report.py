@@ -47,6 +47,14 @@ STAND_IN = (
     "estimator sees. It is not hardware. No training, tuning or choice has read it."
 )
 
+_FIDELITY = (
+    "`raw` is the command itself, `linear` an affine map of the paper's 18 inputs, `paper` the "
+    "paper's net, `residual` the default, `gated` its linear part alone. The walks of the hfs "
+    "were held out of training and of the choice of an epoch. The hardware stand-in is shown for "
+    "information; nothing was chosen by it. `measured` moves the rigid body by the measured "
+    "wrench: what is left there belongs to the legs, not to the ground."
+)
+
 _AXES = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
 _UNITS = {"L": "", "L_Eul": "rad^2", "L_pos": "m^2", "L_ctrl": "N^2, (N m)^2"}
 _VOID = "*"
@@ -260,6 +268,71 @@ def write_report(folder: Path, report: Report) -> Path:
     path = folder / "report.md"
     write_file(path, ("\n\n".join(sections) + "\n").encode())
     return path
+
+
+def write_fidelity(
+    folder: Path, worlds: Mapping[str, Mapping[str, Any]], pictures: Sequence[Picture]
+) -> Path:
+    """Write report.md on the nets' fidelity, and the same numbers as result.json.
+
+    Args:
+        folder: where the pictures are.
+        worlds: by their names, what `fidelity.as_result` gives.
+        pictures: to show.
+
+    Returns:
+        report.md.
+    """
+    sections = ["# What the ground returns: GRFM-Net on walks it never saw", _FIDELITY]
+    for world, found in worlds.items():
+        sections += [
+            f"## {WORLDS.get(world, world)}",
+            _wrench_errors(found["errors"]),
+            "Mean square errors by the phase of the step, since the switch of stance:",
+            _phase_errors(found["phases"]),
+            "Open loop, RMS error after the time ahead:",
+            _drift_table(found["open_loop"]),
+        ]
+    sections += ["## Pictures"]
+    sections += [f"![{p.caption}]({p.file})\n\n*{p.caption}*" for p in pictures]
+    path = folder / "report.md"
+    write_file(path, ("\n\n".join(sections) + "\n").encode())
+    write_file(folder / "result.json", (json.dumps(worlds, indent=2) + "\n").encode())
+    return path
+
+
+def _wrench_errors(errors: Mapping[str, Mapping[str, Any]]) -> str:
+    """Mean square errors per axis; a column for each phi."""
+    rows = []
+    for kind, unit in (("force", "N^2"), ("moment", "(N m)^2")):
+        rows.append([f"{kind}, all [{unit}]", *(f"{e[kind]:.3g}" for e in errors.values())])
+    for contact in ("stance", "swing"):
+        for i, axis in enumerate(_AXES):
+            unit = "N^2" if axis[0] == "F" else "(N m)^2"
+            cells = (f"{e[contact][i]:.3g}" for e in errors.values())
+            rows.append([f"{axis}, {contact} [{unit}]", *cells])
+    return _table(("mean square error", *errors), rows)
+
+
+def _phase_errors(phases: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> str:
+    rows = []
+    first = next(iter(phases.values()))
+    for phase in first:
+        for contact in ("stance", "swing"):
+            for part, unit, axes in (("F", "N^2", slice(3)), ("M", "(N m)^2", slice(3, 6))):
+                cells = (f"{np.mean(found[phase][contact][axes]):.3g}" for found in phases.values())
+                rows.append([f"{phase}, {contact}, {part} [{unit}]", *cells])
+    return _table(("mean over the axes", *phases), rows)
+
+
+def _drift_table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
+    horizons = list(next(iter(found.values())))
+    rows = []
+    for horizon in horizons:
+        for part, unit, scale in (("position", "cm", 100.0), ("euler", "deg", 180.0 / np.pi)):
+            cells = (f"{scale * one[horizon][part]:.2f}" for one in found.values())
+            rows.append([f"{part} after {horizon} [{unit}]", *cells])
+    return _table(("", *found), rows)
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

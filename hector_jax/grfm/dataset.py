@@ -3,14 +3,17 @@
 A shard keeps whole walks at the plan interval, in the world frame, together with the jobs that
 asked for them; windows, frames and labels are made from it anew each time, so another history or
 another label needs no new data. A sample belongs to one tick: the commands of the tick and of those
-before, and the mean wrench that the ground returned over the tick, all in the robot's yaw frame at
+before, the mean wrench that the ground returned over the tick, and the push that a rigid body would
+have needed beside it to move as the trunk moved (that of the legs), all in the robot's yaw frame at
 the start of the tick. Training and validation are split by walk: samples of one walk are too alike.
 """
 
+import hashlib
 import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,15 +26,18 @@ from hector_jax.control import gait
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.model.effect import HISTORY, Window, turn
+from hector_jax.model import srbm
+from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs, hfs_drawn
 from hector_jax.storage import load_tree, read_card, save_tree, write_file
-from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.trajectory import Push, State, Trajectory, Wrench
 
 KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
+ALONG = np.array([1.0, -1.0, 1.0])  # mirror, left for right: of positions, velocities, forces
+ACROSS = -ALONG  # and of angles, angular velocities, moments
 PIECES = 4  # of every command, so that jobs can be stacked
 
 _UNITS = {
@@ -62,6 +68,7 @@ class Dataset(NamedTuple):
 
     window: Window  # what phi may look at, yaw frame
     label: Wrench  # (n, 2, 3) each, mean effect over the tick, yaw frame
+    legs: Push  # (n, 3) each, what moved the rigid body beside the effect, yaw frame
     state: State  # (n, 3) each, true state at the start of the tick, world frame
     walk: Int[Array, " n"]  # which walk
     tick: Int[Array, " n"]  # which tick of it
@@ -232,17 +239,36 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
         ValueError: one line naming folder or file: nothing collected, not finished, damaged, or of
             another robot.
     """
-    card = Path(folder) / "card.json"
+    shards = [
+        _load_shard(Path(folder) / name, robot) for name in _read_collection(folder)["shards"]
+    ]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *shards)
+
+
+def walked_with(folder: Path) -> dict[str, Any]:
+    """What tells one collection from another: a hash of its walks, and the settings it was told.
+
+    Raises:
+        ValueError: nothing collected, not finished, or a card that is none.
+    """
+    card = _read_collection(folder)
+    digest = hashlib.sha256()
+    for name in card["shards"]:
+        digest.update((Path(folder) / name).read_bytes())
+    return {"walks": digest.hexdigest()[:16], **card["told"]}
+
+
+def _read_collection(folder: Path) -> dict[str, Any]:
+    path = Path(folder) / "card.json"
     try:
-        names = json.loads(card.read_text())["shards"]
+        card = json.loads(path.read_text())
+        return {"shards": list(card["shards"]), "told": dict(card["told"])}
     except FileNotFoundError:
         raise ValueError(
             f"{folder}: no finished collection (no card.json); collect first"
         ) from None
     except (ValueError, KeyError, TypeError, OSError) as error:
-        raise ValueError(f"{card}: no card of a collection; collect again") from error
-    shards = [_load_shard(Path(folder) / name, robot) for name in names]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *shards)
+        raise ValueError(f"{path}: no card of a collection; collect again") from error
 
 
 def _load_shard(path: Path, robot: Robot) -> Walks:
@@ -302,11 +328,12 @@ def _like() -> Walks:
 
 
 def make_dataset(
-    walks: Trajectory, start_tick: Any = 0, config: GaitConfig | None = None
+    robot: Robot, walks: Trajectory, start_tick: Any = 0, config: GaitConfig | None = None
 ) -> tuple[Dataset, int]:
     """Samples from walks at the plan interval.
 
     Args:
+        robot: the rigid body that is to move as the trunk did.
         walks: W walks of T ticks, stacked, from t = 0.
         start_tick: gait tick of t = 0, of all walks or of each (W,).
         config: the gait that was walked.
@@ -318,7 +345,7 @@ def make_dataset(
     config = config or GaitConfig()
     count = len(walks.fallen)
     starts = jnp.broadcast_to(jnp.asarray(start_tick, jnp.int32), (count,))
-    samples, usable = jax.vmap(lambda *walk: _samples(config, *walk))(
+    samples, usable = jax.vmap(lambda *walk: _samples(config, robot, *walk))(
         jnp.arange(count), starts, jax.tree.map(jnp.asarray, walks)
     )
     usable = np.asarray(usable)
@@ -326,7 +353,11 @@ def make_dataset(
 
 
 def _samples(
-    config: GaitConfig, number: Int[Array, ""], start_tick: Int[Array, ""], walk: Trajectory
+    config: GaitConfig,
+    robot: Robot,
+    number: Int[Array, ""],
+    start_tick: Int[Array, ""],
+    walk: Trajectory,
 ) -> tuple[Dataset, Bool[Array, " n"]]:
     """Samples of one walk and whether each is of a robot on its feet."""
     first, ticks = HISTORY - 1, walk.fallen.shape[0]
@@ -339,23 +370,31 @@ def _samples(
     def newest_first(w: Array) -> Array:
         return jnp.stack([w[first - i : ticks - i] for i in range(HISTORY)], axis=1)
 
-    to_yaw_frame = jax.vmap(lambda wrench, yaw: turn(wrench, -yaw))
+    to_yaw_frame = jax.vmap(lambda vectors, yaw: turn(vectors, -yaw))
     commands = to_yaw_frame(jax.tree.map(newest_first, walk.command), before.euler[:, 2])
     label = to_yaw_frame(jax.tree.map(lambda w: w[first:], walk.effect), before.euler[:, 2])
+    legs = jax.vmap(partial(srbm.unexplained, robot, dt=config.tick))(
+        before,
+        jax.tree.map(lambda s: s[first:], walk.state),
+        jax.tree.map(lambda w: w[first:], walk.effect),
+        0.5 * (walk.feet[first - 1 : -1] + walk.feet[first:]),
+    )
+    legs = to_yaw_frame(legs, before.euler[:, 2])
     tick = jnp.arange(first, ticks)
     window = Window(
         commands=commands,
         contact=walk.contact[first:],
         phase=gait.cycle_phase(config, start_tick + tick),
         since_switch=gait.since_switch(config, start_tick + tick),
+        base=jax.vmap(from_yaw_frame)(before),
     )
     finite = [
         jnp.isfinite(w).reshape(len(tick), -1).all(axis=1)
-        for w in jax.tree.leaves((commands, label))
+        for w in jax.tree.leaves((commands, label, legs))
     ]
     solved = walk.residual[first:] <= SOLVED
     usable = jnp.stack([~walk.fallen[first:], solved, *finite]).all(axis=0)
-    return Dataset(window, label, before, jnp.full_like(tick, number), tick), usable
+    return Dataset(window, label, legs, before, jnp.full_like(tick, number), tick), usable
 
 
 def with_mirror(dataset: Dataset) -> Dataset:
@@ -364,25 +403,29 @@ def with_mirror(dataset: Dataset) -> Dataset:
     The image of a sample belongs to the same walk, so that a split by walk stays one. What a plant
     has on one side only, such as the gain of a motor, it then has on the other.
     """
-    along, across = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
 
     def flip(wrench: Wrench) -> Wrench:
-        return Wrench(wrench.force[..., ::-1, :] * along, wrench.moment[..., ::-1, :] * across)
+        return Wrench(wrench.force[..., ::-1, :] * ALONG, wrench.moment[..., ::-1, :] * ACROSS)
 
-    window, state = dataset.window, dataset.state
+    def flip_state(state: State) -> State:
+        return State(
+            euler=state.euler * ACROSS,
+            position=state.position * ALONG,
+            ang_velocity=state.ang_velocity * ACROSS,
+            velocity=state.velocity * ALONG,
+        )
+
+    window = dataset.window
     image = dataset._replace(
         window=window._replace(
             commands=flip(window.commands),
             contact=window.contact[:, ::-1],
             phase=(window.phase + 0.5) % 1.0,
+            base=flip_state(window.base),
         ),
         label=flip(dataset.label),
-        state=State(
-            euler=state.euler * across,
-            position=state.position * along,
-            ang_velocity=state.ang_velocity * across,
-            velocity=state.velocity * along,
-        ),
+        legs=Push(dataset.legs.force * ALONG, dataset.legs.torque * ACROSS),
+        state=flip_state(dataset.state),
     )
     return jax.tree.map(lambda *both: np.concatenate(both), dataset, image)
 

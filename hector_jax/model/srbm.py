@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hector_jax.geometry import euler_rates, rotation_from_euler, skew
 from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Wrench
+from hector_jax.trajectory import Push, State, Wrench
 
 
 def centroidal_rates(
@@ -31,9 +31,13 @@ def centroidal_rates(
 
 
 @jax.jit  # traced once for the four stages of a step
-def rates(robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"]) -> State:
+def rates(
+    robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], push: Push | None = None
+) -> State:
     """Time derivative of the state; `feet` are the foot points in the world [m]. Source: Eq. 2."""
     acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
+    if push is not None:
+        acceleration, torque = acceleration + push.force / robot.mass, torque + push.torque
     R_wb = rotation_from_euler(state.euler)
     momentum = R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
     torque = torque - jnp.cross(state.ang_velocity, momentum)
@@ -46,18 +50,58 @@ def rates(robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"])
     )
 
 
-def step(robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], dt: float) -> State:
-    """State after `dt` [s] of constant wrench (fourth-order Runge-Kutta)."""
+def step(
+    robot: Robot,
+    state: State,
+    wrench: Wrench,
+    feet: Float[Array, "2 3"],
+    dt: float,
+    push: Push | None = None,
+) -> State:
+    """State after `dt` [s] of constant wrench and push, world frame (4th-order Runge-Kutta)."""
 
     def ahead(slope: State, h: float) -> State:
         return jax.tree.map(lambda x, dx: x + h * dx, state, slope)
 
-    k1 = rates(robot, state, wrench, feet)
-    k2 = rates(robot, ahead(k1, dt / 2), wrench, feet)
-    k3 = rates(robot, ahead(k2, dt / 2), wrench, feet)
-    k4 = rates(robot, ahead(k3, dt), wrench, feet)
+    k1 = rates(robot, state, wrench, feet, push)
+    k2 = rates(robot, ahead(k1, dt / 2), wrench, feet, push)
+    k3 = rates(robot, ahead(k2, dt / 2), wrench, feet, push)
+    k4 = rates(robot, ahead(k3, dt), wrench, feet, push)
     return jax.tree.map(
         lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), state, k1, k2, k3, k4
+    )
+
+
+def unexplained(
+    robot: Robot,
+    before: State,
+    after: State,
+    wrench: Wrench,
+    feet: Float[Array, "2 3"],
+    dt: float,
+) -> Push:
+    """The push that the motion from one state to the next owes to something beside the wrench.
+
+    Args:
+        robot: mass, gravity and inertia.
+        before: state at the start.
+        after: state `dt` [s] later.
+        wrench: mean of the wrench of the ground in between.
+        feet: foot points halfway [m].
+        dt: time between the states [s].
+
+    Source: Eq. 2, solved for the forces; the inverse of `step` but for terms of second order.
+    """
+
+    def momentum(state: State) -> Float[Array, "3"]:
+        R_wb = rotation_from_euler(state.euler)
+        return R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
+
+    lever = feet - 0.5 * (before.position + after.position)
+    acceleration, torque = centroidal_rates(robot, wrench, lever)
+    return Push(
+        force=robot.mass * ((after.velocity - before.velocity) / dt - acceleration),
+        torque=(momentum(after) - momentum(before)) / dt - torque,
     )
 
 

@@ -18,7 +18,7 @@ from hector_jax.control.reference import Anchor, Command, anchor_at, reference_a
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
 from hector_jax.model import srbm
-from hector_jax.model.effect import HISTORY, Window, turn
+from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
@@ -103,14 +103,16 @@ def step_carry(
         contact=decided.contact,
         phase=gait.cycle_phase(ticks, tick),
         since_switch=gait.since_switch(ticks, tick),
+        base=from_yaw_frame(state),
     )
-    returned = turn(effect(window).wrench, yaw)
+    found = effect(window)
+    returned = turn(found.wrench, yaw)
     stands = decided.contact
     feet = Feet(
         jnp.where(stands[:, None], feet.position, decided.touchdown.position),
         jnp.where(stands, feet.yaw, decided.touchdown.yaw),
     )
-    moved = srbm.step(robot, state, returned, feet.position, ticks.tick)
+    moved = srbm.step(robot, state, returned, feet.position, ticks.tick, turn(found.legs, yaw))
     fallen = carry.fallen | has_fallen(moved)
     sample = Trajectory(
         period=jnp.asarray(ticks.tick),

@@ -1,0 +1,197 @@
+"""The linear part of phi: gated by contact and by the time since the stance last switched.
+
+Two maps, each fitted by ridge regression to what the high-fidelity simulator shows:
+
+- **ground**: what the ground returns to a foot is the command itself (nothing, for a foot planned
+  to swing), a bias of the tick since the switch, and terms in the latest changes of the commands.
+- **legs**: the push that the moving legs give the trunk, which a rigid body cannot know: a bias of
+  the tick, and terms in the motion of the base and in the latest changes of the commands.
+
+A command that stays is returned as it is, by construction. It has to be: the walks were recorded in
+closed loop, where the controller asks for whatever the ground withheld, so that over a step the
+wrench is that which walking needs, whatever was commanded. A regression on the command itself reads
+this as a ground that hardly answers, and the body of the rollout cannot hold itself on such ground.
+Changes of the command within 20 ms are too quick for that loop.
+
+Each foot sees the walk as if it were the left one, so a mirrored window has the mirrored effect.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset
+from hector_jax.model.effect import HISTORY, Effect, Window, sure
+from hector_jax.trajectory import Push, Wrench
+
+CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
+MOTION = 3  # of the base: yaw rate, forward and sideways velocity
+GATES = (0.0, 0.01, 0.03, 0.08, 0.19)  # [s] after a switch, where the terms of the legs may differ
+RIDGE, RIDGE_LEGS = 0.03, 1e-3  # penalty on standardised terms, relative to the number of samples
+_SIGNS = np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])])  # of force and moment, by foot
+_FLOOR = 0.05  # least scale of a change, relative to the largest of its kind
+
+
+class View(NamedTuple):
+    """What a foot sees of a window; the right one sees the mirror image."""
+
+    command: Float[Array, "*batch 6"]  # force and moment on it, newest
+    changes: Float[Array, "*batch changes"]  # of the commands, newest first; its own, the other's
+    motion: Float[Array, "*batch 3"]  # of the base
+    stands: Bool[Array, "*batch"]  # planned
+    alone: Bool[Array, "*batch"]  # it stands and the other foot swings
+
+
+class GatedMap(NamedTuple):
+    """Both maps; the axis of 2 is swing, stance, that of 6 force and moment (torque)."""
+
+    ticks: Float[Array, " ticks"]  # [s] after a switch, where a bias is given
+    gates: Float[Array, " gates"]  # [s] after a switch, where terms of the legs are given
+    bias: Float[Array, "2 ticks 6"]
+    changes: Float[Array, "2 changes 6"]
+    legs_bias: Float[Array, "ticks 6"]
+    legs: Float[Array, "gates terms 6"]  # of motion, then changes
+
+
+def in_dtype_of(window: Window, tree: Any) -> Any:
+    """A tree on the device, its floating-point leaves in the dtype of a window's commands."""
+    dtype = window.commands.force.dtype
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, dtype if jnp.issubdtype(x.dtype, jnp.floating) else None), tree
+    )
+
+
+def views(window: Window) -> View:
+    """What the left and the right foot see (leading axis 2) of one window."""
+    dtype = window.commands.force.dtype
+
+    def own(foot: int) -> View:
+        along, across = (jnp.asarray(s if foot else np.ones(3), dtype) for s in (ALONG, ACROSS))
+        both = [
+            jnp.concatenate(
+                [window.commands.force[:, f] * along, window.commands.moment[:, f] * across], axis=1
+            )
+            for f in (foot, 1 - foot)
+        ]
+        base = window.base
+        motion = (base.ang_velocity * across)[2:], (base.velocity * along)[:2]
+        stands = window.contact[foot]
+        return View(
+            command=both[0][0],
+            changes=jnp.concatenate([(w[:-1] - w[1:]).ravel() for w in both]),
+            motion=jnp.concatenate(motion),
+            stands=stands,
+            alone=stands & ~window.contact[1 - foot],
+        )
+
+    return jax.tree.map(lambda *feet: jnp.stack(feet), own(0), own(1))
+
+
+def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[Array, "... knots"]:
+    """Piecewise linear functions of the time [s], one at each knot; the ends reach on."""
+    rows = jnp.eye(len(knots), dtype=jnp.result_type(time))
+    return jnp.stack([jnp.interp(time, knots, row) for row in rows], axis=-1)
+
+
+def from_views(values: Float[Array, "2 6"]) -> Wrench:
+    """Forces and moments as each foot sees them, back in the yaw frame."""
+    back = values * jnp.asarray(_SIGNS, values.dtype)
+    return Wrench(back[:, :3], back[:, 3:])
+
+
+def apply_gated(gated: GatedMap, window: Window, seen: View) -> tuple[Array, Push]:
+    """Ground wrench as each foot sees it (2, 6), and the push of the legs in the yaw frame."""
+    stands = seen.stands.astype(int)
+    tick, gate = hats(window.since_switch, gated.ticks), hats(window.since_switch, gated.gates)
+    ground = (
+        seen.stands[:, None] * seen.command
+        + jnp.einsum("k,fko->fo", tick, gated.bias[stands])
+        + jnp.einsum("fi,fio->fo", seen.changes, gated.changes[stands])
+    )
+    terms = jnp.concatenate([seen.motion, seen.changes], axis=-1)
+    push = tick @ gated.legs_bias + jnp.einsum("g,fi,gio->fo", gate, terms, gated.legs)
+    back = from_views(push * seen.alone[:, None])
+    return ground, Push(back.force.sum(axis=0), back.moment.sum(axis=0))
+
+
+def gated_effect(gated: GatedMap) -> jax.tree_util.Partial:
+    """Phi of the linear part alone: `Window -> Effect`, with no spread."""
+    return jax.tree_util.Partial(_gated_effect, gated)
+
+
+def _gated_effect(gated: GatedMap, window: Window) -> Effect:
+    gated, window = in_dtype_of(window, gated), in_dtype_of(window, window)
+    ground, legs = apply_gated(gated, window, views(window))
+    return sure(from_views(ground))._replace(legs=legs)
+
+
+def seen_labels(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Wrench of the ground and push of the legs (n, 2, 6) each, as each foot sees them."""
+    ground = np.concatenate([dataset.label.force, dataset.label.moment], axis=-1)
+    legs = np.concatenate([dataset.legs.force, dataset.legs.torque], axis=-1)
+    return ground * _SIGNS, legs[:, None] * _SIGNS
+
+
+def fit_gated(dataset: Dataset) -> GatedMap:
+    """Ridge regression of both maps; every sample is seen by both feet."""
+    window = jax.tree.map(jnp.asarray, dataset.window)
+    seen = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
+    ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
+    tick, gate = (
+        np.repeat(np.asarray(hats(window.since_switch, jnp.asarray(knots)))[:, None], 2, axis=1)
+        for knots in (ticks, gates)
+    )
+    ground, legs = seen_labels(dataset)
+    left = ground - seen.stands[..., None] * seen.command
+    scale = _scale(seen.changes)
+    changes = seen.changes / scale
+    bias, slope = zip(
+        *(
+            _ridge(RIDGE, tick[rows], changes[rows], left[rows])
+            for rows in (~seen.stands, seen.stands)
+        ),
+        strict=True,
+    )
+    alone = seen.alone
+    term_scale = np.concatenate([_spread(seen.motion[alone]), scale])
+    terms = np.concatenate([seen.motion, seen.changes], axis=-1)[alone] / term_scale
+    gated = (gate[alone][:, :, None] * terms[:, None]).reshape(len(terms), -1)
+    legs_bias, legs_slope = _ridge(RIDGE_LEGS, tick[alone], gated, legs[alone])
+    found = GatedMap(
+        ticks=ticks,
+        gates=gates,
+        bias=np.stack(bias),
+        changes=np.stack(slope) / scale[:, None],
+        legs_bias=legs_bias,
+        legs=legs_slope.reshape(len(gates), -1, 6) / term_scale[:, None],
+    )
+    return jax.tree.map(jnp.asarray, found)
+
+
+def _spread(x: np.ndarray) -> np.ndarray:
+    spread = x.reshape(-1, x.shape[-1]).std(axis=0)
+    return np.where(spread > 0.0, spread, 1.0)
+
+
+def _scale(changes: np.ndarray) -> np.ndarray:
+    """Spread of each change; one that hardly moves is no signal to be blown up."""
+    spread = changes.reshape(-1, 2 * (HISTORY - 1), 2, 3).std(axis=0)
+    largest = spread.max(axis=(0, 2), keepdims=True)
+    largest = np.where(largest > 0.0, largest, 1.0)
+    return np.maximum(spread, _FLOOR * largest).ravel()
+
+
+def _ridge(
+    penalty: float, free: np.ndarray, terms: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of the free columns and of the penalised ones, in the mean square."""
+    if len(y) == 0:
+        return np.zeros((free.shape[1], 6)), np.zeros((terms.shape[1], 6))
+    columns = np.concatenate([free, terms], axis=1)
+    penalties = np.r_[np.full(free.shape[1], 1e-6), np.full(terms.shape[1], penalty)]
+    gram = columns.T @ columns / len(y) + np.diag(penalties)
+    found = np.linalg.solve(gram, columns.T @ y / len(y))
+    return found[: free.shape[1]], found[free.shape[1] :]
