@@ -310,9 +310,7 @@ def _walk_one(
         planned = carry._replace(memory=memory, plan=plan)
         carry = _where(carry.fallen, carry, planned)
         when = (jnp.full(count, tick), jnp.arange(count))
-        carry, seen = jax.lax.scan(
-            sample, carry, jax.tree.map(lambda x: x.reshape(-1, each), when)
-        )
+        carry, seen = jax.lax.scan(sample, carry, jax.tree.map(lambda x: x.reshape(-1, each), when))
         return carry, (carry.plan, seen)
 
     anchor = standing_anchor(robot, start_tick)
@@ -328,9 +326,7 @@ def _walk_one(
     seen = observe(config, robot, command, anchor, 1.0 * now, yaw, start, zero_wrench(), never)
     if single:
         physics = _single(physics)
-    carry = _Carry(
-        memory, plan, init_actuators(), anchor, yaw, physics, never, zero_wrench(), seen
-    )
+    carry = _Carry(memory, plan, init_actuators(), anchor, yaw, physics, never, zero_wrench(), seen)
     _, (plans, seen) = jax.lax.scan(one_tick, carry, jnp.arange(begin, last_start + ticks))
 
     # Each walk's own part, from its t = 0 on.
@@ -344,13 +340,9 @@ def _walk_one(
     return as_trajectory(jnp.asarray(1e-3 * each), initial, *walked)
 
 
-@partial(
-    jax.jit, static_argnames=("config", "places", "last_start", "ticks", "fine", "single")
-)
+@partial(jax.jit, static_argnames=("config", "places", "last_start", "ticks", "fine", "single"))
 def _walk_all(config, places, last_start, ticks, fine, single, robot, model, qpos, asked):
-    one = partial(
-        _walk_one, config, places, last_start, ticks, fine, single, robot, model, qpos
-    )
+    one = partial(_walk_one, config, places, last_start, ticks, fine, single, robot, model, qpos)
     return jax.vmap(one)(asked)
 
 
