@@ -98,13 +98,19 @@ def job(weights, name="s", plant=None, seconds=0.1, start_tick=0, push=(0.0, 0.0
     return Job(weights, command, plant or hfs(), seconds, 0, start_tick, push)
 
 
+ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
+
+
 @pytest.mark.parametrize(
     ("jobs", "message"),
     [
         ([job(expert(), plant=ideal()), job(expert())], "all have backlash or none"),
         ([job(expert(), plant=standin(0))], "estimator errors must be zero"),
         ([job(expert()), job(expert(), seconds=0.2)], r"agree in seconds, got \[0.1, 0.2\]"),
-        ([job(expert(), "c"), job(expert(), "straight")], "agree in pieces of the command"),
+        (
+            [job(expert()), job(expert())._replace(command=ONE_PIECE)],
+            "agree in pieces of the command",
+        ),
         ([job(expert()), job(expert())._replace(push=NO_PUSH)], "agree in pushes"),
         ([job(expert(), seconds=0.0)], "at least one tick"),
         ([job(expert()), job(expert(), start_tick=-110)], "start_tick -110 is not later"),
@@ -128,9 +134,6 @@ def three():
         job(nominal(), "c", hfs_drawn(1), start_tick=7),
         job(expert()),
     ]
-    pieces = jobs[0].command  # as many pieces as "s"
-    straight = jax.tree.map(lambda x: np.repeat(x[:1], len(pieces.duration), axis=0), pieces)
-    jobs[1] = jobs[1]._replace(command=straight)
     return jobs, list(walk_batch(CONFIG, ROBOT, jobs, chunk=2))
 
 

@@ -67,11 +67,11 @@ def test_the_ideal_plant_is_the_robot_of_the_file():
 def test_a_push_lasts_from_its_start_on_and_pushes_add_up():
     force = np.array([[10.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
     push = Push(force, start=np.array([0.1, 0.15]), duration=np.array([0.1, 0.01]))
-    felt = np.stack([push_force(push, np.array(step)) for step in range(-5, 300)])[:, :2]
+    felt = np.stack([push_force(push, jnp.array(step)) for step in range(-5, 300)])[:, :2]
     at = np.arange(-5, 300)
     np.testing.assert_array_equal(felt[:, 0], np.where((at >= 100) & (at < 200), 10.0, 0.0))
     np.testing.assert_array_equal(felt[:, 1], np.where((at >= 150) & (at < 160), 5.0, 0.0))
-    assert not np.any(push_force(NO_PUSH, np.array(0)))
+    assert not np.any(push_force(NO_PUSH, jnp.array(0)))
 
 
 def test_what_is_only_looked_at_is_no_part_of_a_world():

@@ -154,13 +154,13 @@ def _falling(world: World) -> list[int]:
     meets = (model.geom_contype[floor] & model.geom_conaffinity) | (
         model.geom_conaffinity[floor] & model.geom_contype
     )
-    return [g for g in np.flatnonzero(meets) if g != floor and world.foot_of_geom[g] < 0]
+    return [g for g in np.flatnonzero(meets).tolist() if g != floor and world.foot_of_geom[g] < 0]
 
 
 def _places(world: World) -> _Places:
     kinds = {mujoco.mjtGeom.mjGEOM_BOX: [], mujoco.mjtGeom.mjGEOM_CAPSULE: []}
     for geom in _falling(world):
-        kinds[mujoco.mjtGeom(world.model.geom_type[geom])].append(int(geom))
+        kinds[mujoco.mjtGeom(world.model.geom_type[geom])].append(geom)
     boxes, capsules = (tuple(geoms) for geoms in kinds.values())
     return _Places(
         coordinates=tuple(sensing.coordinates(world).tolist()),
