@@ -77,7 +77,7 @@ def test_a_push_lasts_from_its_start_on_and_pushes_add_up():
 def test_what_is_only_looked_at_is_no_part_of_a_world():
     model = build_world(hfs()).model
     assert np.all(model.geom_contype | model.geom_conaffinity)
-    assert model.ngeom == 12
+    assert (model.ngeom, model.ntex, model.nmat) == (12, 0, 0)
 
 
 def test_joints_are_found_by_name_with_and_without_backlash():

@@ -131,8 +131,8 @@ class _Carry(NamedTuple):
     seen: Observed  # the last sample
 
 
-def batched_model(worlds: Sequence[World]) -> tuple[mjx.Model, dict[str, Array]]:
-    """One MJX model, and the leaves in which the worlds' models differ, stacked.
+def batched_model(worlds: Sequence[World]) -> tuple[mjx.Model, dict[str, np.ndarray]]:
+    """One MJX model, and the leaves in which the worlds' models may differ, stacked.
 
     Raises:
         ValueError: the models do not have the same joints.

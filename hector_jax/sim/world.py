@@ -212,9 +212,12 @@ def _check(imperfections: Imperfections) -> None:
 def _model(path: Path, slack: bool) -> mujoco.MjModel:
     load_model(path)  # for its checks
     spec = mujoco.MjSpec.from_file(str(path))
-    for geom in list(spec.geoms):  # what is only looked at costs time in every step
+    for geom in list(spec.geoms):  # what is only looked at costs time and room in every plant
+        geom.material = ""
         if not geom.contype and not geom.conaffinity:
             spec.delete(geom)
+    for looks in (*spec.materials, *spec.textures):
+        spec.delete(looks)
     if not slack:
         return spec.compile()
     for name in JOINT_NAMES:
