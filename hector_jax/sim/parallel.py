@@ -313,7 +313,7 @@ def _walk_one(
         carry, seen = jax.lax.scan(sample, carry, jax.tree.map(lambda x: x.reshape(-1, each), when))
         return carry, (carry.plan, seen)
 
-    anchor = standing_anchor(robot, start_tick)
+    anchor = standing_anchor(robot)._replace(tick=start_tick)
     physics = _Physics(qpos, jnp.zeros(model.nv), jnp.zeros(model.nv))
     yaw, never = jnp.zeros(()), jnp.zeros((), bool)
     start = read(physics)
@@ -403,7 +403,7 @@ def walk_batch(
         command=_stack([job.command for job in jobs]),
         plant=_stack([job.imperfections for job in jobs]),
         push=_stack([job.push for job in jobs]),
-        start_tick=np.array([job.start_tick for job in jobs]),
+        start_tick=np.array([job.start_tick for job in jobs], np.int32),
         model=varied,
     )
     last_start = int(asked.start_tick.max())
