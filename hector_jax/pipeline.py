@@ -194,7 +194,7 @@ def collect(
                 "engine": engine,
                 "physics_bits": 32 if single else 64,
             },
-            progress=lambda done, of: tell(done, of, ""),
+            progress=lambda done, of: tell(done, of, "" if done else "compiling"),
         )
 
 

@@ -179,11 +179,13 @@ def test_physics_in_32_bits_walks_as_in_64(three):
 def test_a_fall_in_a_batch_is_held_and_marked():
     """Both engines see the same fall at the same time."""
     ice = hfs()._replace(floor_friction=np.array(0.1))
-    jobs = [job(expert(), seconds=1.0), job(expert(), plant=ice, seconds=1.0)]
+    jobs = [job(expert(), seconds=2.0), job(expert(), plant=ice, seconds=2.0)]
     upright, fall = walk_batch(CONFIG, ROBOT, jobs)
     assert not upright.fallen.any()
     first = int(np.argmax(fall.fallen))
     alone = at_interval(walk(CONFIG, ROBOT, *jobs[1]), 0.01)
+    assert fall.fallen[-1]
+    assert alone.fallen[-1]
     assert first > 0
     assert abs(first - int(np.argmax(alone.fallen))) <= 2
     for leaf in jax.tree.leaves(fall._replace(period=None, initial=None, fallen=None)):
