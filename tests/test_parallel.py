@@ -189,4 +189,4 @@ def test_a_fall_in_a_batch_is_held_and_marked():
     assert abs(first - int(np.argmax(alone.fallen))) <= 2
     for leaf in jax.tree.leaves(fall._replace(period=None, initial=None, fallen=None)):
         assert np.isfinite(leaf).all()
-        assert (leaf[first:] == leaf[first - 1]).all()
+        assert (leaf[first:] == leaf[first]).all()
