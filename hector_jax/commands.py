@@ -86,7 +86,7 @@ def _as_json(flags: Any) -> dict[str, Any]:
 
 @run.register
 def _collect(args: Collect) -> None:
-    config = pipeline.CollectConfig(args.walks, args.seconds, args.seed)
+    config = pipeline.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     with workers(args.processes) as pool:
         pipeline.collect(pool, config, TuneConfig(), load_robot(), args.out)
     say(f"walks are in {args.out}")

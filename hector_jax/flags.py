@@ -11,7 +11,8 @@ class Collect:
     out: Path = Path("data/walks")  # folder of the walks; what is there already is kept
     walks: int = 64  # how many
     seconds: float = 4.0  # length of each
-    seed: int = 0  # of everything drawn: commands, weights, plants
+    seed: int = 0  # of everything drawn: commands, weights, plants, pushes
+    engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
     processes: int = 2  # one core each
 
 

@@ -24,9 +24,10 @@ from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot
+from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import Imperfections
-from hector_jax.storage import read_card
+from hector_jax.storage import make_folder, read_card
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
@@ -40,8 +41,11 @@ class CollectConfig:
     walks: int = 64
     seconds: float = 4.0  # of each
     seed: int = 0
+    engine: str = "auto"  # c: MuJoCo on the processes; mjx: all at once; auto: mjx on a GPU
 
     def __post_init__(self) -> None:
+        if self.engine not in ("auto", "c", "mjx"):
+            raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {self.engine!r}")
         if self.walks < 3 or not self.seconds > 0.0:  # to learn from, to choose by, to judge by
             raise ValueError(
                 f"CollectConfig needs walks >= 3 and seconds > 0, got {self.walks}, {self.seconds}"
@@ -155,18 +159,40 @@ def tuning_paths(pool: Executor, config: TuneConfig, robot: Robot) -> list[Weigh
 def collect(
     pool: Executor, config: CollectConfig, tune: TuneConfig, robot: Robot, folder: Path
 ) -> None:
-    """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there."""
+    """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there.
+
+    Raises:
+        OSError: the folder cannot be written; told before anything is walked.
+        ValueError: it holds walks of other jobs, another robot, controller or engine.
+    """
+    make_folder(folder)
+    engine, walk_config = config.engine, tune.rollout.walk
+    if engine == "auto":
+        engine = "c" if jax.default_backend() == "cpu" else "mjx"
+    # On a GPU the physics is walked in 32 bits; on a CPU that gains nothing.
+    single = engine == "mjx" and jax.default_backend() != "cpu"
+
+    def walk_jobs(jobs: list[Job]) -> Iterator[Trajectory]:
+        if engine == "c":
+            return walk_many(pool, walk_config, robot, jobs)
+        return walk_batch(walk_config, robot, jobs, single=single)
+
     jobs = dataset.draw_jobs(
         config.seed, config.walks, tuning_paths(pool, tune, robot), config.seconds
     )
-    with bar(f"collecting {config.walks} walks on the high-fidelity simulator") as tell:
+    title = f"collecting {config.walks} walks on the high-fidelity simulator, engine {engine}"
+    with bar(title) as tell:
         dataset.collect(
             folder,
             jobs,
-            lambda missing: walk_many(pool, tune.rollout.walk, robot, missing),
+            walk_jobs,
             robot=robot,
-            about={"controller": repr(tune.rollout.walk)},
-            progress=lambda done, of: tell(done, of, ""),
+            about={
+                "controller": repr(walk_config),
+                "engine": engine,
+                "physics_bits": 32 if single else 64,
+            },
+            progress=lambda done, of: tell(done, of, "" if done else "compiling"),
         )
 
 

@@ -41,8 +41,11 @@ def setup_jax() -> None:
 
 
 def start_worker() -> None:
-    """Set up a worker process as its parent is, with interrupts left to the parent."""
+    """Set up a worker process as its parent is, with interrupts and accelerators left to it."""
+    import jax
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    jax.config.update("jax_platforms", "cpu")
     setup_jax()
 
 

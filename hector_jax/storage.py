@@ -81,6 +81,20 @@ def write_file(path: Path, data: bytes) -> None:
         raise
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder, and find out that it can be written before anything is computed for it.
+
+    Raises:
+        OSError: one line with the folder, where it cannot be made or written.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write to {folder}: {error.strerror}") from error
+
+
 def save_tree(
     path: Path, tree: Any, *, kind: str, robot: Any = None, about: Mapping[str, Any] | None = None
 ) -> None:

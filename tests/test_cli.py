@@ -5,11 +5,14 @@ import re
 import subprocess
 import sys
 
+import jax
+import numpy as np
 import pytest
 
 from hector_jax import commands
 from hector_jax.cli import main
 from hector_jax.control.weights import expert
+from hector_jax.grfm.dataset import load_walks
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import MODEL_PATH, load_robot
 from hector_jax.storage import save_weights
@@ -104,6 +107,31 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", "--data", tmp_path)
     assert "exists" in line
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["kept"]
+
+
+def test_collection_refuses_a_folder_it_cannot_write_and_an_unknown_engine(
+    monkeypatch, capsys, tmp_path
+):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
+    assert "file" in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "file" / "walks")
+    assert "engine" in refused(monkeypatch, capsys, "collect", "--engine", "warp")
+
+
+@pytest.mark.slow
+def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
+    """Both leave shards of one layout; the card names the engine, and resuming keeps to it."""
+    monkeypatch.setattr(commands.pipeline, "tuning_paths", lambda *args: [])
+    flags = ("collect", "--walks", "2", "--seconds", "0.1")
+    found = {}
+    for engine in ("c", "mjx"):
+        folder = tmp_path / engine
+        assert call(monkeypatch, *flags, "--engine", engine, "--out", folder) == 0
+        assert json.loads((folder / "card.json").read_text())["told"]["engine"] == engine
+        found[engine] = load_walks(folder, load_robot())
+    for one, other in zip(*map(jax.tree.leaves, found.values()), strict=True):
+        np.testing.assert_allclose(one, other, atol=0.01)
+    assert call(monkeypatch, *flags, "--engine", "mjx", "--out", tmp_path / "c") == 2
 
 
 def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):

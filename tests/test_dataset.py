@@ -69,6 +69,19 @@ def test_drawn_weights_lie_within_a_third_and_three_times_of_their_centres():
     assert np.all(logs.std(axis=0) > 0.1)
 
 
+def test_a_third_of_the_walks_is_pushed_once_or_twice():
+    pushes = [job.push for job in draw_jobs(0, 300)]
+    size = np.array([np.linalg.norm(push.force, axis=1) for push in pushes])
+    number = (size > 0.0).sum(axis=1)
+    assert 0.25 < np.mean(number > 0) < 0.42
+    assert set(number) == {0, 1, 2}
+    assert size[size > 0.0].min() >= 10.0
+    assert size.max() <= 30.0
+    for push in pushes:
+        assert np.all((push.start >= 0.0) & (push.start + push.duration <= 4.0))
+        assert not push.force[:, 2].any()
+
+
 def test_points_of_tuning_paths_are_walked_where_paths_are_given():
     path = jax.tree.map(lambda w: np.stack([w * (1 + i) for i in range(5)]), nominal())
     vectors = np.asarray(weights_to_vector(path))

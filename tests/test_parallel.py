@@ -1,25 +1,21 @@
 """The closed loop in MJX, against MuJoCo C."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
+from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.parallel import batched_model, mjx, mjx_contacts, walk_batch
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import build_world, build_worlds, hfs, hfs_drawn, ideal
+from hector_jax.sim.walk import Job, walk
+from hector_jax.sim.world import NO_PUSH, Push, build_world, build_worlds, hfs, hfs_drawn, ideal
 
 CONFIG, ROBOT = WalkConfig(), load_robot()
-
-
-def stacked(trees):
-    return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 
 @pytest.fixture(scope="module")
@@ -74,53 +70,123 @@ def test_one_step_of_mjx_is_one_step_of_mujoco(recorded):
         np.testing.assert_allclose(mine.moment, theirs.moment, atol=1e-3)
 
 
+UNUSED = ("cam_", "light_", "actuator_acc0")  # by MJX, in a robot without muscles
+
+
 def test_only_what_differs_between_plants_is_batched():
-    plants = [hfs_drawn(seed) for seed in range(3)]
-    worlds = build_worlds(plants)
+    worlds = build_worlds([hfs_drawn(seed) for seed in range(3)])
     shared, varied = batched_model(worlds)
-    assert {"dof_damping", "body_mass", "geom_friction", "jnt_range"} <= set(varied)
-    assert not {"qpos0", "body_pos", "jnt_axis"} & set(varied)
-    for name, leaf in varied.items():
-        expected = np.stack([getattr(world.model, name) for world in worlds])
-        np.testing.assert_allclose(leaf, expected)
-    assert batched_model([worlds[0], worlds[0]])[1] == {}
+    for name in shared.__dataclass_fields__:
+        values = [getattr(world.model, name, None) for world in worlds]
+        if isinstance(values[0], np.ndarray) and not name.startswith(UNUSED):
+            if name in varied:
+                np.testing.assert_array_equal(varied[name], np.stack(values))
+            else:
+                np.testing.assert_array_equal(values[0], values[1], err_msg=name)
     assert shared.nq == worlds[0].model.nq
 
 
-def test_a_batch_of_unlike_plants_is_refused():
-    two = stacked([expert(), expert()])
-    commands = stacked([named_command("c"), named_command("s")])
-    with pytest.raises(ValueError, match="all have backlash or none"):
-        walk_batch(CONFIG, ROBOT, two, commands, [ideal(), hfs()])
-    with pytest.raises(ValueError, match="estimator errors must be zero"):
-        walk_batch(CONFIG, ROBOT, two, commands, [standin(0), standin(1)])
-    with pytest.raises(ValueError, match=r"weights has batch sizes \[2\] for 3 plants"):
-        walk_batch(CONFIG, ROBOT, two, commands, [hfs()] * 3)
+def test_mjx_looks_for_contacts_of_the_feet_and_between_the_legs_alone():
+    world = build_world(hfs())
+    model, _ = batched_model([world])
+    found = jax.jit(lambda data: mjx.collision(model, mjx.kinematics(model, data)))
+    geoms = np.asarray(found(mjx.make_data(model))._impl.contact.geom)
+    with_floor = geoms[(geoms == world.floor).any(axis=1)]
+    assert len(with_floor) == 4
+    assert (world.foot_of_geom[with_floor.max(axis=1)] >= 0).all()
+    assert len(geoms) == 20
+
+
+def job(weights, name="s", plant=None, seconds=0.1, start_tick=0, push=(0.0, 0.0, 0.0)):
+    push = Push(np.array([push]), np.array([0.02]), np.array([0.05]))
+    command = named_command(name)
+    return Job(weights, command, plant or hfs(), seconds, 0, start_tick, push)
+
+
+ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
+
+
+@pytest.mark.parametrize(
+    ("jobs", "message"),
+    [
+        ([job(expert(), plant=ideal()), job(expert())], "all have backlash or none"),
+        ([job(expert(), plant=standin(0))], "estimator errors must be zero"),
+        ([job(expert()), job(expert(), seconds=0.2)], r"agree in seconds, got \[0.1, 0.2\]"),
+        (
+            [job(expert()), job(expert())._replace(command=ONE_PIECE)],
+            "agree in pieces of the command",
+        ),
+        ([job(expert()), job(expert())._replace(push=NO_PUSH)], "agree in pushes"),
+        ([job(expert(), seconds=0.0)], "at least one tick"),
+        ([job(expert()), job(expert(), start_tick=-110)], "start_tick -110 is not later"),
+        ([job(expert(), plant=hfs()._replace(mass=np.array(-1.0)))], "Imperfections.mass"),
+    ],
+)
+def test_jobs_that_make_no_batch_are_refused_at_once(jobs, message):
+    with pytest.raises(ValueError, match=message):
+        walk_batch(CONFIG, ROBOT, jobs)
+
+
+def test_no_jobs_are_no_walks():
+    assert list(walk_batch(CONFIG, ROBOT, [])) == []
+
+
+@pytest.fixture(scope="module")
+def three():
+    """Three jobs that differ in all that may differ, and their walks two at once."""
+    jobs = [
+        job(expert(), push=(10.0, 20.0, 0.0)),
+        job(nominal(), "c", hfs_drawn(1), start_tick=7),
+        job(expert()),
+    ]
+    return jobs, list(walk_batch(CONFIG, ROBOT, jobs, chunk=2))
+
+
+def test_walks_of_a_batch_are_those_of_mujoco(three):
+    """Weights, command, plant, start and push are each walk's own, in every chunk."""
+    for asked, mine in zip(*three, strict=True):
+        alone = at_interval(walk(CONFIG, ROBOT, *asked), 0.01)
+        for one, other in zip(jax.tree.leaves(mine), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-3)
+            assert one.dtype == other.dtype
+        np.testing.assert_allclose(mine.state.position, alone.state.position, atol=1e-6)
+    pushed, _, free = three[1]
+    assert (pushed.state.velocity - free.state.velocity)[-1, 1] > 0.05
 
 
 @pytest.mark.slow
-def test_a_batch_walks_as_mujoco_does():
-    """Over 100 ms after the start-up each trunk is within 1 cm of its twin in C."""
-    plants = [hfs(), hfs_drawn(1)]
-    weights, commands = [expert(), nominal()], [named_command("straight"), named_command("s")]
-    args = (CONFIG, ROBOT, stacked(weights), stacked(commands), plants)
-    batch = walk_batch(*args, seconds=0.1, fine=True)
-    coarse = walk_batch(*args, seconds=0.1)
-    assert coarse.state.position.shape == (2, 10, 3)
-    for i in range(2):
-        alone = walk(CONFIG, ROBOT, weights[i], commands[i], plants[i], seconds=0.1)
-        mine = jax.tree.map(lambda x, i=i: np.asarray(x[i]), batch)
-        np.testing.assert_allclose(mine.state.position, alone.state.position, atol=0.01)
-        np.testing.assert_array_equal(mine.contact, alone.contact)
-        means = mine.effect.force.reshape(10, 10, 2, 3).mean(axis=1)
-        np.testing.assert_allclose(coarse.effect.force[i], means, atol=1e-6)
-        np.testing.assert_allclose(coarse.state.euler[i], mine.state.euler[9::10], atol=1e-9)
+def test_fine_samples_are_milliseconds(three):
+    fine = list(walk_batch(CONFIG, ROBOT, three[0][:2], fine=True))
+    for mine, coarse in zip(fine, three[1][:2], strict=True):
+        assert mine.fallen.shape == (100,)
+        again = at_interval(mine, 0.01)
+        for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(coarse), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_physics_in_32_bits_walks_as_in_64(three):
+    """After 1.2 s of walking the trunk is within 2 mm; tick means of the wrench within 10 N rms."""
+    single = walk_batch(CONFIG, ROBOT, three[0], chunk=2, single=True)
+    for mine, double in zip(single, three[1], strict=True):
+        np.testing.assert_allclose(mine.state.position, double.state.position, atol=2e-3)
+        assert np.sqrt(np.mean((mine.effect.force - double.effect.force) ** 2)) < 10.0
+        assert mine.state.position.dtype == double.state.position.dtype
+        assert mine.residual.max() < 1e-6
 
 
 @pytest.mark.slow
 def test_a_fall_in_a_batch_is_held_and_marked():
-    ice = hfs()._replace(floor_friction=np.array(0.1))
-    weights, commands = stacked([expert()] * 2), stacked([named_command("s")] * 2)
-    batch = walk_batch(CONFIG, ROBOT, weights, commands, [hfs(), ice], seconds=2.0)
-    assert np.asarray(batch.fallen).any(axis=1).tolist() == [False, True]
-    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(batch))
+    """Both engines see the same fall at the same time."""
+    jobs = [job(expert(), seconds=1.0), job(expert(), seconds=1.0, push=(0.0, 600.0, 0.0))]
+    upright, fall = walk_batch(CONFIG, ROBOT, jobs)
+    assert not upright.fallen.any()
+    first = int(np.argmax(fall.fallen))
+    alone = at_interval(walk(CONFIG, ROBOT, *jobs[1]), 0.01)
+    assert fall.fallen[-1]
+    assert alone.fallen[-1]
+    assert first > 0
+    assert abs(first - int(np.argmax(alone.fallen))) <= 2
+    for leaf in jax.tree.leaves(fall._replace(period=None, initial=None, fallen=None)):
+        assert np.isfinite(leaf).all()
+        assert (leaf[first:] == leaf[first]).all()

@@ -12,7 +12,7 @@ from hector_jax.robot import load_robot
 from hector_jax.runtime import workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk, walk_many
-from hector_jax.sim.world import build_world, hfs, ideal
+from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import LossConfig, losses, total
 
 CONFIG, ROBOT = WalkConfig(), load_robot()
@@ -163,6 +163,27 @@ def test_expert_weights_walk_on_the_standin(seed):
     for name in COMMANDS:
         trajectory = walk(CONFIG, ROBOT, expert(), named_command(name), standin(seed), seed=seed)
         assert not trajectory.fallen.any(), name
+
+
+def test_a_push_moves_the_robot_and_the_sensed_wrench_stays_the_grounds():
+    """What the whole robot gains is from the ground, its weight and the push, in every sample."""
+    push = Push(np.array([[0.0, 30.0, 0.0]]), start=np.array([0.02]), duration=np.array([0.05]))
+    gained = []
+
+    def record(world, data):
+        mujoco.mj_subtreeVel(world.model, data)
+        gained.append(data.subtree_linvel[0] * world.model.body_subtreemass[0])
+
+    args = (CONFIG, ROBOT, expert(), named_command("straight"), ideal(), 0.1)
+    pushed = walk(*args, push=push, on_sample=record)
+    free = walk(*args)
+    assert (pushed.state.velocity - free.state.velocity)[70, 1] > 0.05
+    # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
+    sideways = np.diff(np.array(gained), axis=0)[1100:, 1] / 0.001
+    ground = pushed.effect.force.sum(axis=1)[:99, 1]
+    on = (np.arange(99) >= 20) & (np.arange(99) < 70)
+    np.testing.assert_allclose(np.mean((sideways - ground)[on]), 30.0, atol=1.0)
+    np.testing.assert_allclose(np.mean((sideways - ground)[~on]), 0.0, atol=1.0)
 
 
 @pytest.mark.slow

@@ -13,6 +13,8 @@ from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import (
     MAX_DELAY,
+    NO_PUSH,
+    Push,
     build_world,
     build_worlds,
     hfs,
@@ -20,6 +22,7 @@ from hector_jax.sim.world import (
     hfs_varied,
     ideal,
     named_world,
+    push_force,
     standing_qpos,
 )
 
@@ -59,6 +62,22 @@ def test_the_ideal_plant_is_the_robot_of_the_file():
     assert (world.model.nq, world.model.nv, world.model.nu) == (17, 16, 10)
     assert world.model.body_mass.sum() == pytest.approx(float(ROBOT.mass), rel=1e-9)
     assert world.model.body_mass.sum() == pytest.approx(12.0, abs=0.05)
+
+
+def test_a_push_lasts_from_its_start_on_and_pushes_add_up():
+    force = np.array([[10.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
+    push = Push(force, start=np.array([0.1, 0.15]), duration=np.array([0.1, 0.01]))
+    felt = np.stack([push_force(push, jnp.array(step)) for step in range(-5, 300)])[:, :2]
+    at = np.arange(-5, 300)
+    np.testing.assert_array_equal(felt[:, 0], np.where((at >= 100) & (at < 200), 10.0, 0.0))
+    np.testing.assert_array_equal(felt[:, 1], np.where((at >= 150) & (at < 160), 5.0, 0.0))
+    assert not np.any(push_force(NO_PUSH, jnp.array(0)))
+
+
+def test_what_is_only_looked_at_is_no_part_of_a_world():
+    model = build_world(hfs()).model
+    assert np.all(model.geom_contype | model.geom_conaffinity)
+    assert (model.ngeom, model.ntex, model.nmat) == (12, 0, 0)
 
 
 def test_joints_are_found_by_name_with_and_without_backlash():

@@ -30,7 +30,7 @@ from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
 from hector_jax.sim.walk import Job
-from hector_jax.sim.world import hfs, hfs_drawn
+from hector_jax.sim.world import Push, hfs, hfs_drawn
 from hector_jax.storage import load_tree, read_card, save_tree, write_file
 from hector_jax.trajectory import Push, State, Trajectory, Wrench
 
@@ -39,6 +39,8 @@ SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
 ALONG = np.array([1.0, -1.0, 1.0])  # mirror, left for right: of positions, velocities, forces
 ACROSS = -ALONG  # and of angles, angular velocities, moments
 PIECES = 4  # of every command, so that jobs can be stacked
+PUSHES = 2  # of every walk, likewise; most are of no force
+PUSH_TIME = 0.1  # [s]
 
 _UNITS = {
     "period": "s",
@@ -50,6 +52,8 @@ _UNITS = {
     "moment": "N m",
     "feet": "m",
     "joints": "rad",
+    "duration": "s",
+    "start": "s",
 }
 
 
@@ -81,7 +85,8 @@ def draw_jobs(
 
     Trajectories take turns: straight, c, s, random velocities. Weights take turns too: each of the
     24 log-uniform around nominal, around expert and, where tuning paths are given, a point of one.
-    Each walk has a plant of its own, drawn around the hfs. Job i depends on the seed and on i
+    Each walk has a plant of its own, drawn around the hfs. A third of the walks, drawn too, is
+    pushed once or twice: 10 to 30 N for 0.1 s, from any side. Job i depends on the seed and on i
     alone, so a longer list begins with the shorter one.
 
     Args:
@@ -110,7 +115,17 @@ def _draw_job(rng: np.random.Generator, i: int, paths: Sequence[Weights], second
         weights = jax.tree.map(
             lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape), (nominal(), expert())[centre]
         )
-    return Job(weights, command, hfs_drawn(int(rng.integers(2**31))), seconds, seed=i)
+    plant = hfs_drawn(int(rng.integers(2**31)))
+    return Job(weights, command, plant, seconds, seed=i, push=_draw_push(rng, seconds))
+
+
+def _draw_push(rng: np.random.Generator, seconds: float) -> Push:
+    number = rng.integers(1, PUSHES + 1) if rng.random() < 1.0 / 3.0 else 0
+    size = rng.uniform(10.0, 30.0, PUSHES) * (np.arange(PUSHES) < number)
+    side = rng.uniform(-np.pi, np.pi, PUSHES)
+    force = size[:, None] * np.stack([np.cos(side), np.sin(side), np.zeros(PUSHES)], axis=1)
+    start = rng.uniform(0.0, max(seconds - PUSH_TIME, 0.0), PUSHES)
+    return Push(force, start, np.full(PUSHES, PUSH_TIME))
 
 
 def _random_command(rng: np.random.Generator) -> Command:
@@ -310,6 +325,7 @@ def _like() -> Walks:
         seconds=zeros(0),
         seed=zeros(0),
         start_tick=zeros(0),
+        push=Push(zeros(0, PUSHES, 3), zeros(0, PUSHES), zeros(0, PUSHES)),
     )
     trajectory = Trajectory(
         period=zeros(0),

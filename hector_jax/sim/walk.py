@@ -3,9 +3,9 @@
 Start-up: double stance under the MPC, gait cycles in place, then t = 0, where the reference is
 anchored at the true centre of mass and yaw.
 Controller and sensing are compiled once per process and serve every walk, whatever its weights,
-command and plant: per tick one program
-plans and one observes, per millisecond one turns the plan into torques, and MuJoCo steps between. A
-fall ends the walk: what is missing is held and marked, never started afresh.
+command and plant: per tick one program plans and one observes, per millisecond one turns the plan
+into torques, and MuJoCo steps between. A fall ends the walk: what is missing is held and marked,
+never started afresh. The steps of the loop, and how they become a Trajectory, serve MJX too.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -43,7 +43,16 @@ from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.sensing import Contacts, Reading
-from hector_jax.sim.world import TIME_STEP, Imperfections, World, build_world, standing_qpos
+from hector_jax.sim.world import (
+    NO_PUSH,
+    TIME_STEP,
+    Imperfections,
+    Push,
+    World,
+    build_world,
+    push_force,
+    standing_qpos,
+)
 from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
 
 
@@ -56,10 +65,11 @@ class Job(NamedTuple):
     seconds: float = 4.0  # from t = 0
     seed: int = 0  # of the estimator's errors
     start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
+    push: Push = NO_PUSH
 
 
 class Observed(NamedTuple):
-    """What a millisecond turned out to be; see Trajectory."""
+    """What a sample turned out to be; see Trajectory."""
 
     state: State
     reference: State
@@ -109,6 +119,26 @@ def drive(
     return motors, yaw, applied
 
 
+def feel(
+    robot: Robot,
+    before: Reading,
+    contacts: Contacts,
+    floor: Int[Array, ""],
+    foot_of_geom: Int[Array, " ngeom"],
+) -> tuple[Wrench, Bool[Array, ""]]:
+    """The ground's wrench over a millisecond, and whether anything but the feet touches the floor.
+
+    Args:
+        robot: nominal body.
+        before: coordinates at its start.
+        contacts: found at its start; their forces act over it.
+        floor: from the World.
+        foot_of_geom: from the World.
+    """
+    foot, touches = sensing.foot_contacts(contacts, floor, foot_of_geom)
+    return sensing.ground_wrench(contacts, foot, floor, sensing.foot_points(robot, before)), touches
+
+
 def observe(
     config: WalkConfig,
     robot: Robot,
@@ -116,13 +146,11 @@ def observe(
     anchor: Anchor,
     time: Float[Array, ""],
     yaw: Float[Array, ""],
-    before: Reading,
-    contacts: Contacts,
     after: Reading,
-    floor: Int[Array, ""],
-    foot_of_geom: Int[Array, " ngeom"],
+    effect: Wrench,
+    touches: Bool[Array, ""],
 ) -> Observed:
-    """The truth about one millisecond.
+    """The truth about one sample.
 
     Args:
         config: times.
@@ -131,22 +159,37 @@ def observe(
         anchor: from where.
         time: gait time at its end, in ticks.
         yaw: a yaw [rad] shortly before.
-        before: coordinates at its start.
-        contacts: found at its start; their forces act over it.
         after: coordinates at its end.
-        floor: from the World.
-        foot_of_geom: from the World.
+        effect: mean wrench of the ground over it.
+        touches: whether anything but the feet touched the floor.
     """
-    foot, touches = sensing.foot_contacts(contacts, floor, foot_of_geom)
-    points = sensing.foot_points(robot, before)
     state = sensing.base_state(robot, after, yaw)
     return Observed(
         state=state,
         reference=reference_at(config.gait.tick, command, anchor, time),
-        effect=sensing.ground_wrench(contacts, foot, floor, points),
+        effect=effect,
         feet=sensing.foot_points(robot, after),
         joints=after.joints + after.slack,
         fallen=has_fallen(state) | touches,
+    )
+
+
+def as_trajectory(
+    period: Float[Array | np.ndarray, ""], initial: State, plan: Plan, seen: Observed
+) -> Trajectory:
+    """The walk of these samples, each with the plan in force."""
+    return Trajectory(
+        period=period,
+        initial=initial,
+        state=seen.state,
+        reference=seen.reference,
+        command=plan.wrench,
+        effect=seen.effect,
+        contact=plan.contact,
+        feet=seen.feet,
+        joints=seen.joints,
+        fallen=seen.fallen,
+        residual=plan.residual,
     )
 
 
@@ -167,6 +210,22 @@ def substeps(config: WalkConfig) -> int:
 def first_tick(config: WalkConfig) -> int:
     """Tick at which a walk in MuJoCo begins, standing."""
     return config.gait.first_tick - config.gait.stand
+
+
+def walk_ticks(config: WalkConfig, seconds: float, start_tick: int) -> int:
+    """Ticks of a walk from t = 0 on.
+
+    Raises:
+        ValueError: there are none, or t = 0 is not after the walk's first tick.
+    """
+    ticks = round(seconds / config.gait.tick)
+    if ticks < 1:
+        raise ValueError(f"a walk needs at least one tick of {config.gait.tick} s, got {seconds} s")
+    if start_tick <= first_tick(config):
+        raise ValueError(
+            f"a walk stands from tick {first_tick(config)} on; start_tick {start_tick} is not later"
+        )
+    return ticks
 
 
 @dataclass(frozen=True)
@@ -197,14 +256,14 @@ def _programs(config: WalkConfig) -> _Programs:
 
     def observe_(robot, command, anchor, tick, yaw, rows, contacts, floor, foot_of_geom):
         count = substeps(config)
+
+        def one(time: Array, before: Array, after: Array, contacts: Contacts) -> Observed:
+            felt = feel(robot, sensing.unpack_reading(before), contacts, floor, foot_of_geom)
+            reading = sensing.unpack_reading(after)
+            return observe(config, robot, command, anchor, time, yaw, reading, *felt)
+
         times = tick + (1 + jnp.arange(count)) / count
-        readings = sensing.unpack_reading(rows)
-        before = jax.tree.map(lambda x: x[:-1], readings)
-        after = jax.tree.map(lambda x: x[1:], readings)
-        one = partial(observe, config, robot, command, anchor)
-        return jax.vmap(one, in_axes=(0, None, 0, 0, 0, None, None))(
-            times, yaw, before, contacts, after, floor, foot_of_geom
-        )
+        return jax.vmap(one)(times, rows[:-1], rows[1:], contacts)
 
     return _Programs(
         begin=jax.jit(begin),
@@ -223,6 +282,7 @@ def walk(
     seconds: float = 4.0,
     seed: int = 0,
     start_tick: int = 0,
+    push: Push = NO_PUSH,
     path: Path | None = None,
     on_sample: Callable[[World, mujoco.MjData], None] | None = None,
 ) -> Trajectory:
@@ -237,6 +297,7 @@ def walk(
         seconds: length from t = 0, start-up apart.
         seed: of the estimator's errors.
         start_tick: gait tick of t = 0, for other start phases.
+        push: on the trunk.
         path: the plant's XML, hector.xml by default.
         on_sample: called after each millisecond, start-up included.
 
@@ -247,15 +308,8 @@ def walk(
         ValueError: the plant's file or numbers are wrong, or the length is no positive
             number of ticks.
     """
-    count = substeps(config)
-    ticks = round(seconds / config.gait.tick)
-    if ticks < 1:
-        raise ValueError(f"a walk needs at least one tick of {config.gait.tick} s, got {seconds} s")
-    begin = first_tick(config)
-    if start_tick <= begin:
-        raise ValueError(
-            f"a walk stands from tick {begin} on; start_tick {start_tick} is not later"
-        )
+    count, begin = substeps(config), first_tick(config)
+    ticks = walk_ticks(config, seconds, start_tick)
     world = build_world(imperfections, path)
     model, data = world.model, mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
@@ -266,6 +320,7 @@ def walk(
     place = jax.device_put((np.array(world.floor), world.foot_of_geom))
     lead = (start_tick - begin) * count
     errors = sensing.draw_errors(imperfections.estimator, seed, lead, ticks * count)
+    forces = np.asarray(_push_forces(push, np.arange(-lead, ticks * count)))
     anchor = jax.device_put(standing_anchor(robot, start_tick))
     substep_numbers = [jax.device_put(np.array(i, np.int32)) for i in range(count)]
 
@@ -306,6 +361,7 @@ def walk(
                 error[i],
             )
             data.ctrl[world.actuator] = torque
+            data.xfrc_applied[world.trunk, :3] = forces[(tick - begin) * count + i]
             mujoco.mj_step(model, data)
             np.concatenate([data.qpos, data.qvel, nothing]).take(where, out=rows[i + 1])
             sensing.read_contacts(world, data, contacts, i)
@@ -319,6 +375,9 @@ def walk(
             break
         rows[0] = rows[-1]
     return _trajectory(told, count, lead, ticks * count, bool(data.warning.number.any()))
+
+
+_push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
 
 def _trajectory(
@@ -339,19 +398,9 @@ def _trajectory(
     held = np.minimum(wanted, good)
     sample = jax.tree.map(lambda x: x[held], seen)
     planned = jax.tree.map(lambda x: x[held // count], plans)
-    return Trajectory(
-        period=np.array(TIME_STEP),
-        initial=jax.tree.map(lambda x: x[min(lead - 1, good)], seen.state),
-        state=sample.state,
-        reference=sample.reference,
-        command=planned.wrench,
-        effect=sample.effect,
-        contact=planned.contact,
-        feet=sample.feet,
-        joints=sample.joints,
-        fallen=wanted > good,
-        residual=planned.residual,
-    )
+    initial = jax.tree.map(lambda x: x[min(lead - 1, good)], seen.state)
+    sample = sample._replace(fallen=wanted > good)
+    return as_trajectory(np.array(TIME_STEP), initial, planned, sample)
 
 
 def walk_job(config: WalkConfig, robot: Robot, job: Job, path: Path | None = None) -> Trajectory:

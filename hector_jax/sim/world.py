@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hector_jax.robot import JOINT_NAMES, MODEL_PATH, load_model
 
@@ -44,6 +45,17 @@ class Estimator(NamedTuple):
     drift_yaw: Float[Array, "*batch"]  # [rad] likewise
 
 
+class Push(NamedTuple):
+    """Forces on the trunk at its centre of mass, from outside; any number of them, n."""
+
+    force: Float[Array, "*batch n 3"]  # [N] world frame
+    start: Float[Array, "*batch n"]  # [s] after t = 0
+    duration: Float[Array, "*batch n"]  # [s]
+
+
+NO_PUSH = Push(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
+
 class Imperfections(NamedTuple):
     """What a plant has that the controller does not know."""
 
@@ -60,6 +72,13 @@ class Imperfections(NamedTuple):
     mass: Float[Array, "*batch"]  # times that of hector.xml, all links
     trunk_com: Float[Array, "*batch 3"]  # [m] shift of the trunk's centre of mass
     estimator: Estimator
+
+
+def push_force(push: Push, step: Int[Array, ""]) -> Float[Array, "3"]:
+    """Force on the trunk [N] over the millisecond that begins `step` milliseconds after t = 0."""
+    first = jnp.round(push.start / TIME_STEP)
+    last = jnp.round((push.start + push.duration) / TIME_STEP)
+    return jnp.where((first <= step) & (step < last), push.force.T, 0.0).sum(axis=1)
 
 
 def truth() -> Estimator:
@@ -173,6 +192,7 @@ class World:
     actuator: np.ndarray  # (10,)
     foot_of_geom: np.ndarray  # (ngeom,) 0 left, 1 right, -1 no foot
     floor: int  # geom
+    trunk: int  # body
 
 
 def _check(imperfections: Imperfections) -> None:
@@ -189,8 +209,17 @@ def _check(imperfections: Imperfections) -> None:
         raise ValueError(f"Imperfections.delay is at most {MAX_DELAY} s, got {imperfections.delay}")
 
 
-def _model_with_backlash(path: Path) -> mujoco.MjModel:
+def _model(path: Path, slack: bool) -> mujoco.MjModel:
+    load_model(path)  # for its checks
     spec = mujoco.MjSpec.from_file(str(path))
+    for geom in list(spec.geoms):  # what is only looked at costs time and room in every plant
+        geom.material = ""
+        if not geom.contype and not geom.conaffinity:
+            spec.delete(geom)
+    for looks in (*spec.materials, *spec.textures):
+        spec.delete(looks)
+    if not slack:
+        return spec.compile()
     for name in JOINT_NAMES:
         motor = spec.joint(name)
         motor.parent.add_joint(
@@ -212,9 +241,7 @@ def _model_with_backlash(path: Path) -> mujoco.MjModel:
 
 
 def _compile(path: Path, slack: bool) -> World:
-    model = load_model(path)
-    if slack:
-        model = _model_with_backlash(path)
+    model = _model(path, slack)
     floors = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
     if len(floors) != 1:
         raise ValueError(f"{path}: expected one floor that collides, got {len(floors)}")
@@ -231,6 +258,7 @@ def _compile(path: Path, slack: bool) -> World:
         actuator=np.array([of_joint[joint.id] for joint in joints]),
         foot_of_geom=np.array([feet.index(b) if b in feet else -1 for b in model.geom_bodyid]),
         floor=floors[0],
+        trunk=int(model.jnt_bodyid[0]),
     )
 
 
