@@ -208,7 +208,9 @@ class Samples(NamedTuple):
 def samples(robot: Robot, folder: Path) -> Samples:
     """Samples of the walks under `folder`: a fifth of the walks held out, of the rest another."""
     walks = dataset.load_walks(folder, robot)
-    found, dropped = dataset.make_dataset(robot, walks.trajectory, walks.job.start_tick)
+    found, dropped = dataset.make_dataset(
+        robot, walks.trajectory, walks.job.start_tick, walks.job.push
+    )
     rest, held_out = dataset.split_by_walk(found)
     return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
 

@@ -31,7 +31,7 @@ class Wrench(NamedTuple):
     moment: Float[Array, "*batch 2 3"]  # [N m]
 
 
-class Push(NamedTuple):
+class Load(NamedTuple):
     """Force on the centre of mass and torque about it."""
 
     force: Float[Array, "*batch 3"]  # [N]

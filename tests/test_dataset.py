@@ -207,6 +207,14 @@ def test_a_mirror_image_has_the_other_foot_s_turn_and_is_its_own_inverse(three, 
     leaves_close(again, data, 1e-12)
 
 
+def test_ticks_of_a_push_are_no_samples(three, robot):
+    none = make_dataset(robot, three)[0]
+    push = Push(np.array([[0.0, 9.0, 0.0]]), np.array([0.05]), np.array([0.021]))
+    data, dropped = make_dataset(robot, three, push=push)
+    assert dropped == 9
+    assert set(none.tick) - set(data.tick) == {5, 6, 7}
+
+
 def test_no_walk_is_in_both_parts_of_a_split(three, robot):
     data, _ = make_dataset(robot, three)
     for share in (0.01, 0.4, 0.99):

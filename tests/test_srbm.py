@@ -7,7 +7,7 @@ from hector_jax.geometry import euler_from_rotation, rot_z, rotation_from_euler,
 from hector_jax.model import srbm
 from hector_jax.robot import load_robot
 from hector_jax.trajectory import (
-    Push,
+    Load,
     State,
     Wrench,
     pack_state,
@@ -143,19 +143,19 @@ def test_euler_angles_round_trip():
     np.testing.assert_allclose(euler_from_rotation(rotation_from_euler(euler)), euler, atol=1e-12)
 
 
-def test_a_push_accelerates_the_centre_of_mass_and_turns_the_body_about_it(robot):
+def test_a_load_accelerates_the_centre_of_mass_and_turns_the_body_about_it(robot):
     level = State(jnp.zeros(3), jnp.array([0.0, 0.0, 0.5]), jnp.zeros(3), jnp.zeros(3))
-    push = Push(jnp.array([3.0, -2.0, 1.0]), jnp.array([0.1, 0.2, -0.3]))
-    rate = srbm.rates(robot, level, zero_wrench(), FEET, push)
-    np.testing.assert_allclose(rate.velocity, push.force / robot.mass - robot.gravity)
-    np.testing.assert_allclose(robot.inertia @ rate.ang_velocity, push.torque, atol=1e-12)
+    load = Load(jnp.array([3.0, -2.0, 1.0]), jnp.array([0.1, 0.2, -0.3]))
+    rate = srbm.rates(robot, level, zero_wrench(), FEET, load)
+    np.testing.assert_allclose(rate.velocity, load.force / robot.mass - robot.gravity)
+    np.testing.assert_allclose(robot.inertia @ rate.ang_velocity, load.torque, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_a_wrench_leaves_unexplained_is_the_push(robot, seed):
+def test_what_a_wrench_leaves_unexplained_is_the_load(robot, seed):
     state, wrench, dt = some_state(seed), some_wrench(seed), 1e-4
-    push = Push(jnp.array([3.0, -2.0, 1.0]), jnp.array([0.4, 0.2, -0.3]))
-    after = srbm.step(robot, state, wrench, FEET, dt, push)
+    load = Load(jnp.array([3.0, -2.0, 1.0]), jnp.array([0.4, 0.2, -0.3]))
+    after = srbm.step(robot, state, wrench, FEET, dt, load)
     found = srbm.unexplained(robot, state, after, wrench, FEET, dt)
-    np.testing.assert_allclose(found.force, push.force, atol=1e-6)
-    np.testing.assert_allclose(found.torque, push.torque, atol=1e-3)
+    np.testing.assert_allclose(found.force, load.force, atol=1e-6)
+    np.testing.assert_allclose(found.torque, load.torque, atol=1e-3)

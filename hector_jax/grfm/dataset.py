@@ -30,9 +30,9 @@ from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
 from hector_jax.sim.walk import Job
-from hector_jax.sim.world import Push, hfs, hfs_drawn
+from hector_jax.sim.world import NO_PUSH, Push, hfs, hfs_drawn
 from hector_jax.storage import load_tree, read_card, save_tree, write_file
-from hector_jax.trajectory import Push, State, Trajectory, Wrench
+from hector_jax.trajectory import Load, State, Trajectory, Wrench
 
 KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
@@ -72,7 +72,7 @@ class Dataset(NamedTuple):
 
     window: Window  # what phi may look at, yaw frame
     label: Wrench  # (n, 2, 3) each, mean effect over the tick, yaw frame
-    legs: Push  # (n, 3) each, what moved the rigid body beside the effect, yaw frame
+    legs: Load  # (n, 3) each, what moved the rigid body beside the effect, yaw frame
     state: State  # (n, 3) each, true state at the start of the tick, world frame
     walk: Int[Array, " n"]  # which walk
     tick: Int[Array, " n"]  # which tick of it
@@ -344,7 +344,11 @@ def _like() -> Walks:
 
 
 def make_dataset(
-    robot: Robot, walks: Trajectory, start_tick: Any = 0, config: GaitConfig | None = None
+    robot: Robot,
+    walks: Trajectory,
+    start_tick: Any = 0,
+    push: Push = NO_PUSH,
+    config: GaitConfig | None = None,
 ) -> tuple[Dataset, int]:
     """Samples from walks at the plan interval.
 
@@ -352,17 +356,24 @@ def make_dataset(
         robot: the rigid body that is to move as the trunk did.
         walks: W walks of T ticks, stacked, from t = 0.
         start_tick: gait tick of t = 0, of all walks or of each (W,).
+        push: pushes from outside, of all walks or of each (W, ...).
         config: the gait that was walked.
 
     Returns:
-        The dataset, with numpy arrays, and how many samples were dropped because of a fall or an
-        unsolved QP. The first HISTORY - 1 ticks of a walk have no full history and are no samples.
+        The dataset, with numpy arrays, and how many samples were dropped because of a fall, an
+        unsolved QP, or a push, which would pass for one by the legs. The first HISTORY - 1 ticks of
+        a walk have no full history and are no samples.
     """
     config = config or GaitConfig()
     count = len(walks.fallen)
     starts = jnp.broadcast_to(jnp.asarray(start_tick, jnp.int32), (count,))
+    pushes = jax.tree.map(
+        lambda given, one: jnp.broadcast_to(given, (count, *jnp.shape(given)[-one.ndim :])),
+        push,
+        NO_PUSH,
+    )
     samples, usable = jax.vmap(lambda *walk: _samples(config, robot, *walk))(
-        jnp.arange(count), starts, jax.tree.map(jnp.asarray, walks)
+        jnp.arange(count), starts, pushes, jax.tree.map(jnp.asarray, walks)
     )
     usable = np.asarray(usable)
     return jax.tree.map(lambda x: np.asarray(x)[usable], samples), int((~usable).sum())
@@ -373,6 +384,7 @@ def _samples(
     robot: Robot,
     number: Int[Array, ""],
     start_tick: Int[Array, ""],
+    push: Push,
     walk: Trajectory,
 ) -> tuple[Dataset, Bool[Array, " n"]]:
     """Samples of one walk and whether each is of a robot on its feet."""
@@ -409,7 +421,9 @@ def _samples(
         for w in jax.tree.leaves((commands, label, legs))
     ]
     solved = walk.residual[first:] <= SOLVED
-    usable = jnp.stack([~walk.fallen[first:], solved, *finite]).all(axis=0)
+    begin, end = config.tick * tick[:, None], config.tick * (tick[:, None] + 1)
+    acts = (push.start < end) & (push.start + push.duration > begin) & push.force.any(axis=-1)
+    usable = jnp.stack([~walk.fallen[first:], solved, ~acts.any(axis=1), *finite]).all(axis=0)
     return Dataset(window, label, legs, before, jnp.full_like(tick, number), tick), usable
 
 
@@ -440,7 +454,7 @@ def with_mirror(dataset: Dataset) -> Dataset:
             base=flip_state(window.base),
         ),
         label=flip(dataset.label),
-        legs=Push(dataset.legs.force * ALONG, dataset.legs.torque * ACROSS),
+        legs=Load(dataset.legs.force * ALONG, dataset.legs.torque * ACROSS),
         state=flip_state(dataset.state),
     )
     return jax.tree.map(lambda *both: np.concatenate(both), dataset, image)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset
 from hector_jax.model.effect import HISTORY, Effect, Window, sure
-from hector_jax.trajectory import Push, Wrench
+from hector_jax.trajectory import Load, Wrench
 
 CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
 MOTION = 3  # of the base: yaw rate, forward and sideways velocity
@@ -102,7 +102,7 @@ def from_views(values: Float[Array, "2 6"]) -> Wrench:
     return Wrench(back[:, :3], back[:, 3:])
 
 
-def apply_gated(gated: GatedMap, window: Window, seen: View) -> tuple[Array, Push]:
+def apply_gated(gated: GatedMap, window: Window, seen: View) -> tuple[Array, Load]:
     """Ground wrench as each foot sees it (2, 6), and the push of the legs in the yaw frame."""
     stands = seen.stands.astype(int)
     tick, gate = hats(window.since_switch, gated.ticks), hats(window.since_switch, gated.gates)
@@ -114,7 +114,7 @@ def apply_gated(gated: GatedMap, window: Window, seen: View) -> tuple[Array, Pus
     terms = jnp.concatenate([seen.motion, seen.changes], axis=-1)
     push = tick @ gated.legs_bias + jnp.einsum("g,fi,gio->fo", gate, terms, gated.legs)
     back = from_views(push * seen.alone[:, None])
-    return ground, Push(back.force.sum(axis=0), back.moment.sum(axis=0))
+    return ground, Load(back.force.sum(axis=0), back.moment.sum(axis=0))
 
 
 def gated_effect(gated: GatedMap) -> jax.tree_util.Partial:

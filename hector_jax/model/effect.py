@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.geometry import rot_z
-from hector_jax.trajectory import Push, State, Wrench
+from hector_jax.trajectory import Load, State, Wrench
 
 HISTORY = 3  # commands in a window: the current one and two before it
 
@@ -33,10 +33,10 @@ class Effect(NamedTuple):
 
     wrench: Wrench  # that the ground returns
     spread: Wrench  # of it, where phi knows one, else zero
-    legs: Push  # that the moving legs give the trunk, where phi knows it, else zero
+    legs: Load  # that the moving legs give the trunk, where phi knows it, else zero
 
 
-Vectors = TypeVar("Vectors", Wrench, Push)
+Vectors = TypeVar("Vectors", Wrench, Load)
 
 
 def turn(vectors: Vectors, yaw: Float[Array, ""]) -> Vectors:
@@ -59,7 +59,7 @@ def from_yaw_frame(state: State) -> State:
 def sure(wrench: Wrench) -> Effect:
     """The effect of a wrench without spread, and of legs that do not push."""
     nothing = jnp.zeros_like(wrench.force[0])
-    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench), Push(nothing, nothing))
+    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench), Load(nothing, nothing))
 
 
 def _last_command(window: Window) -> Effect:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hector_jax.geometry import euler_rates, rotation_from_euler, skew
 from hector_jax.robot import Robot
-from hector_jax.trajectory import Push, State, Wrench
+from hector_jax.trajectory import Load, State, Wrench
 
 
 def centroidal_rates(
@@ -32,12 +32,12 @@ def centroidal_rates(
 
 @jax.jit  # traced once for the four stages of a step
 def rates(
-    robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], push: Push | None = None
+    robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], load: Load | None = None
 ) -> State:
     """Time derivative of the state; `feet` are the foot points in the world [m]. Source: Eq. 2."""
     acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
-    if push is not None:
-        acceleration, torque = acceleration + push.force / robot.mass, torque + push.torque
+    if load is not None:
+        acceleration, torque = acceleration + load.force / robot.mass, torque + load.torque
     R_wb = rotation_from_euler(state.euler)
     momentum = R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
     torque = torque - jnp.cross(state.ang_velocity, momentum)
@@ -56,17 +56,17 @@ def step(
     wrench: Wrench,
     feet: Float[Array, "2 3"],
     dt: float,
-    push: Push | None = None,
+    load: Load | None = None,
 ) -> State:
-    """State after `dt` [s] of constant wrench and push, world frame (4th-order Runge-Kutta)."""
+    """State after `dt` [s] of constant wrench and load, world frame (4th-order Runge-Kutta)."""
 
     def ahead(slope: State, h: float) -> State:
         return jax.tree.map(lambda x, dx: x + h * dx, state, slope)
 
-    k1 = rates(robot, state, wrench, feet, push)
-    k2 = rates(robot, ahead(k1, dt / 2), wrench, feet, push)
-    k3 = rates(robot, ahead(k2, dt / 2), wrench, feet, push)
-    k4 = rates(robot, ahead(k3, dt), wrench, feet, push)
+    k1 = rates(robot, state, wrench, feet, load)
+    k2 = rates(robot, ahead(k1, dt / 2), wrench, feet, load)
+    k3 = rates(robot, ahead(k2, dt / 2), wrench, feet, load)
+    k4 = rates(robot, ahead(k3, dt), wrench, feet, load)
     return jax.tree.map(
         lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), state, k1, k2, k3, k4
     )
@@ -79,8 +79,8 @@ def unexplained(
     wrench: Wrench,
     feet: Float[Array, "2 3"],
     dt: float,
-) -> Push:
-    """The push that the motion from one state to the next owes to something beside the wrench.
+) -> Load:
+    """The load that the motion from one state to the next owes to something beside the wrench.
 
     Args:
         robot: mass, gravity and inertia.
@@ -99,7 +99,7 @@ def unexplained(
 
     lever = feet - 0.5 * (before.position + after.position)
     acceleration, torque = centroidal_rates(robot, wrench, lever)
-    return Push(
+    return Load(
         force=robot.mass * ((after.velocity - before.velocity) / dt - acceleration),
         torque=(momentum(after) - momentum(before)) / dt - torque,
     )
