@@ -25,6 +25,7 @@ from hector_jax.grfm.dataset import (
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, turn
 from hector_jax.robot import load_robot
+from hector_jax.sim.world import Push
 
 TICKS = 40
 
