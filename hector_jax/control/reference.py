@@ -5,8 +5,10 @@ integrated first and the velocity turned by it; on each piece of constant yaw ra
 exact arc. Height, roll and pitch are constant.
 """
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
@@ -80,6 +82,7 @@ def _displacement(command: Command, time: Float[Array, ""]) -> tuple[Array, Arra
     return arcs.sum(axis=0), turned.sum()
 
 
+@partial(jax.jit, static_argnums=0)  # traced once for all that ask
 def reference_at(
     tick_length: float, command: Command, anchor: Anchor, tick: Real[Array, ""]
 ) -> State:

@@ -105,6 +105,7 @@ def unexplained(
     )
 
 
+@jax.jit  # traced once for all steps of the horizon and both passes
 def linearise(
     robot: Robot, euler: Float[Array, "3"], lever: Float[Array, "2 3"], dt: float
 ) -> tuple[Float[Array, "15 15"], Float[Array, "15 12"]]:
