@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hector_jax.control.qp import QP, QpConfig, Solution, solve_qp
+from hector_jax.control.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.control.weights import Weights
 from hector_jax.geometry import rot_z
 from hector_jax.model import srbm
@@ -178,30 +178,26 @@ def write_qp(
     effort = effort + jax.vmap(jnp.diag)(empty)
 
     wide = jnp.swapaxes(angles, 1, 2).reshape(3 * N, 3 * N)  # rows: step and angle
-    turning = (wide.T @ (jnp.tile(Q.euler, N)[:, None] * wide)).reshape(N, 3, N, 3)
     both = later.T @ later  # steps that feel both inputs
-    turning += jnp.einsum("ij,xy->ixjy", both, jnp.diag(Q.ang_velocity))
-    eyeN = jnp.eye(N, dtype=dtype)
-    Wd = (turn[:, :, None] * eyeN[:, None, :, None]).reshape(3 * N, N * b)
+    turning = wide.T @ (jnp.tile(Q.euler, N)[:, None] * wide)
+    turning += jnp.kron(both, jnp.diag(Q.ang_velocity))
+    spin = block_diagonal(turn)
     pushing = both[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
-    P = (Wd.T @ (turning.reshape(3 * N, 3 * N) @ Wd)).reshape(N, b, N, b)
-    P += jnp.einsum("ixa,ixjb->iajb", push, jnp.einsum("ijx,jxb->ixjb", pushing, push))
-    P = 2.0 * (P + jnp.einsum("kij,kl->kilj", effort, jnp.eye(N, dtype=dtype)))
-    P = P.reshape(N * b, N * b)
+    pushed = jnp.einsum("ixa,ixjb->iajb", push, jnp.einsum("ijx,jxb->ixjb", pushing, push))
+    P = spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
     torque = jnp.einsum("kjxy,kx->jy", angles, error.euler) + later.T @ error.ang_velocity
     force = travel.T @ error.position + later.T @ error.velocity
-    q = 2.0 * (jnp.einsum("jxb,jx->jb", turn, torque) + jnp.einsum("jxb,jx->jb", push, force))
-    q = q.reshape(-1)
+    q = jnp.einsum("jxb,jx->jb", turn, torque) + jnp.einsum("jxb,jx->jb", push, force)
     if config.effort_about == "weight":
         share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
         weight = jnp.zeros((N, 12), dtype).at[:, 2].set(share).at[:, 5].set(share)
-        q = q - 2.0 * jnp.einsum("kui,u,ku->ki", G, R, weight).reshape(-1)
+        q = q - jnp.einsum("kui,u,ku->ki", G, R, weight)
 
     yaw = jnp.einsum("ksf,kf->ks", feet, horizon.foot_yaw)
     rows = jax.vmap(jax.vmap(lambda yaw: _rows(config, robot, yaw)))(yaw)
     C = jnp.einsum("st,ksri->ksrti", jnp.eye(slots, dtype=dtype), rows).reshape(N, -1, b)
     lower, upper = (jnp.asarray(np.tile(bound, N * slots), dtype) for bound in _bounds(config))
-    return QP(P, q, C, lower, upper), G[0]
+    return QP(2.0 * P, 2.0 * q.reshape(-1), C, lower, upper), G[0]
 
 
 def solve_mpc(

@@ -8,10 +8,10 @@ rows of A D of length one, kappa the larger of |D q| and the bounds violated at 
 those of (x, y) alone in that form, and nothing is called solved by another measure.
 
 Algorithm. First the active set is guessed and corrected by signs (`_active_set`, a semismooth
-Newton method): one n x n Cholesky per try, three or four tries on the QPs of walking, exact to
-rounding where it settles. Where it does not, Mehrotra's predictor and corrector
-(`_interior_point`), which always gets near, names the active set for a last correction. Both are
-proximal in x and in the multipliers,
+Newton method): one n x n Cholesky per try, five tries on the QPs of walking, exact to rounding
+where it settles; on a GPU a kernel (`control.pivot`) makes the guess and one try proves it. Where
+it does not settle, Mehrotra's predictor and corrector (`_interior_point`), which always gets near,
+names the active set for a last correction. Both are proximal in x and in the multipliers,
 
     (P + rho I + A'WA) dx = rhs,    W = 1 / (slack / multiplier + delta),
 
@@ -210,8 +210,8 @@ def _columns(A: Array, y: Array) -> Array:
     return jnp.einsum("krb,kr->kb", A, y.reshape(A.shape[:2])).ravel()
 
 
-def _on_diagonal(blocks: Array) -> Array:
-    """Block-diagonal matrix of (N, r, b) blocks."""
+def block_diagonal(blocks: Float[Array, "N r b"]) -> Float[Array, "m n"]:
+    """Matrix (N r, N b) with these blocks on its diagonal."""
     N, r, b = blocks.shape
     wide = blocks[:, :, None, :] * jnp.eye(N, dtype=blocks.dtype)[:, None, :, None]
     return wide.reshape(N * r, N * b)
@@ -222,7 +222,7 @@ def _plus_gram(P: Array, A: Array, w: Array) -> Array:
     if A.ndim == 2:
         return P + (w[:, None] * A).T @ A
     weighted = w.reshape(*A.shape[:2], 1) * A
-    return P + _on_diagonal(jnp.einsum("krb,krc->kbc", weighted, A))
+    return P + block_diagonal(jnp.einsum("krb,krc->kbc", weighted, A))
 
 
 def _cholesky(matrix: Array) -> Array:
@@ -424,7 +424,7 @@ def _first_guess(qp: _Normal, loose: _Point) -> tuple[_Point, Array]:
     def pivoted(qp: _Normal) -> tuple[_Point, Array]:
         held = qp.side | qp.equality
         upper, lower = jnp.where(held, qp.bound, jnp.asarray(_SIGN, qp.q.dtype) * jnp.inf)
-        x, y, side, settled = pivot.guess(qp.P, qp.q, _on_diagonal(qp.A), lower, upper)
+        x, y, side, settled = pivot.guess(qp.P, qp.q, block_diagonal(qp.A), lower, upper)
         z = jnp.maximum(jnp.asarray(_SIGN, y.dtype) * y, 0.0)
         usable = (settled > 0) & jnp.isfinite(jnp.sum(x) + jnp.sum(y))
         return _choose(usable, (_Point(x, z), jnp.stack([side > 0, side < 0])), violated(qp))
@@ -571,7 +571,7 @@ def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, A
         termination_check_frequency=25,
         implicit_diff=False,
     )
-    A = qp.A if qp.A.ndim == 2 else _on_diagonal(qp.A)
+    A = qp.A if qp.A.ndim == 2 else block_diagonal(qp.A)
     params, state = solver.run(None, (qp.P, qp.q), A, (bound[1], bound[0]))
     finite = jnp.isfinite(jnp.sum(params.primal[0]) + jnp.sum(params.dual_eq))
     x = jnp.where(finite, params.primal[0], 0.0)

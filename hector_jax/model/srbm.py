@@ -5,6 +5,8 @@ forward Euler and drops the gyroscopic term, as the public controllers of this r
 simulated body keeps it.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -105,7 +107,7 @@ def unexplained(
     )
 
 
-@jax.jit  # traced once for all steps of the horizon and both passes
+@partial(jax.jit, static_argnums=3)  # traced once for all that ask
 def linearise(
     robot: Robot, euler: Float[Array, "3"], lever: Float[Array, "2 3"], dt: float
 ) -> tuple[Float[Array, "15 15"], Float[Array, "15 12"]]:
