@@ -124,9 +124,7 @@ def _grfm(args: Grfm) -> None:
     found, drifts = {}, {}
     for world, walks in worlds.items():
         samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
-        drifts[world] = fidelity.drifts(
-            robot, effects, walks.trajectory, walks.job.start_tick, walks.job.push
-        )
+        drifts[world] = fidelity.drifts(robot, effects, walks.trajectory, walks.job.start_tick)
         found[world] = fidelity.as_result(
             training.report(effects, samples), fidelity.by_phase(effects, samples), drifts[world]
         )
