@@ -173,6 +173,29 @@ def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, net, seed
     check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4)
 
 
+def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor):
+    command = named_command("s")
+    whole, parts = (
+        tune_step(
+            TuneConfig(rollout=RolloutConfig(ticks=30, block=block)),
+            robot,
+            nominal(),
+            command,
+            anchor,
+            last_command,
+        )
+        for block in (30, 12)
+    )
+    assert float(parts.loss) == pytest.approx(float(whole.loss), rel=1e-12)
+    for a, b in zip(jax.tree.leaves(parts.gradient), jax.tree.leaves(whole.gradient), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
+def test_a_block_has_at_least_one_tick():
+    with pytest.raises(ValueError, match="block must be at least 1"):
+        RolloutConfig(block=0)
+
+
 def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
     config = TuneConfig(rollout=SHORT)
     tune_step(config, robot, nominal(), named_command("s"), anchor, last_command)
