@@ -122,7 +122,7 @@ def test_collection_refuses_a_folder_it_cannot_write_and_an_unknown_engine(
 def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
     """Both leave shards of one layout; the card names the engine, and resuming keeps to it."""
     monkeypatch.setattr(commands.pipeline, "tuning_paths", lambda *args: [])
-    flags = ("collect", "--walks", "2", "--seconds", "0.1")
+    flags = ("collect", "--walks", "3", "--seconds", "0.1")
     found = {}
     for engine in ("c", "mjx"):
         folder = tmp_path / engine
