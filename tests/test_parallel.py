@@ -94,7 +94,7 @@ def test_mjx_looks_for_contacts_of_the_feet_and_between_the_legs_alone():
     with_floor = geoms[(geoms == world.floor).any(axis=1)]
     assert len(with_floor) == 4
     assert (world.foot_of_geom[with_floor.max(axis=1)] >= 0).all()
-    assert len(geoms) == 20
+    assert len(geoms) == 13
 
 
 def job(weights, name="s", plant=None, seconds=0.1, start_tick=0, push=(0.0, 0.0, 0.0)):
