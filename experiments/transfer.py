@@ -15,7 +15,7 @@ nets only where DATA was walked by it.
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -114,7 +114,8 @@ def phis(
         "net": default,
         "net without legs": jax.tree_util.Partial(_without_legs, default),
     }
-    return jax.tree.map(np.asarray, effects), net.params
+    host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
+    return {name: host(effect) for name, effect in effects.items()}, net.params
 
 
 def tuned_sets(
@@ -220,27 +221,20 @@ def _model_job(
     return np.array(rows), np.array(told)
 
 
-def on_model(
+def ask_model(
     pool: Executor,
     configs: Mapping[str, TuneConfig],
     robot: Robot,
     effects: Mapping[str, jax.tree_util.Partial],
     points: Sequence[Point],
     others: Sequence[Point],
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+) -> dict[str, Future]:
     """`_model_job` of each phi with each config; by the phi's name and the config's ending."""
-    with bar(f"gradients on the rigid body, {len(effects)} phi") as tell:
-        running = {
-            pool.submit(_model_job, config, robot, effect, points, others): name + ending
-            for ending, config in configs.items()
-            for name, effect in effects.items()
-        }
-        tell(0, len(running), "compiling")
-        found = {}
-        for future in as_completed(running):
-            found[running[future]] = future.result()
-            tell(len(found), len(running), running[future])
-    return {name: found[name] for name in running.values()}
+    return {
+        name + ending: pool.submit(_model_job, config, robot, effect, points, others)
+        for ending, config in configs.items()
+        for name, effect in effects.items()
+    }
 
 
 def main() -> None:
@@ -287,10 +281,15 @@ def main() -> None:
                 for key, cloud in clouds.items()
             },
         }
-        walked, engine = walk_groups(pool, walk, robot, groups, flags.out / "hfs")
         points = [spot._replace(tick=tick) for spot in spots.values() for tick in flags.phases]
         others = [point for cloud in clouds.values() for point in cloud]
-        found = on_model(pool, configs, robot, effects, points, others)
+        # An accelerator walks while the processes differentiate; without one the walks come after.
+        running = ask_model(pool, configs, robot, effects, points, others)
+        walked, engine = walk_groups(pool, walk, robot, groups, flags.out / "hfs")
+        with bar("gradients on the rigid body") as tell:
+            for done, _ in enumerate(as_completed(running.values()), 1):
+                tell(done, len(running), "")
+        found = {name: future.result() for name, future in running.items()}
 
     truth = {}
     for key in spots:
@@ -353,14 +352,14 @@ def report(
     text = [
         "# Does the gradient transfer?",
         f"The model's gradient of L in 18 log-weights against that of the high-fidelity simulator: "
-        f"central differences of +-5 %, mean over {phases} start phases (gait ticks "
+        f"central differences of +-5 %, mean over the start phases (gait ticks "
         f"{', '.join(map(str, flags.phases))}). Controller: effort priced about "
         f"{flags.effort_about}, leg weight in the stance torque "
         f"{'on' if flags.stance_weight else 'off'}. {count} walks, engine {engine}; worst relative "
         f"KKT residual {worst:.0e}; falls: {_falls(fell)}.",
-        f"Brackets are 95 % intervals from redrawing the {phases} start phases, the same for model "
-        "and simulator. With so few they are rough, rather too narrow, and say nothing of other "
-        "commands or plants. `command` is the plain rigid body; `lead` counts ticks that the "
+        f"Brackets are 95 % intervals from redrawing the start phases, the same ones for model and "
+        f"simulator. There are {phases}: with so few the intervals are rough, rather too narrow (of "
+        "one phase there is none), and say nothing of other commands or plants. `command` is the plain rigid body; `lead` counts ticks that the "
         "model walks in place before t = 0. `most wrong` names the weight whose entry differs most "
         "between the two unit gradients, and its share of their squared distance.",
     ]
@@ -383,7 +382,7 @@ def report(
             "weight sets, drawn log-uniformly about nominal; a fall counts as the loss charges it.",
             transfer.rank_table(ranks),
         ]
-    text += ["## Pictures", *(f"![{caption}]({name})\n\n{caption}" for name, caption in pictures)]
+    text += ["## Pictures", *(f"![{name}]({name})\n\n{caption}" for name, caption in pictures)]
     told = {
         "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
         "environment": environment(),

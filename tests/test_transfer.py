@@ -1,5 +1,7 @@
 """Gradients and orders compared: the pure part of the report on transfer."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -96,6 +98,16 @@ def test_a_phase_with_a_fall_is_left_out_for_all():
     assert row.phases == 3
     assert row.cosine.value == pytest.approx(1.0)
     assert transfer.compare(TRUTH, None, np.full_like(TRUTH, np.nan)) is None
+
+
+def test_a_single_phase_has_no_interval():
+    row = transfer.compare(TRUTH[:1], -TRUTH[:1], TRUTH[:1])
+    assert row is not None
+    assert row.gain is not None
+    assert np.isnan(row.gain.low)
+    assert "[" not in transfer.gradient_table({("c", "net"): row})
+    assert "above zero on 0 of 1" in transfer.verdict({("c", "net"): row}, "net")
+    assert "NaN" not in json.dumps(transfer.as_result(row))
 
 
 def test_rank_correlation_sees_order_alone():

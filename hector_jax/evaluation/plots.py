@@ -426,8 +426,7 @@ def gradients(
         def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, color: str) -> None:
             mean = rows.mean(axis=0)
             size = np.linalg.norm(mean)
-            label = f"{name}, length {size / 1e6:.2g}"
-            axes.bar(x, mean / size, width, color=color, label=label)
+            axes.bar(x, mean / size, width, color=color, label=f"{name}, {size / 1e6:.2g}e6")
 
         bars(at, simulator, 0.9, "hfs", "0.82")
         size = np.linalg.norm(simulator.mean(axis=0))
@@ -445,8 +444,8 @@ def gradients(
         axes.set(ylabel="dL / d log weight, unit length", xlim=(-0.6, len(names) - 0.4))
         _legend(figure, axes, columns=3)
     return (
-        "Gradients of L in log-weights, mean over start phases, each scaled to unit length; "
-        "lengths in 10^6. The dark stripes span the hfs's start phases."
+        "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "
+        "lengths are in the legend. The dark stripes span the start phases on the hfs."
     )
 
 
@@ -482,6 +481,8 @@ def ranks(
                     va="top",
                 )
             panel.set(xscale="log", yscale="log", title=f"{trajectory}, within x/{factor}")
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
             for axis in (panel.xaxis, panel.yaxis):
                 axis.set_major_formatter(lambda y, _: f"{y:g}")
                 axis.set_minor_formatter(lambda y, _: f"{y:g}" if f"{y:.0e}"[0] in "235" else "")

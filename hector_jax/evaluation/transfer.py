@@ -83,13 +83,18 @@ def cosine(
 def over_phases(
     statistic: Callable[..., np.ndarray | float], *gradients: Float[np.ndarray, "P n"]
 ) -> Interval:
-    """A statistic of mean gradients, with its percentile interval when the phases are redrawn."""
-    count = len(gradients[0])
+    """A statistic of mean gradients, with its percentile interval when the phases are redrawn.
+
+    The ends of the interval are NaN for a single phase.
+    """
+    count, value = len(gradients[0]), float(statistic(*(g.mean(axis=0) for g in gradients)))
+    if count < 2:
+        return Interval(value, float("nan"), float("nan"))
     draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
     found = statistic(*(g[draws].mean(axis=1) for g in gradients))
     tail = 50 * (1 - COVERAGE)
     low, high = np.percentile(found, [tail, 100 - tail])
-    return Interval(float(statistic(*(g.mean(axis=0) for g in gradients))), float(low), float(high))
+    return Interval(value, float(low), float(high))
 
 
 def compare(
@@ -162,6 +167,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _told(value: Interval | None) -> str:
     if value is None:
         return ""
+    if np.isnan(value.low):
+        return f"{value.value:.2f}"
     return f"{value.value:.2f} [{value.low:.2f}, {value.high:.2f}]"
 
 
@@ -182,7 +189,9 @@ def gradient_table(rows: Mapping[tuple[str, str], Row | None]) -> str:
 def wrong_sentence(trajectory: str, kind: str, row: Row) -> str:
     """Which weight's gradient is wrong, and by how much."""
     model, simulator = row.entries
-    sign = "the same way" if model * simulator > 0.0 else "the other way"
+    sign = "too weakly" if abs(model) < abs(simulator) else "too strongly"
+    if model * simulator < 0.0:
+        sign = "the wrong way"
     return (
         f"{trajectory}, {kind}: the weight that is most wrong is {row.wrong}. It has {model:+.2f} "
         f"of the model's unit gradient and {simulator:+.2f} of the simulator's, pulls {sign} and "
@@ -216,4 +225,14 @@ def as_result(row: Row | None) -> dict[str, Any] | None:
     """A row as JSON values."""
     if row is None:
         return None
-    return {k: v._asdict() if isinstance(v, Interval) else v for k, v in row._asdict().items()}
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Interval):
+            ends = {"low": value.low, "high": value.high}
+            return {
+                "value": value.value,
+                **{k: None if np.isnan(x) else x for k, x in ends.items()},
+            }
+        return value
+
+    return {name: plain(value) for name, value in row._asdict().items()}
