@@ -357,11 +357,12 @@ def report(
         f"{flags.effort_about}, leg weight in the stance torque "
         f"{'on' if flags.stance_weight else 'off'}. {count} walks, engine {engine}; worst relative "
         f"KKT residual {worst:.0e}; falls: {_falls(fell)}.",
-        f"Brackets are 95 % intervals from redrawing the start phases, the same ones for model and "
+        "Brackets are 95 % intervals from redrawing the start phases, the same ones for model and "
         f"simulator. There are {phases}: with so few the intervals are rough, rather too narrow (of "
-        "one phase there is none), and say nothing of other commands or plants. `command` is the plain rigid body; `lead` counts ticks that the "
-        "model walks in place before t = 0. `most wrong` names the weight whose entry differs most "
-        "between the two unit gradients, and its share of their squared distance.",
+        "one phase there is none), and say nothing of other commands or plants.",
+        "`command` is the plain rigid body; `lead` counts ticks that the model walks in place "
+        "before t = 0. `most wrong` names the weight whose entry differs most between the two unit "
+        "gradients, and its share of their squared distance.",
     ]
     for which in flags.sets:
         text += [f"## {which.capitalize()} weights"]
