@@ -358,8 +358,8 @@ def report(
         f"{'on' if flags.stance_weight else 'off'}. {count} walks, engine {engine}; worst relative "
         f"KKT residual {worst:.0e}; falls: {_falls(fell)}.",
         "Brackets are 95 % intervals from redrawing the start phases, the same ones for model and "
-        f"simulator. There are {phases}: with so few the intervals are rough, rather too narrow (of "
-        "one phase there is none), and say nothing of other commands or plants.",
+        f"simulator. There are {phases}: with so few the intervals are rough, rather too narrow "
+        "(of one phase there is none), and say nothing of other commands or plants.",
         "`command` is the plain rigid body; `lead` counts ticks that the model walks in place "
         "before t = 0. `most wrong` names the weight whose entry differs most between the two unit "
         "gradients, and its share of their squared distance.",
@@ -411,7 +411,7 @@ def report(
 
 def _known(rows: np.ndarray) -> list:
     """JSON knows no NaN: null in its place."""
-    return np.where(np.isfinite(rows), rows, None).tolist()
+    return [[x if np.isfinite(x) else None for x in row] for row in rows.tolist()]
 
 
 def _falls(fell: Mapping[str, int]) -> str:
