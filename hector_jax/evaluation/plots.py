@@ -484,8 +484,12 @@ def ranks(
             low, high = panel.get_ylim()
             panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
             for axis in (panel.xaxis, panel.yaxis):
+                low, high = axis.get_view_interval()
+                digits = "23456789" if high < 6 * low else "25"
                 axis.set_major_formatter(lambda y, _: f"{y:g}")
-                axis.set_minor_formatter(lambda y, _: f"{y:g}" if f"{y:.0e}"[0] in "235" else "")
+                axis.set_minor_formatter(
+                    lambda y, _, digits=digits: f"{y:g}" if f"{y:.0e}"[0] in digits else ""
+                )
         for panel in panels[-1]:
             panel.set_xlabel("L on the hfs [10$^6$]")
         for panel in panels[:, 0]:
