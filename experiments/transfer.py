@@ -398,20 +398,18 @@ def report(
         "residual": worst,
         "gradients": {
             f"{which}: {name}": {
-                "hfs": _known(simulator),
-                **{kind: _known(found[which, name]) for kind, found in gradients.items()},
+                "hfs": simulator.tolist(),
+                **{kind: found[which, name].tolist() for kind, found in gradients.items()},
             }
             for (which, name), simulator in truth.items()
         },
     }
-    write_file(flags.out / "transfer.json", (json.dumps(told, indent=1) + "\n").encode())
+    write_file(
+        flags.out / "transfer.json",
+        (json.dumps(transfer.known(told), indent=1, allow_nan=False) + "\n").encode(),
+    )
     write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
     return flags.out / "report.md"
-
-
-def _known(rows: np.ndarray) -> list:
-    """JSON knows no NaN: null in its place."""
-    return [[x if np.isfinite(x) else None for x in row] for row in rows.tolist()]
 
 
 def _falls(fell: Mapping[str, int]) -> str:

@@ -107,7 +107,9 @@ def test_a_single_phase_has_no_interval():
     assert np.isnan(row.gain.low)
     assert "[" not in transfer.gradient_table({("c", "net"): row})
     assert "above zero on 0 of 1" in transfer.verdict({("c", "net"): row}, "net")
-    assert "NaN" not in json.dumps(transfer.as_result(row))
+    told = json.loads(json.dumps(transfer.known(transfer.as_result(row)), allow_nan=False))
+    assert told["gain"]["low"] is None
+    assert told["gain"]["value"] == pytest.approx(2.0)
 
 
 def test_rank_correlation_sees_order_alone():

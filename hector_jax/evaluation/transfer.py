@@ -222,17 +222,16 @@ def verdict(rows: Mapping[tuple[str, str], Row | None], kind: str) -> str:
 
 
 def as_result(row: Row | None) -> dict[str, Any] | None:
-    """A row as JSON values."""
+    """A row as names and values."""
     if row is None:
         return None
+    return {k: v._asdict() if isinstance(v, Interval) else v for k, v in row._asdict().items()}
 
-    def plain(value: Any) -> Any:
-        if isinstance(value, Interval):
-            ends = {"low": value.low, "high": value.high}
-            return {
-                "value": value.value,
-                **{k: None if np.isnan(x) else x for k, x in ends.items()},
-            }
-        return value
 
-    return {name: plain(value) for name, value in row._asdict().items()}
+def known(value: Any) -> Any:
+    """Nested dictionaries and sequences with None for numbers that are not finite, for JSON."""
+    if isinstance(value, dict):
+        return {key: known(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [known(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
