@@ -426,12 +426,12 @@ def gradients(
         def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, color: str) -> None:
             mean = rows.mean(axis=0)
             size = np.linalg.norm(mean)
-            axes.bar(x, mean / size, width, color=color, label=f"{name}, {size / 1e6:.2g}e6")
+            axes.bar(x, mean / size, width, color=color, label=f"{name}, {size / 1e6:.1f}e6")
 
         bars(at, simulator, 0.9, "hfs", "0.82")
         size = np.linalg.norm(simulator.mean(axis=0))
         low, high = simulator.min(axis=0) / size, simulator.max(axis=0) / size
-        axes.vlines(at, low, high, color="0.55", linewidth=4.5, zorder=1.5)
+        axes.vlines(at - 0.45, low, high, color="black", linewidth=2.0, zorder=3)
         for i, (name, rows) in enumerate(models.items()):
             x = at + width * (i - (len(models) - 1) / 2)
             bars(x, rows, 0.8 * width, name, _PHI[name])
@@ -445,7 +445,8 @@ def gradients(
         _legend(figure, axes, columns=3)
     return (
         "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "
-        "lengths are in the legend. The dark stripes span the start phases on the hfs."
+        "lengths are in the legend. The line at the left of each grey bar spans the start phases "
+        "on the hfs."
     )
 
 

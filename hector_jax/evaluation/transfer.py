@@ -196,7 +196,7 @@ def wrong_sentence(trajectory: str, kind: str, row: Row) -> str:
         f"{trajectory}, {kind}: the weight that is most wrong is {row.wrong}. It has {model:+.2f} "
         f"of the model's unit gradient and {simulator:+.2f} of the simulator's, pulls {sign} and "
         f"makes {row.share:.0%} of the distance between the two; the model's gradient is "
-        f"{row.sizes[0] / row.sizes[1]:.2g} times as long."
+        f"{row.sizes[0] / row.sizes[1]:.2f} times as long."
     )
 
 
