@@ -1,133 +1,456 @@
 """Does the model's gradient point where the better simulator's does?
 
-Cosine between the gradient of L in log-weights on the rigid body (with the command itself, a linear
-map, the paper's GRFM-Net or the default one as phi) and central differences of L on the
-high-fidelity simulator (hfs), at the nominal weights; with all entries and without those of sag and
-float (Q_z, Q_vz, R_Fz). The feet share one R: 18 directions.
+Gradients of L in log-weights on the rigid body, through several phi (the command itself, a linear
+map, the paper's GRFM-Net, the default one with and without its legs part), against central
+differences on the high-fidelity simulator (hfs); and the order in which model and hfs put
+disturbed weight sets. The feet share one R: 18 directions.
 
-    python experiments/transfer.py [--data data] [--lead 0]
+    python experiments/transfer.py --data data --out runs/transfer
+
+Walks on the hfs are kept under OUT/hfs and taken up again: by MuJoCo C on the processes, or all at
+once in MJX where JAX sees an accelerator. Another controller (--effort-about, --stance-weight) has
+nets only where DATA was walked by it.
 """
 
+import hashlib
 import json
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, as_completed
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import numpy as np
 import tyro
 
 from hector_jax import pipeline
-from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
+from hector_jax.console import bar, say
+from hector_jax.control.legs import LegConfig
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
-from hector_jax.control.weights import (
-    WEIGHT_NAMES,
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
-from hector_jax.grfm.network import as_effect, linear_effect
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.evaluation import plots, transfer
+from hector_jax.evaluation.report import environment
+from hector_jax.grfm.dataset import walked_with
+from hector_jax.grfm.network import Params, as_effect, linear_effect
+from hector_jax.model.effect import Effect, Window, last_command
+from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
+from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, tune_step
+from hector_jax.storage import (
+    fingerprint,
+    load_tree,
+    load_weights,
+    save_tree,
+    save_weights,
+    write_file,
+)
+from hector_jax.trajectory import Load, Trajectory
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tune_step
 from hector_jax.tuning.loss import LossConfig, losses, total
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-STEP = np.log(1.05)  # of the central differences, in log-weights
-PHASES = (0, 20)  # gait ticks at which the command starts
-SAG = ("Q_z", "Q_vz", "R_Fz_left")
+FACTORS = (1.5, 3.0)  # within which the weight sets of the rank correlation lie
 
 
 @dataclass(frozen=True)
 class Flags:
     """What to compare."""
 
-    data: Path = Path("data")  # walks and net of `hector collect` and `hector train`
-    lead: int = 0  # ticks that the model walks in place before t = 0
-    processes: int = 2
-    out: Path = Path("runs/transfer.json")
+    data: Path = Path("data")  # walks and nets; made where missing
+    out: Path = Path("runs/transfer")  # folder of the report
+    tuned: dict[str, Path] = field(default_factory=dict)  # TRAJ FILE; else tuned here, ten steps
+    trajectories: tuple[str, ...] = COMMANDS
+    sets: tuple[str, ...] = ("nominal", "expert", "tuned")
+    phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
+    lead: int = 40  # ticks in place before t = 0 on the model; told beside none
+    ranks: int = 64  # weight sets about nominal for each rank correlation; 0 leaves them out
+    effort_about: str = "zero"  # or weight: see MpcConfig
+    stance_weight: bool = False  # see LegConfig
+    processes: int = 2  # one core each
 
 
-def directions() -> tuple[list[str], np.ndarray]:
-    """Names and unit steps (18, 24) in log-weights: each weight of Q, each of R in both feet."""
-    eye = np.eye(24)
-    feet = [eye[k + axis] + eye[k + 3 + axis] for k in (12, 18) for axis in range(3)]
-    names = [name for name in WEIGHT_NAMES if "right" not in name]
-    return names, np.concatenate([eye[:12], feet])
+class Walked(NamedTuple):
+    """What there is to say about some walks on the hfs."""
+
+    loss: np.ndarray
+    fallen: np.ndarray
+    residual: np.ndarray  # worst of a plan
 
 
-def simulator_gradients(processes: int) -> dict[str, np.ndarray]:
-    """Gradients of L on the hfs (phases, 18) by trajectory, from central differences."""
-    robot, (_, steps) = load_robot(), directions()
-    base = np.asarray(weights_to_vector(nominal()))
-    loss = jax.jit(lambda walk: total(LossConfig(), losses(walk)))
-    found = {}
-    with workers(processes) as pool:
-        for name in COMMANDS:
-            jobs = [
-                Job(
-                    vector_to_weights(base * np.exp(side * STEP * step)),
-                    command,
-                    hfs(),
-                    4.0,
-                    0,
-                    phase,
-                )
-                for command in [named_command(name)]
-                for phase in PHASES
-                for step in steps
-                for side in (1, -1)
-            ]
-            walks = walk_many(pool, WalkConfig(), robot, jobs)
-            values = np.array([float(loss(walk)) for walk in walks]).reshape(len(PHASES), -1, 2)
-            found[name] = (values[..., 0] - values[..., 1]) / (2 * STEP)
-    return found
+class Point(NamedTuple):
+    """Where a gradient is asked for."""
+
+    weights: Weights
+    command: Command
+    tick: int  # of t = 0
 
 
-def cosine(a: np.ndarray, b: np.ndarray) -> float:
-    """Of the angle between two gradients."""
-    return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+def _without_legs(effect: jax.tree_util.Partial, window: Window) -> Effect:
+    found = effect(window)
+    return found._replace(legs=Load(*(0.0 * part for part in found.legs)))
+
+
+def phis(
+    pool: Executor, config: TuneConfig, robot: Robot, data: Path
+) -> tuple[dict, Params | None]:
+    """Each phi by name, and the parameters of the default net; None for another's data."""
+    walks = data / "walks"
+    effects = {"command": last_command}
+    if (walks / "card.json").exists():
+        if walked_with(walks).get("controller") != repr(config.rollout.walk):
+            say(f"{walks}: walked by another controller; only the command itself is compared")
+            return effects, None
+    net, paper = (pipeline.ground(pool, config, robot, data, name) for name in (None, "paper"))
+    default = as_effect(net.params)
+    effects |= {
+        "linear": linear_effect(net.linear),
+        "paper": as_effect(paper.params),
+        "net": default,
+        "net without legs": jax.tree_util.Partial(_without_legs, default),
+    }
+    host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
+    return {name: host(effect) for name, effect in effects.items()}, net.params
+
+
+def tuned_sets(
+    pool: Executor, flags: Flags, config: TuneConfig, robot: Robot, params: Params | None
+) -> dict[str, Weights]:
+    """Weights after the paper's ten iterations by trajectory, from files or tuned now."""
+    key = f"{config!r} {fingerprint(params)} {fingerprint(robot)}".encode()
+    digest = hashlib.sha256(key).hexdigest()[:12]
+    kept = {name: flags.out / f"tuned-{name}-{digest}.json" for name in flags.trajectories}
+    kept |= flags.tuned
+    missing = {
+        name: (named_command(name), params)
+        for name in flags.trajectories
+        if not kept[name].exists()
+    }
+    if missing:
+        found = pipeline.tune_many(pool, config, robot, missing, "tuning, ten iterations")
+        for name, tuning in found.items():
+            save_weights(kept[name], tuning.ten)
+    return {name: load_weights(kept[name]) for name in flags.trajectories}
+
+
+_loss = jax.jit(lambda walk: total(LossConfig(), losses(walk)))
+
+
+def walk_groups(
+    pool: Executor,
+    config: WalkConfig,
+    robot: Robot,
+    groups: Mapping[str, Sequence[Job]],
+    folder: Path,
+) -> tuple[dict[str, Walked], str]:
+    """Walks of groups of jobs on the hfs, and their engine; a group that is on disk is taken."""
+    engine = "c" if jax.default_backend() == "cpu" else "mjx"
+
+    def path(name: str) -> Path:
+        key = f"{config!r} {LossConfig()!r} {engine} {fingerprint(list(groups[name]))}"
+        key += fingerprint(robot)
+        return folder / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}.npz"
+
+    missing = [name for name in groups if not path(name).exists()]
+    jobs = [job for name in missing for job in groups[name]]
+
+    def walked() -> Iterator[Trajectory]:
+        if engine == "c":
+            return walk_many(pool, config, robot, jobs)
+        return walk_batch(config, robot, jobs, fine=True, single=False)
+
+    if jobs:
+        with bar(f"{len(jobs)} walks on the high-fidelity simulator, engine {engine}") as tell:
+            tell(0, len(jobs), "compiling")
+            walks, done = walked(), 0
+            for name in missing:
+                told = []
+                for walk in (next(walks) for _ in groups[name]):
+                    told.append((float(_loss(walk)), walk.fallen.any(), walk.residual.max()))
+                    done += 1
+                    tell(done, len(jobs), name)
+                found = Walked(*map(np.array, zip(*told, strict=True)))
+                about = {"controller": repr(config), "engine": engine}
+                save_tree(path(name), found, kind="transfer", robot=robot, about=about)
+    like = Walked(np.zeros(0), np.zeros(0), np.zeros(0))
+    return {
+        name: load_tree(path(name), like, kind="transfer", robot=robot)[0] for name in groups
+    }, engine
+
+
+def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
+    """Walks whose losses make the gradients at a weight set: phases, directions, both sides."""
+    steps = transfer.STEP * np.eye(len(transfer.NAMES))
+    return [
+        Job(transfer.moved(point.weights, side * step), point.command, hfs(), start_tick=phase)
+        for phase in phases
+        for step in steps
+        for side in (1, -1)
+    ]
+
+
+@partial(jax.jit, static_argnums=0)
+def _model_loss(config, robot, weights, command, anchor, effect):
+    walk = rollout(config.rollout, robot, weights, command, anchor, effect)
+    return total(config.loss, losses(walk))
+
+
+def _model_job(
+    config: TuneConfig,
+    robot: Robot,
+    effect: jax.tree_util.Partial,
+    points: Sequence[Point],
+    others: Sequence[Point],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradients at points, NaN where not to be believed, and losses at others; in a worker."""
+    rows = []
+    for weights, command, tick in points:
+        anchor = standing_anchor(robot, tick)
+        found = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
+        row = transfer.as_directions(weights, found.gradient)
+        rows.append(np.where(refusal(config, found), np.nan, row))
+    told = [
+        float(_model_loss(config, robot, weights, command, standing_anchor(robot, tick), effect))
+        for weights, command, tick in others
+    ]
+    return np.array(rows), np.array(told)
+
+
+def ask_model(
+    pool: Executor,
+    configs: Mapping[str, TuneConfig],
+    robot: Robot,
+    effects: Mapping[str, jax.tree_util.Partial],
+    points: Sequence[Point],
+    others: Sequence[Point],
+) -> dict[str, Future]:
+    """`_model_job` of each phi with each config; by the phi's name and the config's ending."""
+    return {
+        name + ending: pool.submit(_model_job, config, robot, effect, points, others)
+        for ending, config in configs.items()
+        for name, effect in effects.items()
+    }
 
 
 def main() -> None:
-    """Print one line per trajectory and phi; keep all gradients as JSON."""
+    """Write report.md, transfer.json and the pictures."""
     flags = tyro.cli(Flags)
     setup_jax()
-    robot, (names, steps) = load_robot(), directions()
-    config = TuneConfig(rollout=RolloutConfig(lead=flags.lead))
-    with workers(flags.processes) as pool:
-        net, paper = (
-            pipeline.ground(pool, config, robot, flags.data, variant) for variant in (None, "paper")
+    robot = jax.tree.map(np.asarray, load_robot())
+    walk = WalkConfig(
+        mpc=MpcConfig(effort_about=flags.effort_about),
+        legs=LegConfig(stance_weight=flags.stance_weight),
+    )
+    configs = {
+        "" if not lead else f", lead {lead}": TuneConfig(
+            rollout=RolloutConfig(walk=walk, lead=lead), iterations=PAPER_ITERATIONS
         )
-    effects = {
-        "command": last_command,
-        "linear": linear_effect(net.linear),
-        "paper": as_effect(paper.params),
-        "net": as_effect(net.params),
+        for lead in sorted({0, flags.lead})
     }
-    kept = [i for i, name in enumerate(names) if name not in SAG]
-    record = {}
-    for name, truth in simulator_gradients(flags.processes).items():
-        expected = truth.mean(axis=0)
-        record[name] = {"hfs": dict(zip(names, expected.tolist(), strict=True))}
-        for kind, effect in effects.items():
-            rows = []
-            for phase in PHASES:
-                anchor = standing_anchor(robot, phase)
-                found = tune_step(config, robot, nominal(), named_command(name), anchor, effect)
-                logs = jax.tree.map(np.multiply, found.gradient, nominal())
-                rows.append(steps @ np.asarray(weights_to_vector(logs)))
-            gradient = np.mean(rows, axis=0)
-            record[name][kind] = dict(zip(names, gradient.tolist(), strict=True))
-            print(
-                f"{name:9s} {kind:8s} cosine {cosine(gradient, expected):6.3f}   "
-                f"without z and R_Fz {cosine(gradient[kept], expected[kept]):6.3f}",
-                flush=True,
+    flags.out.mkdir(parents=True, exist_ok=True)
+    with workers(flags.processes) as pool:
+        effects, params = phis(pool, configs[""], robot, flags.data)
+        tuned = tuned_sets(pool, flags, configs[""], robot, params) if "tuned" in flags.sets else {}
+        spots = {
+            (which, name): Point(
+                {"nominal": nominal(), "expert": expert(), "tuned": tuned.get(name)}[which],
+                named_command(name),
+                0,
             )
-    flags.out.parent.mkdir(parents=True, exist_ok=True)
-    flags.out.write_text(json.dumps(record, indent=2) + "\n")
+            for which in flags.sets
+            for name in flags.trajectories
+        }
+        clouds = {
+            (name, f"{factor:g}"): [
+                Point(weights, named_command(name), 0)
+                for weights in transfer.disturbed(nominal(), factor, flags.ranks)
+            ]
+            for name in flags.trajectories
+            for factor in FACTORS
+            if flags.ranks
+        }
+        groups = {
+            **{"-".join(key): gradient_jobs(spot, flags.phases) for key, spot in spots.items()},
+            **{
+                f"ranks-{'-'.join(key)}": [Job(p.weights, p.command, hfs()) for p in cloud]
+                for key, cloud in clouds.items()
+            },
+        }
+        points = [spot._replace(tick=tick) for spot in spots.values() for tick in flags.phases]
+        others = [point for cloud in clouds.values() for point in cloud]
+        # An accelerator walks while the processes differentiate; without one the walks come after.
+        running = ask_model(pool, configs, robot, effects, points, others)
+        walked, engine = walk_groups(pool, walk, robot, groups, flags.out / "hfs")
+        with bar("gradients on the rigid body") as tell:
+            for done, _ in enumerate(as_completed(running.values()), 1):
+                tell(done, len(running), "")
+        found = {name: future.result() for name, future in running.items()}
+
+    truth = {}
+    for key in spots:
+        seen = walked["-".join(key)]
+        believed = np.where(seen.fallen, np.nan, seen.loss)
+        truth[key] = transfer.slopes(believed.reshape(len(flags.phases), -1, 2))
+    gradients = {
+        kind: dict(zip(spots, rows.reshape(len(spots), len(flags.phases), -1), strict=True))
+        for kind, (rows, _) in found.items()
+    }
+    lost = {
+        kind: dict(zip(clouds, told.reshape(len(clouds), flags.ranks), strict=True))
+        for kind, (_, told) in found.items()
+    }
+    print(report(flags, engine, walked, truth, gradients, lost))
+
+
+def report(
+    flags: Flags,
+    engine: str,
+    walked: Mapping[str, Walked],
+    truth: Mapping[tuple[str, str], np.ndarray],
+    gradients: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
+    lost: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
+) -> Path:
+    """Write the report with its pictures and its numbers as JSON.
+
+    Args:
+        flags: what was asked for.
+        engine: of the walks on the hfs.
+        walked: those walks, by group.
+        truth: gradients on the hfs by weight set and trajectory, a row per phase.
+        gradients: on the model likewise, by phi.
+        lost: losses of the disturbed weight sets on the model, by phi, trajectory and factor.
+    """
+    rows: dict[str, dict[tuple[str, str], transfer.Row | None]] = {n: {} for n in flags.sets}
+    for (which, name), simulator in truth.items():
+        for kind, found in gradients.items():
+            plain, _, lead = kind.partition(",")
+            base = (
+                None if plain == "command" else gradients[f"command,{lead}" if lead else "command"]
+            )
+            compared = None if base is None else base[which, name]
+            rows[which][name, kind] = transfer.compare(found[which, name], compared, simulator)
+    ranks = {
+        (name, kind): {
+            f"{factor:g}": transfer.rank_correlation(
+                found[name, f"{factor:g}"], walked[f"ranks-{name}-{factor:g}"].loss
+            )
+            for factor in FACTORS
+        }
+        for name in flags.trajectories
+        for kind, found in lost.items()
+        if flags.ranks
+    }
+    pictures = _draw(flags, walked, truth, gradients, lost, ranks)
+    fell = {name: int(seen.fallen.sum()) for name, seen in walked.items() if seen.fallen.any()}
+    worst = max(float(seen.residual.max()) for seen in walked.values())
+    count, phases = sum(len(seen.loss) for seen in walked.values()), len(flags.phases)
+    text = [
+        "# Does the gradient transfer?",
+        f"The model's gradient of L in 18 log-weights against that of the high-fidelity simulator: "
+        f"central differences of +-5 %, mean over the start phases (gait ticks "
+        f"{', '.join(map(str, flags.phases))}). Controller: effort priced about "
+        f"{flags.effort_about}, leg weight in the stance torque "
+        f"{'on' if flags.stance_weight else 'off'}. {count} walks, engine {engine}; worst relative "
+        f"KKT residual {worst:.0e}; falls: {_falls(fell)}.",
+        "Brackets are 95 % intervals from redrawing the start phases, the same ones for model and "
+        f"simulator. There are {phases}: with so few the intervals are rough, rather too narrow "
+        "(of one phase there is none), and say nothing of other commands or plants.",
+        "`command` is the plain rigid body; `lead` counts ticks that the model walks in place "
+        "before t = 0. `most wrong` names the weight whose entry differs most between the two unit "
+        "gradients, and its share of their squared distance.",
+    ]
+    for which in flags.sets:
+        text += [f"## {which.capitalize()} weights"]
+        if "net" in gradients:
+            text += [transfer.verdict(rows[which], "net")]
+        text += [transfer.gradient_table(rows[which])]
+        text += [
+            "\n".join(
+                f"- {transfer.wrong_sentence(name, kind, row)}"
+                for (name, kind), row in rows[which].items()
+                if row is not None and kind in ("command", "net")
+            )
+        ]
+    if ranks:
+        text += [
+            "## Order of weight sets",
+            f"Spearman's rank correlation of L on the model and on the hfs over {flags.ranks} "
+            "weight sets, drawn log-uniformly about nominal; a fall counts as the loss charges it.",
+            transfer.rank_table(ranks),
+        ]
+    text += ["## Pictures", *(f"![{name}]({name})\n\n{caption}" for name, caption in pictures)]
+    told = {
+        "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
+        "environment": environment(),
+        "engine": engine,
+        "weights": transfer.NAMES,
+        "rows": {
+            which: {f"{n}: {k}": transfer.as_result(row) for (n, k), row in found.items()}
+            for which, found in rows.items()
+        },
+        "ranks": {f"{name}: {kind}": row for (name, kind), row in ranks.items()},
+        "fell": fell,
+        "residual": worst,
+        "gradients": {
+            f"{which}: {name}": {
+                "hfs": simulator.tolist(),
+                **{kind: found[which, name].tolist() for kind, found in gradients.items()},
+            }
+            for (which, name), simulator in truth.items()
+        },
+    }
+    write_file(
+        flags.out / "transfer.json",
+        (json.dumps(transfer.known(told), indent=1, allow_nan=False) + "\n").encode(),
+    )
+    write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
+    return flags.out / "report.md"
+
+
+def _falls(fell: Mapping[str, int]) -> str:
+    if not fell:
+        return "none"
+    each = ", ".join(f"{name} {count}" for name, count in fell.items())
+    return f"{each} (phases with a fall are left out of the gradients)"
+
+
+def _draw(
+    flags: Flags,
+    walked: Mapping[str, Walked],
+    truth: Mapping[tuple[str, str], np.ndarray],
+    gradients: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
+    lost: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
+    ranks: Mapping[tuple[str, str], Mapping[str, float]],
+) -> list[tuple[str, str]]:
+    """Names and captions of the pictures, all without lead."""
+    plain = [kind for kind in gradients if "," not in kind]
+    pictures = []
+    which = flags.sets[0]
+    for name in flags.trajectories:
+        simulator = truth[which, name]
+        models = {kind: gradients[kind][which, name] for kind in plain}
+        kept = np.isfinite(simulator + sum(models.values())).all(axis=1)
+        if not kept.any():
+            continue
+        file = f"gradients-{name}.png"
+        models = {kind: rows[kept] for kind, rows in models.items()}
+        caption = plots.gradients(flags.out / file, transfer.NAMES, simulator[kept], models)
+        pictures.append((file, f"{name}, {which} weights. {caption}"))
+    if ranks:
+        keys = [(name, f"{factor:g}") for name in flags.trajectories for factor in FACTORS]
+        caption = plots.ranks(
+            flags.out / "ranks.png",
+            {key: walked[f"ranks-{'-'.join(key)}"].loss for key in keys},
+            {key: {kind: lost[kind][key] for kind in plain} for key in keys},
+            {key: {kind: ranks[key[0], kind][key[1]] for kind in plain} for key in keys},
+        )
+        pictures.append(("ranks.png", caption))
+    return pictures
 
 
 if __name__ == "__main__":

@@ -394,3 +394,105 @@ def training(path: Path, course: History) -> str:
         "Errors of GRFM-Net by epoch, mean over the members where it is an ensemble; of each net "
         "the epoch with the least error on the validation walks is kept."
     )
+
+
+_PHI = {
+    "command": "black",
+    "linear": _PURPLE,
+    "paper": _ORANGE,
+    "net": _GREEN,
+    "net without legs": _BLUE,
+}
+
+
+def gradients(
+    path: Path,
+    names: Sequence[str],
+    simulator: Float[np.ndarray, "phases weights"],
+    models: Mapping[str, Float[np.ndarray, "phases weights"]],
+) -> str:
+    """Gradients of the loss in log-weights, scaled to unit length: hfs, and the model by phi.
+
+    Args:
+        path: file to write.
+        names: of the weights.
+        simulator: those of the hfs by start phase.
+        models: those of the model likewise, by the name of a phi.
+    """
+    at, width = np.arange(len(names)), 0.8 / len(models)
+    with _figure(path, 10.0, 4.2) as figure:
+        axes = figure.subplots()
+
+        def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, color: str) -> None:
+            mean = rows.mean(axis=0)
+            size = np.linalg.norm(mean)
+            axes.bar(x, mean / size, width, color=color, label=f"{name}, {size / 1e6:.1f}e6")
+
+        bars(at, simulator, 0.9, "hfs", "0.82")
+        size = np.linalg.norm(simulator.mean(axis=0))
+        low, high = simulator.min(axis=0) / size, simulator.max(axis=0) / size
+        axes.vlines(at - 0.45, low, high, color="black", linewidth=2.0, zorder=3)
+        for i, (name, rows) in enumerate(models.items()):
+            x = at + width * (i - (len(models) - 1) / 2)
+            bars(x, rows, 0.8 * width, name, _PHI[name])
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        for edge in range(3, len(names), 3):  # Euler angles, position, and so on
+            axes.axvline(edge - 0.5, color="0.8", linewidth=0.8, zorder=0)
+        axes.grid(visible=False, axis="x")
+        axes.set_xticks(at, [_weight_label(name) for name in names])
+        axes.tick_params(axis="x", length=0)
+        axes.set(ylabel="dL / d log weight, unit length", xlim=(-0.6, len(names) - 0.4))
+        _legend(figure, axes, columns=3)
+    return (
+        "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "
+        "lengths are in the legend. The line at the left of each grey bar spans the start phases "
+        "on the hfs."
+    )
+
+
+def ranks(
+    path: Path,
+    simulator: Mapping[tuple[str, str], Float[np.ndarray, " sets"]],
+    models: Mapping[tuple[str, str], Mapping[str, Float[np.ndarray, " sets"]]],
+    correlations: Mapping[tuple[str, str], Mapping[str, float]],
+) -> str:
+    """Loss of disturbed weight sets on the model against that on the hfs.
+
+    Args:
+        path: file to write.
+        simulator: losses on the hfs by trajectory and factor, the rows and columns of panels.
+        models: losses on the model, likewise and by the name of a phi.
+        correlations: of ranks, likewise.
+    """
+    trajectories, factors = (list(dict.fromkeys(k[i] for k in simulator)) for i in (0, 1))
+    size = (3.3 * len(trajectories) + 0.2, 3.0 * len(factors) + 0.4)
+    with _figure(path, *size) as figure:
+        panels = figure.subplots(len(factors), len(trajectories), squeeze=False)
+        for (trajectory, factor), truth in simulator.items():
+            panel = panels[factors.index(factor), trajectories.index(trajectory)]
+            for i, (name, found) in enumerate(models[trajectory, factor].items()):
+                color = _PHI[name]
+                panel.plot(truth / 1e6, found / 1e6, "o", color=color, alpha=0.6, markersize=2.5)
+                panel.text(
+                    0.03,
+                    0.97 - 0.075 * i,
+                    f"{name}: {correlations[trajectory, factor][name]:.2f}",
+                    color=color,
+                    transform=panel.transAxes,
+                    va="top",
+                )
+            panel.set(xscale="log", yscale="log", title=f"{trajectory}, within x/{factor}")
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
+            for axis in (panel.xaxis, panel.yaxis):
+                low, high = axis.get_view_interval()
+                digits = "23456789" if high < 6 * low else "25"
+                axis.set_major_formatter(lambda y, _: f"{y:g}")
+                axis.set_minor_formatter(
+                    lambda y, _, digits=digits: f"{y:g}" if f"{y:.0e}"[0] in digits else ""
+                )
+        for panel in panels[-1]:
+            panel.set_xlabel("L on the hfs [10$^6$]")
+        for panel in panels[:, 0]:
+            panel.set_ylabel("L on the model [10$^6$]")
+    return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."
