@@ -106,7 +106,8 @@ def phis(
         if walked_with(walks).get("controller") != repr(config.rollout.walk):
             say(f"{walks}: walked by another controller; only the command itself is compared")
             return effects, None
-    net, paper = (pipeline.ground(pool, config, robot, data, name) for name in (None, "paper"))
+    shared = TuneConfig(rollout=RolloutConfig(walk=config.rollout.walk))  # data know no lead
+    net, paper = (pipeline.ground(pool, shared, robot, data, name) for name in (None, "paper"))
     default = as_effect(net.params)
     effects |= {
         "linear": linear_effect(net.linear),

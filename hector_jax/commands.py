@@ -45,7 +45,14 @@ from hector_jax.runtime import cache_folder, workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
-from hector_jax.storage import load_weights, save_tree, save_weights, versions, write_file
+from hector_jax.storage import (
+    load_weights,
+    make_folder,
+    save_tree,
+    save_weights,
+    versions,
+    write_file,
+)
 from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
@@ -109,7 +116,7 @@ def _grfm(args: Grfm) -> None:
     robot, config = load_robot(), TuneConfig()
     if args.seeds < 0:
         raise ValueError(f"--seeds must be at least 0, got {args.seeds}")
-    args.out.mkdir(parents=True, exist_ok=True)
+    make_folder(args.out)
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, config, robot, args.data)
         paper = pipeline.ground(pool, config, robot, args.data, "paper")
@@ -117,14 +124,18 @@ def _grfm(args: Grfm) -> None:
         if args.seeds:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": linear_effect(net.linear)}
-    effects |= {"paper": as_effect(paper.params), "residual": as_effect(net.params)}
+    effects["paper"] = as_effect(paper.params)
     if isinstance(net.params, ResidualParams):
+        effects["residual"] = as_effect(net.params)
         effects["gated"] = gated_effect(net.params.linear)
     say("predicting")
     found, drifts = {}, {}
     for world, walks in worlds.items():
         samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
-        drifts[world] = fidelity.drifts(robot, effects, walks.trajectory, walks.job.start_tick)
+        # a push from outside is in no model
+        calm = ~np.any(walks.job.push.force, axis=(1, 2))
+        quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
+        drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
         found[world] = fidelity.as_result(
             training.report(effects, samples), fidelity.by_phase(effects, samples), drifts[world]
         )

@@ -202,7 +202,7 @@ class Samples(NamedTuple):
     training: Dataset
     validation: Dataset  # chooses the epoch of a net
     held_out: Dataset  # is only looked at
-    dropped: int  # by a fall or an unsolved QP
+    dropped: int  # by a fall, an unsolved QP or a push
 
 
 def samples(robot: Robot, folder: Path) -> Samples:

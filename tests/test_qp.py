@@ -81,6 +81,19 @@ def test_general_qps_are_right(n, m):
             np.testing.assert_allclose(found.x[i], x, atol=1e-4 * np.abs(x).max())
 
 
+@pytest.mark.parametrize("far", [1e3, 1e6, 1e9, 1e12, 1e20, 1e30, 1e200])
+def test_a_loose_bound_of_any_size_changes_nothing(far):
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        M, A = rng.normal(size=(8, 8)), rng.normal(size=(11, 8))
+        bound = np.r_[np.ones(10), far]
+        P, q = M @ M.T + 0.1 * np.eye(8), 10.0 * rng.normal(size=8)
+        found = solve(QP(P, q, A, -bound, bound))
+        assert found.status == Status.SOLVED
+        without = solve(QP(P, q, A[:10], -bound[:10], bound[:10]))
+        np.testing.assert_allclose(found.x, without.x, atol=1e-8)
+
+
 INF = np.inf
 
 

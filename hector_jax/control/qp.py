@@ -63,7 +63,8 @@ class QP(NamedTuple):
 
     P is positive semidefinite (its symmetric part counts). A is dense (m, n), or block-diagonal by
     step (N, r, b) with m = N r rows and n = N b: rows r k .. r (k+1) read variables b k .. b (k+1).
-    Infinite bounds, rows with l = u, redundant rows and rows of zeros are legal. A batch is vmap.
+    Infinite bounds (1e20 and more), rows with l = u, redundant rows and rows of zeros are legal. A
+    batch is vmap.
     """
 
     P: Float[Array, "n n"]
@@ -78,7 +79,7 @@ class Solution(NamedTuple):
 
     Residuals are those of (x, y) in the normalised problem (module docstring), so they have no unit
     and compare between problems: `primal_residual` is the largest violation of a row over the
-    largest entry of A x and the bounds, `dual_residual` the largest entry of P x + q + A'y over the
+    larger of x and the row's bound, `dual_residual` the largest entry of P x + q + A'y over the
     largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (and a
     little, so that a solution of zeros has residuals too). Where nothing was tried (BAD_DATA, l >
     u, a row of zeros that cannot hold), x and y are zero and the residuals infinite.
@@ -246,9 +247,10 @@ class _Normal(NamedTuple):
     column: Array  # (n,)
     row: Array  # (m,)
     size: Array
-    reach: Array  # largest finite bound, the size of A v; 1 where all are zero
+    reach: Array  # size of A v: largest finite bound, but 1 at most, and where all are zero
 
 
+_INFINITE = 1e20  # a bound as large as this is none, as most solvers have it
 _SMALL = 1e-3  # keeps relative residuals meaningful where the solution is zero
 _SIGN = np.array([[1.0], [-1.0]])  # a side holds where sign * (A v - bound) <= 0
 
@@ -260,8 +262,11 @@ def _scales(qp: QP) -> tuple[Array, Array]:
     priced = diagonal > 1e-3 * jnp.finfo(qp.P.dtype).eps * jnp.max(diagonal)
     column = lax.rsqrt(jnp.where(priced, diagonal, jnp.where(reach > 0, reach, 1.0) ** 2))
     wide = column if qp.A.ndim == 2 else column.reshape(qp.A.shape[0], 1, qp.A.shape[2])
-    squares = jnp.sum((qp.A * wide) ** 2, axis=-1).ravel()
-    return column, lax.rsqrt(jnp.where(squares > 0, squares, 1.0))
+    rows = qp.A * wide
+    most = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)  # first, or squares leave the range
+    most = jnp.where(most > 0, most, 1.0)
+    squares = jnp.sum((rows / most[..., None]) ** 2, axis=-1)
+    return column, (lax.rsqrt(jnp.where(squares > 0, squares, 1.0)) / most).ravel()
 
 
 def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
@@ -276,8 +281,9 @@ def _normalise(qp: QP) -> _Normal:
     A = _scale_rows_and_columns(qp.A, row, column)
     # rows of zeros bind nothing once 0 lies between their bounds, and nothing helps where not
     empty = jnp.all(A == 0, axis=-1).ravel()
-    bound = jnp.stack([row * qp.u, row * qp.l])
-    given = jnp.isfinite(bound)
+    bound = jnp.stack([qp.u, qp.l])
+    given = jnp.abs(bound) < _INFINITE
+    bound = row * bound
     bound = jnp.where(given, bound, 0.0)
     q = column * qp.q
     pressed = jnp.max(jnp.where(empty, 0.0, -jnp.asarray(_SIGN, q.dtype) * bound), initial=0.0)
@@ -298,7 +304,7 @@ def _normalise(qp: QP) -> _Normal:
         column,
         row,
         size,
-        jnp.where(_largest(bound) > 0, _largest(bound), 1.0),
+        jnp.where(_largest(bound) > 0, jnp.minimum(_largest(bound), 1.0), 1.0),
     )
 
 
@@ -313,6 +319,14 @@ def _violation(qp: _Normal, x: Array) -> Array:
     """How far A x lies outside each side (2, m), negative inside; 0 where there is no side."""
     outside = jnp.asarray(_SIGN, x.dtype) * (_rows(qp.A, x) - qp.bound)
     return jnp.where(qp.side | qp.equality, outside, 0.0)
+
+
+def _sizes(qp: _Normal, x: Array) -> Array:
+    """What a violation of each side is measured by (2, m): x, as rows are unit, and its bound.
+
+    Of its own row: one loose bound would otherwise make every violation small.
+    """
+    return jnp.maximum(jnp.maximum(_largest(x), _SMALL * qp.reach), jnp.abs(qp.bound))
 
 
 def _multiplier(z: Array) -> Array:
@@ -371,7 +385,7 @@ def _active_set(
             dx = -cho_solve((factor, True), qp.P @ x + qp.q + _columns(qp.A, _multiplier(z)))
             x, z = x + dx, z + weight * sign * _rows(qp.A, dx)
             outside = _violation(qp, x)
-            pulls, leaves = z < -floors.rounding, outside > floors.rounding * qp.reach
+            pulls, leaves = z < -floors.rounding, outside > floors.rounding * _sizes(qp, x)
             wrong = jnp.where(state.active, pulls, leaves) & ~always
             return _Point(x, z), wrong, jnp.where(state.active, -z, outside)
 
@@ -514,9 +528,11 @@ def _interior_point(
         going &= iterations < config.max_iterations
         return _Loop(point, slack, proximal, iterations, going)
 
+    # every product of slack and multiplier the same, however far the bound
+    room = jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0)
     start = _Loop(
-        _Point(jnp.zeros_like(qp.q), qp.side.astype(dtype)),
-        jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0),
+        _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0)),
+        room,
         least,
         jnp.zeros((), jnp.int32),
         wanted,
@@ -603,7 +619,7 @@ def _evidence(qp: _Normal, point: _Point) -> Array:
     outside = jnp.where(qp.given, jnp.asarray(_SIGN, x.dtype) * (rows - qp.bound), 0.0)
     terms = jnp.stack([jnp.dot(x, price), jnp.dot(qp.q, x), _support(qp, y)])
     pushed = jnp.maximum(jnp.maximum(_largest(price), _largest(pull)), _largest(qp.q))
-    primal = jnp.max(outside, initial=0.0) / jnp.maximum(_largest(rows), qp.reach)
+    primal = jnp.max(outside / _sizes(qp, x), initial=0.0)
     dual = _largest(price + qp.q + pull) / (_SMALL + pushed)
     gap = jnp.abs(jnp.sum(terms)) / (_SMALL * qp.reach + _largest(terms))
     proof = jnp.stack([primal, dual, gap])
@@ -621,7 +637,7 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     """Solution, the ratios W (2, m) of its derivative, and the problem they belong to."""
     floors = _floors(config, qp.q.dtype)
     n, dtype = len(qp.q), qp.q.dtype
-    no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l == jnp.inf) | (qp.u == -jnp.inf)
+    no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= _INFINITE) | (qp.u <= -_INFINITE)
     numbers = jnp.isfinite(jnp.sum(jnp.abs(qp.P)) + _largest(qp.q) + jnp.sum(jnp.abs(qp.A)))
     numbers &= ~jnp.any(no_bound)
     crossed = jnp.any(qp.l > qp.u)
@@ -677,7 +693,7 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
         status,
     )
     slack = jnp.maximum(-_violation(normal, point.x), 0.0)
-    ratio = ((point.z + floors.kink) / (slack / normal.reach + floors.kink)) ** 2
+    ratio = ((point.z + floors.kink) / (slack / _sizes(normal, point.x) + floors.kink)) ** 2
     ratio = jnp.where(normal.side, jnp.minimum(ratio, floors.cap), 0.0)
     # an equality moves with both of its bounds, half with each
     return solution, jnp.where(normal.equality, 0.5 * floors.cap, ratio), normal

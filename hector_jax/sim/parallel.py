@@ -272,7 +272,8 @@ def _walk_one(
         )
         force = push_force(asked.push, (tick - start_tick) * count + substep)
         physics, data = step(carry.physics, torque, force)
-        contacts = jax.tree.map(lambda x: x.astype(jnp.result_type(x, int)), mjx_contacts(data))
+        wide = lambda x: x.astype(qpos.dtype) if x.dtype == data.qpos.dtype else x  # noqa: E731
+        contacts = jax.tree.map(wide, mjx_contacts(data))
         effect, touches = feel(robot, before, contacts, floor, foot_of_geom)
         state = sensing.base_state(robot, read(physics), yaw)
         fallen = carry.fallen | has_fallen(state) | touches | _in_floor(places, model, data)
