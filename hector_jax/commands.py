@@ -35,7 +35,7 @@ from hector_jax.evaluation.report import (
 from hector_jax.evaluation.video import VideoUnavailable, write_video
 from hector_jax.flags import Collect, Doctor, Evaluate, Grfm, Train, Tune, Walk
 from hector_jax.grfm import training
-from hector_jax.grfm.dataset import Walks, at_interval, make_dataset
+from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
 from hector_jax.grfm.network import ResidualParams, as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
@@ -57,8 +57,6 @@ from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.rollout import RolloutConfig, rollout
-
-UNSOLVED = 1e-6  # relative KKT residual above which a plan of a walk is told to be unsolved
 
 
 @singledispatch
@@ -299,7 +297,7 @@ def _verdict(
     scores = {name: [metrics.score(loss, walk) for walk in each] for name, each in walks.items()}
     verdict = metrics.judge(loss, seeds, scores)
     for name, score in verdict.scores.items():
-        if score.residual.max() > UNSOLVED:
+        if score.residual.max() > SOLVED:
             say(f"{name}: a QP of its walks was not solved (residual {score.residual.max():.0e})")
     return verdict
 
@@ -434,7 +432,7 @@ def _doctor(args: Doctor) -> None:
         "ideal": walk(WalkConfig(), robot, expert(), command, _plants("ideal", range(1))[0], 0.2),
     }
     for world, found in walks.items():
-        if found.fallen.any() or not found.residual.max() <= UNSOLVED:
+        if found.fallen.any() or not found.residual.max() <= SOLVED:
             raise ValueError(f"self-test failed: the robot does not walk in {world}")
     print(f"{'self-test':12s} walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s")
     with tempfile.TemporaryDirectory() as folder:

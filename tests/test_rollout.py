@@ -191,6 +191,21 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor)
         np.testing.assert_allclose(a, b, rtol=1e-9)
 
 
+def test_the_way_back_solves_no_qp_again(robot, anchor):
+    step = jax.jit(tune_step, static_argnums=0)
+    lowered = step.lower(
+        TuneConfig(rollout=RolloutConfig(ticks=30)),
+        robot,
+        nominal(),
+        named_command("s"),
+        anchor,
+        last_command,
+    )
+    functions = lowered.as_text().split("func.func")
+    solving = [f for f in functions if "_solve_normal" in f.splitlines()[0] and ".while" in f]
+    assert len(solving) == 1
+
+
 def test_a_block_has_at_least_one_tick():
     with pytest.raises(ValueError, match="block must be at least 1"):
         RolloutConfig(block=0)

@@ -366,8 +366,9 @@ def _active_set(
 ) -> tuple[_Point, Array, Array]:
     """Semismooth Newton: active sides as equations, the guess corrected by signs until it stays.
 
-    Exact to rounding where it settles; it may cycle, so `limit` bounds it. Returns the best point
-    on the way with its evidence, and the tries; does nothing where `wanted` is false.
+    Exact to rounding where it settles; it may cycle, so `limit` bounds it. Returns the best of the
+    points whose guess stayed, with its evidence (infinite where none did), and the tries; does
+    nothing where `wanted` is false.
     """
     dtype = qp.q.dtype
     sign = jnp.asarray(_SIGN, dtype)
