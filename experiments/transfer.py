@@ -268,8 +268,9 @@ def main() -> None:
         }
         clouds = {
             (name, f"{factor:g}"): [
-                Point(weights, named_command(name), 0)
+                Point(weights, named_command(name), tick)
                 for weights in transfer.disturbed(nominal(), factor, flags.ranks)
+                for tick in flags.phases
             ]
             for name in flags.trajectories
             for factor in FACTORS
@@ -278,7 +279,9 @@ def main() -> None:
         groups = {
             **{"-".join(key): gradient_jobs(spot, flags.phases) for key, spot in spots.items()},
             **{
-                f"ranks-{'-'.join(key)}": [Job(p.weights, p.command, hfs()) for p in cloud]
+                f"ranks-{'-'.join(key)}": [
+                    Job(p.weights, p.command, hfs(), start_tick=p.tick) for p in cloud
+                ]
                 for key, cloud in clouds.items()
             },
         }
@@ -301,11 +304,13 @@ def main() -> None:
         kind: dict(zip(spots, rows.reshape(len(spots), len(flags.phases), -1), strict=True))
         for kind, (rows, _) in found.items()
     }
+    shape = flags.ranks, len(flags.phases)
     lost = {
-        kind: dict(zip(clouds, told.reshape(len(clouds), flags.ranks), strict=True))
+        kind: dict(zip(clouds, told.reshape(len(clouds), *shape), strict=True))
         for kind, (_, told) in found.items()
     }
-    print(report(flags, engine, walked, truth, gradients, lost))
+    seen = {key: walked[f"ranks-{'-'.join(key)}"].loss.reshape(shape) for key in clouds}
+    print(report(flags, engine, walked, truth, gradients, seen, lost))
 
 
 def report(
@@ -314,6 +319,7 @@ def report(
     walked: Mapping[str, Walked],
     truth: Mapping[tuple[str, str], np.ndarray],
     gradients: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
+    seen: Mapping[tuple[str, str], np.ndarray],
     lost: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
 ) -> Path:
     """Write the report with its pictures and its numbers as JSON.
@@ -324,7 +330,9 @@ def report(
         walked: those walks, by group.
         truth: gradients on the hfs by weight set and trajectory, a row per phase.
         gradients: on the model likewise, by phi.
-        lost: losses of the disturbed weight sets on the model, by phi, trajectory and factor.
+        seen: losses of the disturbed weight sets on the hfs, by trajectory and factor, a column
+            per phase.
+        lost: those on the model likewise, by phi.
     """
     rows: dict[str, dict[tuple[str, str], transfer.Row | None]] = {n: {} for n in flags.sets}
     for (which, name), simulator in truth.items():
@@ -335,18 +343,22 @@ def report(
             )
             compared = None if base is None else base[which, name]
             rows[which][name, kind] = transfer.compare(found[which, name], compared, simulator)
+    mean = lambda losses: {key: values.mean(axis=1) for key, values in losses.items()}  # noqa: E731
+    pairs = {kind: (mean(found), mean(seen)) for kind, found in lost.items()}
+    if len(flags.phases) > 1:  # how well the simulator agrees with itself
+        halves = ({key: values[:, half::2] for key, values in seen.items()} for half in (0, 1))
+        pairs["hfs, other phases"] = mean(next(halves)), mean(next(halves))
     ranks = {
         (name, kind): {
-            f"{factor:g}": transfer.rank_correlation(
-                found[name, f"{factor:g}"], walked[f"ranks-{name}-{factor:g}"].loss
-            )
+            f"{factor:g}": transfer.rank_correlation(*(side[name, f"{factor:g}"] for side in sides))
             for factor in FACTORS
         }
         for name in flags.trajectories
-        for kind, found in lost.items()
+        for kind, sides in pairs.items()
         if flags.ranks
     }
-    pictures = _draw(flags, walked, truth, gradients, lost, ranks)
+    means = {kind: sides[0] for kind, sides in pairs.items() if kind in lost}
+    pictures = _draw(flags, truth, gradients, mean(seen), means, ranks)
     fell = {name: int(seen.fallen.sum()) for name, seen in walked.items() if seen.fallen.any()}
     worst = max(float(seen.residual.max()) for seen in walked.values())
     count, phases = sum(len(seen.loss) for seen in walked.values()), len(flags.phases)
@@ -381,7 +393,9 @@ def report(
         text += [
             "## Order of weight sets",
             f"Spearman's rank correlation of L on the model and on the hfs over {flags.ranks} "
-            "weight sets, drawn log-uniformly about nominal; a fall counts as the loss charges it.",
+            "weight sets, drawn log-uniformly about nominal, each loss the mean over the start "
+            "phases; a fall counts as the loss charges it. `hfs, other phases` is the correlation "
+            "of the simulator with itself, every other phase against the rest.",
             transfer.rank_table(ranks),
         ]
     text += ["## Pictures", *(f"![{name}]({name})\n\n{caption}" for name, caption in pictures)]
@@ -422,9 +436,9 @@ def _falls(fell: Mapping[str, int]) -> str:
 
 def _draw(
     flags: Flags,
-    walked: Mapping[str, Walked],
     truth: Mapping[tuple[str, str], np.ndarray],
     gradients: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
+    seen: Mapping[tuple[str, str], np.ndarray],
     lost: Mapping[str, Mapping[tuple[str, str], np.ndarray]],
     ranks: Mapping[tuple[str, str], Mapping[str, float]],
 ) -> list[tuple[str, str]]:
@@ -446,7 +460,7 @@ def _draw(
         keys = [(name, f"{factor:g}") for name in flags.trajectories for factor in FACTORS]
         caption = plots.ranks(
             flags.out / "ranks.png",
-            {key: walked[f"ranks-{'-'.join(key)}"].loss for key in keys},
+            {key: seen[key] for key in keys},
             {key: {kind: lost[kind][key] for kind in plain} for key in keys},
             {key: {kind: ranks[key[0], kind][key[1]] for kind in plain} for key in keys},
         )
