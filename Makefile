@@ -30,7 +30,7 @@ grfm: $(STAMP) ## how well the nets tell what the ground returns: runs/grfm/repo
 	@$(BIN)/hector grfm
 
 ceiling: $(STAMP) ## search of 2000 walks for each trajectory, taken up where it was cut; for a GPU
-	@$(BIN)/hector search --traj all --budget 2000 --population 20 --record runs/ceiling \
+	@$(BIN)/hector search --traj all --budget 2000 --population 40 --record runs/ceiling \
 		--out docs/results/ceiling
 
 test: $(STAMP) ## the fast suite (under 8 minutes on 2 cores)
