@@ -61,7 +61,7 @@ def test_a_search_goes_downhill_and_counts_its_walks(tmp_path):
     apart = np.reshape(GOAL[12:], (2, 2, 3))
     rest = np.sum((apart[:, 0] - apart[:, 1]) ** 2) / 2
     assert found.loss - rest < 0.02 * (np.sum(GOAL**2) - rest)
-    assert found.stop == "100 generations"
+    assert found.stop == "the budget is spent"
     losses = np.concatenate([generation.losses for generation in found.history])
     assert losses[found.walk - 1] == found.loss == losses.min()
 
