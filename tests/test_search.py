@@ -211,3 +211,9 @@ def test_a_start_outside_the_box_or_with_unlike_feet_is_refused(tmp_path):
 def test_wrong_settings_are_named(wrong, says):
     with pytest.raises(ValueError, match=says):
         SearchConfig(**wrong)
+
+
+def test_a_search_without_its_package_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr("hector_jax.tuning.search.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"hector-jax\[search\]"):
+        run(tmp_path)
