@@ -49,6 +49,7 @@ from hector_jax.storage import fingerprint, load_tree, load_weights, save_tree, 
 from hector_jax.tuning.loss import LossConfig
 
 BASELINE = "nominal"
+HEADLINE = {"push": 50.0, "friction": 0.4}  # of the kinds that are drawn as curves
 
 
 @dataclass(frozen=True)
@@ -184,15 +185,15 @@ def main() -> None:
 def report(flags: Flags, found: Found, folder: Path) -> Path:
     """Write the report with its pictures and its numbers as JSON; returns its path."""
     folder.mkdir(parents=True, exist_ok=True)
-    world, traj = WORLDS.get(flags.world, flags.world), flags.scenes.traj
+    world, count = WORLDS.get(flags.world, flags.world), flags.scenes.phases
     curves = {
         kind: {level.size: row for level, row in found.cells.items() if level.kind == kind}
-        for kind in ("push", "friction")
+        for kind in HEADLINE
     }
     rows = {
         level.name: row
         for level, row in found.cells.items()
-        if level.kind not in curves or level.size in (50.0, 0.4)
+        if level.size == HEADLINE.get(level.kind, level.size)
     }
     captions = {
         "curves.png": plots.survival(folder / "curves.png", curves),
@@ -200,24 +201,29 @@ def report(flags: Flags, found: Found, folder: Path) -> Path:
         "directions.png": plots.push_directions(folder / "directions.png", found.endured),
     }
     last = flags.first_seed + flags.seeds - 1
+    phases = "one phase of the gait" if count == 1 else f"{count} phases of the gait"
     text = [
         "# What the weight sets bear",
-        f"Trajectory {traj}, world {world}, plants {flags.first_seed} to {last}. "
+        f"Trajectory {flags.scenes.traj}, world {world}, plants {flags.first_seed} to {last}. "
         f"Pushes of 0.1 s on the trunk from eight sides, floors that turn slippery for 2 s, both "
-        f"begun at {flags.scenes.phases} phases of the gait; slopes of 3 degrees that rise towards "
+        f"begun at {phases}; slopes of 3 degrees that rise towards "
         "the named side; 2 kg on top of the trunk; commands that no tuning saw. The controller "
         f"learns of none of it. Worst relative KKT residual of a plan {found.residual:.0e}"
         + ("." if found.residual <= SOLVED else ": **not solved**."),
         table(found.cells, found.losses),
         f"L / {BASELINE} is the median of the ratio in the same scene on the same plant, falls "
         "charged as the loss charges them; in brackets its 95 % interval from redrawing the "
-        f"plants. With {flags.seeds} plants that is rough. A star marks a ratio that is no "
+        f"plants, rough where they are few ({flags.seeds} here). A star marks a ratio that is no "
         "comparison, because one of the two falls more often by 2 of 32 or more.",
         *(f"![{name}]({name})\n\n{caption}" for name, caption in captions.items()),
     ]
     told = {
-        "flags": {"world": flags.world, "seeds": flags.seeds, "first_seed": flags.first_seed}
-        | {"set": [text.partition("=")[0] for text in flags.set], "scenes": asdict(flags.scenes)},
+        "flags": {
+            name: value
+            for name, value in asdict(flags).items()
+            if name in ("world", "seeds", "first_seed", "scenes")
+        },
+        "weights": {name: fingerprint(w) for name, w in weight_sets(flags.set).items()},
         "environment": environment(),
         "residual": found.residual,
         "levels": {

@@ -14,7 +14,9 @@ import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from hector_jax.evaluation.fidelity import Drift
 from hector_jax.evaluation.robustness import DIRECTIONS, Cell
@@ -509,6 +511,13 @@ def _set_looks(names: Iterable[str]) -> dict[str, dict]:
     return {name: _LOOK[name] if name in _MARKER else next(free) for name in names}
 
 
+def _plain_log(axis: Axis) -> None:
+    """Ticks of a logarithmic axis at 1, 2 and 5, written out."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
 def survival(path: Path, curves: Mapping[str, Mapping[float, Mapping[str, Cell]]]) -> str:
     """Share of walks without a fall and loss against the baseline, by the size of a disturbance.
 
@@ -535,8 +544,8 @@ def survival(path: Path, curves: Mapping[str, Mapping[float, Mapping[str, Cell]]
                     )
             row[0].set(ylabel="walks without a fall [%]", ylim=(-4, 104), xlabel=labels[kind])
             row[1].set(ylabel=f"median L / {names[0]}", yscale="log", xlabel=labels[kind])
-            row[1].yaxis.set_major_formatter(lambda y, _: f"{y:g}")
-            row[1].yaxis.set_minor_formatter(lambda y, _: f"{y:.2g}")
+            _plain_log(row[1].yaxis)
+            row[0].set_xticks(sizes, [f"{size:g}" for size in sizes])
             if kind == "friction":  # the harder the further to the right
                 row[0].invert_xaxis()
         _legend(figure, panels[0, 0])
@@ -575,8 +584,7 @@ def scene_ratios(path: Path, rows: Mapping[str, Mapping[str, Cell]]) -> str:
             panels[1].plot(100 * stood[:, 0], y, **dot)
         panels[0].axvline(1.0, **_LOOK["nominal"])
         panels[0].set(xscale="log", xlabel=f"median L / {baseline}")
-        panels[0].xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-        panels[0].xaxis.set_minor_formatter(lambda x, _: f"{x:.1g}")
+        _plain_log(panels[0].xaxis)
         panels[0].set_yticks(at, list(rows))
         panels[1].set(xlabel="walks without a fall [%]", xlim=(-5, 105))
         _legend(figure, panels[1])
