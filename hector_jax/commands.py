@@ -383,6 +383,7 @@ def _json_bytes(value: Any) -> bytes:
 @run.register
 def _evaluate(args: Evaluate) -> None:
     command, robot = named_command(args.traj), load_robot()
+    _check_seconds(args.seconds)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
@@ -390,7 +391,9 @@ def _evaluate(args: Evaluate) -> None:
     plants = _plants(args.world, seeds)
     with workers(args.processes) as pool:
         title = f"judging on {args.world}, {count} plants"
-        walks = pipeline.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title)
+        walks = pipeline.judge(
+            pool, TuneConfig(), robot, sets, command, plants, seeds, title, args.seconds
+        )
     verdict = _verdict(LossConfig(), seeds, walks)
     if args.json:
         print(json.dumps(metrics.as_result(verdict, args.world), allow_nan=False))
@@ -398,11 +401,15 @@ def _evaluate(args: Evaluate) -> None:
         print_table(verdict, f"{args.traj}, {count} plants", args.world)
 
 
+def _check_seconds(seconds: float) -> None:
+    if not 0.0 < seconds <= 600.0:
+        raise ValueError(f"--seconds must be above 0 and at most 600, got {seconds}")
+
+
 @run.register
 def _walk(args: Walk) -> None:
     command, weights, robot = named_command(args.traj), _weights(args.weights), load_robot()
-    if not 0.0 < args.seconds <= 600.0:
-        raise ValueError(f"--seconds must be above 0 and at most 600, got {args.seconds}")
+    _check_seconds(args.seconds)
 
     def walked(weights: Weights) -> Trajectory:
         if args.world == "srbm":

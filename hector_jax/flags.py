@@ -73,8 +73,9 @@ class Evaluate:
     """Judge weight sets on plants of a world and print one table."""
 
     weights: tuple[str, ...] = ("nominal", "expert")  # names or files
-    traj: str = "straight"  # straight, c or s
+    traj: str = "straight"  # straight, c, s, sideways, turn, eight or stop-and-go
     world: str = "standin"  # ideal, hfs, hfs-varied or standin
+    seconds: float = 4.0  # of each walk; an eight takes 8
     seeds: int = 8  # plants
     first_seed: int = 0
     processes: int = 2  # one core each
@@ -85,7 +86,7 @@ class Evaluate:
 class Walk:
     """Walk once and say how it went."""
 
-    traj: str = "straight"  # straight, c or s
+    traj: str = "straight"  # straight, c, s, sideways, turn, eight or stop-and-go
     world: str = "hfs"  # srbm, ideal, hfs, hfs-varied or standin
     seed: int = 0  # of the plant and of the estimator's noise
     weights: str = "nominal"  # nominal, expert or a weights file

@@ -426,10 +426,11 @@ def judge(
     plants: Sequence[Imperfections],
     seeds: Sequence[int],
     title: str,
+    seconds: float = 4.0,
 ) -> dict[str, list[Trajectory]]:
-    """Walk every weight set on every plant, four seconds each; by set, in order of the plants."""
+    """Walk every weight set on every plant, `seconds` each; by set, in order of the plants."""
     jobs = [
-        Job(weights, command, plant, seed=seed)
+        Job(weights, command, plant, seconds, seed)
         for weights in sets.values()
         for plant, seed in zip(plants, seeds, strict=True)
     ]

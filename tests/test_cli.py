@@ -72,6 +72,12 @@ def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("command", ["walk", "evaluate"])
+def test_a_walk_of_no_length_is_refused(monkeypatch, capsys, command):
+    line = refused(monkeypatch, capsys, command, "--traj", "eight", "--seconds", "0")
+    assert "--seconds must be above 0 and at most 600, got 0.0" in line
+
+
 def test_unknown_world(monkeypatch, capsys):
     line = refused(monkeypatch, capsys, "walk", "--world", "moon")
     assert "moon" in line

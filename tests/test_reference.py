@@ -3,7 +3,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.reference import COMMANDS, Anchor, named_command, reference_at
+from hector_jax.control.reference import (
+    COMMANDS,
+    UNSEEN,
+    Anchor,
+    named_command,
+    reference_at,
+)
 
 ANCHOR = Anchor(jnp.array([0.3, -0.2, 0.42]), jnp.array(0.7), jnp.array(10))
 
@@ -19,7 +25,7 @@ def test_before_the_start_it_stands_at_the_anchor():
     assert not np.asarray(state.velocity).any()
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", COMMANDS + UNSEEN)
 def test_the_path_is_the_integral_of_its_velocity(name):
     times = np.arange(0, 9.0, 1e-3)
     state = path(named_command(name), times)
@@ -56,6 +62,35 @@ def test_laps_of_a_turning_command_join():
     np.testing.assert_allclose(state.position[2], state.position[3], atol=1e-6)
 
 
+def test_a_figure_of_eight_is_two_circles_through_one_point():
+    state = path(named_command("eight"), [0.0, 2.0, 4.0, 6.0, 8.0])
+    np.testing.assert_allclose(state.position[2::2] - state.position[0], 0.0, atol=1e-12)
+    left, right = (state.position[i, :2] - state.position[0, :2] for i in (1, 3))
+    np.testing.assert_allclose(left, -right, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(left), 2 * 0.3 / (0.5 * np.pi))
+    np.testing.assert_allclose(
+        np.asarray(state.euler)[[0, 2, 4], 2], 0.7 + np.array([0, 2, 0]) * np.pi
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "ahead", "left", "turned"),
+    [("sideways", 0.0, 0.8, 0.0), ("turn", 0.0, 0.0, np.pi), ("stop-and-go", 1.0, 0.0, 0.0)],
+)
+def test_unseen_commands_lead_where_their_names_say(name, ahead, left, turned):
+    level = Anchor(jnp.array([0.0, 0.0, 0.42]), jnp.array(0.0), jnp.array(0))
+    state = path(named_command(name), [4.0], level)
+    np.testing.assert_allclose(state.position[0], [ahead, left, 0.42], atol=1e-12)
+    np.testing.assert_allclose(state.euler[0, 2], turned)
+
+
+def test_stop_and_go_stands_in_every_other_second():
+    speed = np.asarray(path(named_command("stop-and-go"), [0.5, 1.5, 2.5, 3.5]).velocity)
+    np.testing.assert_allclose(np.linalg.norm(speed, axis=1), [0.5, 0.0, 0.5, 0.0])
+
+
 def test_unknown_trajectory_is_named():
-    with pytest.raises(ValueError, match="unknown trajectory 'circle'; there are: straight, c, s"):
+    with pytest.raises(
+        ValueError, match="unknown trajectory 'circle'; there are: straight, c, s, "
+    ):
         named_command("circle")

@@ -46,22 +46,38 @@ def anchor_at(robot: Robot, state: State, start_tick: Int[Array, ""] | int) -> A
 
 
 COMMANDS = ("straight", "c", "s")
+"""The paper's trajectories."""
+
+UNSEEN = ("sideways", "turn", "eight", "stop-and-go")
+"""Beyond the paper: for judging what was tuned on others."""
+
+_QUARTER, _HALF = 0.25 * np.pi, 0.5 * np.pi  # [rad/s]
+# Seconds of each of two pieces; velocity ahead and to the left [m/s], yaw rate [rad/s] of both.
+_PIECES = {
+    "straight": (2.0, ((0.5, 0.0), (0.5, 0.0)), (0.0, 0.0)),
+    "c": (2.0, ((0.25, 0.0), (0.25, 0.0)), (_QUARTER, _QUARTER)),
+    "s": (2.0, ((0.5, 0.0), (0.5, 0.0)), (_HALF, -_HALF)),
+    "sideways": (2.0, ((0.0, 0.2), (0.0, 0.2)), (0.0, 0.0)),
+    "turn": (2.0, ((0.0, 0.0), (0.0, 0.0)), (_QUARTER, _QUARTER)),
+    "eight": (4.0, ((0.3, 0.0), (0.3, 0.0)), (_HALF, -_HALF)),
+    "stop-and-go": (1.0, ((0.5, 0.0), (0.0, 0.0)), (0.0, 0.0)),
+}
 
 
 def named_command(name: str) -> Command:
-    """The paper's three trajectories: straight line, C curve, S curve (period 4 s).
+    """A trajectory of COMMANDS or UNSEEN.
+
+    The paper's straight line, C curve and S curve (period 4 s); 0.2 m/s to the left; half a turn on
+    the spot in 4 s; a figure of eight, two circles of 4 s each; a second at 0.5 m/s and one in
+    place. All have two pieces, so that they may share a batch.
 
     Raises:
-        ValueError: the name is none of COMMANDS.
+        ValueError: the name is none of them.
     """
-    speed, rates = {
-        "straight": (0.5, (0.0, 0.0)),
-        "c": (0.25, (0.25 * np.pi, 0.25 * np.pi)),
-        "s": (0.5, (0.5 * np.pi, -0.5 * np.pi)),
-    }.get(name, (None, None))
-    if speed is None:
-        raise ValueError(f"unknown trajectory {name!r}; there are: {', '.join(COMMANDS)}")
-    return Command(np.array([2.0, 2.0]), np.array([[speed, 0.0]] * 2), np.array(rates))
+    if name not in _PIECES:
+        raise ValueError(f"unknown trajectory {name!r}; there are: {', '.join(_PIECES)}")
+    seconds, velocity, rates = _PIECES[name]
+    return Command(np.full(2, seconds), np.array(velocity), np.array(rates))
 
 
 def _turn(angle: Float[Array, "*batch"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:

@@ -5,17 +5,21 @@ its caption. Weight sets keep their colour, line and marker through all pictures
 be told apart in grey too. Figures are made without pyplot: no display, no global state.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from hector_jax.evaluation.fidelity import Drift
+from hector_jax.evaluation.robustness import DIRECTIONS, Cell
 from hector_jax.grfm.training import History
 from hector_jax.trajectory import LEFT, Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
@@ -496,3 +500,120 @@ def ranks(
         for panel in panels[:, 0]:
             panel.set_ylabel("L on the model [10$^6$]")
     return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."
+
+
+_OTHERS = (_PURPLE, "black", "#b8860b", "#c2569c")
+
+
+def _set_looks(names: Iterable[str]) -> dict[str, dict]:
+    """Look of each weight set; those without one of their own take the next free colour."""
+    free = ({"color": color, "linestyle": (0, (1.5, 1.2))} for color in cycle(_OTHERS))
+    return {name: _LOOK[name] if name in _MARKER else next(free) for name in names}
+
+
+def _plain_log(axis: Axis) -> None:
+    """Ticks of a logarithmic axis at 1, 2 and 5, written out."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def survival(path: Path, curves: Mapping[str, Mapping[float, Mapping[str, Cell]]]) -> str:
+    """Share of walks without a fall and loss against the baseline, by the size of a disturbance.
+
+    Args:
+        path: file to write.
+        curves: `push` by force and `friction` by the floor's friction, cells by set, the baseline
+            first.
+    """
+    labels = {"push": "push [N]", "friction": "friction that the floor steps to"}
+    with _figure(path, 7.0, 2.5 * len(curves) + 0.3) as figure:
+        panels = figure.subplots(len(curves), 2, squeeze=False, sharex="row")
+        for row, (kind, found) in zip(panels, curves.items(), strict=True):
+            sizes = sorted(found)
+            names = list(found[sizes[0]])
+            for name, look in _set_looks(names).items():
+                cells = [found[size][name] for size in sizes]
+                stood = np.array([cell.survived for cell in cells])
+                ratio = np.array([cell.ratio for cell in cells])
+                for panel, values in zip(row, (100 * stood, ratio), strict=True):
+                    marker = {"marker": _MARKER.get(name, "^"), "markersize": 3.5}
+                    panel.plot(sizes, values[:, 0], **look, **marker, label=_named(name))
+                    panel.fill_between(
+                        sizes, values[:, 1], values[:, 2], color=look["color"], alpha=0.12, lw=0
+                    )
+            row[0].set(ylabel="walks without a fall [%]", ylim=(-4, 104), xlabel=labels[kind])
+            row[1].set(ylabel=f"median L / {names[0]}", yscale="log", xlabel=labels[kind])
+            _plain_log(row[1].yaxis)
+            row[0].set_xticks(sizes, [f"{size:g}" for size in sizes])
+            if kind == "friction":  # the harder the further to the right
+                row[0].invert_xaxis()
+        _legend(figure, panels[0, 0])
+    return (
+        "Walks without a fall, and the median ratio of L to the baseline's in the same scene on "
+        "the same plant, by the force of a push from eight sides and by how slippery the floor "
+        "turns. Bands redraw the plants."
+    )
+
+
+def scene_ratios(path: Path, rows: Mapping[str, Mapping[str, Cell]]) -> str:
+    """Loss against the baseline and share of walks without a fall, one row per scene.
+
+    Args:
+        path: file to write.
+        rows: by the scene's name, cells by set, the baseline first.
+    """
+    baseline, *others = next(iter(rows.values()))
+    at = -np.arange(len(rows))
+    with _figure(path, 7.0, 0.3 * len(rows) + 0.9) as figure:
+        panels = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
+        looks = _set_looks([baseline, *others])
+        for i, (name, look) in enumerate(looks.items()):
+            y = at + 0.2 * ((len(looks) - 1) / 2 - i)
+            dot = {
+                "linestyle": "none",
+                "marker": _MARKER.get(name, "^"),
+                "color": look["color"],
+                "label": _named(name),
+            }
+            stood = np.array([row[name].survived for row in rows.values()])
+            ratio = np.array([row[name].ratio for row in rows.values()])
+            if name != baseline:
+                panels[0].hlines(y, ratio[:, 1], ratio[:, 2], color=look["color"], linewidth=1.0)
+                panels[0].plot(ratio[:, 0], y, **dot)
+            panels[1].plot(100 * stood[:, 0], y, **dot)
+        panels[0].axvline(1.0, **_LOOK["nominal"])
+        panels[0].set(xscale="log", xlabel=f"median L / {baseline}")
+        _plain_log(panels[0].xaxis)
+        panels[0].set_yticks(at, list(rows))
+        panels[1].set(xlabel="walks without a fall [%]", xlim=(-5, 105))
+        _legend(figure, panels[1])
+    return (
+        "Scenes in which something is in the way: the median ratio of L to the baseline's (left of "
+        "1 is better) with its interval from redrawing the plants, and what did not fall."
+    )
+
+
+def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -> str:
+    """Largest push survived, by the direction in which it pushes.
+
+    Args:
+        path: file to write.
+        endured: [N] by set, in the order of `DIRECTIONS`.
+    """
+    angles = np.deg2rad(np.append(DIRECTIONS, DIRECTIONS[0]))
+    with _figure(path, 4.6, 4.4) as figure:
+        axes = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
+        for name, look in _set_looks(endured).items():
+            closed = np.append(endured[name], endured[name][0])
+            marker = {"marker": _MARKER.get(name, "^"), "markersize": 3.5}
+            axes.plot(angles, closed, **look, **marker, label=_named(name))
+        axes.set_rmin(0.0)
+        axes.set_rlabel_position(22.5)
+        names = {0: "ahead", 90: "left", 180: "back", 270: "right"}
+        axes.set_xticks(angles[:-1], [names.get(int(d), "") for d in DIRECTIONS])
+        _legend(figure, axes, columns=3)
+    return (
+        "Largest push [N] of 0.1 s that is survived together with all smaller ones, by where it "
+        "pushes to; mean over plants and gait phases."
+    )

@@ -1,0 +1,166 @@
+"""Scenes with something in the way, and what is told of their walks."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from pretend import pretend_score
+
+from hector_jax.control.reference import UNSEEN
+from hector_jax.control.weights import nominal
+from hector_jax.evaluation import plots
+from hector_jax.evaluation.metrics import Score
+from hector_jax.evaluation.robustness import (
+    DIRECTIONS,
+    Level,
+    SceneConfig,
+    as_job,
+    as_result,
+    endured,
+    judge,
+    scenes,
+    table,
+)
+from hector_jax.sim.world import hfs
+
+ROOT = Path(__file__).parents[1]
+SMALL = SceneConfig(forces=(50.0, 100.0), frictions=(0.4, 0.2), phases=3)
+
+
+def scores(losses, fallen=()):
+    """Scores of (plants, scenes); `fallen` names pairs that fell."""
+    rows = [
+        [pretend_score(loss, (i, j) in fallen) for j, loss in enumerate(row)]
+        for i, row in enumerate(losses)
+    ]
+    stacked = [Score(*(np.stack(x) for x in zip(*row, strict=True))) for row in rows]
+    return Score(*(np.stack(x) for x in zip(*stacked, strict=True)))
+
+
+def test_pushes_come_from_eight_sides_at_all_phases_of_a_cycle():
+    found = scenes(SMALL)[Level("push", 50.0)]
+    force = np.stack([scene.push.force[0] for scene in found])
+    angles = np.rad2deg(np.arctan2(force[:, 1], force[:, 0])) % 360
+    np.testing.assert_allclose(np.linalg.norm(force, axis=1), 50.0)
+    np.testing.assert_allclose(angles, np.repeat(DIRECTIONS, 3), atol=1e-9)
+    start = np.array([scene.push.start[0] for scene in found[:3]])
+    np.testing.assert_allclose((start - start[0]) / 0.4, [0, 1 / 3, 2 / 3])
+    assert all(scene.push.start[0] + 1.0 < scene.seconds for scene in found)
+
+
+def test_scenes_hold_all_that_may_be_in_the_way():
+    found = scenes(SMALL)
+    sizes = {kind: [level.size for level in found if level.kind == kind] for kind, _ in found}
+    assert sizes["calm"] == ["straight"]
+    assert sizes["friction"] == [0.4, 0.2]
+    assert sizes["slope"] == ["up", "down", "left", "right"]
+    assert sizes["command"] == list(UNSEEN)
+    assert [s[0].changes[0].payload for level, s in found.items() if level.kind == "payload"] == [
+        2.0,
+        2.0,
+    ]
+    assert found[Level("command", "eight")][0].seconds == 8.0
+    assert not found[Level("calm", "straight")][0].changes
+
+
+def test_a_scene_becomes_the_walk_of_a_set_on_a_plant():
+    scene = scenes(SMALL)[Level("slope", "up")][0]
+    job = as_job(scene, nominal(), hfs(), 7)
+    assert (job.seed, job.seconds, job.changes) == (7, scene.seconds, scene.changes)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"phases": 0}, "phases must be at least 1, got 0"),
+        ({"forces": (50.0, -1.0)}, "forces must be positive and differ"),
+        ({"frictions": ()}, "frictions must be positive and differ, at least one, got"),
+    ],
+)
+def test_scenes_that_make_no_sense_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        SceneConfig(**wrong)
+
+
+def test_a_set_is_judged_by_the_median_of_paired_ratios():
+    base = np.array([[2e6, 4e6, 8e6], [1e6, 3e6, 9e6]])
+    half = judge(scores(0.5 * base), scores(base))
+    assert half.ratio == pytest.approx((0.5, 0.5, 0.5))
+    assert half.survived == (1.0, 1.0, 1.0)
+    assert (half.falls, half.walks, half.counts) == (0, 6, True)
+
+
+def test_the_interval_redraws_plants_with_all_their_scenes():
+    base = np.full((2, 3), 1e6)
+    found = judge(scores(base * [[0.5], [2.0]], {(1, 0), (1, 1), (1, 2)}), scores(base))
+    assert found.ratio == pytest.approx((1.25, 0.5, 2.0))
+    assert found.survived == pytest.approx((0.5, 0.0, 1.0))
+    assert found.falls == 3
+    assert not found.counts
+    alone = judge(scores(base[:1]), scores(base[:1]))
+    assert alone.ratio.low == alone.ratio.high
+
+
+def test_a_force_is_endured_with_all_smaller_ones():
+    stands = np.zeros((1, 8), bool)
+    weak = stands.copy()
+    weak[0, 2] = True  # falls at the smallest, stands at the next by luck
+    strong = stands.copy()
+    strong[0, 0] = True
+    found = endured({50.0: stands, 25.0: weak, 100.0: strong})
+    np.testing.assert_array_equal(found, [50.0, 100.0, 0.0, *[100.0] * 5])
+
+
+def test_the_table_has_a_row_per_level_and_marks_what_does_not_count():
+    base, levels = np.full((2, 4), 2e6), (Level("push", 50.0), Level("slope", "up"))
+    sets = {"nominal": scores(base), "with": scores(0.5 * base, {(0, 0)})}
+    cells = {
+        level: {name: judge(one, sets["nominal"]) for name, one in sets.items()} for level in levels
+    }
+    text = table(cells, dict.fromkeys(levels, 2e6)).splitlines()
+    assert len(text) == 4
+    assert len({line.count("|") for line in text}) == 1
+    assert text[2] == "| push 50 N | 0 of 8 | 2.00 | 1 of 8 | 0.50 * |"
+    json.dumps(as_result(cells[levels[0]]["with"]), allow_nan=False)
+
+
+def test_the_pictures_are_drawn_for_sets_of_any_name(tmp_path):
+    names, rng = ("nominal", "expert", "with", "mine", "yours"), np.random.default_rng(0)
+    base = scores(np.exp(rng.normal(size=(2, 4))) * 1e6)
+    others = [scores(np.exp(rng.normal(size=(2, 4))) * 1e6, {(0, i)}) for i in range(4)]
+    row = {name: judge(one, base) for name, one in zip(names, (base, *others), strict=True)}
+    plots.survival(tmp_path / "a.png", {"push": {25.0: row, 50.0: row}, "friction": {0.4: row}})
+    plots.scene_ratios(tmp_path / "b.png", {"calm": row, "slope up": row})
+    plots.push_directions(tmp_path / "c.png", {name: 100 * rng.random(8) for name in names})
+    for name in "abc":
+        with Image.open(tmp_path / f"{name}.png") as picture:
+            grey = np.asarray(picture.convert("L"))
+        assert 0.01 < np.mean(grey < 200) < 0.5
+
+
+@pytest.mark.slow
+def test_the_report_is_written_and_walks_are_taken_up_again(tmp_path):
+    script = [sys.executable, ROOT / "experiments/robustness.py", "--out", tmp_path]
+    flags = ["--world", "ideal", "--seeds", "1", "--forces", "50", "--frictions", "0.4"]
+    flags += ["--phases", "1", "--processes", "1"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    waited = []
+    for _ in range(2):
+        done = subprocess.run(
+            [*script, *flags], env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.strip() == str(tmp_path / "report.md")
+        waited.append(done.stderr)
+    assert "40 walks" in waited[0]
+    assert "walks" not in waited[1]
+    told = json.loads((tmp_path / "robustness.json").read_text())
+    assert told["levels"]["calm straight"]["sets"]["expert"]["falls"] == 0
+    assert len(told["endured"]["nominal"]) == 8
+    text = (tmp_path / "report.md").read_text()
+    assert "hardware" not in text
+    assert all((tmp_path / name).exists() for name in ("curves.png", "directions.png"))
