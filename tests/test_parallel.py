@@ -1,5 +1,7 @@
 """The closed loop in MJX, against MuJoCo C."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -8,9 +10,9 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.grfm.dataset import at_interval
-from hector_jax.robot import load_robot
+from hector_jax.robot import MODEL_PATH, load_robot
 from hector_jax.sim import sensing
-from hector_jax.sim.parallel import batched_model, mjx, mjx_contacts, walk_batch
+from hector_jax.sim.parallel import _in_floor, _places, batched_model, mjx, mjx_contacts, walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import NO_PUSH, Push, build_world, build_worlds, hfs, hfs_drawn, ideal
@@ -125,6 +127,21 @@ ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
 def test_jobs_that_make_no_batch_are_refused_at_once(jobs, message):
     with pytest.raises(ValueError, match=message):
         walk_batch(CONFIG, ROBOT, jobs)
+
+
+def test_a_part_whose_height_over_the_floor_is_unknown_here_is_refused_by_name(tmp_path):
+    path = tmp_path / "hector.xml"
+    round_trunk = MODEL_PATH.read_text().replace('"trunk" type="box"', '"trunk" type="cylinder"')
+    path.write_text(round_trunk)
+    with pytest.raises(ValueError, match="geom trunk .* is a CYLINDER; .* BOX or CAPSULE"):
+        walk_batch(CONFIG, ROBOT, [job(expert())], path=path)
+
+
+def test_a_robot_of_feet_alone_has_nothing_that_may_not_touch_the_floor():
+    world = build_world(hfs())
+    nothing_else = replace(_places(world), boxes=(), capsules=())
+    model, _ = batched_model([world])
+    assert not _in_floor(nothing_else, model, mjx.make_data(model))
 
 
 def test_no_jobs_are_no_walks():

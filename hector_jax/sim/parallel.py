@@ -164,7 +164,14 @@ def _falling(world: World) -> list[int]:
 def _places(world: World) -> _Places:
     kinds = {mujoco.mjtGeom.mjGEOM_BOX: [], mujoco.mjtGeom.mjGEOM_CAPSULE: []}
     for geom in _falling(world):
-        kinds[mujoco.mjtGeom(world.model.geom_type[geom])].append(geom)
+        kind = mujoco.mjtGeom(world.model.geom_type[geom])
+        if kind not in kinds:
+            name = world.model.geom(geom).name or f"number {geom}"
+            raise ValueError(
+                f"geom {name} may touch the floor and is a {kind.name.removeprefix('mjGEOM_')}; "
+                "in MJX all but feet are expected to be BOX or CAPSULE"
+            )
+        kinds[kind].append(geom)
     boxes, capsules = (tuple(geoms) for geoms in kinds.values())
     return _Places(
         coordinates=tuple(sensing.coordinates(world).tolist()),
@@ -193,7 +200,7 @@ def mjx_contacts(data: mjx.Data) -> Contacts:
 
 def _in_floor(places: _Places, model: mjx.Model, data: mjx.Data) -> Bool[Array, ""]:
     """Whether a part that may not touch the floor does; poses are those of the step's start."""
-    boxes, capsules = np.array(places.boxes), np.array(places.capsules)
+    boxes, capsules = np.array(places.boxes, int), np.array(places.capsules, int)
     up = data.geom_xmat[:, 2]  # of each geom's axes, their z in the world
     of_box = jnp.abs(up[boxes] * model.geom_size[boxes]).sum(axis=1)
     radius, half = model.geom_size[capsules, 0], model.geom_size[capsules, 1]
@@ -382,7 +389,7 @@ def walk_batch(
     Raises:
         ValueError: the jobs differ in length, in the pieces of their commands, in the number of
             their pushes or in their joints, have errors of the estimator, or a number of one is
-            out of its range.
+            out of its range; or a geom that may touch the floor has a shape unknown here.
     """
     if chunk is None:
         chunk = CPU_CHUNK if jax.default_backend() == "cpu" else DEVICE_CHUNK
@@ -401,6 +408,7 @@ def walk_batch(
         raise ValueError("a batch in MJX knows its state exactly: estimator errors must be zero")
     ticks = [walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
     worlds = build_worlds([job.imperfections for job in jobs], path)
+    places = _places(worlds[0])
     model, varied = batched_model(worlds, single)
     qpos = jnp.asarray(standing_qpos(worlds[0], robot.standing_joints, float(robot.trunk_height)))
     asked = _Asked(
@@ -412,9 +420,7 @@ def walk_batch(
         model=varied,
     )
     last_start = int(asked.start_tick.max())
-    walk = partial(
-        _walk_all, config, _places(worlds[0]), last_start, ticks, fine, single, robot, model, qpos
-    )
+    walk = partial(_walk_all, config, places, last_start, ticks, fine, single, robot, model, qpos)
     size = ceil(len(jobs) / ceil(len(jobs) / chunk))  # chunks of one size, the last one filled up
 
     def walks() -> Iterator[Trajectory]:
