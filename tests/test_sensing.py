@@ -49,12 +49,22 @@ def stand(plant, height=0.0, steps=1500):
     return world, data, row
 
 
+def momentum(world, data):
+    """Of all links together, at the start of the last step [kg m/s]."""
+    mujoco.mj_subtreeVel(world.model, data)
+    return data.subtree_linvel[0] * world.model.body_subtreemass[0]
+
+
 @pytest.mark.parametrize("plant", [ideal(), hfs()], ids=["ideal", "hfs"])
 def test_at_rest_the_ground_carries_the_weight_inside_the_feet(plant):
     world, data, row = stand(plant)
     _, wrench, _, touches = sense(world, data, row)
     force, moment = np.asarray(wrench.force), np.asarray(wrench.moment)
     weight = world.model.body_mass.sum() * 9.81
+    before = momentum(world, data)
+    mujoco.mj_step(world.model, data)
+    wanted = (momentum(world, data) - before) / 0.001 + [0.0, 0.0, weight]
+    assert np.linalg.norm(force.sum(axis=0) - wanted) <= 0.01 * weight  # m (a + g) of all links
     assert force[:, 2].sum() == pytest.approx(weight, rel=0.005)
     assert np.abs(force[:, :2].sum(axis=0)).max() < 0.02 * weight  # the loose robot still sways
     ahead, aside = -moment[:, 1] / force[:, 2], moment[:, 0] / force[:, 2]
