@@ -16,13 +16,14 @@ import jax
 import numpy as np
 
 from hector_jax.console import Tell, bar
+from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
-from hector_jax.model.effect import last_command
+from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
@@ -46,9 +47,16 @@ class CollectConfig:
     def __post_init__(self) -> None:
         if self.engine not in ("auto", "c", "mjx"):
             raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {self.engine!r}")
-        if self.walks < 3 or not self.seconds > 0.0:  # to learn from, to choose by, to judge by
+        if self.walks < 3:
             raise ValueError(
-                f"CollectConfig needs walks >= 3 and seconds > 0, got {self.walks}, {self.seconds}"
+                "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
+                f"by), got {self.walks}"
+            )
+        least = HISTORY * GaitConfig.tick
+        if not least <= self.seconds < np.inf:
+            raise ValueError(
+                f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
+                f"sample, got {self.seconds:g}"
             )
 
 

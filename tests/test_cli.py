@@ -109,13 +109,27 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["kept"]
 
 
-def test_collection_refuses_a_folder_it_cannot_write_and_an_unknown_engine(
-    monkeypatch, capsys, tmp_path
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        (("--engine", "warp"), "engine"),
+        (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
+        (("--seconds", "nan"), "at least 0.03 s"),
+        (("--walks", "2"), "at least 3"),
+    ],
+)
+def test_collection_refuses_what_it_cannot_walk_at_once(
+    monkeypatch, capsys, tmp_path, wrong, expected
 ):
+    monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
+    assert expected in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "walks", *wrong)
+    assert not (tmp_path / "walks").exists()
+
+
+def test_collection_refuses_a_folder_it_cannot_write(monkeypatch, capsys, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
     assert "file" in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "file" / "walks")
-    assert "engine" in refused(monkeypatch, capsys, "collect", "--engine", "warp")
 
 
 @pytest.mark.slow
