@@ -1,7 +1,6 @@
 """What each command of `hector` does with its flags (flags.py)."""
 
 import dataclasses
-import json
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -46,12 +45,13 @@ from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
 from hector_jax.storage import (
+    as_json,
     load_weights,
     make_folder,
     save_tree,
     save_weights,
     versions,
-    write_file,
+    write_json,
 )
 from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning, aligned
@@ -84,7 +84,7 @@ def _plants(world: str, seeds: range) -> list[Imperfections]:
         raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
 
 
-def _as_json(flags: Any) -> dict[str, Any]:
+def _settings(flags: Any) -> dict[str, Any]:
     plain = lambda x: x if isinstance(x, bool | int | float | tuple) else str(x)  # noqa: E731
     return {name: plain(value) for name, value in dataclasses.asdict(flags).items()}
 
@@ -220,9 +220,9 @@ def _tune(args: Tune) -> None:
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        resolved = {"flags": _as_json(args), "tune": dataclasses.asdict(config)}
-        write_file(folder / "config.json", _json_bytes(resolved))
-        write_file(folder / "versions.json", _json_bytes(environment()))
+        resolved = {"flags": _settings(args), "tune": dataclasses.asdict(config)}
+        write_json(folder / "config.json", resolved)
+        write_json(folder / "versions.json", environment())
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
             tunings = pipeline.tune_many(
                 pool,
@@ -261,7 +261,7 @@ def _tune(args: Tune) -> None:
     result = metrics.as_result(verdict)
     for name, found in metrics.as_result(_verdict(config.loss, [0], on_hfs), "hfs")["sets"].items():
         result["sets"][name] |= found
-    write_file(folder / "result.json", _json_bytes(result))
+    write_json(folder / "result.json", result)
     pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
     film: Picture | str = "left out (--no-video)"
     if args.video:
@@ -332,10 +332,6 @@ def _draw(
     return [Picture(f"pictures/{name}.png", caption) for name, caption in captions.items()]
 
 
-def _json_bytes(value: Any) -> bytes:
-    return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
-
-
 @run.register
 def _evaluate(args: Evaluate) -> None:
     command, robot = named_command(args.traj), load_robot()
@@ -349,7 +345,7 @@ def _evaluate(args: Evaluate) -> None:
         walks = pipeline.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title)
     verdict = _verdict(LossConfig(), seeds, walks)
     if args.json:
-        print(json.dumps(metrics.as_result(verdict, args.world), allow_nan=False))
+        print(as_json(metrics.as_result(verdict, args.world)))
     else:
         print_table(verdict, f"{args.traj}, {count} plants", args.world)
 
@@ -371,16 +367,12 @@ def _walk(args: Walk) -> None:
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     if args.out is not None:
-        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=_as_json(args))
+        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=_settings(args))
     if args.json:
         losses = {part: float(getattr(found, part)) for part in metrics.PARTS}
-        errors = {"rms_position": found.rms_position, "rms_euler": found.rms_euler}
-        errors = {  # a walk that falls at once has no errors
-            name: [x if np.isfinite(x) else None for x in values.tolist()]
-            for name, values in errors.items()
-        }
+        errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}
         told = {"seconds": upright, "fell": bool(found.fallen), **losses, **errors}
-        print(json.dumps(told, allow_nan=False))
+        print(as_json(told))  # a walk that falls at once has no errors
     else:
         print(
             f"{args.traj} in {args.world}, {args.weights} weights: "

@@ -4,7 +4,6 @@ Everything that is walked or tuned runs in worker processes, one core each, beca
 one long chain of small operations. A step that finds its result on disk takes it.
 """
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
 from dataclasses import asdict, dataclass
@@ -28,7 +27,7 @@ from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import Imperfections
-from hector_jax.storage import make_folder, read_card
+from hector_jax.storage import as_json, make_folder, read_card
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
@@ -366,11 +365,4 @@ def as_line(name: str, iteration: Iteration) -> str:
         "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
         "gradient_log": dict(zip(WEIGHT_NAMES, vector(gradient), strict=True)),
     }
-    return json.dumps(_finite(row), allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null in their place."""
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return as_json(row) + "\n"
