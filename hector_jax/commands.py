@@ -38,7 +38,7 @@ from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
 from hector_jax.grfm.network import ResidualParams, as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
-from hector_jax.model.effect import HISTORY, last_command
+from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import cache_folder, workers
 from hector_jax.sim.standin import standin
@@ -183,11 +183,14 @@ def _curves(
         "measured": samples.label,
         **{names[n]: predict(effect, window) for n, effect in effects.items() if n in names},
     }
-    unknown = ((HISTORY - 1, 0), (0, 0), (0, 0))  # the first ticks have no full window
-    return {
-        name: jax.tree.map(lambda w: np.pad(w, unknown, constant_values=np.nan), wrench)
-        for name, wrench in curves.items()
-    }
+
+    def by_tick(values: Any) -> np.ndarray:
+        """NaN at ticks that are no samples: the first, unsolved ones, those after a fall."""
+        rows = np.full((one.fallen.shape[1], *values.shape[1:]), np.nan)
+        rows[samples.tick] = values
+        return rows
+
+    return {name: jax.tree.map(by_tick, wrench) for name, wrench in curves.items()}
 
 
 def _new_folder(args: Tune) -> Path:

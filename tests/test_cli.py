@@ -8,11 +8,13 @@ import sys
 import jax
 import numpy as np
 import pytest
+from synthetic import synthetic_walk
 
 from hector_jax import commands
 from hector_jax.cli import main
 from hector_jax.control.weights import expert
-from hector_jax.grfm.dataset import load_walks
+from hector_jax.grfm.dataset import at_interval, load_walks
+from hector_jax.model.effect import last_command
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import MODEL_PATH, load_robot
 from hector_jax.storage import save_weights
@@ -130,6 +132,24 @@ def test_collection_refuses_a_folder_it_cannot_write(monkeypatch, capsys, tmp_pa
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
     assert "file" in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "file" / "walks")
+
+
+def test_curves_leave_a_gap_where_a_tick_is_no_sample():
+    whole = at_interval(synthetic_walk(0, 30), 0.01)
+    one = jax.tree.map(lambda x: np.asarray(x)[None], whole)
+    unsolved = np.zeros((1, 30))
+    unsolved[0, 11] = 1.0
+    curves = commands._curves(load_robot(), one, {"residual": last_command})
+    gapped = commands._curves(
+        load_robot(), one._replace(residual=unsolved), {"residual": last_command}
+    )
+    assert curves.keys() == gapped.keys() == {"commanded", "measured", "predicted"}
+    for name, wrench in curves.items():
+        assert np.isnan(wrench.force[:2]).all()
+        assert np.isnan(gapped[name].force[11]).all()
+        others = np.arange(30) != 11
+        np.testing.assert_array_equal(gapped[name].force[others], wrench.force[others])
+        assert np.isfinite(wrench.force[2:]).all()
 
 
 @pytest.mark.slow
