@@ -36,7 +36,7 @@ from hector_jax.flags import Collect, Doctor, Evaluate, Grfm, Train, Tune, Walk
 from hector_jax.grfm import training
 from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
-from hector_jax.grfm.network import ResidualParams, as_effect, linear_effect
+from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
@@ -100,13 +100,14 @@ def _collect(args: Collect) -> None:
 @run.register
 def _train(args: Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
-    found = pipeline.train(config, load_robot(), args.data, args.out)
+    path = args.out or pipeline.net_path(args.data.parent, args.variant)
+    found = pipeline.train(config, load_robot(), args.data, path)
     for name, errors in found.errors.items():
         print(
             f"{name:7s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
             "   (held-out walks)"
         )
-    say(f"the net is in {args.out}")
+    say(f"the net is in {path}")
 
 
 @run.register
@@ -123,9 +124,8 @@ def _grfm(args: Grfm) -> None:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": linear_effect(net.linear)}
     effects["paper"] = as_effect(paper.params)
-    if isinstance(net.params, ResidualParams):
-        effects["residual"] = as_effect(net.params)
-        effects["gated"] = gated_effect(net.params.linear)
+    effects["residual"] = as_effect(net.params)
+    effects["gated"] = gated_effect(net.params.linear)
     say("predicting")
     found, drifts = {}, {}
     for world, walks in worlds.items():
@@ -213,11 +213,12 @@ def _tune(args: Tune) -> None:
     for name, least in (("seeds", 1), ("processes", 1), ("iterations", PAPER_ITERATIONS)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
-    config = TuneConfig(iterations=args.iterations)
+    config, variant = TuneConfig(iterations=args.iterations), args.variant
+    TrainConfig(variant)  # refuses an unknown one before a folder is made
     folder = _new_folder(args)
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, config, robot, args.data)
+        net = pipeline.ground(pool, config, robot, args.data, variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
@@ -287,7 +288,7 @@ def _tune(args: Tune) -> None:
             config=resolved,
             environment=environment(),
             command=f"hector tune --traj {args.traj} --seeds {args.seeds} "
-            f"--iterations {args.iterations} --alpha {args.alpha}",
+            f"--iterations {args.iterations} --variant {variant} --alpha {args.alpha}",
         ),
     )
     print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")

@@ -27,7 +27,7 @@ from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import Imperfections
-from hector_jax.storage import as_json, make_folder, read_card
+from hector_jax.storage import as_json, make_folder
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
@@ -273,18 +273,27 @@ def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learne
     return Learned(params, linear, about["errors"], course)
 
 
+def net_path(data: Path, variant: str) -> Path:
+    """Where the net of a variant is kept: `grfm.npz`, and others than the default by their name."""
+    default = variant == TrainConfig().variant
+    return data / ("grfm.npz" if default else f"grfm-{variant}.npz")
+
+
 def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
-    """The net kept at `path`, of whatever variant, trained anew where it is stale or missing.
+    """The net kept at `path`, trained anew where it is stale or missing.
 
     Stale is a net of other walks or of another controller than those under `folder`.
 
     Raises:
-        ValueError: one line naming the file that is damaged or of another robot.
+        ValueError: one line naming the file that is damaged, of another robot or another variant.
     """
     made_of = dataset.walked_with(folder)
-    if not path.exists() or read_card(path)["about"].get("made_of") != made_of:
+    if not path.exists():
         return train(config, robot, folder, path)
-    params, _, card = network.load_net(path, robot)
+    _, card = network.read_net_card(path, config.variant)
+    if card["about"].get("made_of") != made_of:
+        return train(config, robot, folder, path)
+    params, _, card = network.load_net(path, robot, config.variant)
     about = card["about"]
     course = History(**{name: np.array(about["course"][name]) for name in History._fields})
     linear = network.fit_linear(samples(robot, folder).training)
@@ -300,20 +309,20 @@ def ground(
         pool: worker processes.
         config: the controller that has to have walked.
         robot: the body.
-        data: folder of `walks/` and `grfm.npz`, or `grfm-<variant>.npz`.
-        variant: a variant for comparison; None takes the net that tunings use.
+        data: folder of `walks/` and of the net, see `net_path`.
+        variant: of the net; None takes the default one.
 
     Raises:
-        ValueError: the walks are of another controller or robot, or a file is damaged.
+        ValueError: the walks are of another controller or robot, the net's file is of another
+            variant, or a file is damaged.
     """
+    train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
     walks = data / "walks"
     if not (walks / "card.json").exists():
         collect(pool, CollectConfig(), config, robot, walks)
     if dataset.walked_with(walks).get("controller") != repr(config.rollout.walk):
         raise ValueError(f"{walks}: walked by another controller; choose another folder")
-    train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
-    name = "grfm.npz" if variant is None else f"grfm-{variant}.npz"
-    return learned(train_config, robot, walks, data / name)
+    return learned(train_config, robot, walks, net_path(data, train_config.variant))
 
 
 def judge(

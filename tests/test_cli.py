@@ -231,9 +231,16 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrong", [("--processes", "0"), ("--iterations", "3"), ("--seeds", "0"), ("--alpha", "both")]
+    "wrong",
+    [
+        ("--processes", "0"),
+        ("--iterations", "3"),
+        ("--seeds", "0"),
+        ("--alpha", "both"),
+        ("--variant", "papier"),
+    ],
 )
 def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
     line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)
-    assert wrong[0] in line
+    assert wrong[0].lstrip("-") in line
     assert not (tmp_path / "run").exists()
