@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
@@ -190,6 +191,19 @@ def test_physics_in_32_bits_walks_as_in_64(three):
         assert np.sqrt(np.mean((mine.effect.force - double.effect.force) ** 2)) < 10.0
         assert mine.state.position.dtype == double.state.position.dtype
         assert mine.residual.max() < 1e-6
+
+
+@pytest.mark.slow
+def test_both_engines_tell_when_the_legs_touch():
+    """A gait so narrow that they do, and nobody falls."""
+    narrow = WalkConfig(footstep=FootstepConfig(width=0.01))
+    asked = job(expert(), "straight", seconds=0.4)
+    mine = next(walk_batch(narrow, ROBOT, [asked]))
+    alone = at_interval(walk(narrow, ROBOT, *asked), 0.01)
+    assert not alone.fallen.any()
+    assert alone.legs_touch.any()
+    assert not alone.legs_touch.all()
+    assert (mine.legs_touch == alone.legs_touch).mean() > 0.9
 
 
 @pytest.mark.slow

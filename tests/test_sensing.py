@@ -71,7 +71,8 @@ def test_at_rest_the_ground_carries_the_weight_inside_the_feet(plant):
     assert (-ROBOT.heel <= ahead).all()
     assert (ahead <= ROBOT.toe).all()
     assert np.abs(aside).max() < 1e-3
-    assert not touches
+    assert not touches.floor
+    assert not touches.legs
 
 
 def test_in_flight_there_is_no_wrench():
@@ -151,7 +152,22 @@ def test_a_knee_on_the_floor_is_no_foot():
     data = mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 0.2)
     mujoco.mj_forward(world.model, data)
-    assert sense(world, data, flat_reading(world, data))[3]
+    touches = sense(world, data, flat_reading(world, data))[3]
+    assert touches.floor
+    assert not touches.legs
+
+
+def test_legs_that_cross_touch_each_other_and_not_the_floor():
+    world = build_world(ideal())
+    data = mujoco.MjData(world.model)
+    for inwards in (0.0, 0.3):
+        roll = inwards * np.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        data.qpos[:] = standing_qpos(world, ROBOT.standing_joints + roll, 1.0)
+        mujoco.mj_forward(world.model, data)
+        _, wrench, _, touches = sense(world, data, flat_reading(world, data))
+        assert touches.legs == (inwards > 0.0)
+        assert not touches.floor
+        assert not np.any(wrench.force)
 
 
 def test_a_known_state_has_no_errors():

@@ -171,6 +171,10 @@ def _legend(verdict: Verdict) -> list[str]:
     ]
     if _void(verdict):
         lines.append(f"{_VOID} does not count: one of the two falls more often than the other.")
+    touched = {name: float(score.legs_touch.sum()) for name, score in verdict.scores.items()}
+    told = [f"{name} {seconds:.3f} s" for name, seconds in touched.items() if seconds > 0.0]
+    if told:
+        lines.append(f"The legs touched each other, which is no fall: {', '.join(told)} in all.")
     return lines
 
 

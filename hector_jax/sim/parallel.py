@@ -33,7 +33,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators
-from hector_jax.sim.sensing import Contacts
+from hector_jax.sim.sensing import Contacts, Touches
 from hector_jax.sim.walk import (
     Job,
     Observed,
@@ -130,6 +130,7 @@ class _Carry(NamedTuple):
     physics: _Physics
     fallen: Bool[Array, ""]
     effect: Wrench  # summed over the sample so far
+    legs: Bool[Array, ""]  # touched in the sample so far
     seen: Observed  # the last sample
 
 
@@ -283,7 +284,7 @@ def _walk_one(
         contacts = jax.tree.map(wide, mjx_contacts(data))
         effect, touches = feel(robot, before, contacts, floor, foot_of_geom)
         state = sensing.base_state(robot, read(physics), yaw)
-        fallen = carry.fallen | has_fallen(state) | touches | _in_floor(places, model, data)
+        fallen = carry.fallen | has_fallen(state) | touches.floor | _in_floor(places, model, data)
         held = _where(fallen, (carry.physics, carry.motors, carry.yaw), (physics, motors, yaw))
         return carry._replace(
             physics=held[0],
@@ -291,10 +292,12 @@ def _walk_one(
             yaw=held[2],
             fallen=fallen,
             effect=jax.tree.map(jnp.add, carry.effect, effect),
+            legs=carry.legs | touches.legs,
         ), None
 
     def sample(carry: _Carry, when: tuple[Array, Array]) -> tuple[_Carry, Observed]:
-        carry, _ = jax.lax.scan(millisecond, carry._replace(effect=zero_wrench()), when)
+        carry = carry._replace(effect=zero_wrench(), legs=never)
+        carry, _ = jax.lax.scan(millisecond, carry, when)
         seen = observe(
             config,
             robot,
@@ -304,7 +307,7 @@ def _walk_one(
             carry.yaw,
             read(carry.physics),
             jax.tree.map(lambda w: w / each, carry.effect),
-            carry.fallen,
+            Touches(carry.fallen, carry.legs),
         )
         carry = carry._replace(seen=_where(carry.fallen, carry.seen, seen))
         return carry, carry.seen._replace(fallen=carry.fallen)
@@ -335,10 +338,14 @@ def _walk_one(
         lambda: decide(config, robot, weights, command, anchor, now, *known, slots=2)[1]
     )
     plan = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-    seen = observe(config, robot, command, anchor, 1.0 * now, yaw, start, zero_wrench(), never)
+    seen = observe(
+        config, robot, command, anchor, 1.0 * now, yaw, start, zero_wrench(), Touches(never, never)
+    )
     if single:
         physics = _single(physics)
-    carry = _Carry(memory, plan, init_actuators(), anchor, yaw, physics, never, zero_wrench(), seen)
+    carry = _Carry(
+        memory, plan, init_actuators(), anchor, yaw, physics, never, zero_wrench(), never, seen
+    )
     _, (plans, seen) = jax.lax.scan(one_tick, carry, jnp.arange(begin, last_start + ticks))
 
     # Each walk's own part, from its t = 0 on.

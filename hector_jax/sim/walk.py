@@ -42,7 +42,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
-from hector_jax.sim.sensing import Contacts, Reading
+from hector_jax.sim.sensing import Contacts, Reading, Touches
 from hector_jax.sim.world import (
     NO_PUSH,
     TIME_STEP,
@@ -77,6 +77,7 @@ class Observed(NamedTuple):
     feet: Float[Array, "*batch 2 3"]
     joints: Float[Array, "*batch 10"]
     fallen: Bool[Array, "*batch"]
+    legs_touch: Bool[Array, "*batch"]
 
 
 def decide(
@@ -125,8 +126,8 @@ def feel(
     contacts: Contacts,
     floor: Int[Array, ""],
     foot_of_geom: Int[Array, " ngeom"],
-) -> tuple[Wrench, Bool[Array, ""]]:
-    """The ground's wrench over a millisecond, and whether anything but the feet touches the floor.
+) -> tuple[Wrench, Touches]:
+    """The ground's wrench over a millisecond, and what touches beside the feet and the floor.
 
     Args:
         robot: nominal body.
@@ -148,7 +149,7 @@ def observe(
     yaw: Float[Array, ""],
     after: Reading,
     effect: Wrench,
-    touches: Bool[Array, ""],
+    touches: Touches,
 ) -> Observed:
     """The truth about one sample.
 
@@ -161,7 +162,7 @@ def observe(
         yaw: a yaw [rad] shortly before.
         after: coordinates at its end.
         effect: mean wrench of the ground over it.
-        touches: whether anything but the feet touched the floor.
+        touches: what touched in it, feet on the floor apart.
     """
     state = sensing.base_state(robot, after, yaw)
     return Observed(
@@ -170,7 +171,8 @@ def observe(
         effect=effect,
         feet=sensing.foot_points(robot, after),
         joints=after.joints + after.slack,
-        fallen=has_fallen(state) | touches,
+        fallen=has_fallen(state) | touches.floor,
+        legs_touch=touches.legs,
     )
 
 
@@ -189,6 +191,7 @@ def as_trajectory(
         feet=seen.feet,
         joints=seen.joints,
         fallen=seen.fallen,
+        legs_touch=seen.legs_touch,
         residual=plan.residual,
     )
 
