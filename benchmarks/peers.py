@@ -4,8 +4,9 @@ Compiled solvers get ready dense QPs from Python, one by one. JAX solvers stand 
 the layer; they get Jacobi columns and unit rows, without which their answers are of no use here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,31 +42,34 @@ def _quadprog() -> Compiled:
     return solve
 
 
+def _to_1e8(new: Callable[[QP], Any], load: str, result: str) -> Compiled:
+    """A solver of two-sided rows: how it is made, and what it calls taking data and its result."""
+
+    def solve(qp: QP) -> np.ndarray:
+        problem = new(qp)
+        problem.settings.eps_abs = 1e-8
+        getattr(problem, load)(qp.P, qp.q, None, None, qp.A, qp.l, qp.u)
+        problem.solve()
+        return getattr(problem, result).x
+
+    return solve
+
+
 def _proxqp() -> Compiled:
     from proxsuite import proxqp
 
-    def solve(qp: QP) -> np.ndarray:
+    def new(qp: QP) -> Any:
         problem = proxqp.dense.QP(len(qp.q), 0, len(qp.u))
-        problem.settings.eps_abs = 1e-8
         problem.settings.initial_guess = proxqp.NO_INITIAL_GUESS
-        problem.init(qp.P, qp.q, None, None, qp.A, qp.l, qp.u)
-        problem.solve()
-        return problem.results.x
+        return problem
 
-    return solve
+    return _to_1e8(new, "init", "results")
 
 
 def _piqp() -> Compiled:
     import piqp
 
-    def solve(qp: QP) -> np.ndarray:
-        problem = piqp.DenseSolver()
-        problem.settings.eps_abs = 1e-8
-        problem.setup(qp.P, qp.q, None, None, qp.A, qp.l, qp.u)
-        problem.solve()
-        return problem.result.x
-
-    return solve
+    return _to_1e8(lambda qp: piqp.DenseSolver(), "setup", "result")
 
 
 def _osqp() -> Compiled:
@@ -89,6 +93,14 @@ def _osqp() -> Compiled:
     return solve
 
 
+def _installed(
+    doors: Mapping[str, tuple[str, Callable]], *given: np.ndarray
+) -> tuple[dict[str, Any], list[str]]:
+    """Solvers by their names, and the packages that are not here."""
+    here = {name: make(*given) for package, (name, make) in doors.items() if find_spec(package)}
+    return here, [package for package in doors if not find_spec(package)]
+
+
 def compiled_peers() -> tuple[dict[str, Compiled], list[str]]:
     """Compiled solvers that are here, DAQP first, and the packages that are not."""
     doors = {
@@ -98,8 +110,7 @@ def compiled_peers() -> tuple[dict[str, Compiled], list[str]]:
         "piqp": ("PIQP 1e-8", _piqp),
         "osqp": ("OSQP 1e-6", _osqp),
     }
-    here = {name: make() for package, (name, make) in doors.items() if find_spec(package)}
-    return here, [package for package in doors if not find_spec(package)]
+    return _installed(doors)
 
 
 def _scaled(qp: QP) -> tuple[QP, jax.Array]:
@@ -151,7 +162,4 @@ def traced_peers(upper: np.ndarray, lower: np.ndarray) -> tuple[dict[str, Traced
         upper, lower: numbers of the rows with a finite bound, the same in all problems.
     """
     doors = {"qpax": ("qpax e, kappa 1e-5", _qpax), "jaxopt": ("jaxopt BoxOSQP 1e-5", _jaxopt)}
-    here = {
-        name: make(upper, lower) for package, (name, make) in doors.items() if find_spec(package)
-    }
-    return here, [package for package in doors if not find_spec(package)]
+    return _installed(doors, upper, lower)

@@ -13,7 +13,6 @@ nets only where DATA was walked by it.
 """
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, field
@@ -49,6 +48,7 @@ from hector_jax.storage import (
     save_tree,
     save_weights,
     write_file,
+    write_json,
 )
 from hector_jax.trajectory import Load, Trajectory
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tune_step
@@ -419,10 +419,7 @@ def report(
             for (which, name), simulator in truth.items()
         },
     }
-    write_file(
-        flags.out / "transfer.json",
-        (json.dumps(transfer.known(told), indent=1, allow_nan=False) + "\n").encode(),
-    )
+    write_json(flags.out / "transfer.json", told)
     write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
     return flags.out / "report.md"
 

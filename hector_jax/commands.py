@@ -1,7 +1,6 @@
 """What each command of `hector` does with its flags (flags.py)."""
 
 import dataclasses
-import json
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -37,21 +36,22 @@ from hector_jax.flags import Collect, Doctor, Evaluate, Grfm, Search, Train, Tun
 from hector_jax.grfm import training
 from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
-from hector_jax.grfm.network import ResidualParams, as_effect, linear_effect
+from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
-from hector_jax.model.effect import HISTORY, last_command
+from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import cache_folder, workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
 from hector_jax.storage import (
+    as_json,
     load_weights,
     make_folder,
     save_tree,
     save_weights,
     versions,
-    write_file,
+    write_json,
 )
 from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning, aligned
@@ -85,7 +85,7 @@ def _plants(world: str, seeds: range) -> list[Imperfections]:
         raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
 
 
-def _as_json(flags: Any) -> dict[str, Any]:
+def _settings(flags: Any) -> dict[str, Any]:
     plain = lambda x: x if isinstance(x, bool | int | float | tuple) else str(x)  # noqa: E731
     return {name: plain(value) for name, value in dataclasses.asdict(flags).items()}
 
@@ -101,13 +101,14 @@ def _collect(args: Collect) -> None:
 @run.register
 def _train(args: Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
-    found = pipeline.train(config, load_robot(), args.data, args.out)
+    path = args.out or pipeline.net_path(args.data.parent, args.variant)
+    found = pipeline.train(config, load_robot(), args.data, path)
     for name, errors in found.errors.items():
         print(
             f"{name:7s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
             "   (held-out walks)"
         )
-    say(f"the net is in {args.out}")
+    say(f"the net is in {path}")
 
 
 @run.register
@@ -124,9 +125,8 @@ def _grfm(args: Grfm) -> None:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": linear_effect(net.linear)}
     effects["paper"] = as_effect(paper.params)
-    if isinstance(net.params, ResidualParams):
-        effects["residual"] = as_effect(net.params)
-        effects["gated"] = gated_effect(net.params.linear)
+    effects["residual"] = as_effect(net.params)
+    effects["gated"] = gated_effect(net.params.linear)
     say("predicting")
     found, drifts = {}, {}
     for world, walks in worlds.items():
@@ -184,11 +184,14 @@ def _curves(
         "measured": samples.label,
         **{names[n]: predict(effect, window) for n, effect in effects.items() if n in names},
     }
-    unknown = ((HISTORY - 1, 0), (0, 0), (0, 0))  # the first ticks have no full window
-    return {
-        name: jax.tree.map(lambda w: np.pad(w, unknown, constant_values=np.nan), wrench)
-        for name, wrench in curves.items()
-    }
+
+    def by_tick(values: Any) -> np.ndarray:
+        """NaN at ticks that are no samples: the first, unsolved ones, those after a fall."""
+        rows = np.full((one.fallen.shape[1], *values.shape[1:]), np.nan)
+        rows[samples.tick] = values
+        return rows
+
+    return {name: jax.tree.map(by_tick, wrench) for name, wrench in curves.items()}
 
 
 def _new_folder(args: Tune) -> Path:
@@ -211,19 +214,20 @@ def _tune(args: Tune) -> None:
     for name, least in (("seeds", 1), ("processes", 1), ("iterations", PAPER_ITERATIONS)):
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
-    config = TuneConfig(iterations=args.iterations)
+    config, variant = TuneConfig(iterations=args.iterations), args.variant
+    TrainConfig(variant)  # refuses an unknown one before a folder is made
     folder = _new_folder(args)
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, config, robot, args.data)
+        net = pipeline.ground(pool, config, robot, args.data, variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        resolved = {"flags": _as_json(args), "tune": dataclasses.asdict(config)}
-        write_file(folder / "config.json", _json_bytes(resolved))
-        write_file(folder / "versions.json", _json_bytes(environment()))
+        resolved = {"flags": _settings(args), "tune": dataclasses.asdict(config)}
+        write_json(folder / "config.json", resolved)
+        write_json(folder / "versions.json", environment())
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
             tunings = pipeline.tune_many(
                 pool,
@@ -262,7 +266,7 @@ def _tune(args: Tune) -> None:
     result = metrics.as_result(verdict)
     for name, found in metrics.as_result(_verdict(config.loss, [0], on_hfs), "hfs")["sets"].items():
         result["sets"][name] |= found
-    write_file(folder / "result.json", _json_bytes(result))
+    write_json(folder / "result.json", result)
     pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
     film: Picture | str = "left out (--no-video)"
     if args.video:
@@ -285,7 +289,7 @@ def _tune(args: Tune) -> None:
             config=resolved,
             environment=environment(),
             command=f"hector tune --traj {args.traj} --seeds {args.seeds} "
-            f"--iterations {args.iterations} --alpha {args.alpha}",
+            f"--iterations {args.iterations} --variant {variant} --alpha {args.alpha}",
         ),
     )
     print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")
@@ -370,14 +374,10 @@ def _search(args: Search) -> None:
             "versions": versions(),
         }
         save_weights(args.out / f"{name}.json", one.weights)
-        write_file(args.out / f"{name}-card.json", _json_bytes(card))
+        write_json(args.out / f"{name}-card.json", card)
         shown = "".join(f"{x / 1e6:9.3f}" for x in (at_start, one.loss, at_expert))
         print(f"{name:10s}{shown}{walks:8d}{one.walk:9d}")
     say(f"weights are in {args.out}")
-
-
-def _json_bytes(value: Any) -> bytes:
-    return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
 
 
 @run.register
@@ -396,7 +396,7 @@ def _evaluate(args: Evaluate) -> None:
         )
     verdict = _verdict(LossConfig(), seeds, walks)
     if args.json:
-        print(json.dumps(metrics.as_result(verdict, args.world), allow_nan=False))
+        print(as_json(metrics.as_result(verdict, args.world)))
     else:
         print_table(verdict, f"{args.traj}, {count} plants", args.world)
 
@@ -422,16 +422,12 @@ def _walk(args: Walk) -> None:
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     if args.out is not None:
-        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=_as_json(args))
+        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=_settings(args))
     if args.json:
         losses = {part: float(getattr(found, part)) for part in metrics.PARTS}
-        errors = {"rms_position": found.rms_position, "rms_euler": found.rms_euler}
-        errors = {  # a walk that falls at once has no errors
-            name: [x if np.isfinite(x) else None for x in values.tolist()]
-            for name, values in errors.items()
-        }
+        errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}
         told = {"seconds": upright, "fell": bool(found.fallen), **losses, **errors}
-        print(json.dumps(told, allow_nan=False))
+        print(as_json(told))  # a walk that falls at once has no errors
     else:
         print(
             f"{args.traj} in {args.world}, {args.weights} weights: "

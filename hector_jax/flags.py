@@ -21,7 +21,7 @@ class Train:
     """Train GRFM-Net on collected walks."""
 
     data: Path = Path("data/walks")  # folder of the walks
-    out: Path = Path("data/grfm.npz")  # the net
+    out: Path | None = None  # the net; by default beside the walks, grfm.npz or grfm-paper.npz
     variant: str = "residual"  # or paper
     epochs: int = 200
     seed: int = 0
@@ -44,6 +44,7 @@ class Tune:
     traj: str = "straight"  # straight, c or s
     seeds: int = 8  # stand-in plants in the verdict
     iterations: int = 100  # of the tuning, at most
+    variant: str = "residual"  # of the net, or paper
     alpha: str = "paper"  # loss weights: the paper's, or auto (gradient norms aligned)
     data: Path = Path("data")  # walks and net; made where missing
     runs: Path = Path("runs")  # results go to RUNS/TRAJ/TIME

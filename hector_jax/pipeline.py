@@ -4,7 +4,6 @@ Everything that is walked or tuned runs in worker processes, one core each, beca
 one long chain of small operations. A step that finds its result on disk takes it.
 """
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
 from dataclasses import asdict, dataclass
@@ -17,18 +16,19 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.console import Tell, bar
+from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
-from hector_jax.model.effect import last_command
+from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import Imperfections, hfs
-from hector_jax.storage import fingerprint, make_folder, read_card
+from hector_jax.storage import as_json, fingerprint, make_folder
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning import search as searching
@@ -61,9 +61,16 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         choose_engine(self.engine)
-        if self.walks < 3 or not self.seconds > 0.0:  # to learn from, to choose by, to judge by
+        if self.walks < 3:
             raise ValueError(
-                f"CollectConfig needs walks >= 3 and seconds > 0, got {self.walks}, {self.seconds}"
+                "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
+                f"by), got {self.walks}"
+            )
+        least = HISTORY * GaitConfig.tick
+        if not least <= self.seconds < np.inf:
+            raise ValueError(
+                f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
+                f"sample, got {self.seconds:g}"
             )
 
 
@@ -279,18 +286,27 @@ def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learne
     return Learned(params, linear, about["errors"], course)
 
 
+def net_path(data: Path, variant: str) -> Path:
+    """Where the net of a variant is kept: `grfm.npz`, and others than the default by their name."""
+    default = variant == TrainConfig().variant
+    return data / ("grfm.npz" if default else f"grfm-{variant}.npz")
+
+
 def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
-    """The net kept at `path`, of whatever variant, trained anew where it is stale or missing.
+    """The net kept at `path`, trained anew where it is stale or missing.
 
     Stale is a net of other walks or of another controller than those under `folder`.
 
     Raises:
-        ValueError: one line naming the file that is damaged or of another robot.
+        ValueError: one line naming the file that is damaged, of another robot or another variant.
     """
     made_of = dataset.walked_with(folder)
-    if not path.exists() or read_card(path)["about"].get("made_of") != made_of:
+    if not path.exists():
         return train(config, robot, folder, path)
-    params, _, card = network.load_net(path, robot)
+    _, card = network.read_net_card(path, config.variant)
+    if card["about"].get("made_of") != made_of:
+        return train(config, robot, folder, path)
+    params, _, card = network.load_net(path, robot, config.variant)
     about = card["about"]
     course = History(**{name: np.array(about["course"][name]) for name in History._fields})
     linear = network.fit_linear(samples(robot, folder).training)
@@ -306,20 +322,20 @@ def ground(
         pool: worker processes.
         config: the controller that has to have walked.
         robot: the body.
-        data: folder of `walks/` and `grfm.npz`, or `grfm-<variant>.npz`.
-        variant: a variant for comparison; None takes the net that tunings use.
+        data: folder of `walks/` and of the net, see `net_path`.
+        variant: of the net; None takes the default one.
 
     Raises:
-        ValueError: the walks are of another controller or robot, or a file is damaged.
+        ValueError: the walks are of another controller or robot, the net's file is of another
+            variant, or a file is damaged.
     """
+    train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
     walks = data / "walks"
     if not (walks / "card.json").exists():
         collect(pool, CollectConfig(), config, robot, walks)
     if dataset.walked_with(walks).get("controller") != repr(config.rollout.walk):
         raise ValueError(f"{walks}: walked by another controller; choose another folder")
-    train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
-    name = "grfm.npz" if variant is None else f"grfm-{variant}.npz"
-    return learned(train_config, robot, walks, data / name)
+    return learned(train_config, robot, walks, net_path(data, train_config.variant))
 
 
 _loss = jax.jit(lambda config, walk: total(config, losses(walk)), static_argnums=0)
@@ -467,11 +483,4 @@ def as_line(name: str, iteration: Iteration) -> str:
         "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
         "gradient_log": dict(zip(WEIGHT_NAMES, vector(gradient), strict=True)),
     }
-    return json.dumps(_finite(row), allow_nan=False) + "\n"
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN and no infinity: null in their place."""
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return as_json(row) + "\n"

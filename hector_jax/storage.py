@@ -205,6 +205,28 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
+def as_json(value: Any, indent: int | None = None) -> str:
+    """JSON of nested values; numbers that are not finite, which JSON does not have, are null."""
+    return json.dumps(_known(value), indent=indent, allow_nan=False)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write nested values as JSON, `as_json` with line breaks.
+
+    Raises:
+        OSError: where the file cannot be written.
+    """
+    write_file(path, (as_json(value, indent=2) + "\n").encode())
+
+
+def _known(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _known(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_known(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 def save_weights(path: Path, weights: Weights) -> None:
     """Write weights as JSON, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`.
 

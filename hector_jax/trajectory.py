@@ -56,6 +56,7 @@ class Trajectory(NamedTuple):
     feet: Float[Array, "*batch T 2 3"]  # foot points [m]
     joints: Float[Array, "*batch T 10"]  # [rad] hip yaw, roll, pitch, knee, ankle; left, right
     fallen: Bool[Array, "*batch T"]  # true from the sample of the fall on
+    legs_touch: Bool[Array, "*batch T"]  # one leg touched the other, which is no fall
     residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
 
 

@@ -63,6 +63,7 @@ def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, tur
         feet=feet,
         joints=np.concatenate([left_leg, right_leg], axis=1),
         fallen=fallen,
+        legs_touch=np.zeros(count, bool),
         residual=np.zeros(count),
     )
 
@@ -74,6 +75,7 @@ def pretend_score(loss, fallen=False):
         rms_euler=np.array([0.02, 0.03, 0.01]),
         rms_position=np.array([0.02, 0.01, 0.005]),
         fallen=np.array(fallen),
+        legs_touch=np.array(0.0),
         residual=np.array(1e-14),
     )
 

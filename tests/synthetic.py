@@ -74,5 +74,6 @@ def synthetic_walk(seed: int, ticks: int = 400, noise: float = 1.0) -> Trajector
         feet=rng.normal(size=(samples, 2, 3)),
         joints=rng.normal(size=(samples, 10)),
         fallen=np.zeros(samples, bool),
+        legs_touch=np.zeros(samples, bool),
         residual=np.zeros(samples),
     )

@@ -8,11 +8,13 @@ import sys
 import jax
 import numpy as np
 import pytest
+from synthetic import synthetic_walk
 
 from hector_jax import commands
 from hector_jax.cli import main
 from hector_jax.control.weights import expert
-from hector_jax.grfm.dataset import load_walks
+from hector_jax.grfm.dataset import at_interval, load_walks
+from hector_jax.model.effect import last_command
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import MODEL_PATH, load_robot
 from hector_jax.storage import load_weights, save_weights
@@ -117,13 +119,45 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["kept"]
 
 
-def test_collection_refuses_a_folder_it_cannot_write_and_an_unknown_engine(
-    monkeypatch, capsys, tmp_path
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        (("--engine", "warp"), "engine"),
+        (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
+        (("--seconds", "nan"), "at least 0.03 s"),
+        (("--walks", "2"), "at least 3"),
+    ],
+)
+def test_collection_refuses_what_it_cannot_walk_at_once(
+    monkeypatch, capsys, tmp_path, wrong, expected
 ):
+    monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
+    assert expected in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "walks", *wrong)
+    assert not (tmp_path / "walks").exists()
+
+
+def test_collection_refuses_a_folder_it_cannot_write(monkeypatch, capsys, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
     assert "file" in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "file" / "walks")
-    assert "engine" in refused(monkeypatch, capsys, "collect", "--engine", "warp")
+
+
+def test_curves_leave_a_gap_where_a_tick_is_no_sample():
+    whole = at_interval(synthetic_walk(0, 30), 0.01)
+    one = jax.tree.map(lambda x: np.asarray(x)[None], whole)
+    unsolved = np.zeros((1, 30))
+    unsolved[0, 11] = 1.0
+    curves = commands._curves(load_robot(), one, {"residual": last_command})
+    gapped = commands._curves(
+        load_robot(), one._replace(residual=unsolved), {"residual": last_command}
+    )
+    assert curves.keys() == gapped.keys() == {"commanded", "measured", "predicted"}
+    for name, wrench in curves.items():
+        assert np.isnan(wrench.force[:2]).all()
+        assert np.isnan(gapped[name].force[11]).all()
+        others = np.arange(30) != 11
+        np.testing.assert_array_equal(gapped[name].force[others], wrench.force[others])
+        assert np.isfinite(wrench.force[2:]).all()
 
 
 @pytest.mark.slow
@@ -246,9 +280,16 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrong", [("--processes", "0"), ("--iterations", "3"), ("--seeds", "0"), ("--alpha", "both")]
+    "wrong",
+    [
+        ("--processes", "0"),
+        ("--iterations", "3"),
+        ("--seeds", "0"),
+        ("--alpha", "both"),
+        ("--variant", "papier"),
+    ],
 )
 def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
     line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)
-    assert wrong[0] in line
+    assert wrong[0].lstrip("-") in line
     assert not (tmp_path / "run").exists()

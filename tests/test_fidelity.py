@@ -1,5 +1,7 @@
 """Errors of a phi by phase, and where a rigid body goes under recorded commands."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -107,3 +109,22 @@ def test_the_report_holds_every_world_and_phi(tmp_path, robot, samples, walks):
         assert len({row.count("|") for row in rows}) <= 1, block
     assert (tmp_path / "result.json").exists()
     assert jnp.isfinite(found["open_loop"]["raw"]["0.4 s"]["euler"])
+
+
+def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path, robot, samples, walks):
+    """No sample in the last phase, no walk that stayed up: no warning, no NaN in a file."""
+    early = samples.window.since_switch < 0.1
+    some = jax.tree.map(lambda x: x[early], samples)
+    fell = walks._replace(fallen=np.ones_like(walks.fallen))
+    effects = {"raw": last_command}
+    found = fidelity.as_result(
+        report(effects, some),
+        fidelity.by_phase(effects, some),
+        fidelity.drifts(robot, effects, fell, np.zeros(1, int)),
+    )
+    text = write_fidelity(tmp_path, {"hfs": found}, []).read_text()
+    assert "| last 50 ms, stance, F [N^2] | - |" in text
+    assert "nan" not in text
+    told = json.loads((tmp_path / "result.json").read_text())["hfs"]
+    assert told["phases"]["raw"]["last 50 ms"] == {"stance": [None] * 6, "swing": [None] * 6}
+    assert told["open_loop"]["measured"]["0.4 s"] == {"position": None, "euler": None}

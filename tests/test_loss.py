@@ -28,6 +28,7 @@ def walk(count=6, period=0.01):
         feet=np.zeros((count, 2, 3)),
         joints=np.zeros((count, 10)),
         fallen=np.zeros(count, bool),
+        legs_touch=np.zeros(count, bool),
         residual=np.zeros(count),
     )
 

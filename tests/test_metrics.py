@@ -96,6 +96,15 @@ def test_the_result_has_the_promised_keys_and_is_json():
     assert result["sets"]["with"]["standin"]["change"]["nominal"]["high"] < 0
 
 
+def test_legs_that_touch_are_counted_up_to_a_fall():
+    touching = np.arange(400) >= 150
+    walk = pretend_walk(fall_at=2.0)._replace(legs_touch=touching)
+    one = metrics.score(LossConfig(), walk)
+    assert one.legs_touch == pytest.approx(0.5)
+    verdict = metrics.judge(LossConfig(), [0, 1], {"with": [one, one]})
+    assert metrics.as_result(verdict)["sets"]["with"]["standin"]["legs_touch"] == pytest.approx(1.0)
+
+
 def test_the_result_of_a_set_that_falls_at_once_is_still_json():
     walk = metrics.score(LossConfig(), pretend_walk(fall_at=-1.0))
     verdict = metrics.judge(LossConfig(), [0, 1], {"nominal": [walk] * 2, "with": [walk] * 2})

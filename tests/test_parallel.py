@@ -1,17 +1,20 @@
 """The closed loop in MJX, against MuJoCo C."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
+from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.grfm.dataset import at_interval
-from hector_jax.robot import load_robot
+from hector_jax.robot import MODEL_PATH, load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.changes import Change
-from hector_jax.sim.parallel import batched_model, mjx, mjx_contacts, walk_batch
+from hector_jax.sim.parallel import _in_floor, _places, batched_model, mjx, mjx_contacts, walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import NO_PUSH, Push, build_world, build_worlds, hfs, hfs_drawn, ideal
@@ -132,6 +135,21 @@ def test_jobs_that_make_no_batch_are_refused_at_once(jobs, message):
         walk_batch(CONFIG, ROBOT, jobs)
 
 
+def test_a_part_whose_height_over_the_floor_is_unknown_here_is_refused_by_name(tmp_path):
+    path = tmp_path / "hector.xml"
+    round_trunk = MODEL_PATH.read_text().replace('"trunk" type="box"', '"trunk" type="cylinder"')
+    path.write_text(round_trunk)
+    with pytest.raises(ValueError, match="geom trunk .* is a CYLINDER; .* BOX or CAPSULE"):
+        walk_batch(CONFIG, ROBOT, [job(expert())], path=path)
+
+
+def test_a_robot_of_feet_alone_has_nothing_that_may_not_touch_the_floor():
+    world = build_world(hfs())
+    nothing_else = replace(_places(world), boxes=(), capsules=())
+    model, _ = batched_model([world])
+    assert not _in_floor(nothing_else, model, mjx.make_data(model))
+
+
 def test_no_jobs_are_no_walks():
     assert list(walk_batch(CONFIG, ROBOT, [])) == []
 
@@ -178,6 +196,19 @@ def test_physics_in_32_bits_walks_as_in_64(three):
         assert np.sqrt(np.mean((mine.effect.force - double.effect.force) ** 2)) < 10.0
         assert mine.state.position.dtype == double.state.position.dtype
         assert mine.residual.max() < 1e-6
+
+
+@pytest.mark.slow
+def test_both_engines_tell_when_the_legs_touch():
+    """A gait so narrow that they do, and nobody falls."""
+    narrow = WalkConfig(footstep=FootstepConfig(width=0.01))
+    asked = job(expert(), "straight", seconds=0.4)
+    mine = next(walk_batch(narrow, ROBOT, [asked]))
+    alone = at_interval(walk(narrow, ROBOT, *asked), 0.01)
+    assert not alone.fallen.any()
+    assert alone.legs_touch.any()
+    assert not alone.legs_touch.all()
+    assert (mine.legs_touch == alone.legs_touch).mean() > 0.9
 
 
 @pytest.mark.slow

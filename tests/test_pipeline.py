@@ -13,7 +13,7 @@ from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation.metrics import score
 from hector_jax.grfm.dataset import collect, draw_jobs
-from hector_jax.grfm.network import NetParams, ResidualParams
+from hector_jax.grfm.network import NetParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot import load_robot
 from hector_jax.sim.walk import walk
@@ -67,14 +67,30 @@ def test_a_net_is_trained_once_and_again_for_other_walks(tmp_path, robot):
     assert read_card(path)["about"]["made_of"] != card["made_of"]
 
 
-def test_the_variant_that_was_trained_is_the_one_that_is_used(tmp_path, robot):
+def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):
     gather(tmp_path / "walks", robot)
-    paper = TrainConfig("paper", epochs=1)
-    pipeline.train(paper, robot, tmp_path / "walks", tmp_path / "grfm.npz")
-    found = pipeline.learned(QUICK, robot, tmp_path / "walks", tmp_path / "grfm.npz")
+    path = tmp_path / "grfm.npz"
+    pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    written = path.read_bytes()
+    gather(tmp_path / "others", robot, seed=1)
+    pool = ThreadPoolExecutor(1)
+    expected = "grfm.npz: holds grfm-paper, expected grfm-residual"
+    with pytest.raises(ValueError, match=expected):
+        pipeline.ground(pool, TuneConfig(), robot, tmp_path)
+    with pytest.raises(ValueError, match=expected):  # though it is stale too
+        pipeline.learned(QUICK, robot, tmp_path / "others", path)
+    assert path.read_bytes() == written
+
+
+def test_a_net_is_kept_and_found_by_its_variant(tmp_path, robot, monkeypatch):
+    assert pipeline.net_path(tmp_path, "residual") == tmp_path / "grfm.npz"
+    path = pipeline.net_path(tmp_path, "paper")
+    assert path == tmp_path / "grfm-paper.npz"
+    gather(tmp_path / "walks", robot)
+    pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    monkeypatch.setattr(pipeline, "train", None)  # nothing is to be trained again
+    found = pipeline.ground(ThreadPoolExecutor(1), TuneConfig(), robot, tmp_path, "paper")
     assert isinstance(found.params, NetParams)
-    other = pipeline.learned(QUICK, robot, tmp_path / "walks", tmp_path / "other.npz")
-    assert isinstance(other.params, ResidualParams)
 
 
 def test_walks_of_another_controller_are_refused(tmp_path, robot):

@@ -15,6 +15,7 @@ from oracles import (
     walking_qp,
 )
 
+from hector_jax.control import qp as qp_door
 from hector_jax.control.qp import QP, QpConfig, Status, check_solved, solve_qp
 
 WALKING = 500
@@ -216,6 +217,69 @@ def test_forward_and_reverse_are_one_derivative(walking):
             reverse = sum(float(jnp.vdot(b, t)) for b, t in zip(back, tangent, strict=True))
             scale = np.linalg.norm(moved) * np.linalg.norm(cotangent)
             assert abs(float(moved @ cotangent) - reverse) <= 1e-9 * scale
+
+
+FLOORS = qp_door._floors(QpConfig(), jnp.dtype(np.float64))
+
+
+def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
+    """Rows hold x far from where a large q would have it: one attempt ends off, the next near."""
+    made = [general_qp(seed, 5, 12)[0] for seed in (16, 52, 104)]
+
+    def evidence(qp):
+        normal, wanted = qp_door._normalise(qp), jnp.ones((), bool)
+        found = [
+            method(QpConfig(), FLOORS, normal, wanted)[0]
+            for method in (qp_door._interior_point, qp_door._approach)
+        ]
+        return [jnp.max(qp_door._evidence(normal, point)) for point in found]
+
+    far = stack([qp._replace(q=1e6 * qp.q) for qp in made])
+    once, again = jax.jit(partial(jax.lax.map, evidence))(far)
+    assert (np.asarray(once) > 1e-2).all()
+    assert (np.asarray(again) <= FLOORS.target).all()
+
+
+@pytest.fixture
+def as_on_a_gpu(monkeypatch):
+    """Programs traced here take the branch of a GPU, its kernel interpreted."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
+    monkeypatch.setattr(qp_door.pivot, "guess", partial(qp_door.pivot.guess, interpret=True))
+
+
+def first_guess(qp):
+    """The normalised problem, where its active set starts from, and with which rows."""
+    qp = jax.tree.map(jnp.asarray, qp)
+    normal = qp_door._normalise(qp)
+    loose = qp_door._Point(-jnp.linalg.solve(normal.P, normal.q), jnp.zeros(normal.side.shape))
+    return normal, *qp_door._first_guess(normal, loose)
+
+
+def test_on_a_gpu_the_kernels_guess_is_proved_at_once(walking, as_on_a_gpu):
+    @jax.jit
+    @jax.vmap
+    def tries(qp):
+        normal, start, active = first_guess(qp)
+        wanted = jnp.ones((), bool)
+        _, proof, count = qp_door._active_set(FLOORS, normal, start, active, wanted, 15)
+        return jnp.max(proof), count
+
+    proof, count = tries(stack(walking[:8]))
+    assert (proof <= FLOORS.target).all()
+    assert (count <= 2).all()
+
+
+def test_on_a_gpu_a_guess_that_did_not_settle_is_not_taken(walking, as_on_a_gpu, monkeypatch):
+    def lost(P, q, A, lower, upper):
+        side = jnp.ones(len(lower), jnp.int32)
+        return qp_door.pivot.Guess(jnp.full_like(q, jnp.nan), lower, side, jnp.int32(0))
+
+    monkeypatch.setattr(qp_door.pivot, "guess", lost)
+    found = first_guess(walking[3])
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    for one, other in zip(*map(jax.tree.leaves, (found, first_guess(walking[3]))), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_bounds_move_the_solution():

@@ -73,6 +73,17 @@ def test_a_comparison_that_falls_make_void_is_shown_with_a_mark():
     assert "does not count" in text
 
 
+def test_legs_that_touch_are_told_where_they_do(tmp_path):
+    verdict = pretend_verdict()
+    assert "touched" not in _printed(verdict)
+    scores = dict(verdict.scores)
+    scores["with"] = scores["with"]._replace(legs_touch=np.array([0.03] + [0.0] * 7))
+    verdict = verdict._replace(scores=scores)
+    line = "The legs touched each other, which is no fall: with 0.030 s in all."
+    assert line in _printed(verdict)
+    assert line in write_report(tmp_path, _report(verdict)).read_text()
+
+
 def test_the_table_goes_without_baselines_that_were_not_walked():
     whole = pretend_verdict(2)
     text = _printed(Verdict(whole.seeds, {"mine.json": whole.scores["with"]}, LossConfig()))

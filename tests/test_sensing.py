@@ -49,19 +49,30 @@ def stand(plant, height=0.0, steps=1500):
     return world, data, row
 
 
+def momentum(world, data):
+    """Of all links together, at the start of the last step [kg m/s]."""
+    mujoco.mj_subtreeVel(world.model, data)
+    return data.subtree_linvel[0] * world.model.body_subtreemass[0]
+
+
 @pytest.mark.parametrize("plant", [ideal(), hfs()], ids=["ideal", "hfs"])
 def test_at_rest_the_ground_carries_the_weight_inside_the_feet(plant):
     world, data, row = stand(plant)
     _, wrench, _, touches = sense(world, data, row)
     force, moment = np.asarray(wrench.force), np.asarray(wrench.moment)
     weight = world.model.body_mass.sum() * 9.81
+    before = momentum(world, data)
+    mujoco.mj_step(world.model, data)
+    wanted = (momentum(world, data) - before) / 0.001 + [0.0, 0.0, weight]
+    assert np.linalg.norm(force.sum(axis=0) - wanted) <= 0.01 * weight  # m (a + g) of all links
     assert force[:, 2].sum() == pytest.approx(weight, rel=0.005)
     assert np.abs(force[:, :2].sum(axis=0)).max() < 0.02 * weight  # the loose robot still sways
     ahead, aside = -moment[:, 1] / force[:, 2], moment[:, 0] / force[:, 2]
     assert (-ROBOT.heel <= ahead).all()
     assert (ahead <= ROBOT.toe).all()
     assert np.abs(aside).max() < 1e-3
-    assert not touches
+    assert not touches.floor
+    assert not touches.legs
 
 
 def test_in_flight_there_is_no_wrench():
@@ -141,7 +152,22 @@ def test_a_knee_on_the_floor_is_no_foot():
     data = mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 0.2)
     mujoco.mj_forward(world.model, data)
-    assert sense(world, data, flat_reading(world, data))[3]
+    touches = sense(world, data, flat_reading(world, data))[3]
+    assert touches.floor
+    assert not touches.legs
+
+
+def test_legs_that_cross_touch_each_other_and_not_the_floor():
+    world = build_world(ideal())
+    data = mujoco.MjData(world.model)
+    for inwards in (0.0, 0.3):
+        roll = inwards * np.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        data.qpos[:] = standing_qpos(world, ROBOT.standing_joints + roll, 1.0)
+        mujoco.mj_forward(world.model, data)
+        _, wrench, _, touches = sense(world, data, flat_reading(world, data))
+        assert touches.legs == (inwards > 0.0)
+        assert not touches.floor
+        assert not np.any(wrench.force)
 
 
 def test_a_known_state_has_no_errors():

@@ -147,6 +147,14 @@ def test_a_robot_is_known_by_its_numbers():
     assert storage.fingerprint(ROBOT) != storage.fingerprint(other)
 
 
+def test_json_has_null_for_what_is_no_number(tmp_path):
+    odd = {"a": (1.0, np.nan), "b": [{"c": -np.inf}], "d": "nan", "e": np.float64("nan")}
+    storage.write_json(tmp_path / "odd.json", odd)
+    told = json.loads((tmp_path / "odd.json").read_text())
+    assert told == {"a": [1.0, None], "b": [{"c": None}], "d": "nan", "e": None}
+    assert "\n" not in storage.as_json(odd)
+
+
 def test_weights_come_back_as_they_were_written(tmp_path):
     path = tmp_path / "weights.json"
     for weights in (nominal(), expert()):

@@ -33,11 +33,16 @@ FIRST, APART = 5, 35  # ticks: of the first prediction in a walk, and from one t
 
 
 class Drift(NamedTuple):
-    """RMS error of open-loop predictions by time ahead."""
+    """RMS error of open-loop predictions by time ahead; NaN where no walk stayed up so long."""
 
     time: Float[np.ndarray, " ticks"]  # [s]
     position: Float[np.ndarray, " ticks"]  # [m], distance of the centres of mass
     euler: Float[np.ndarray, " ticks"]  # [rad], all three angles
+
+
+def _mean(rows: np.ndarray) -> np.ndarray:
+    """Mean over the rows; NaN, without a warning, where there are none."""
+    return rows.mean(axis=0) if len(rows) else np.full(rows.shape[1:], np.nan)
 
 
 def by_phase(
@@ -46,7 +51,8 @@ def by_phase(
     """Mean square errors by phi, phase of the step and planned contact, per axis.
 
     Returns:
-        `[phi][phase]["stance" | "swing"]`: F_x F_y F_z [N^2], M_x M_y M_z [(N m)^2].
+        `[phi][phase]["stance" | "swing"]`: F_x F_y F_z [N^2], M_x M_y M_z [(N m)^2]; NaN where no
+        sample is in the phase.
     """
     since, stands = dataset.window.since_switch, np.asarray(dataset.window.contact)
     told: dict[str, dict[str, dict[str, list[float]]]] = {}
@@ -60,8 +66,8 @@ def by_phase(
         for phase, (low, high) in PHASES.items():
             inside = ((since > low - 1e-6) & (since < high - 1e-6))[:, None]
             told[name][phase] = {
-                "stance": wrong[inside & stands].mean(axis=0).tolist(),
-                "swing": wrong[inside & ~stands].mean(axis=0).tolist(),
+                "stance": _mean(wrong[inside & stands]).tolist(),
+                "swing": _mean(wrong[inside & ~stands]).tolist(),
             }
     return told
 
@@ -141,7 +147,7 @@ def drift(
         effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
     )
     whole = np.stack([~fallen[:, s : s + ticks].any(axis=1) for s in starts], axis=1)
-    rms = lambda square: np.sqrt(np.asarray(square)[whole].mean(axis=0))  # noqa: E731
+    rms = lambda square: np.sqrt(_mean(np.asarray(square)[whole]))  # noqa: E731
     return Drift(config.tick * np.arange(1, ticks + 1), rms(position), rms(euler))
 
 

@@ -41,6 +41,7 @@ class Score(NamedTuple):
     rms_euler: Float[np.ndarray, "*seeds 3"]  # roll, pitch, yaw [rad], up to a fall
     rms_position: Float[np.ndarray, "*seeds 3"]  # x, y, z [m], up to a fall
     fallen: Bool[np.ndarray, "*seeds"]
+    legs_touch: Float[np.ndarray, "*seeds"]  # [s] one leg touches the other, up to a fall
     residual: Float[np.ndarray, "*seeds"]  # worst relative KKT residual of a plan
 
 
@@ -87,6 +88,7 @@ def score(config: LossConfig, walk: Trajectory) -> Score:
         rms_euler=_rms(np.asarray(walk.state.euler) - walk.reference.euler, fallen),
         rms_position=_rms(np.asarray(walk.state.position) - walk.reference.position, fallen),
         fallen=np.asarray(fallen.any()),
+        legs_touch=np.asarray(float(walk.period) * np.sum(np.asarray(walk.legs_touch) & ~fallen)),
         residual=np.asarray(walk.residual, float).max(),
     )
 
@@ -161,9 +163,10 @@ def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
 def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
     """The verdict as JSON values: the content of result.json.
 
-    `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls`, `.seeds`, `.L_ctrl_switching` and
-    `.rms`, and `sets.<name>.<world>.change.<baseline>.{median,low,high,wins,counts}` in %, of L,
-    with those of the other parts under `.parts`.
+    `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls`, `.seeds`, `.legs_touch` [s, all
+    walks together], `.L_ctrl_switching` and `.rms`, and
+    `sets.<name>.<world>.change.<baseline>.{median,low,high,wins,counts}` in %, of L, with those of
+    the other parts under `.parts`.
     """
     return {
         "alpha": {"euler": verdict.alpha.euler, "position": verdict.alpha.position},
@@ -179,6 +182,7 @@ def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
     one = verdict.scores[name]
     found["falls"] = falls(verdict, name)
     found["seeds"] = verdict.seeds.tolist()
+    found["legs_touch"] = float(one.legs_touch.sum())
     found["residual"] = float(one.residual.max())
     found["L_ctrl_switching"] = float(one.switching.mean())
     found["rms"] = {

@@ -34,7 +34,7 @@ from hector_jax.evaluation.metrics import (
     mean,
     rms,
 )
-from hector_jax.storage import versions, write_file
+from hector_jax.storage import versions, write_file, write_json
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig, Losses
 
@@ -171,6 +171,10 @@ def _legend(verdict: Verdict) -> list[str]:
     ]
     if _void(verdict):
         lines.append(f"{_VOID} does not count: one of the two falls more often than the other.")
+    touched = {name: float(score.legs_touch.sum()) for name, score in verdict.scores.items()}
+    told = [f"{name} {seconds:.3f} s" for name, seconds in touched.items() if seconds > 0.0]
+    if told:
+        lines.append(f"The legs touched each other, which is no fall: {', '.join(told)} in all.")
     return lines
 
 
@@ -297,19 +301,24 @@ def write_fidelity(
     sections += [f"![{p.caption}]({p.file})\n\n*{p.caption}*" for p in pictures]
     path = folder / "report.md"
     write_file(path, ("\n\n".join(sections) + "\n").encode())
-    write_file(folder / "result.json", (json.dumps(worlds, indent=2) + "\n").encode())
+    write_json(folder / "result.json", worlds)
     return path
+
+
+def _number(x: float, form: str = ".3g") -> str:
+    """A number of a table; none where nothing was there to measure."""
+    return format(x, form) if math.isfinite(x) else "-"
 
 
 def _wrench_errors(errors: Mapping[str, Mapping[str, Any]]) -> str:
     """Mean square errors per axis; a column for each phi."""
     rows = []
     for kind, unit in (("force", "N^2"), ("moment", "(N m)^2")):
-        rows.append([f"{kind}, all [{unit}]", *(f"{e[kind]:.3g}" for e in errors.values())])
+        rows.append([f"{kind}, all [{unit}]", *(_number(e[kind]) for e in errors.values())])
     for contact in ("stance", "swing"):
         for i, axis in enumerate(_AXES):
             unit = "N^2" if axis[0] == "F" else "(N m)^2"
-            cells = (f"{e[contact][i]:.3g}" for e in errors.values())
+            cells = (_number(e[contact][i]) for e in errors.values())
             rows.append([f"{axis}, {contact} [{unit}]", *cells])
     return _table(("mean square error", *errors), rows)
 
@@ -320,7 +329,7 @@ def _phase_errors(phases: Mapping[str, Mapping[str, Mapping[str, Sequence[float]
     for phase in first:
         for contact in ("stance", "swing"):
             for part, unit, axes in (("F", "N^2", slice(3)), ("M", "(N m)^2", slice(3, 6))):
-                cells = (f"{np.mean(found[phase][contact][axes]):.3g}" for found in phases.values())
+                cells = (_number(np.mean(found[phase][contact][axes])) for found in phases.values())
                 rows.append([f"{phase}, {contact}, {part} [{unit}]", *cells])
     return _table(("mean over the axes", *phases), rows)
 
@@ -330,7 +339,7 @@ def _drift_table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
     rows = []
     for horizon in horizons:
         for part, unit, scale in (("position", "cm", 100.0), ("euler", "deg", 180.0 / np.pi)):
-            cells = (f"{scale * one[horizon][part]:.2f}" for one in found.values())
+            cells = (_number(scale * one[horizon][part], ".2f") for one in found.values())
             rows.append([f"{part} after {horizon} [{unit}]", *cells])
     return _table(("", *found), rows)
 

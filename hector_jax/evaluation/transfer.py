@@ -209,12 +209,3 @@ def as_result(row: Row | None) -> dict[str, Any] | None:
     if row is None:
         return None
     return {k: v._asdict() if isinstance(v, Interval) else v for k, v in row._asdict().items()}
-
-
-def known(value: Any) -> Any:
-    """Nested dictionaries and sequences with None for numbers that are not finite, for JSON."""
-    if isinstance(value, dict):
-        return {key: known(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [known(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -179,6 +179,7 @@ def at_interval(walk: Trajectory, interval: float) -> Trajectory:
         feet=last(walk.feet),
         joints=last(walk.joints),
         fallen=cut(walk.fallen).any(axis=1),
+        legs_touch=cut(walk.legs_touch).any(axis=1),
         residual=cut(walk.residual).max(axis=1),
     )
 
@@ -338,6 +339,7 @@ def _like() -> Walks:
         feet=zeros(0, 0, 2, 3),
         joints=zeros(0, 0, 10),
         fallen=zeros(0, 0),
+        legs_touch=zeros(0, 0),
         residual=zeros(0, 0),
     )
     return Walks(job, trajectory)

@@ -330,6 +330,19 @@ def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any])
     save_tree(path, params, kind=f"grfm-{variant}", robot=robot, about={**facts, **about})
 
 
+def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str, Any]]:
+    """Variant and card of the GRFM-Net in a file; see `load_net`.
+
+    Raises:
+        ValueError: one line naming the file: damaged, no net, or a net of another variant.
+    """
+    card = read_card(path)
+    kinds = {f"grfm-{name}": name for name in ([variant] if variant else VARIANTS)}
+    if card["kind"] not in kinds:
+        raise ValueError(f"{path}: holds {card['kind']}, expected {' or '.join(kinds)}")
+    return kinds[card["kind"]], card
+
+
 def load_net(
     path: Path, robot: Robot, variant: str | None = None
 ) -> tuple[Params, str, dict[str, Any]]:
@@ -344,15 +357,12 @@ def load_net(
         ValueError: one line naming the file: damaged, of another robot, kind, layout or variant, or
             with a number that is not finite.
     """
-    card = read_card(path)
-    kinds = {f"grfm-{name}": name for name in ([variant] if variant else VARIANTS)}
-    if card["kind"] not in kinds:
-        raise ValueError(f"{path}: holds {card['kind']}, expected one of: {', '.join(kinds)}")
-    like = _like(kinds[card["kind"]], tuple(card["about"]["hidden"]))
+    found, card = read_net_card(path, variant)
+    like = _like(found, tuple(card["about"]["hidden"]))
     params, card = load_tree(path, like, kind=card["kind"], robot=robot)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise ValueError(f"{path}: a parameter of the net is not finite")
-    return params, kinds[card["kind"]], card
+    return params, found, card
 
 
 def _like(variant: str, hidden: tuple[int, ...]) -> Params:

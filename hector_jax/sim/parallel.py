@@ -33,7 +33,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators
-from hector_jax.sim.sensing import Contacts
+from hector_jax.sim.sensing import Contacts, Touches
 from hector_jax.sim.walk import (
     Job,
     Observed,
@@ -130,6 +130,7 @@ class _Carry(NamedTuple):
     physics: _Physics
     fallen: Bool[Array, ""]
     effect: Wrench  # summed over the sample so far
+    legs: Bool[Array, ""]  # touched in the sample so far
     seen: Observed  # the last sample
 
 
@@ -164,7 +165,14 @@ def _falling(world: World) -> list[int]:
 def _places(world: World) -> _Places:
     kinds = {mujoco.mjtGeom.mjGEOM_BOX: [], mujoco.mjtGeom.mjGEOM_CAPSULE: []}
     for geom in _falling(world):
-        kinds[mujoco.mjtGeom(world.model.geom_type[geom])].append(geom)
+        kind = mujoco.mjtGeom(world.model.geom_type[geom])
+        if kind not in kinds:
+            name = world.model.geom(geom).name or f"number {geom}"
+            raise ValueError(
+                f"geom {name} may touch the floor and is a {kind.name.removeprefix('mjGEOM_')}; "
+                "in MJX all but feet are expected to be BOX or CAPSULE"
+            )
+        kinds[kind].append(geom)
     boxes, capsules = (tuple(geoms) for geoms in kinds.values())
     return _Places(
         coordinates=tuple(sensing.coordinates(world).tolist()),
@@ -193,7 +201,7 @@ def mjx_contacts(data: mjx.Data) -> Contacts:
 
 def _in_floor(places: _Places, model: mjx.Model, data: mjx.Data) -> Bool[Array, ""]:
     """Whether a part that may not touch the floor does; poses are those of the step's start."""
-    boxes, capsules = np.array(places.boxes), np.array(places.capsules)
+    boxes, capsules = np.array(places.boxes, int), np.array(places.capsules, int)
     up = data.geom_xmat[:, 2]  # of each geom's axes, their z in the world
     of_box = jnp.abs(up[boxes] * model.geom_size[boxes]).sum(axis=1)
     radius, half = model.geom_size[capsules, 0], model.geom_size[capsules, 1]
@@ -276,7 +284,7 @@ def _walk_one(
         contacts = jax.tree.map(wide, mjx_contacts(data))
         effect, touches = feel(robot, before, contacts, floor, foot_of_geom)
         state = sensing.base_state(robot, read(physics), yaw)
-        fallen = carry.fallen | has_fallen(state) | touches | _in_floor(places, model, data)
+        fallen = carry.fallen | has_fallen(state) | touches.floor | _in_floor(places, model, data)
         held = _where(fallen, (carry.physics, carry.motors, carry.yaw), (physics, motors, yaw))
         return carry._replace(
             physics=held[0],
@@ -284,10 +292,12 @@ def _walk_one(
             yaw=held[2],
             fallen=fallen,
             effect=jax.tree.map(jnp.add, carry.effect, effect),
+            legs=carry.legs | touches.legs,
         ), None
 
     def sample(carry: _Carry, when: tuple[Array, Array]) -> tuple[_Carry, Observed]:
-        carry, _ = jax.lax.scan(millisecond, carry._replace(effect=zero_wrench()), when)
+        carry = carry._replace(effect=zero_wrench(), legs=never)
+        carry, _ = jax.lax.scan(millisecond, carry, when)
         seen = observe(
             config,
             robot,
@@ -297,7 +307,7 @@ def _walk_one(
             carry.yaw,
             read(carry.physics),
             jax.tree.map(lambda w: w / each, carry.effect),
-            carry.fallen,
+            Touches(carry.fallen, carry.legs),
         )
         carry = carry._replace(seen=_where(carry.fallen, carry.seen, seen))
         return carry, carry.seen._replace(fallen=carry.fallen)
@@ -328,10 +338,14 @@ def _walk_one(
         lambda: decide(config, robot, weights, command, anchor, now, *known, slots=2)[1]
     )
     plan = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-    seen = observe(config, robot, command, anchor, 1.0 * now, yaw, start, zero_wrench(), never)
+    seen = observe(
+        config, robot, command, anchor, 1.0 * now, yaw, start, zero_wrench(), Touches(never, never)
+    )
     if single:
         physics = _single(physics)
-    carry = _Carry(memory, plan, init_actuators(), anchor, yaw, physics, never, zero_wrench(), seen)
+    carry = _Carry(
+        memory, plan, init_actuators(), anchor, yaw, physics, never, zero_wrench(), never, seen
+    )
     _, (plans, seen) = jax.lax.scan(one_tick, carry, jnp.arange(begin, last_start + ticks))
 
     # Each walk's own part, from its t = 0 on.
@@ -383,7 +397,7 @@ def walk_batch(
     Raises:
         ValueError: the jobs differ in length, in the pieces of their commands, in the number of
             their pushes or in their joints, have errors of the estimator or changes, or a number
-            of one is out of its range.
+            of one is out of its range; or a geom that may touch the floor has a shape unknown here.
     """
     if chunk is None:
         chunk = CPU_CHUNK if jax.default_backend() == "cpu" else DEVICE_CHUNK
@@ -405,6 +419,7 @@ def walk_batch(
         raise ValueError(f"MJX walks plants that do not change: jobs {changing} have changes")
     ticks = [walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
     worlds = build_worlds([job.imperfections for job in jobs], path)
+    places = _places(worlds[0])
     model, varied = batched_model(worlds, single)
     qpos = jnp.asarray(standing_qpos(worlds[0], robot.standing_joints, float(robot.trunk_height)))
     asked = _Asked(
@@ -416,9 +431,7 @@ def walk_batch(
         model=varied,
     )
     last_start = int(asked.start_tick.max())
-    walk = partial(
-        _walk_all, config, _places(worlds[0]), last_start, ticks, fine, single, robot, model, qpos
-    )
+    walk = partial(_walk_all, config, places, last_start, ticks, fine, single, robot, model, qpos)
     size = ceil(len(jobs) / ceil(len(jobs) / chunk))  # chunks of one size, the last one filled up
 
     def walks() -> Iterator[Trajectory]:

@@ -38,6 +38,13 @@ class Reading(NamedTuple):
     slack: Float[Array, "*batch 10"]  # [rad] from motor to link; zero without backlash
 
 
+class Touches(NamedTuple):
+    """What touches what; feet on the floor apart."""
+
+    floor: Bool[Array, "*batch"]  # the floor is touched by anything else
+    legs: Bool[Array, "*batch"]  # one leg touches the other
+
+
 class Contacts(NamedTuple):
     """Contact points of one step as MuJoCo has them; rows without a contact have geoms -1."""
 
@@ -84,14 +91,17 @@ def foot_points(robot: Robot, reading: Reading) -> Float[Array, "2 3"]:
 
 def foot_contacts(
     contacts: Contacts, floor: Int[Array, ""], foot_of_geom: Int[Array, " ngeom"]
-) -> tuple[Int[Array, " n"], Bool[Array, ""]]:
-    """Foot of each contact with the floor (-1: none); whether anything else touches the floor."""
+) -> tuple[Int[Array, " n"], Touches]:
+    """Foot of each contact with the floor (-1: none), and what else touches.
+
+    Whatever touches and is not the floor are legs: the model lets no other parts collide.
+    """
     real = contacts.geoms[:, 0] >= 0
     on_floor = contacts.geoms == floor
     ground = on_floor.any(axis=1) & real
     other = jnp.where(on_floor[:, 0], contacts.geoms[:, 1], contacts.geoms[:, 0])
     foot = jnp.where(ground, foot_of_geom[other], -1)
-    return foot, (ground & (foot < 0)).any()
+    return foot, Touches((ground & (foot < 0)).any(), (real & ~ground).any())
 
 
 def ground_wrench(

@@ -43,7 +43,7 @@ from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.changes import Change, worlds_by_step
-from hector_jax.sim.sensing import Contacts, Reading
+from hector_jax.sim.sensing import Contacts, Reading, Touches
 from hector_jax.sim.world import (
     NO_PUSH,
     TIME_STEP,
@@ -79,6 +79,7 @@ class Observed(NamedTuple):
     feet: Float[Array, "*batch 2 3"]
     joints: Float[Array, "*batch 10"]
     fallen: Bool[Array, "*batch"]
+    legs_touch: Bool[Array, "*batch"]
 
 
 def decide(
@@ -127,8 +128,8 @@ def feel(
     contacts: Contacts,
     floor: Int[Array, ""],
     foot_of_geom: Int[Array, " ngeom"],
-) -> tuple[Wrench, Bool[Array, ""]]:
-    """The ground's wrench over a millisecond, and whether anything but the feet touches the floor.
+) -> tuple[Wrench, Touches]:
+    """The ground's wrench over a millisecond, and what touches beside the feet and the floor.
 
     Args:
         robot: nominal body.
@@ -150,7 +151,7 @@ def observe(
     yaw: Float[Array, ""],
     after: Reading,
     effect: Wrench,
-    touches: Bool[Array, ""],
+    touches: Touches,
 ) -> Observed:
     """The truth about one sample.
 
@@ -163,7 +164,7 @@ def observe(
         yaw: a yaw [rad] shortly before.
         after: coordinates at its end.
         effect: mean wrench of the ground over it.
-        touches: whether anything but the feet touched the floor.
+        touches: what touched in it, feet on the floor apart.
     """
     state = sensing.base_state(robot, after, yaw)
     return Observed(
@@ -172,7 +173,8 @@ def observe(
         effect=effect,
         feet=sensing.foot_points(robot, after),
         joints=after.joints + after.slack,
-        fallen=has_fallen(state) | touches,
+        fallen=has_fallen(state) | touches.floor,
+        legs_touch=touches.legs,
     )
 
 
@@ -191,6 +193,7 @@ def as_trajectory(
         feet=seen.feet,
         joints=seen.joints,
         fallen=seen.fallen,
+        legs_touch=seen.legs_touch,
         residual=plan.residual,
     )
 

@@ -125,6 +125,7 @@ def step_carry(
         feet=feet.position,
         joints=jnp.asarray(robot.standing_joints),
         fallen=fallen,
+        legs_touch=jnp.zeros_like(fallen),  # a rigid body has none
         residual=decided.residual,
     )
     return Carry(moved, feet, commands, anchor, fallen), sample
