@@ -188,11 +188,12 @@ def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
     found["change"] = {}
     for baseline in BASELINES:
         if baseline in verdict.scores and baseline != name:
-            found["change"][baseline] = _change_result(compare(verdict, name, baseline))
+            found["change"][baseline] = change_result(compare(verdict, name, baseline))
     return found
 
 
-def _change_result(comparison: Comparison) -> dict[str, Any]:
+def change_result(comparison: Comparison) -> dict[str, Any]:
+    """A comparison as JSON values: the change of L, wins, counts, and the parts' changes."""
     keys = ("median", "low", "high")
     rows = {p: dict(zip(keys, c, strict=True)) for p, c in comparison.change.items()}
     return rows.pop("L") | {"wins": comparison.wins, "counts": comparison.counts, "parts": rows}
