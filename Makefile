@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	>/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: help setup tune grfm test test-all bench check format lock
+.PHONY: help setup tune grfm ceiling test test-all bench check format lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -28,6 +28,10 @@ tune: $(STAMP) ## tune one trajectory and judge it: make tune TRAJ=straight|c|s
 
 grfm: $(STAMP) ## how well the nets tell what the ground returns: runs/grfm/report.md
 	@$(BIN)/hector grfm
+
+ceiling: $(STAMP) ## search of 2000 walks for each trajectory, taken up where it was cut; for a GPU
+	@$(BIN)/hector search --traj all --budget 2000 --population 20 --record runs/ceiling \
+		--out docs/results/ceiling
 
 test: $(STAMP) ## the fast suite (under 8 minutes on 2 cores)
 	@$(BIN)/pytest -q -n 2

@@ -31,7 +31,7 @@ from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
-from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights import DIRECTION_NAMES, Weights, expert, moved, nominal
 from hector_jax.evaluation import plots, transfer
 from hector_jax.evaluation.report import environment
 from hector_jax.grfm.dataset import walked_with
@@ -186,9 +186,9 @@ def walk_groups(
 
 def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
     """Walks whose losses make the gradients at a weight set: phases, directions, both sides."""
-    steps = transfer.STEP * np.eye(len(transfer.NAMES))
+    steps = transfer.STEP * np.eye(len(DIRECTION_NAMES))
     return [
-        Job(transfer.moved(point.weights, side * step), point.command, hfs(), start_tick=phase)
+        Job(moved(point.weights, side * step), point.command, hfs(), start_tick=phase)
         for phase in phases
         for step in steps
         for side in (1, -1)
@@ -389,7 +389,7 @@ def report(
         "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
         "environment": environment(),
         "engine": engine,
-        "weights": transfer.NAMES,
+        "weights": DIRECTION_NAMES,
         "rows": {
             which: {f"{n}: {k}": transfer.as_result(row) for (n, k), row in found.items()}
             for which, found in rows.items()
@@ -440,7 +440,7 @@ def _draw(
             continue
         file = f"gradients-{name}.png"
         models = {kind: rows[kept] for kind, rows in models.items()}
-        caption = plots.gradients(flags.out / file, transfer.NAMES, simulator[kept], models)
+        caption = plots.gradients(flags.out / file, DIRECTION_NAMES, simulator[kept], models)
         pictures.append((file, f"{name}, {which} weights. {caption}"))
     if ranks:
         keys = [(name, f"{factor:g}") for name in flags.trajectories for factor in FACTORS]

@@ -33,7 +33,7 @@ from hector_jax.evaluation.report import (
     write_report,
 )
 from hector_jax.evaluation.video import VideoUnavailable, write_video
-from hector_jax.flags import Collect, Doctor, Evaluate, Grfm, Train, Tune, Walk
+from hector_jax.flags import Collect, Doctor, Evaluate, Grfm, Search, Train, Tune, Walk
 from hector_jax.grfm import training
 from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
@@ -57,6 +57,7 @@ from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.search import SearchConfig
 
 
 @singledispatch
@@ -330,6 +331,48 @@ def _draw(
         "training": plots.training(path / "training.png", net.course),
     }
     return [Picture(f"pictures/{name}.png", caption) for name, caption in captions.items()]
+
+
+@run.register
+def _search(args: Search) -> None:
+    names = COMMANDS if args.traj == "all" else (args.traj,)
+    for name in names:
+        named_command(name)
+    config = SearchConfig(args.budget, args.population, args.seed)
+    engine = pipeline.choose_engine(args.engine)
+    robot, tune, start = load_robot(), TuneConfig(), _weights(args.start)
+    make_folder(args.out)
+    with workers(args.processes) as pool:
+        found = pipeline.search(
+            pool, config, tune, robot, dict.fromkeys(names, start), engine, args.record or args.out
+        )
+        say("walking start, expert and the best once more")
+        sets = {name: [start, expert(), found[name].weights] for name in names}
+        at_once = config.population * len(names)
+        compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once)
+    print("L in 1e6 on the high-fidelity simulator")
+    print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+    for name, one in found.items():
+        at_start, at_expert, again = compared[name].tolist()
+        walks = len(one.history) * config.population
+        losses = {"start": at_start, "best": one.loss, "best_again": again, "expert": at_expert}
+        card = {
+            "trajectory": name,
+            "L": losses,
+            "walks": walks,
+            "best_at": one.walk,
+            "stop": one.stop,
+            "search": dataclasses.asdict(config),
+            "start": args.start,
+            "engine": engine,
+            "tune": dataclasses.asdict(tune),
+            "versions": versions(),
+        }
+        save_weights(args.out / f"{name}.json", one.weights)
+        write_file(args.out / f"{name}-card.json", _json_bytes(card))
+        shown = "".join(f"{x / 1e6:9.3f}" for x in (at_start, one.loss, at_expert))
+        print(f"{name:10s}{shown}{walks:8d}{one.walk:9d}")
+    say(f"weights are in {args.out}")
 
 
 def _json_bytes(value: Any) -> bytes:

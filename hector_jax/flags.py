@@ -53,6 +53,21 @@ class Tune:
 
 
 @dataclass(frozen=True)
+class Search:
+    """Search weights on the high-fidelity simulator without derivatives (CMA-ES)."""
+
+    traj: str = "straight"  # straight, c, s or all
+    budget: int = 200  # walks for each trajectory, at most; whole generations are walked
+    population: int = 10  # walks in a generation
+    seed: int = 0
+    start: str = "nominal"  # nominal, expert or a weights file
+    engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
+    out: Path = Path("runs/search")  # folder of the weights found, with a card of each
+    record: Path | None = None  # folder of what was walked, taken up again; OUT by default
+    processes: int = 2  # one core each
+
+
+@dataclass(frozen=True)
 class Evaluate:
     """Judge weight sets on plants of a world and print one table."""
 
@@ -84,4 +99,4 @@ class Doctor:
     """Say what this machine offers: versions, device, precision, cache, video; and test it."""
 
 
-Command = Collect | Train | Grfm | Tune | Evaluate | Walk | Doctor
+Command = Collect | Train | Grfm | Tune | Search | Evaluate | Walk | Doctor

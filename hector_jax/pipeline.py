@@ -1,4 +1,4 @@
-"""What the commands do, one step each: collect walks, train the net, tune, judge.
+"""What the commands do, one step each: collect walks, train the net, tune, search, judge.
 
 Everything that is walked or tuned runs in worker processes, one core each, because a closed loop is
 one long chain of small operations. A step that finds its result on disk takes it.
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.console import bar
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
@@ -26,12 +27,27 @@ from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
-from hector_jax.sim.world import Imperfections
-from hector_jax.storage import make_folder, read_card
+from hector_jax.sim.world import Imperfections, hfs
+from hector_jax.storage import fingerprint, make_folder, read_card
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
+from hector_jax.tuning import search as searching
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
-from hector_jax.tuning.loss import Losses
+from hector_jax.tuning.loss import Losses, losses, total
+from hector_jax.tuning.search import Found, Generation, SearchConfig, best
+
+
+def choose_engine(asked: str) -> str:
+    """The engine of walks in MuJoCo: `c` or `mjx`; `auto` is mjx where JAX sees an accelerator.
+
+    Raises:
+        ValueError: none of the three.
+    """
+    if asked not in ("auto", "c", "mjx"):
+        raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {asked!r}")
+    if asked == "auto":
+        return "c" if jax.default_backend() == "cpu" else "mjx"
+    return asked
 
 
 @dataclass(frozen=True)
@@ -44,8 +60,7 @@ class CollectConfig:
     engine: str = "auto"  # c: MuJoCo on the processes; mjx: all at once; auto: mjx on a GPU
 
     def __post_init__(self) -> None:
-        if self.engine not in ("auto", "c", "mjx"):
-            raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {self.engine!r}")
+        choose_engine(self.engine)
         if self.walks < 3 or not self.seconds > 0.0:  # to learn from, to choose by, to judge by
             raise ValueError(
                 f"CollectConfig needs walks >= 3 and seconds > 0, got {self.walks}, {self.seconds}"
@@ -166,9 +181,7 @@ def collect(
         ValueError: it holds walks of other jobs, another robot, controller or engine.
     """
     make_folder(folder)
-    engine, walk_config = config.engine, tune.rollout.walk
-    if engine == "auto":
-        engine = "c" if jax.default_backend() == "cpu" else "mjx"
+    engine, walk_config = choose_engine(config.engine), tune.rollout.walk
     # On a GPU the physics is walked in 32 bits; on a CPU that gains nothing.
     single = engine == "mjx" and jax.default_backend() != "cpu"
 
@@ -316,6 +329,99 @@ def ground(
     train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
     name = "grfm.npz" if variant is None else f"grfm-{variant}.npz"
     return learned(train_config, robot, walks, data / name)
+
+
+_loss = jax.jit(lambda config, walk: total(config, losses(walk)), static_argnums=0)
+
+
+def losses_on_hfs(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    engine: str,
+    sets: Mapping[str, Sequence[Weights]],
+    at_once: int,
+) -> dict[str, Float[np.ndarray, " sets"]]:
+    """L of weight sets on the high-fidelity simulator, one walk each, as long as the rollouts.
+
+    Args:
+        pool: worker processes, for the engine c.
+        config: controller, length and loss.
+        robot: the body.
+        engine: c or mjx, in 64 bits.
+        sets: by the trajectory that they walk.
+        at_once: walks that MJX is compiled for; fewer are filled up to it.
+    """
+    walk = config.rollout.walk
+    seconds = config.rollout.ticks * walk.gait.tick
+    jobs = [
+        Job(weights, named_command(name), hfs(), seconds)
+        for name, each in sets.items()
+        for weights in each
+    ]
+    if engine == "c":
+        walks = walk_many(pool, walk, robot, jobs)
+    else:
+        filled = jobs + jobs[-1:] * (at_once - len(jobs))
+        walks = walk_batch(walk, robot, filled, fine=True)
+    told = iter([float(_loss(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)])
+    return {name: np.array([next(told) for _ in each]) for name, each in sets.items()}
+
+
+def search(
+    pool: Executor,
+    config: SearchConfig,
+    tune: TuneConfig,
+    robot: Robot,
+    starts: Mapping[str, Weights],
+    engine: str,
+    folder: Path,
+) -> dict[str, Found]:
+    """CMA-ES on the high-fidelity simulator, taking up the records under `folder`.
+
+    Args:
+        pool: worker processes.
+        config: of the search.
+        tune: controller, length of the walks and loss, the same as those of tunings.
+        robot: the body.
+        starts: where to start, by the name of the trajectory; all go in lock-step.
+        engine: auto, c or mjx.
+        folder: of the records.
+
+    Raises:
+        ValueError: see `choose_engine`, `named_command` and `tuning.search.search`.
+        OSError: the folder cannot be written; told before anything is walked.
+    """
+    engine = choose_engine(engine)
+    make_folder(folder)
+    size = config.population * len(starts)
+    about = {
+        "world": "hfs",
+        "engine": engine,
+        "rollout": repr(tune.rollout),
+        "loss": repr(tune.loss),
+        "robot": fingerprint(robot),
+    }
+
+    def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
+        return losses_on_hfs(pool, tune, robot, engine, sets, size)
+
+    with bar(f"searching on the high-fidelity simulator, engine {engine}") as tell:
+
+        def on_generation(histories: Mapping[str, list[Generation]]) -> None:
+            done = sum(len(history) for history in histories.values()) * config.population
+            lowest = (
+                f"{name} {best(history)[1] / 1e6:.3f}e6"
+                for name, history in histories.items()
+                if history
+            )
+            tell(
+                done,
+                config.generations * size,
+                "lowest L: " + ", ".join(lowest) if done else "compiling",
+            )
+
+        return searching.search(config, starts, walk, folder, about, on_generation)
 
 
 def judge(

@@ -26,6 +26,7 @@ DOORS = {
     "flax": ("grfm.network",),
     "optax": ("grfm.training", "tuning.difftune"),
     "jaxopt": ("control.qp",),
+    "cmaes": ("tuning.search",),
     "matplotlib": ("evaluation.plots",),
     "tyro": ("cli",),
 }

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from hector_jax.control.weights import (
+    DIRECTION_NAMES,
     WEIGHT_NAMES,
     bounds,
+    directions,
     expert,
+    moved,
     nominal,
     vector_to_weights,
     weights_to_vector,
@@ -61,3 +64,14 @@ def test_the_expert_is_stricter_than_nominal_on_pose_and_dearer_in_effort():
 def test_named_weights_are_fresh_each_time():
     nominal().Q.euler[0] = -1.0
     assert nominal().Q.euler[0] > 0.0
+
+
+def test_the_feet_share_their_weights_in_every_direction():
+    steps = directions()
+    assert len(DIRECTION_NAMES) == len(steps) == 18
+    assert (steps.sum(axis=0) == 1).all()
+    step = np.zeros(18)
+    step[DIRECTION_NAMES.index("R_Fz")] = np.log(2.0)
+    weights = moved(nominal(), step)
+    np.testing.assert_allclose(weights.R.force[:, 2], 2.0 * nominal().R.force[:, 2])
+    np.testing.assert_allclose(weights.R.force[:, :2], nominal().R.force[:, :2])

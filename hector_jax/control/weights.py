@@ -31,6 +31,11 @@ WEIGHT_NAMES = tuple(
 )
 """Names of the entries of `weights_to_vector`."""
 
+DIRECTION_NAMES = tuple(
+    name.removesuffix("_left") for name in WEIGHT_NAMES if not name.endswith("_right")
+)
+"""Names of the 18 directions in which the weights move when the feet share one R."""
+
 
 def _weights(
     euler: tuple, position: tuple, ang_velocity: tuple, velocity: tuple, force: tuple, moment: tuple
@@ -77,3 +82,16 @@ def vector_to_weights(vector: Float[Array, "*batch 24"]) -> Weights:
         vector[..., 12 + 6 * i : 18 + 6 * i].reshape(*vector.shape[:-1], 2, 3) for i in range(2)
     ]
     return Weights(State(*rows), Wrench(*feet))
+
+
+def directions() -> Float[np.ndarray, "18 24"]:
+    """The 18 unit steps in the log-weights of `weights_to_vector`."""
+    eye = np.eye(24)
+    feet = [eye[k + axis] + eye[k + 3 + axis] for k in (12, 18) for axis in range(3)]
+    return np.concatenate([eye[:12], feet])
+
+
+def moved(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
+    """Weights after a step in the 18 directions."""
+    vector = weights_to_vector(weights) * jnp.exp(logs @ directions())
+    return jax.tree.map(np.asarray, vector_to_weights(vector))

@@ -10,17 +10,13 @@ commands.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import spearmanr
 
-from hector_jax.control.weights import WEIGHT_NAMES, Weights, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import DIRECTION_NAMES as NAMES
+from hector_jax.control.weights import Weights, directions, moved, weights_to_vector
 from hector_jax.evaluation.metrics import COVERAGE, RESAMPLES, Interval
-
-NAMES = tuple(name.removesuffix("_left") for name in WEIGHT_NAMES if "right" not in name)
-"""Of the 18 directions."""
 
 SAG = ("Q_z", "Q_vz", "R_Fz")
 """What a rigid body that sinks, or a robot that floats, pulls at."""
@@ -41,19 +37,6 @@ class Row(NamedTuple):
     entries: tuple[float, float]  # of that weight, in the unit gradients of model and simulator
     sizes: tuple[float, float]  # norms of the mean gradients of model and simulator
     phases: int  # in which all that is compared could be believed
-
-
-def directions() -> Float[np.ndarray, "18 24"]:
-    """The 18 unit steps in the log-weights of `weights_to_vector`."""
-    eye = np.eye(24)
-    feet = [eye[k + axis] + eye[k + 3 + axis] for k in (12, 18) for axis in range(3)]
-    return np.concatenate([eye[:12], feet])
-
-
-def moved(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
-    """Weights after a step in the 18 directions."""
-    vector = weights_to_vector(weights) * jnp.exp(logs @ directions())
-    return jax.tree.map(np.asarray, vector_to_weights(vector))
 
 
 def as_directions(weights: Weights, gradient: Weights) -> Float[np.ndarray, "18"]:

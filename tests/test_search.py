@@ -1,0 +1,213 @@
+"""CMA-ES in log-weights: tied feet, inside the box, the same by seed and after a cut."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from hector_jax.control.weights import (
+    DIRECTION_NAMES,
+    bounds,
+    expert,
+    moved,
+    nominal,
+    weights_to_vector,
+)
+from hector_jax.tuning.search import SearchConfig, search
+
+GOAL = np.linspace(-2.0, 2.0, 24)
+CONFIG = SearchConfig(budget=60, population=10, seed=3)
+ABOUT = {"world": "bowl"}
+
+
+def bowl(sets):
+    """A stand-in for a walk: squared distance in log-weights from a goal."""
+    at = np.asarray(weights_to_vector(nominal()))
+    distance = lambda w: np.sum((np.log(np.asarray(weights_to_vector(w)) / at) - GOAL) ** 2)  # noqa: E731
+    return {name: np.array([distance(w) for w in each]) for name, each in sets.items()}
+
+
+def unasked(sets):
+    raise AssertionError(f"walked {sets}")
+
+
+def run(folder, config=CONFIG, walk=bowl, start=None, names=("s",)):
+    starts = dict.fromkeys(names, nominal() if start is None else start)
+    return search(config, starts, walk, folder, ABOUT)
+
+
+def same(one, other):
+    assert one[1:3] == other[1:3]
+    jax.tree.map(np.testing.assert_array_equal, one.weights, other.weights)
+    for a, b in zip(one.history, other.history, strict=True):
+        np.testing.assert_array_equal(a.steps, b.steps)
+        np.testing.assert_array_equal(a.losses, b.losses)
+
+
+def test_a_search_goes_downhill_and_counts_its_walks(tmp_path):
+    calls = []
+
+    def walk(sets):
+        calls.append([len(each) for each in sets.values()])
+        return bowl(sets)
+
+    config = SearchConfig(budget=1209, population=12)
+    found = run(tmp_path, config, walk)["s"]
+    assert calls == [[12]] * 100
+    least = bowl({"": [found.weights]})[""][0]
+    assert found.loss == pytest.approx(least)
+    # what tied feet and directions leave: the goal's differences between the feet
+    apart = np.reshape(GOAL[12:], (2, 2, 3))
+    rest = np.sum((apart[:, 0] - apart[:, 1]) ** 2) / 2
+    assert found.loss - rest < 0.02 * (np.sum(GOAL**2) - rest)
+    assert found.stop == "100 generations"
+    losses = np.concatenate([generation.losses for generation in found.history])
+    assert losses[found.walk - 1] == found.loss == losses.min()
+
+
+def test_the_same_seed_gives_the_same_search_and_another_one_another(tmp_path):
+    first, again = run(tmp_path / "a")["s"], run(tmp_path / "b")["s"]
+    same(first, again)
+    assert (tmp_path / "a/s.jsonl").read_bytes() == (tmp_path / "b/s.jsonl").read_bytes()
+    other = run(tmp_path / "c", SearchConfig(60, 10, seed=4))["s"]
+    assert other.loss != first.loss
+
+
+@pytest.mark.parametrize("cut", [0, 50])
+def test_a_search_that_was_cut_ends_as_if_it_had_not_been(tmp_path, cut):
+    whole = run(tmp_path / "whole")["s"]
+    path = tmp_path / "cut" / "s.jsonl"
+    path.parent.mkdir()
+    lines = (tmp_path / "whole/s.jsonl").read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:3]) + lines[3][:cut])  # between two lines, or in one
+    walked = []
+
+    def walk(sets):
+        walked.append(sets)
+        return bowl(sets)
+
+    same(run(tmp_path / "cut", walk=walk)["s"], whole)
+    assert len(walked) == 4
+    assert path.read_bytes() == (tmp_path / "whole/s.jsonl").read_bytes()
+    same(run(tmp_path / "cut", walk=unasked)["s"], whole)  # nothing is left to walk
+
+
+def test_a_record_is_carried_on_to_a_larger_budget_and_read_for_a_smaller_one(tmp_path):
+    small = run(tmp_path, SearchConfig(30, 10, seed=3))["s"]
+    large = run(tmp_path)["s"]
+    same(large, run(tmp_path / "fresh")["s"])
+    same(small, run(tmp_path, SearchConfig(30, 10, seed=3), walk=unasked)["s"])
+
+
+def test_searches_in_lock_step_are_those_that_go_alone(tmp_path):
+    together = run(tmp_path / "both", names=("c", "s"))
+    alone = run(tmp_path / "one", names=("s",))["s"]
+    same(together["s"], alone)
+    # one record a generation behind the other
+    path = tmp_path / "both/c.jsonl"
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-1]))
+    walked = []
+
+    def walk(sets):
+        walked.append(list(sets))
+        return bowl(sets)
+
+    same(run(tmp_path / "both", walk=walk, names=("c", "s"))["c"], together["c"])
+    assert walked == [["c"]]
+
+
+def test_what_is_asked_lies_in_the_box_and_treats_both_feet_alike(tmp_path):
+    step = np.zeros(18)
+    step[DIRECTION_NAMES.index("Q_x")] = np.log(1e4 / 50.0)  # at the upper edge
+    start = jax.tree.map(np.clip, moved(nominal(), step), *bounds())
+    low, high = (np.asarray(weights_to_vector(w)) for w in bounds())
+    seen = []
+
+    def walk(sets):
+        seen.extend(np.asarray(weights_to_vector(w)) for w in sets["s"])
+        return bowl(sets)
+
+    run(tmp_path, SearchConfig(200, 10, spread=3.0), walk, start)
+    seen = np.array(seen)
+    assert (low <= seen).all()
+    assert (seen <= high).all()
+    np.testing.assert_array_equal(seen[:, 12:15], seen[:, 15:18])
+    np.testing.assert_array_equal(seen[:, 18:21], seen[:, 21:24])
+    assert (np.ptp(np.log(seen), axis=0) > 1.0).all()
+
+
+def test_a_loss_without_a_number_is_the_worst_and_leaves_valid_json(tmp_path):
+    def walk(sets):
+        losses = bowl(sets)["s"]
+        return {"s": np.where(losses > np.median(losses), np.nan, losses)}
+
+    found = run(tmp_path, walk=walk)["s"]
+    assert np.isfinite(found.loss)
+    assert np.isinf(found.history[0].losses).sum() == 5
+    lines = (tmp_path / "s.jsonl").read_text().splitlines()
+    assert json.loads(lines[1])["losses"].count(None) == 5
+    same(run(tmp_path, walk=unasked)["s"], found)
+
+
+def test_a_record_of_another_search_is_refused(tmp_path):
+    run(tmp_path)
+    kept = (tmp_path / "s.jsonl").read_bytes()
+    with pytest.raises(ValueError, match=r"s\.jsonl: .* its seed is 3, asked for is 5"):
+        run(tmp_path, SearchConfig(60, 10, seed=5))
+    with pytest.raises(ValueError, match="its start is"):
+        run(tmp_path, start=expert())
+    with pytest.raises(ValueError, match="its world is bowl"):
+        search(CONFIG, {"s": nominal()}, bowl, tmp_path, {"world": "hfs"})
+    assert (tmp_path / "s.jsonl").read_bytes() == kept
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        (b"{}\n", "line 3 is damaged"),
+        (b'{"steps": [[0]], "losses": [1]}\n', "expected"),
+        (b"\xff\n", "line 3 is damaged"),
+        (b"[1, 2]\n", "line 3 is damaged"),
+    ],
+)
+def test_a_damaged_record_is_refused(tmp_path, line, says):
+    run(tmp_path)
+    path = tmp_path / "s.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:2], line, *lines[3:]]))
+    with pytest.raises(ValueError, match=says):
+        run(tmp_path)
+
+
+def test_another_file_is_no_record(tmp_path):
+    (tmp_path / "s.jsonl").write_text("[1]\nmine\n")
+    with pytest.raises(ValueError, match="no record of a search"):
+        run(tmp_path)
+
+
+def test_a_start_outside_the_box_or_with_unlike_feet_is_refused(tmp_path):
+    outside = nominal()
+    outside.Q.euler[0] = 1e5
+    with pytest.raises(ValueError, match="outside the box"):
+        run(tmp_path, start=outside)
+    limping = nominal()
+    limping.R.force[0, 0] *= 2.0
+    with pytest.raises(ValueError, match="feet share one R"):
+        run(tmp_path, start=limping)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"population": 3}, "population"),
+        ({"budget": 9}, "budget"),
+        ({"seed": -1}, "seed"),
+        ({"spread": 0.0}, "spread"),
+        ({"spread": float("nan")}, "spread"),
+    ],
+)
+def test_wrong_settings_are_named(wrong, says):
+    with pytest.raises(ValueError, match=says):
+        SearchConfig(**wrong)
