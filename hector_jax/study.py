@@ -34,9 +34,9 @@ SETS = ("nominal", "expert", "searched", "without_ten", "with_ten", "without", "
 CEILING = "ceiling"
 
 # what `quick` cuts down to, so that all is done in under five minutes on two cores
-_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 30}
+_QUICK = {"seeds": 4, "rollouts": 20, "iterations": 30}
 
-_SNAPSHOTS = VideoConfig(width=960, height=320, rate=1, speed=0.75)  # 0.75 s from one to the next
+_SNAPSHOTS = VideoConfig(width=640, height=214, rate=8)  # no film of it is kept
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,10 @@ def make_table(
         net = pipeline.ground(pool, plan.tune, robot, args.data)
         searches = _search(pool, plan, robot, shelf)
         tunings, judged = {}, {}
-        for name in plan.commands:
+        for name, command in plan.commands.items():
+            problems = {"without": (command, None), "with": (command, net.params)}
             tunings[name], judged[name] = _walk_sets(
-                pool, plan, robot, name, net.params, searches[name], plants, shelf, made_with
+                pool, plan, robot, name, problems, searches[name], plants, shelf, made_with
             )
     verdicts = {name: _verdict(plan, found) for name, found in judged.items()}
     commits = {tuned.commit for each in tunings.values() for tuned in each.values()}
@@ -157,15 +158,14 @@ def _walk_sets(
     plan: _Plan,
     robot: Robot,
     name: str,
-    params: Params,
+    problems: Mapping[str, tuple[Command, Params | None]],
     searched: Found,
     plants: Callable[[range], list[Imperfections]],
     shelf: Path,
     made_with: Mapping[str, str],
 ) -> tuple[dict[str, Tuned], Judged]:
     """The tunings of one trajectory, and the walks of all its sets."""
-    command, commit = plan.commands[name], made_with.get("commit", "")
-    problems = {"without": (command, None), "with": (command, params)}
+    commit = made_with.get("commit", "")
     tuned = kept.tune(
         pool,
         plan.tune,
@@ -189,7 +189,7 @@ def _walk_sets(
         plan.tune,
         robot,
         sets,
-        command,
+        plan.commands[name],
         plants(plan.seeds),
         plan.seeds,
         shelf / name,

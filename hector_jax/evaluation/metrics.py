@@ -10,6 +10,7 @@ set falls more often than the other by 2 of 32 seeds or the same share of fewer.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -129,6 +130,12 @@ def bootstrap(samples: Float[np.ndarray, " seeds"], statistic: Any = np.mean) ->
         samples: one value per seed.
         statistic: reduces along `axis`, such as `numpy.mean` or `numpy.median`.
     """
+    return _bootstrap(np.asarray(samples, float).tobytes(), statistic)
+
+
+@lru_cache(maxsize=4096)  # a report tells the same interval in many places
+def _bootstrap(kept: bytes, statistic: Any) -> Interval:
+    samples = np.frombuffer(kept)
     # the same draws every time: the same scores give the same bytes
     draws = np.random.default_rng(0).integers(len(samples), size=(RESAMPLES, len(samples)))
     tail = 50 * (1 - COVERAGE)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from matplotlib.ticker import FixedLocator, NullLocator
+from matplotlib.ticker import NullLocator
 
 from hector_jax.evaluation.fidelity import Drift
 from hector_jax.evaluation.metrics import BASELINES, Verdict, compare
@@ -338,7 +338,7 @@ def changes(
     names = [name for name in every if name not in BASELINES]
     size = (3.3 * len(verdicts) + 1.2, 2 * (0.27 * len(names) + 0.75) + 0.3)
     with _figure(path, *size) as figure:
-        panels = figure.subplots(2, len(verdicts), sharey=True, squeeze=False)
+        panels = figure.subplots(2, len(verdicts), sharex="row", sharey=True, squeeze=False)
         for column, (trajectory, verdict) in zip(panels.T, verdicts.items(), strict=True):
             for panel, baseline in zip(column, BASELINES, strict=True):
                 _draw_changes(panel, verdict, names, baseline)
@@ -352,17 +352,17 @@ def changes(
                     markerfacecolor="white",
                     markersize=5,
                     zorder=4,
-                    label="the paper, one walk on the robot",
+                    label="the paper, on the robot",
                 )
                 panel.set_xscale("log")
-                panel.xaxis.set_major_locator(FixedLocator(_RATIOS))
-                panel.xaxis.set_minor_locator(NullLocator())
-                panel.xaxis.set_major_formatter(
-                    lambda r, _: f"{100 * (r - 1):+.0f}" if r != 1 else "0"
-                )
                 panel.set(xlabel=f"L against {baseline} [%]", title=trajectory)
+        for row in panels:
+            low, high = row[0].get_xlim()
+            ticks = [r for r in (_TENTHS if high < 3.0 * low else _RATIOS) if low <= r <= high]
+            row[0].xaxis.set_minor_locator(NullLocator())
+            row[0].set_xticks(ticks, [f"{100 * (r - 1):+.0f}" if r != 1 else "0" for r in ticks])
         panels[0, 0].set_yticks(range(len(names)), [_named(name) for name in names])
-        panels[0, 0].invert_yaxis()
+        panels[0, 0].set_ylim(len(names) - 0.5, -0.5)
         _legend(figure, panels[0, 0])
     return (
         "L of each set against that of nominal and expert on the same plant, one dot per plant, "
@@ -371,7 +371,8 @@ def changes(
     )
 
 
-_RATIOS = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+_RATIOS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+_TENTHS = tuple(i / 10 for i in range(1, 30))
 
 
 def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline: str) -> None:
