@@ -236,7 +236,7 @@ def judge(
             if walk is None:
                 continue
             shown[name] = walk[0]
-        scored[name, seed] = Walked(*taken[0], taken[1]["commit"])
+        scored[name, seed] = Walked(*taken[0], commit=taken[1]["commit"])
     missing = [key for key in jobs if key not in scored]
     if missing:
         title = f"{title}, {len(scored)} of {len(jobs)} walks kept" if scored else title

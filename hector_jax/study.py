@@ -34,7 +34,7 @@ SETS = ("nominal", "expert", "searched", "without_ten", "with_ten", "without", "
 CEILING = "ceiling"
 
 # what `quick` cuts down to, so that all is done in under five minutes on two cores
-_QUICK = {"seeds": 4, "rollouts": 20, "iterations": 30}
+_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20}
 
 _SNAPSHOTS = VideoConfig(width=640, height=214, rate=8)  # no film of it is kept
 

@@ -299,7 +299,7 @@ def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | No
     legend = 0.55
     with _figure(path, width, top + middle + bottom + legend) as figure:
         heights = [height for height in (top, middle, bottom) if height]
-        rows = iter(np.atleast_1d(figure.subfigures(len(heights), 1, height_ratios=heights)))
+        rows = iter(figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat)
         if image is not None:
             axes = next(rows).subplots()
             axes.imshow(image)
