@@ -356,7 +356,7 @@ def _search(args: Search) -> None:
     names = COMMANDS if args.traj == "all" else (args.traj,)
     for name in names:
         named_command(name)
-    config = SearchConfig(args.budget, args.population, args.seed)
+    config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = pipeline.choose_engine(args.engine)
     robot, tune, start = load_robot(), TuneConfig(), _weights(args.start)
     make_folder(args.out)
@@ -383,7 +383,8 @@ def _search(args: Search) -> None:
             "search": dataclasses.asdict(config),
             "start": args.start,
             "engine": engine,
-            "tune": dataclasses.asdict(tune),
+            "rollout": dataclasses.asdict(tune.rollout),
+            "loss": dataclasses.asdict(tune.loss),
             "versions": versions(),
         }
         save_weights(args.out / f"{name}.json", one.weights)

@@ -61,6 +61,7 @@ class Search:
     budget: int = 200  # walks for each trajectory, at most; whole generations are walked
     population: int = 10  # walks in a generation
     seed: int = 0
+    spread: float = 1.0  # first standard deviation of each log-weight
     start: str = "nominal"  # nominal, expert or a weights file
     engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
     out: Path = Path("runs/search")  # folder of the weights found, with a card of each

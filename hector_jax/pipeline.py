@@ -396,11 +396,13 @@ def search(
     make_folder(folder)
     size = config.population * len(starts)
     about = {
-        "world": "hfs",
         "engine": engine,
-        "rollout": repr(tune.rollout),
+        "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
+        "controller": repr(tune.rollout.walk),
         "loss": repr(tune.loss),
         "robot": fingerprint(robot),
+        "plant": fingerprint(hfs()),
+        "commands": {name: fingerprint(named_command(name)) for name in COMMANDS},
     }
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:

@@ -24,7 +24,7 @@ from hector_jax.grfm.network import Params
 from hector_jax.kept import Judged, Tuned
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
-from hector_jax.sim.world import Imperfections
+from hector_jax.sim.world import Imperfections, hfs
 from hector_jax.storage import load_weights, make_folder
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
@@ -147,10 +147,11 @@ def make_table(
 def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str, Found]:
     """The derivative-free baseline of all trajectories, in lock-step."""
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
-    key = kept.digest(plan.tune.rollout, plan.tune.loss, settings, robot, nominal())
+    engine, model = pipeline.choose_engine("auto"), plan.tune.rollout
+    key = kept.digest(engine, model, plan.tune.loss, settings, robot, hfs(), nominal())
     starts = dict.fromkeys(plan.commands, nominal())
     folder = shelf / f"search-{key}"
-    return pipeline.search(pool, plan.search, plan.tune, robot, starts, "auto", folder)
+    return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)
 
 
 def _walk_sets(

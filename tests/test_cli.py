@@ -15,7 +15,9 @@ from hector_jax.control.weights import expert
 from hector_jax.grfm.dataset import load_walks
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import MODEL_PATH, load_robot
-from hector_jax.storage import save_weights
+from hector_jax.storage import load_weights, save_weights
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.rollout import RolloutConfig
 
 
 def call(monkeypatch, *arguments):
@@ -38,7 +40,8 @@ def test_help_names_the_commands():
         [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
     )
     assert shown.returncode == 0
-    for name in ("collect", "train", "grfm", "tune", "table", "evaluate", "walk", "doctor"):
+    names = ("collect", "train", "grfm", "tune", "search", "table", "evaluate", "walk", "doctor")
+    for name in names:
         assert name in shown.stdout
     assert shown.stderr == ""
 
@@ -61,7 +64,7 @@ def test_walking_on_the_rigid_body_prints_json(monkeypatch, capsys):
     assert not found["fell"]
 
 
-@pytest.mark.parametrize("command", ["walk", "tune", "evaluate"])
+@pytest.mark.parametrize("command", ["walk", "tune", "search", "evaluate"])
 def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
     monkeypatch.chdir(tmp_path)
     line = refused(monkeypatch, capsys, command, "--traj", "circle")
@@ -166,6 +169,47 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     line = refused(monkeypatch, capsys, "walk")
     assert "hector.xml" in line
     assert expected in line
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (("--budget", "9"), "budget"),
+        (("--population", "2"), "population"),
+        (("--engine", "warp"), "engine"),
+        (("--start", "none.json"), "none.json"),
+    ],
+)
+def test_a_search_refuses_wrong_input_before_it_makes_a_folder(
+    monkeypatch, capsys, tmp_path, wrong, says
+):
+    assert says in refused(monkeypatch, capsys, "search", "--out", tmp_path / "found", *wrong)
+    assert not (tmp_path / "found").exists()
+
+
+@pytest.mark.slow
+def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch, capsys, tmp_path):
+    """Two generations of short walks on all trajectories; the second call finds all done."""
+    short = TuneConfig(rollout=RolloutConfig(ticks=20))
+    monkeypatch.setattr(commands, "TuneConfig", lambda: short)
+    flags = ("search", "--traj", "all", "--budget", "9", "--population", "4", "--engine", "c")
+    folders = ("--out", tmp_path / "found", "--record", tmp_path / "record", "--processes", "1")
+    assert call(monkeypatch, *flags, *folders) == 0
+    shown = capsys.readouterr().out
+    for name in ("straight", "c", "s"):
+        card = json.loads((tmp_path / "found" / f"{name}-card.json").read_text())
+        assert card["walks"] == 8
+        assert card["L"]["best"] == card["L"]["best_again"] > 0.0
+        assert f"{card['L']['start'] / 1e6:.3f}" in shown
+        weights = load_weights(tmp_path / "found" / f"{name}.json")
+        np.testing.assert_array_equal(weights.R.force[0], weights.R.force[1])
+        assert len((tmp_path / "record" / f"{name}.jsonl").read_text().splitlines()) == 3
+    kept = {path: path.read_bytes() for path in tmp_path.rglob("*.json*")}
+    assert call(monkeypatch, *flags, *folders) == 0
+    assert capsys.readouterr().out == shown
+    assert kept == {path: path.read_bytes() for path in tmp_path.rglob("*.json*")}
+    line = refused(monkeypatch, capsys, *flags, *folders, "--seed", "1")
+    assert "another search" in line
 
 
 @pytest.mark.slow

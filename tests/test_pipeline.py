@@ -1,4 +1,4 @@
-"""A net is reused only for the walks and the controller that it was made of."""
+"""A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,13 +8,19 @@ import pytest
 from synthetic import synthetic_walk
 
 from hector_jax import pipeline
+from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import expert, nominal
+from hector_jax.evaluation.metrics import score
 from hector_jax.grfm.dataset import collect, draw_jobs
 from hector_jax.grfm.network import NetParams, ResidualParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot import load_robot
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import hfs
 from hector_jax.storage import read_card
 from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.rollout import RolloutConfig
 
 QUICK = TrainConfig(epochs=1)
 
@@ -76,3 +82,19 @@ def test_walks_of_another_controller_are_refused(tmp_path, robot):
     pool = ThreadPoolExecutor(1)
     with pytest.raises(ValueError, match="walks: walked by another controller"):
         pipeline.ground(pool, TuneConfig(), robot, tmp_path)
+
+
+@pytest.mark.slow
+def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine(robot):
+    config = TuneConfig(rollout=RolloutConfig(ticks=4))
+    sets = {"c": [nominal(), expert()], "s": [nominal()]}
+    pool = ThreadPoolExecutor(1)
+    told = {
+        engine: pipeline.losses_on_hfs(pool, config, robot, engine, sets, at_once=3)
+        for engine in ("c", "mjx")
+    }
+    for name, each in sets.items():
+        for weights, loss in zip(each, told["c"][name], strict=True):
+            walked = walk(WalkConfig(), robot, weights, named_command(name), hfs(), 0.04)
+            assert loss == pytest.approx(float(score(config.loss, walked).L), rel=1e-12)
+        np.testing.assert_allclose(told["mjx"][name], told["c"][name], rtol=1e-4)

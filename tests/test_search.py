@@ -61,7 +61,7 @@ def test_a_search_goes_downhill_and_counts_its_walks(tmp_path):
     apart = np.reshape(GOAL[12:], (2, 2, 3))
     rest = np.sum((apart[:, 0] - apart[:, 1]) ** 2) / 2
     assert found.loss - rest < 0.02 * (np.sum(GOAL**2) - rest)
-    assert found.stop == "100 generations"
+    assert found.stop == "the budget is spent"
     losses = np.concatenate([generation.losses for generation in found.history])
     assert losses[found.walk - 1] == found.loss == losses.min()
 
@@ -211,3 +211,9 @@ def test_a_start_outside_the_box_or_with_unlike_feet_is_refused(tmp_path):
 def test_wrong_settings_are_named(wrong, says):
     with pytest.raises(ValueError, match=says):
         SearchConfig(**wrong)
+
+
+def test_a_search_without_its_package_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr("hector_jax.tuning.search.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"hector-jax\[search\]"):
+        run(tmp_path)

@@ -157,6 +157,7 @@ class _Search:
         )
         head = {
             "format": FORMAT,
+            "name": path.stem,
             "population": config.population,
             "seed": config.seed,
             "spread": config.spread,
@@ -174,8 +175,8 @@ class _Search:
     @property
     def stop(self) -> str:
         if len(self.history) >= self.config.generations:
-            return f"{self.config.generations} generations"
-        return "converged" if self.optimiser.should_stop() else ""
+            return "the budget is spent"
+        return "CMA-ES has converged" if self.optimiser.should_stop() else ""
 
     def ask(self) -> Float[np.ndarray, "population 18"]:
         return np.stack([self.optimiser.ask() for _ in range(self.config.population)])
