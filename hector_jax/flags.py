@@ -80,6 +80,7 @@ class Table:
     iterations: int = 100  # of the tuning, at most
     extra: tuple[str, ...] = ()  # NAME=FOLDER of straight.json, c.json, s.json: one more row each
     ceiling: Path = Path("docs/results/ceiling")  # such a folder too; row `ceiling` where it exists
+    earlier: Path | None = None  # table.json of other plants: do the sets keep their order?
     data: Path = Path("data")  # walks and net; made where missing
     out: Path = Path("runs/table")  # folder of the report
     kept: Path | None = None  # folder of what is taken up again; OUT/kept by default

@@ -18,7 +18,7 @@ from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation import metrics, plots, table
 from hector_jax.evaluation.metrics import BASELINES, Verdict
 from hector_jax.evaluation.report import Picture, environment
-from hector_jax.evaluation.table import PAPER, Fall, Search, Table
+from hector_jax.evaluation.table import PAPER, Earlier, Fall, Search, Table
 from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_video
 from hector_jax.grfm.network import Params
 from hector_jax.kept import Judged, Tuned
@@ -48,6 +48,7 @@ class _Plan:
     tune: TuneConfig
     search: SearchConfig
     extra: Mapping[str, Mapping[str, Weights]]  # by trajectory, the sets from files
+    earlier: Earlier | None
 
 
 def _plan(args: flags.Table) -> _Plan:
@@ -67,6 +68,7 @@ def _plan(args: flags.Table) -> _Plan:
         TuneConfig(iterations=args.iterations),
         SearchConfig(budget=args.rollouts),
         _sets_from_files(args),
+        None if args.earlier is None else table.load_earlier(args.earlier),
     )
 
 
@@ -139,6 +141,7 @@ def make_table(
             environment=made_with,
             commits=sorted(commits),
             command=flags.as_command("table", args),
+            earlier=plan.earlier,
         ),
     )
     return told, verdicts

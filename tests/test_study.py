@@ -1,6 +1,7 @@
 """The table from flags to files, on walks that no simulator made."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,6 +112,7 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
         ({"extra": ("with=x",)}, "--extra with=x: there is a set 'with' already"),
         ({"extra": ("a=x", "a=y")}, "--extra a=y: there is a set 'a' already"),
         ({"extra": ("a=nowhere",)}, "cannot read nowhere/straight.json"),
+        ({"earlier": Path("nowhere.json")}, "cannot read nowhere.json"),
         ({"processes": 0}, "processes must be at least 1, got 0"),
     ],
 )

@@ -102,6 +102,29 @@ def test_the_ranking_is_by_the_median_of_the_paired_ratio():
     assert table.ranking(judged(**GOOD)) == ["with", "searched", "without", "expert", "nominal"]
 
 
+def test_the_order_is_held_against_that_of_an_earlier_table(tmp_path):
+    write_table(tmp_path, whole(s=judged(**GOOD, mine=1e6)))
+    earlier = table.load_earlier(tmp_path / "table.json")
+    assert earlier.seeds == "0-3"
+    (same,) = table.same_order({"s": judged(**GOOD)}, earlier)
+    assert (same.holds, same.measured) == (True, "all 5")
+    (other,) = table.same_order({"s": judged(**GOOD | {"with": 2.5e6})}, earlier)
+    assert (other.holds, other.measured) == (False, "changed places: `with` and `searched`")
+    (unknown,) = table.same_order({"c": judged(**GOOD)}, earlier)
+    assert unknown.holds is None
+    text = write_table(tmp_path, whole(s=judged(**GOOD))._replace(earlier=earlier)).read_text()
+    assert "- [x] s: sets in the same order as on seeds 0-3: all 5: **holds**" in text
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"trajectories": {"s": 1}}'])
+def test_a_file_that_is_no_table_is_refused(tmp_path, content):
+    path = tmp_path / "table.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ValueError, match="table.json"):
+        table.load_earlier(path)
+
+
 def test_the_four_files_tell_the_same_numbers(tmp_path):
     verdict = pretend_verdict(8)
     path = write_table(tmp_path, whole(straight=verdict, c=verdict))

@@ -7,6 +7,7 @@ compared with ours, but its changes in % are.
 
 import csv
 import io
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -83,6 +84,13 @@ class Search(NamedTuple):
     stop: str
 
 
+class Earlier(NamedTuple):
+    """An earlier table, on other plants, to hold the order of the sets against."""
+
+    seeds: str
+    rankings: Mapping[str, Sequence[str]]  # by trajectory, see `ranking`
+
+
 class Table(NamedTuple):
     """All that is told."""
 
@@ -95,6 +103,7 @@ class Table(NamedTuple):
     environment: Mapping[str, str]
     commits: Sequence[str]  # at which the results were made that are told
     command: str  # that makes this table again
+    earlier: Earlier | None = None
 
 
 class Line(NamedTuple):
@@ -198,6 +207,44 @@ def ranking(verdict: Verdict) -> list[str]:
     return sorted(verdict.scores, key=lambda name: float(np.median(verdict.scores[name].L / base)))
 
 
+def load_earlier(path: Path) -> Earlier:
+    """The order of the sets in a table.json.
+
+    Raises:
+        ValueError: one line naming the file, where it cannot be read or is no such file.
+    """
+    try:
+        told = json.loads(path.read_text())
+        rankings = {name: list(one["ranking"]) for name, one in told["trajectories"].items()}
+        return Earlier(str(told["seeds"]), rankings)
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path}: no table.json of `hector table`: {error}") from error
+
+
+def same_order(verdicts: Mapping[str, Verdict], earlier: Earlier) -> list[Bar]:
+    """Whether the sets that both tables have stand in the same order."""
+    told = []
+    for trajectory, verdict in verdicts.items():
+        text = f"sets in the same order as on seeds {earlier.seeds}"
+        before = earlier.rankings.get(trajectory)
+        if before is None:
+            told.append(Bar(trajectory, text, "not walked", None))
+            continue
+        now = [name for name in ranking(verdict) if name in before]
+        before = [name for name in before if name in now]
+        pairs = itertools.combinations(before, 2)
+        swapped = [f"`{a}` and `{b}`" for a, b in pairs if now.index(a) > now.index(b)]
+        measured = f"changed places: {', '.join(swapped)}" if swapped else f"all {len(now)}"
+        told.append(Bar(trajectory, text, measured, not swapped))
+    return told
+
+
+def _all_bars(table: Table, found: Mapping[tuple[str, str], Line]) -> list[Bar]:
+    return bars(found) + (same_order(table.verdicts, table.earlier) if table.earlier else [])
+
+
 def write_table(folder: Path, table: Table) -> Path:
     """Write report.md, table.csv, table.json and table.tex, each whole or not at all.
 
@@ -227,7 +274,7 @@ def _report(table: Table, found: Mapping[tuple[str, str], Line]) -> str:
         _summary(found),
         STAND_IN,
         "## What it had to show",
-        _checklist(bars(found)),
+        _checklist(_all_bars(table, found)),
         "Beyond that it was hoped for:",
         _checklist(aims(found)),
     ]
@@ -443,8 +490,9 @@ def _result(table: Table, found: Mapping[tuple[str, str], Line]) -> dict[str, An
         "command": table.command,
         "environment": dict(table.environment),
         "commits": list(table.commits),
+        "seeds": seeds_text(next(iter(table.verdicts.values()))),
         "config": dict(table.config),
-        "bars": [bar._asdict() for bar in bars(found)],
+        "bars": [bar._asdict() for bar in _all_bars(table, found)],
         "aims": [bar._asdict() for bar in aims(found)],
         "falls": [fall._asdict() for fall in table.falls],
         "trajectories": told,
