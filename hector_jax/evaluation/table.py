@@ -432,7 +432,12 @@ def _searches(searches: Mapping[str, Search]) -> str:
 
 def _made_at(table: Table) -> str:
     known = ", ".join(f"`{commit}`" if commit else "unknown" for commit in table.commits)
-    return f"Tunings and walks were made at {known}."
+    scores = [score for verdict in table.verdicts.values() for score in verdict.scores.values()]
+    worst = max(float(score.residual.max()) for score in scores)
+    return (
+        f"Tunings and walks were made at {known}. "
+        f"Worst relative KKT residual of a plan in any walk: {worst:.0e}."
+    )
 
 
 def _csv(found: Mapping[tuple[str, str], Line]) -> str:
