@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	>/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: help setup tune grfm ceiling test test-all bench check format lock
+.PHONY: help setup tune table grfm ceiling test test-all bench check format lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -23,8 +23,11 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
-tune: $(STAMP) ## tune one trajectory and judge it: make tune TRAJ=straight|c|s
+tune: $(STAMP) ## tune a trajectory and judge it: make tune TRAJ=straight|c|s|all
 	@$(BIN)/hector tune --traj $(TRAJ)
+
+table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a look
+	@$(BIN)/hector table $(if $(QUICK),--quick)
 
 grfm: $(STAMP) ## how well the nets tell what the ground returns: runs/grfm/report.md
 	@$(BIN)/hector grfm

@@ -11,7 +11,6 @@ scores of finished walks are kept under OUT/scores and taken up again.
 """
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -45,7 +44,14 @@ from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import named_world
-from hector_jax.storage import fingerprint, load_tree, load_weights, save_tree, write_file
+from hector_jax.storage import (
+    fingerprint,
+    load_tree,
+    load_weights,
+    save_tree,
+    write_file,
+    write_json,
+)
 from hector_jax.tuning.loss import LossConfig
 
 BASELINE = "nominal"
@@ -235,8 +241,7 @@ def report(flags: Flags, found: Found, folder: Path) -> Path:
         },
         "endured": {name: force.tolist() for name, force in found.endured.items()},
     }
-    content = (json.dumps(told, indent=1, allow_nan=False) + "\n").encode()
-    write_file(folder / "robustness.json", content)
+    write_json(folder / "robustness.json", told)
     write_file(folder / "report.md", ("\n\n".join(text) + "\n").encode())
     return folder / "report.md"
 

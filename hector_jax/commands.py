@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from datetime import datetime
-from functools import singledispatch
+from functools import partial, singledispatch
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import pipeline
+from hector_jax import pipeline, study
 from hector_jax.console import say
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
@@ -32,7 +32,18 @@ from hector_jax.evaluation.report import (
     write_report,
 )
 from hector_jax.evaluation.video import VideoUnavailable, write_video
-from hector_jax.flags import Collect, Doctor, Evaluate, Grfm, Search, Train, Tune, Walk
+from hector_jax.flags import (
+    Collect,
+    Doctor,
+    Evaluate,
+    Grfm,
+    Search,
+    Table,
+    Train,
+    Tune,
+    Walk,
+    settings,
+)
 from hector_jax.grfm import training
 from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
@@ -83,11 +94,6 @@ def _plants(world: str, seeds: range) -> list[Imperfections]:
         return [named_world(world, seed) for seed in seeds]
     except ValueError as error:
         raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
-
-
-def _settings(flags: Any) -> dict[str, Any]:
-    plain = lambda x: x if isinstance(x, bool | int | float | tuple) else str(x)  # noqa: E731
-    return {name: plain(value) for name, value in dataclasses.asdict(flags).items()}
 
 
 @run.register
@@ -208,6 +214,10 @@ def _new_folder(args: Tune) -> Path:
 
 @run.register
 def _tune(args: Tune) -> None:
+    if args.traj == "all":
+        for name in COMMANDS:
+            run(replace(args, traj=name, run=args.run and args.run / name))
+        return
     command, robot = named_command(args.traj), load_robot()
     if args.alpha not in ("paper", "auto"):
         raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
@@ -225,7 +235,7 @@ def _tune(args: Tune) -> None:
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        resolved = {"flags": _settings(args), "tune": dataclasses.asdict(config)}
+        resolved = {"flags": settings(args), "tune": dataclasses.asdict(config)}
         write_json(folder / "config.json", resolved)
         write_json(folder / "versions.json", environment())
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
@@ -338,6 +348,14 @@ def _draw(
 
 
 @run.register
+def _table(args: Table) -> None:
+    told, verdicts = study.make_table(args, partial(_plants, "standin"))
+    for name, verdict in verdicts.items():
+        print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
+    say(f"the whole story, with pictures: {told}")
+
+
+@run.register
 def _search(args: Search) -> None:
     names = COMMANDS if args.traj == "all" else (args.traj,)
     for name in names:
@@ -422,7 +440,7 @@ def _walk(args: Walk) -> None:
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     if args.out is not None:
-        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=_settings(args))
+        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=settings(args))
     if args.json:
         losses = {part: float(getattr(found, part)) for part in metrics.PARTS}
         errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}

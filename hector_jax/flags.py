@@ -1,7 +1,8 @@
 """The flags of each command; a field's comment is its help text."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -41,14 +42,14 @@ class Grfm:
 class Tune:
     """Tune the MPC weights for a trajectory, with and without the net, and judge them."""
 
-    traj: str = "straight"  # straight, c or s
+    traj: str = "straight"  # straight, c, s, or all: one after the other
     seeds: int = 8  # stand-in plants in the verdict
     iterations: int = 100  # of the tuning, at most
     variant: str = "residual"  # of the net, or paper
     alpha: str = "paper"  # loss weights: the paper's, or auto (gradient norms aligned)
     data: Path = Path("data")  # walks and net; made where missing
     runs: Path = Path("runs")  # results go to RUNS/TRAJ/TIME
-    run: Path | None = None  # or to this folder, which must not exist
+    run: Path | None = None  # or to this folder, which must not exist (all: to RUN/TRAJ)
     video: bool = True  # film nominal beside tuned
     processes: int = 2  # one core each
 
@@ -66,6 +67,25 @@ class Search:
     engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
     out: Path = Path("runs/search")  # folder of the weights found, with a card of each
     record: Path | None = None  # folder of what was walked, taken up again; OUT by default
+    processes: int = 2  # one core each
+
+
+@dataclass(frozen=True)
+class Table:
+    """Make the paper's table: search, tune and judge all sets, take up what is there already."""
+
+    trajectories: tuple[str, ...] = ("straight", "c", "s")
+    seeds: int = 32  # stand-in plants
+    first_seed: int = 0  # 0 in development, 1000 for the final verdict
+    rollouts: int = 200  # walks of the search on the high-fidelity simulator
+    iterations: int = 100  # of the tuning, at most
+    extra: tuple[str, ...] = ()  # NAME=FOLDER of straight.json, c.json, s.json: one more row each
+    ceiling: Path = Path("docs/results/ceiling")  # such a folder too; row `ceiling` where it exists
+    earlier: Path | None = None  # table.json of other plants: do the sets keep their order?
+    data: Path = Path("data")  # walks and net; made where missing
+    out: Path = Path("runs/table")  # folder of the report
+    kept: Path | None = None  # folder of what is taken up again; OUT/kept by default
+    quick: bool = False  # 4 plants, a short search and tuning, into OUT/quick: does it all work?
     processes: int = 2  # one core each
 
 
@@ -102,4 +122,24 @@ class Doctor:
     """Say what this machine offers: versions, device, precision, cache, video; and test it."""
 
 
-Command = Collect | Train | Grfm | Tune | Search | Evaluate | Walk | Doctor
+Command = Collect | Train | Grfm | Tune | Search | Table | Evaluate | Walk | Doctor
+
+
+def settings(flags: Any) -> dict[str, Any]:
+    """The flags as JSON values."""
+    plain = lambda x: x if isinstance(x, bool | int | float | tuple) else str(x)  # noqa: E731
+    return {name: plain(value) for name, value in asdict(flags).items()}
+
+
+def as_command(name: str, flags: Any) -> str:
+    """The line that asks for these flags, those at their default left out."""
+    words = ["hector", name]
+    for field in fields(flags):
+        value, flag = getattr(flags, field.name), field.name.replace("_", "-")
+        if value == field.default:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{'' if value else 'no-'}{flag}")
+        else:
+            words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return " ".join(words)

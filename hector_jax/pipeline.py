@@ -4,7 +4,7 @@ Everything that is walked or tuned runs in worker processes, one core each, beca
 one long chain of small operations. A step that finds its result on disk takes it.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.console import Tell, bar
+from hector_jax.console import bar
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
@@ -242,14 +242,23 @@ def held_out(robot: Robot, folder: Path) -> Walks:
     return jax.tree.map(lambda x: x[chosen], walks)
 
 
+def walks_of(
+    pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
+) -> Iterator[Trajectory]:
+    """The walks of jobs, in order, as they come."""
+    with bar(title) as tell:
+        tell(0, len(jobs), "compiling")
+        for done, found in enumerate(walk_many(pool, config.rollout.walk, robot, jobs), 1):
+            yield found
+            tell(done, len(jobs), "")
+
+
 def walk_all(
     pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
 ) -> Walks:
     """Walks of jobs whose commands are alike, at the plan interval."""
-    with bar(title) as tell:
-        tell(0, len(jobs), "compiling")
-        walked = _told(walk_many(pool, config.rollout.walk, robot, jobs), len(jobs), tell)
-        walks = [dataset.at_interval(walk, config.rollout.walk.gait.tick) for walk in walked]
+    walked = walks_of(pool, config, robot, jobs, title)
+    walks = [dataset.at_interval(walk, config.rollout.walk.gait.tick) for walk in walked]
     stack = lambda trees: jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *trees)  # noqa: E731
     return Walks(stack(jobs), stack(walks))
 
@@ -450,17 +459,9 @@ def judge(
         for weights in sets.values()
         for plant, seed in zip(plants, seeds, strict=True)
     ]
-    with bar(title) as tell:
-        tell(0, len(jobs), "compiling")
-        walks = list(_told(walk_many(pool, config.rollout.walk, robot, jobs), len(jobs), tell))
+    walks = list(walks_of(pool, config, robot, jobs, title))
     each = len(plants)
     return {name: walks[i * each : (i + 1) * each] for i, name in enumerate(sets)}
-
-
-def _told(walks: Iterable[Trajectory], count: int, tell: Tell) -> Iterator[Trajectory]:
-    for done, walk in enumerate(walks, 1):
-        yield walk
-        tell(done, count, "")
 
 
 def as_line(name: str, iteration: Iteration) -> str:

@@ -17,6 +17,8 @@ FLOORS = [
     ["grfm"],
     ["evaluation"],
     ["flags", "pipeline"],
+    ["kept"],
+    ["study"],
     ["commands"],
     ["cli"],
 ]

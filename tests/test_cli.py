@@ -42,7 +42,8 @@ def test_help_names_the_commands():
         [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
     )
     assert shown.returncode == 0
-    for name in ("collect", "train", "grfm", "tune", "search", "evaluate", "walk", "doctor"):
+    names = ("collect", "train", "grfm", "tune", "search", "table", "evaluate", "walk", "doctor")
+    for name in names:
         assert name in shown.stdout
     assert shown.stderr == ""
 
@@ -277,6 +278,33 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tmp_path):
+    """One plant and one trajectory, really searched, tuned and walked; then all is taken up."""
+    monkeypatch.chdir(tmp_path)
+    small = CollectConfig(walks=6, seconds=1.0)
+    monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
+    flags = ("--trajectories", "c", "--seeds", "1", "--rollouts", "10", "--iterations", "10")
+    assert call(monkeypatch, "table", *flags) == 0
+    first = (tmp_path / "runs/table/table.csv").read_bytes()
+    monkeypatch.setattr(commands.pipeline, "walks_of", None)
+    monkeypatch.setattr(commands.pipeline, "tune_many", None)
+    monkeypatch.setattr(commands.pipeline, "losses_on_hfs", None)
+    capsys.readouterr()
+    assert call(monkeypatch, "table", *flags) == 0
+    assert (tmp_path / "runs/table/table.csv").read_bytes() == first
+    out = capsys.readouterr().out
+    for name in commands.study.SETS:
+        assert name in out
+    assert (tmp_path / "runs/table/pictures/c.png").stat().st_size > 50_000
+
+
+def test_the_table_refuses_wrong_flags_in_one_line(monkeypatch, capsys, tmp_path):
+    flags = ("table", "--out", tmp_path / "out", "--extra")
+    assert "NAME=FOLDER" in refused(monkeypatch, capsys, *flags, "mine")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

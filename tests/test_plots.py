@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
-from pretend import pretend_history, pretend_walk
+from pretend import pretend_history, pretend_verdict, pretend_walk
 
 from hector_jax.control.weights import WEIGHT_NAMES
 from hector_jax.evaluation import plots
@@ -45,6 +45,32 @@ def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):
     plots.path_from_above(tmp_path / "path.png", {"with": pretend_walk(seconds=4.0)})
     with Image.open(tmp_path / "path.png") as picture:
         assert picture.height < picture.width / 2
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.8])
+def test_the_collective_figure_goes_with_and_without_snapshots(tmp_path, turn):
+    """A straight path lies across, a bent one stands beside the panels."""
+    names = ("nominal", "searched", "mine", "with")
+    walks = {name: pretend_walk(i, seconds=2.0, turn=turn) for i, name in enumerate(names)}
+    strip = tmp_path / "strip.png"
+    Image.new("RGB", (600, 200), "grey").save(strip)
+    heights = {}
+    for name, snapshots in {"with.png": strip, "without.png": None}.items():
+        caption = plots.collective(tmp_path / name, walks, snapshots)
+        assert caption.startswith("Snapshots; ") is (snapshots is not None)
+        assert _has_ink(tmp_path / name)
+        with Image.open(tmp_path / name) as picture:
+            heights[name] = picture.height
+    assert heights["with.png"] > heights["without.png"]
+
+
+def test_changes_are_drawn_for_sets_that_only_one_trajectory_has_and_with_falls(tmp_path):
+    one, other = pretend_verdict(8), pretend_verdict(8, fallen={("with", 1)})
+    other.scores["mine"] = other.scores["with"]
+    paper = {("c", "with_ten", "nominal"): -68.7}
+    path = tmp_path / "changes.png"
+    assert "cross" in plots.changes(path, {"c": one, "s": other}, paper)
+    assert _has_ink(path)
 
 
 def test_weights_are_drawn_with_and_without_the_expert(tmp_path):

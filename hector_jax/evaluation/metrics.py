@@ -10,6 +10,7 @@ set falls more often than the other by 2 of 32 seeds or the same share of fewer.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -131,6 +132,12 @@ def bootstrap(samples: Float[np.ndarray, " seeds"], statistic: Any = np.mean) ->
         samples: one value per seed.
         statistic: reduces along `axis`, such as `numpy.mean` or `numpy.median`.
     """
+    return _bootstrap(np.asarray(samples, float).tobytes(), statistic)
+
+
+@lru_cache(maxsize=4096)  # a report tells the same interval in many places
+def _bootstrap(kept: bytes, statistic: Any) -> Interval:
+    samples = np.frombuffer(kept)
     # the same draws every time: the same scores give the same bytes
     draws = np.random.default_rng(0).integers(len(samples), size=(RESAMPLES, len(samples)))
     tail = 50 * (1 - COVERAGE)
@@ -192,11 +199,12 @@ def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
     found["change"] = {}
     for baseline in BASELINES:
         if baseline in verdict.scores and baseline != name:
-            found["change"][baseline] = _change_result(compare(verdict, name, baseline))
+            found["change"][baseline] = change_result(compare(verdict, name, baseline))
     return found
 
 
-def _change_result(comparison: Comparison) -> dict[str, Any]:
+def change_result(comparison: Comparison) -> dict[str, Any]:
+    """A comparison as JSON values: the change of L, wins, counts, and the parts' changes."""
     keys = ("median", "low", "high")
     rows = {p: dict(zip(keys, c, strict=True)) for p, c in comparison.change.items()}
     return rows.pop("L") | {"wins": comparison.wins, "counts": comparison.counts, "parts": rows}

@@ -16,9 +16,11 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.image import imread
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from hector_jax.evaluation.fidelity import Drift
+from hector_jax.evaluation.metrics import BASELINES, Verdict, compare
 from hector_jax.evaluation.robustness import DIRECTIONS, Cell
 from hector_jax.grfm.training import History
 from hector_jax.trajectory import LEFT, Trajectory, Wrench
@@ -53,6 +55,10 @@ _LOOK = {
     "expert": {"color": _BLUE, "linestyle": (0, (5, 1.5))},
     "without": {"color": _ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": _GREEN, "linestyle": "-"},
+    "searched": {"color": _PURPLE, "linestyle": (0, (1.2, 1.2))},
+    "without_ten": {"color": "#e8a36a", "linestyle": (0, (4, 1.2, 1, 1.2)), "linewidth": 0.9},
+    "with_ten": {"color": "#63b89f", "linestyle": "-", "linewidth": 0.9},
+    "ceiling": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},
     "commanded": {"color": "black", "linestyle": "-", "linewidth": 0.9},
     "measured": {"color": _GREY, "linestyle": "-", "linewidth": 2.2},
     "predicted": {"color": _GREEN, "linestyle": (0, (5, 1.2))},
@@ -65,6 +71,10 @@ _MARKER = {"nominal": "o", "expert": "D", "without": "s", "with": "o"}
 _NAMES = {
     "without": "tuned without net",
     "with": "tuned with net",
+    "without_ten": "without net, ten iterations",
+    "with_ten": "with net, ten iterations",
+    "searched": "searched on the simulator",
+    "ceiling": "long search",
     "predicted": "predicted by the net",
     "linear": "predicted by a linear map",
     "paper": "predicted by the paper's net",
@@ -97,6 +107,19 @@ def _legend(figure: Figure, axes: Axes, columns: int = 6) -> None:
 
 def _named(name: str) -> str:
     return _NAMES.get(name, name)
+
+
+_SPARE = tuple(
+    {"color": color, "linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
+    for color in ("#b0186a", "#2f7fb8", "#8a8a00")
+)
+
+
+def _looks(names: Iterable[str]) -> dict[str, dict]:
+    """How each weight set is drawn; those that are none of ours take what is spare, in turn."""
+    unknown = [name for name in names if name not in _LOOK]
+    spare = {name: _SPARE[i % len(_SPARE)] for i, name in enumerate(unknown)}
+    return {name: _LOOK.get(name) or spare[name] for name in names}
 
 
 def losses(
@@ -168,7 +191,16 @@ def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
         path: file to write.
         walks: by set, on the same plant and command.
     """
-    first = next(iter(walks.values()))
+    with _figure(path, 10.0, 6.2) as figure:
+        panels = figure.subplots(3, 3, sharex=True)
+        _draw_tracking(panels, walks)
+        _legend(figure, panels[0, 0])
+    return "Centre of mass and Euler angles of one stand-in walk of each set against the reference."
+
+
+def _draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
+    """Fill 3 x 3 panels."""
+    first, looks = next(iter(walks.values())), _looks(walks)
     rows = {
         "x [m]": lambda s: s.position[:, 0],
         "y [m]": lambda s: s.position[:, 1],
@@ -182,26 +214,20 @@ def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
         "error in y [cm]": lambda s, r: 100 * (s.position[:, 1] - r.position[:, 1]),
         "error in yaw [deg]": lambda s, r: np.rad2deg(s.euler[:, 2] - r.euler[:, 2]),
     }
-    with _figure(path, 10.0, 6.2) as figure:
-        panels = figure.subplots(3, 3, sharex=True)
-        for panel, (label, value) in zip(panels.flat, rows.items(), strict=False):
-            for name, walk in walks.items():
-                kept = _standing(walk, value(walk.state)[:, None])
-                panel.plot(_times(walk), kept, **_LOOK[name], label=_named(name))
-            panel.plot(
-                _times(first), value(first.reference), **_LOOK["reference"], label="reference"
-            )
-            panel.set_ylabel(label)
-        for panel, (label, value) in zip(panels[2], errors.items(), strict=True):
-            for name, walk in walks.items():
-                kept = _standing(walk, value(walk.state, walk.reference)[:, None])
-                panel.plot(_times(walk), kept, **_LOOK[name])
-            panel.axhline(0.0, **_LOOK["reference"])
-            panel.set(ylabel=label, xlabel="time [s]")
-        for panel in panels.flat:
-            _widen(panel, 0.02 if "[m]" in panel.get_ylabel() else 1.0)
-        _legend(figure, panels[0, 0])
-    return "Centre of mass and Euler angles of one stand-in walk of each set against the reference."
+    for panel, (label, value) in zip(panels.flat, rows.items(), strict=False):
+        for name, walk in walks.items():
+            kept = _standing(walk, value(walk.state)[:, None])
+            panel.plot(_times(walk), kept, **looks[name], label=_named(name))
+        panel.plot(_times(first), value(first.reference), **_LOOK["reference"], label="reference")
+        panel.set_ylabel(label)
+    for panel, (label, value) in zip(panels[2], errors.items(), strict=True):
+        for name, walk in walks.items():
+            kept = _standing(walk, value(walk.state, walk.reference)[:, None])
+            panel.plot(_times(walk), kept, **looks[name])
+        panel.axhline(0.0, **_LOOK["reference"])
+        panel.set(ylabel=label, xlabel="time [s]")
+    for panel in panels.flat:
+        _widen(panel, 0.02 if "[m]" in panel.get_ylabel() else 1.0)
 
 
 def _widen(axes: Axes, least: float) -> None:
@@ -218,36 +244,155 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
         path: file to write.
         walks: by set, on the same plant and command.
     """
-    last = list(walks.values())[-1]
-    reference = next(iter(walks.values())).reference.position
-    points = np.concatenate([walk.state.position[~walk.fallen, :2] for walk in walks.values()])
-    span = np.ptp(np.concatenate([points, reference[:, :2]]), axis=0) + 0.35
-    width = 7.0
+    span, width = _span(walks), 7.0
     with _figure(path, width, float(np.clip(width * span[1] / span[0], 1.4, 5.0)) + 0.9) as figure:
         axes = figure.subplots()
-        stands = np.asarray(last.contact)
-        landed = stands & ~np.roll(stands, 1, axis=0)
-        landed[0] = stands[0]
-        for name, walk in walks.items():
-            kept = _standing(walk, np.asarray(walk.state.position))
-            axes.plot(kept[:, 0], kept[:, 1], **_LOOK[name], label=_named(name))
-        axes.plot(*np.asarray(reference)[:, :2].T, **_LOOK["reference"], label="reference")
-        for foot, marker in enumerate((4, 5)):
-            spots = np.asarray(last.feet)[landed[:, foot] & ~np.asarray(last.fallen), foot]
-            side = ("left", "right")[foot]
-            axes.plot(
-                *spots[:, :2].T,
-                linestyle="none",
-                marker=marker,
-                color="0.6",
-                markersize=6,
-                zorder=1,
-                label=f"{side} foot set down",
-            )
-        axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-        axes.margins(0.05)
+        _draw_path(axes, walks)
         figure.legend(loc="outside upper center", ncols=4)
     return f"Path from above; foot marks are those of the set '{list(walks)[-1]}'."
+
+
+def _span(walks: Mapping[str, Trajectory]) -> np.ndarray:
+    """Extent of all paths in x and y [m], with room for the feet."""
+    reference = next(iter(walks.values())).reference.position
+    points = np.concatenate([walk.state.position[~walk.fallen, :2] for walk in walks.values()])
+    return np.ptp(np.concatenate([points, reference[:, :2]]), axis=0) + 0.35
+
+
+def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
+    last, looks = list(walks.values())[-1], _looks(walks)
+    reference = next(iter(walks.values())).reference.position
+    stands = np.asarray(last.contact)
+    landed = stands & ~np.roll(stands, 1, axis=0)
+    landed[0] = stands[0]
+    for name, walk in walks.items():
+        kept = _standing(walk, np.asarray(walk.state.position))
+        axes.plot(kept[:, 0], kept[:, 1], **looks[name], label=_named(name))
+    axes.plot(*np.asarray(reference)[:, :2].T, **_LOOK["reference"], label="reference")
+    for foot, marker in enumerate((4, 5)):
+        spots = np.asarray(last.feet)[landed[:, foot] & ~np.asarray(last.fallen), foot]
+        side = ("left", "right")[foot]
+        axes.plot(
+            *spots[:, :2].T,
+            linestyle="none",
+            marker=marker,
+            color="0.6",
+            markersize=6,
+            zorder=1,
+            label=f"{side} foot set down",
+        )
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.margins(0.05)
+
+
+def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | None) -> str:
+    """The paper's collective figure: snapshots, path from above, and tracking of all sets.
+
+    Args:
+        path: file to write.
+        walks: by set, on the same plant and command.
+        snapshots: picture of the walk, two rows of tiles; None where there is none.
+    """
+    width = 10.0
+    image = None if snapshots is None else imread(snapshots)
+    top = 0.0 if image is None else 0.97 * width * image.shape[0] / image.shape[1] + 0.1
+    span = _span(walks)
+    flat = span[0] > 3.0 * span[1]  # a straight line has a row of its own
+    middle, bottom = (0.85 * width * span[1] / span[0] + 0.7 if flat else 0.0), 6.2
+    legend = 0.55
+    with _figure(path, width, top + middle + bottom + legend) as figure:
+        heights = [height for height in (top, middle, bottom) if height]
+        rows = iter(figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat)
+        if image is not None:
+            axes = next(rows).subplots()
+            axes.imshow(image)
+            axes.set_axis_off()
+        if flat:
+            above, beside = next(rows), next(rows)
+        else:
+            # as wide as the path needs at the height of the panels
+            share = float(np.clip(bottom * span[0] / span[1] / width, 0.25, 0.42))
+            above, beside = next(rows).subfigures(1, 2, width_ratios=[share, 1.0 - share])
+        axes = above.subplots()
+        _draw_path(axes, walks)
+        _draw_tracking(beside.subplots(3, 3, sharex=True), walks)
+        _legend(figure, axes, columns=4)
+    seen = "" if image is None else "Snapshots; "
+    return (
+        f"{seen}path of the centre of mass from above, foot marks those of "
+        f"'{_named(list(walks)[-1])}'; centre of mass and Euler angles of all sets against the "
+        "reference. One stand-in plant."
+    )
+
+
+def changes(
+    path: Path,
+    verdicts: Mapping[str, Verdict],
+    paper: Mapping[tuple[str, str, str], float],
+) -> str:
+    """Loss of every set against nominal and expert on every plant.
+
+    Args:
+        path: file to write.
+        verdicts: by trajectory.
+        paper: the paper's change [%] by trajectory, set and baseline.
+    """
+    every = dict.fromkeys(name for verdict in verdicts.values() for name in verdict.scores)
+    names = [name for name in every if name not in BASELINES]
+    size = (3.3 * len(verdicts) + 1.2, 2 * (0.27 * len(names) + 0.75) + 0.3)
+    with _figure(path, *size) as figure:
+        panels = figure.subplots(2, len(verdicts), sharex="row", sharey=True, squeeze=False)
+        for column, (trajectory, verdict) in zip(panels.T, verdicts.items(), strict=True):
+            for panel, baseline in zip(column, BASELINES, strict=True):
+                _draw_changes(panel, verdict, names, baseline)
+                known = {n: paper.get((trajectory, n, baseline)) for n in names}
+                at = {names.index(n): 1 + x / 100 for n, x in known.items() if x is not None}
+                panel.plot(
+                    list(at.values()),
+                    list(at),
+                    "D",
+                    color="black",
+                    markerfacecolor="white",
+                    markersize=5,
+                    zorder=4,
+                    label="the paper, on the robot",
+                )
+                panel.set_xscale("log")
+                panel.set(xlabel=f"L against {baseline} [%]", title=trajectory)
+        for row in panels:
+            low, high = row[0].get_xlim()
+            ticks = [r for r in (_TENTHS if high < 3.0 * low else _RATIOS) if low <= r <= high]
+            row[0].xaxis.set_minor_locator(NullLocator())
+            row[0].set_xticks(ticks, [f"{100 * (r - 1):+.0f}" if r != 1 else "0" for r in ticks])
+        panels[0, 0].set_yticks(range(len(names)), [_named(name) for name in names])
+        panels[0, 0].set_ylim(len(names) - 0.5, -0.5)
+        _legend(figure, panels[0, 0])
+    return (
+        "L of each set against that of nominal and expert on the same plant, one dot per plant, "
+        "with the median and its 95 % bootstrap interval; left of the line is better. A cross is a "
+        "plant on which the set fell. Diamonds are the paper's table, after ten iterations."
+    )
+
+
+_RATIOS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+_TENTHS = tuple(i / 10 for i in range(1, 30))
+
+
+def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline: str) -> None:
+    panel.axvline(1.0, color="black", linewidth=0.9)
+    looks = _looks(names)
+    for row, name in enumerate(names):
+        if name not in verdict.scores:
+            continue
+        score, color = verdict.scores[name], looks[name]["color"]
+        ratio = score.L / verdict.scores[baseline].L
+        fell, up = ratio[score.fallen], ratio[~score.fallen]
+        panel.plot(up, np.full(len(up), row), "o", color=color, alpha=0.3, markersize=3, mew=0)
+        panel.plot(fell, np.full(len(fell), row), "x", color=color, markersize=5)
+        value, low, high = (1 + x / 100 for x in compare(verdict, name, baseline).change["L"])
+        panel.hlines(row, low, high, color=color, linewidth=2.2, zorder=3)
+        panel.plot(value, row, "|", color=color, markersize=11, mew=2.2, zorder=3)
+    panel.grid(visible=False, axis="y")
 
 
 def weights(

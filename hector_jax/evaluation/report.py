@@ -56,8 +56,8 @@ _FIDELITY = (
 )
 
 _AXES = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
-_UNITS = {"L": "", "L_Eul": "rad^2", "L_pos": "m^2", "L_ctrl": "N^2, (N m)^2"}
-_VOID = "*"
+UNITS = {"L": "", "L_Eul": "rad^2", "L_pos": "m^2", "L_ctrl": "N^2, (N m)^2"}
+VOID = "*"
 
 
 class Picture(NamedTuple):
@@ -107,7 +107,7 @@ def _commit(folder: Path) -> str:
 
     try:
         changed = " with changes" if git("status", "--porcelain", "--untracked-files=no") else ""
-        return git("rev-parse", "HEAD") + changed
+        return git("describe", "--tags", "--always", "--abbrev=40", "--long") + changed
     except (OSError, subprocess.SubprocessError):
         return ""
 
@@ -119,7 +119,7 @@ def _scale(largest: float) -> int:
     return 3 * math.floor(math.log10(largest) / 3)
 
 
-def _columns(verdict: Verdict) -> dict[str, tuple[int, Callable[[float], str]]]:
+def part_columns(verdict: Verdict) -> dict[str, tuple[int, Callable[[float], str]]]:
     """By part: the power of ten of its column and how its numbers are written."""
     columns = {}
     for part in PARTS:
@@ -134,12 +134,14 @@ def _columns(verdict: Verdict) -> dict[str, tuple[int, Callable[[float], str]]]:
     return columns
 
 
-def _percent(x: float) -> str:
+def percent(x: float) -> str:
+    """A change in %, two digits."""
     return f"{x:+.1f}" if abs(x) < 9.95 else f"{x:+.0f}"
 
 
-def _change(change: Interval) -> str:
-    return f"{_percent(change.value)} [{_percent(change.low)}, {_percent(change.high)}]"
+def change_text(change: Interval) -> str:
+    """A change in % with its interval."""
+    return f"{percent(change.value)} [{percent(change.low)}, {percent(change.high)}]"
 
 
 def _compared(verdict: Verdict, name: str, baseline: str) -> Comparison | None:
@@ -147,7 +149,8 @@ def _compared(verdict: Verdict, name: str, baseline: str) -> Comparison | None:
     return compare(verdict, name, baseline) if known else None
 
 
-def _seeds(verdict: Verdict) -> str:
+def seeds_text(verdict: Verdict) -> str:
+    """The seeds, as a range where they are one."""
     seeds = verdict.seeds
     if len(seeds) > 1 and np.array_equal(seeds, np.arange(seeds[0], seeds[0] + len(seeds))):
         return f"{seeds[0]}-{seeds[-1]}"
@@ -162,15 +165,16 @@ def _power(x: float) -> str:
     return f"{x:.0e}".replace("e+0", "e") if x >= 1e3 else f"{x:g}"
 
 
-def _legend(verdict: Verdict) -> list[str]:
+def legend(verdict: Verdict) -> list[str]:
+    """What the columns of a verdict mean."""
     count = len(verdict.seeds)
     lines = [
-        f"{_formula(verdict.alpha)}; means over {count} plants (seeds {_seeds(verdict)}).",
+        f"{_formula(verdict.alpha)}; means over {count} plants (seeds {seeds_text(verdict)}).",
         "Change of L in %, median over plants of the paired ratio [95 % bootstrap interval]; "
         "below zero is better.",
     ]
     if _void(verdict):
-        lines.append(f"{_VOID} does not count: one of the two falls more often than the other.")
+        lines.append(f"{VOID} does not count: one of the two falls more often than the other.")
     touched = {name: float(score.legs_touch.sum()) for name, score in verdict.scores.items()}
     told = [f"{name} {seconds:.3f} s" for name, seconds in touched.items() if seconds > 0.0]
     if told:
@@ -201,12 +205,12 @@ def print_table(
     where = WORLDS.get(world, world)
     console.print(Text(f"{title} on the {where}" if title else f"On the {where}", style="bold"))
     console.print(_terminal_table(verdict, padding=1 if console.width >= 90 else 0))
-    for line in _legend(verdict):
+    for line in legend(verdict):
         console.print(Text(line, style="dim"))
 
 
 def _terminal_table(verdict: Verdict, padding: int) -> Table:
-    columns = _columns(verdict)
+    columns = part_columns(verdict)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, padding, 0, 0), pad_edge=False, show_edge=False)
     table.add_column("set\n", no_wrap=True)
     order = ("L_Eul", "L_pos", "L_ctrl", "L")
@@ -229,9 +233,9 @@ def _terminal_change(comparison: Comparison | None) -> Text:
         return Text("-", style="dim")
     change = comparison.change["L"]
     if not comparison.counts:
-        return Text(_change(change) + _VOID, style="yellow")
+        return Text(change_text(change) + VOID, style="yellow")
     style = "green" if change.high < 0.0 else "red" if change.low > 0.0 else ""
-    return Text(_change(change), style=style)
+    return Text(change_text(change), style=style)
 
 
 def write_report(folder: Path, report: Report) -> Path:
@@ -249,13 +253,13 @@ def write_report(folder: Path, report: Report) -> Path:
         _summary(report.verdict),
         "## Verdict",
         STAND_IN,
-        _verdict_table(report.verdict),
-        *(line.replace(_VOID, "\\" + _VOID) for line in _legend(report.verdict)),
-        _parts_table(report.verdict),
-        _errors_of_tracking(report.verdict),
+        verdict_table(report.verdict),
+        *(line.replace(VOID, "\\" + VOID) for line in legend(report.verdict)),
+        parts_table(report.verdict),
+        errors_of_tracking(report.verdict),
         _switching(report.verdict),
         "## Tuning",
-        *(_tuning(name, tuning) for name, tuning in report.tunings.items()),
+        *(tuning_section(name, tuning) for name, tuning in report.tunings.items()),
         "### Gradients of the three parts",
         _norms(report.verdict.alpha, report.norms),
         "## GRFM-Net on held-out walks",
@@ -264,7 +268,7 @@ def write_report(folder: Path, report: Report) -> Path:
         *(f"![{p.caption}]({p.file})\n\n*{p.caption}*" for p in report.pictures),
         _film(report.film),
         "## What was run",
-        _table(("what", "version"), list(report.environment.items())),
+        markdown_table(("what", "version"), list(report.environment.items())),
         "```json\n" + json.dumps(report.config, indent=2) + "\n```",
         "## How to reproduce",
         _reproduce(report),
@@ -320,7 +324,7 @@ def _wrench_errors(errors: Mapping[str, Mapping[str, Any]]) -> str:
             unit = "N^2" if axis[0] == "F" else "(N m)^2"
             cells = (_number(e[contact][i]) for e in errors.values())
             rows.append([f"{axis}, {contact} [{unit}]", *cells])
-    return _table(("mean square error", *errors), rows)
+    return markdown_table(("mean square error", *errors), rows)
 
 
 def _phase_errors(phases: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> str:
@@ -331,7 +335,7 @@ def _phase_errors(phases: Mapping[str, Mapping[str, Mapping[str, Sequence[float]
             for part, unit, axes in (("F", "N^2", slice(3)), ("M", "(N m)^2", slice(3, 6))):
                 cells = (_number(np.mean(found[phase][contact][axes])) for found in phases.values())
                 rows.append([f"{phase}, {contact}, {part} [{unit}]", *cells])
-    return _table(("mean over the axes", *phases), rows)
+    return markdown_table(("mean over the axes", *phases), rows)
 
 
 def _drift_table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
@@ -341,10 +345,10 @@ def _drift_table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
         for part, unit, scale in (("position", "cm", 100.0), ("euler", "deg", 180.0 / np.pi)):
             cells = (_number(scale * one[horizon][part], ".2f") for one in found.values())
             rows.append([f"{part} after {horizon} [{unit}]", *cells])
-    return _table(("", *found), rows)
+    return markdown_table(("", *found), rows)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown; the first column to the left, the others to the right."""
     line = lambda cells: "| " + " | ".join(cells) + " |"  # noqa: E731
     rule = "|" + "|".join([" :--- "] + [" ---: "] * (len(head) - 1)) + "|"
@@ -378,8 +382,9 @@ def _clause(comparison: Comparison, baseline: str) -> str:
     return size if clear else f"{size} (the interval holds zero)"
 
 
-def _verdict_table(verdict: Verdict) -> str:
-    columns = _columns(verdict)
+def verdict_table(verdict: Verdict) -> str:
+    """Means, falls, changes and wins of all sets, in Markdown."""
+    columns = part_columns(verdict)
     head = ["set", "L_Eul", "L_pos", "L_ctrl", "L", "falls"]
     head = [h + (f" x1e{columns[h][0]}" if h in columns and columns[h][0] else "") for h in head]
     for baseline in BASELINES:
@@ -394,57 +399,59 @@ def _verdict_table(verdict: Verdict) -> str:
         for baseline in BASELINES:
             row += _verdict_cells(_compared(verdict, name, baseline), len(verdict.seeds))
         rows.append(row)
-    return _table(head, rows)
+    return markdown_table(head, rows)
 
 
 def _verdict_cells(comparison: Comparison | None, seeds: int) -> list[str]:
     if comparison is None:
         return ["", ""]
-    mark = "" if comparison.counts else " \\" + _VOID
+    mark = "" if comparison.counts else " \\" + VOID
     return [
-        _change(comparison.change["L"]) + mark,
+        change_text(comparison.change["L"]) + mark,
         f"{round(comparison.wins * seeds)} / {seeds}",
     ]
 
 
-def _parts_table(verdict: Verdict) -> str:
+def parts_table(verdict: Verdict) -> str:
     """Changes of the parts against each baseline."""
     rows = []
     for name in verdict.scores:
         for baseline in BASELINES:
             comparison = _compared(verdict, name, baseline)
             if comparison is not None:
-                cells = [_change(comparison.change[p]) for p in ("L_Eul", "L_pos", "L_ctrl")]
+                cells = [change_text(comparison.change[p]) for p in ("L_Eul", "L_pos", "L_ctrl")]
                 rows.append([f"{name} against {baseline}", *cells])
-    head = ("change in % of", *(f"{p} [{_UNITS[p]}]" for p in ("L_Eul", "L_pos", "L_ctrl")))
-    return _table(head, rows)
+    head = ("change in % of", *(f"{p} [{UNITS[p]}]" for p in ("L_Eul", "L_pos", "L_ctrl")))
+    return markdown_table(head, rows)
 
 
-def _errors_of_tracking(verdict: Verdict) -> str:
+def errors_of_tracking(verdict: Verdict) -> str:
+    """RMS errors of all sets, in Markdown."""
     head = ("RMS error", "roll [deg]", "pitch [deg]", "yaw [deg]", "x [cm]", "y [cm]", "z [cm]")
     rows = []
     for name in verdict.scores:
         euler, position = rms(verdict, name)
         values = [*np.rad2deg(euler), *(100 * position)]
         rows.append([name, *(f"{v:.2f}" for v in values)])
-    return _table(head, rows) + "\n\nOver all plants, up to a fall where there is one."
+    return markdown_table(head, rows) + "\n\nOver all plants, up to a fall where there is one."
 
 
 def _switching(verdict: Verdict) -> str:
-    power, write = _columns(verdict)["L_ctrl"]
+    power, write = part_columns(verdict)["L_ctrl"]
     head = [f"L_ctrl{f' x1e{power}' if power else ''}", "whole", "at switches", "between them"]
     rows = []
     for name, score in verdict.scores.items():
         whole, owed = float(score.L_ctrl.mean()), float(score.switching.mean())
         rows.append([name, write(whole), write(owed), write(whole - owed)])
     return (
-        _table(head, rows)
+        markdown_table(head, rows)
         + "\n\nWhere the stance switches, one foot lets go of the weight and the other takes it: "
         "about 2 (m g)^2 per switch is owed whatever the weights."
     )
 
 
-def _tuning(name: str, tuning: Tuning) -> str:
+def tuning_section(name: str, tuning: Tuning) -> str:
+    """What a tuning did, under a heading of its name."""
     history = tuning.history
     refused = [i for i in history if not i.accepted]
     accepted = [i for i in history if i.accepted]
@@ -499,7 +506,7 @@ def _norms(alpha: LossConfig, norms: Mapping[str, Losses]) -> str:
         "Norms of the gradients in log-weights at the nominal weights. The paper's footnote "
         "chooses alpha so that the three have one order of magnitude; `auto` is what "
         "`--alpha auto` takes for alpha_1, alpha_2. This run: "
-        f"{_power(alpha.euler)}, {_power(alpha.position)}.\n\n" + _table(head, rows)
+        f"{_power(alpha.euler)}, {_power(alpha.position)}.\n\n" + markdown_table(head, rows)
     )
 
 
@@ -517,7 +524,9 @@ def _net_errors(errors: Mapping[str, Mapping[str, Any]]) -> str:
     return (
         "Mean square errors on walks that the net has not seen, beside the raw command (what the "
         "plain rigid body believes) and a linear map of the same inputs.\n\n"
-        + _table(("", "raw command", "linear map", "GRFM-Net", "net / raw", "net / linear"), rows)
+        + markdown_table(
+            ("", "raw command", "linear map", "GRFM-Net", "net / raw", "net / linear"), rows
+        )
     )
 
 

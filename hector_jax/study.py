@@ -1,0 +1,265 @@
+"""The whole table: search, tune and judge every set on every trajectory, and write what came out.
+
+Each step takes up what is kept of it (kept.py, tuning/search.py), so that a run that was cut goes
+on where it was, and another set or more plants cost only what is new.
+"""
+
+import re
+import tempfile
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from hector_jax import flags, kept, pipeline
+from hector_jax.console import say
+from hector_jax.control.reference import Command, named_command
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.evaluation import metrics, plots, table
+from hector_jax.evaluation.metrics import BASELINES, Verdict
+from hector_jax.evaluation.report import Picture, environment
+from hector_jax.evaluation.table import PAPER, Earlier, Fall, Search, Table
+from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_video
+from hector_jax.grfm.network import Params
+from hector_jax.kept import Judged, Tuned
+from hector_jax.robot import Robot, load_robot
+from hector_jax.runtime import workers
+from hector_jax.sim.world import Imperfections, hfs
+from hector_jax.storage import load_weights, make_folder
+from hector_jax.trajectory import Trajectory
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
+from hector_jax.tuning.search import Found, SearchConfig
+
+SETS = ("nominal", "expert", "searched", "without_ten", "with_ten", "without", "with")
+CEILING = "ceiling"
+
+# what `quick` cuts down to, so that all is done in under five minutes on two cores
+_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20}
+
+_SNAPSHOTS = VideoConfig(width=640, height=214, rate=8)  # no film of it is kept
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What the flags ask for, found sound."""
+
+    commands: Mapping[str, Command]
+    seeds: range
+    tune: TuneConfig
+    search: SearchConfig
+    extra: Mapping[str, Mapping[str, Weights]]  # by trajectory, the sets from files
+    earlier: Earlier | None
+
+
+def _plan(args: flags.Table) -> _Plan:
+    """Raises ValueError, before anything is computed, where the flags ask for what cannot be."""
+    if args.quick:
+        args = replace(args, **{n: min(getattr(args, n), most) for n, most in _QUICK.items()})
+    for name, least in (("seeds", 1), ("first_seed", 0), ("iterations", PAPER_ITERATIONS)):
+        if getattr(args, name) < least:
+            flag = name.replace("_", "-")
+            raise ValueError(f"--{flag} must be at least {least}, got {getattr(args, name)}")
+    commands = {name: named_command(name) for name in args.trajectories}
+    if len(commands) < len(args.trajectories) or not commands:
+        raise ValueError(f"--trajectories must name each once, got {' '.join(args.trajectories)}")
+    return _Plan(
+        commands,
+        range(args.first_seed, args.first_seed + args.seeds),
+        TuneConfig(iterations=args.iterations),
+        SearchConfig(budget=args.rollouts),
+        _sets_from_files(args),
+        None if args.earlier is None else table.load_earlier(args.earlier),
+    )
+
+
+def _sets_from_files(args: flags.Table) -> dict[str, dict[str, Weights]]:
+    """The ceiling, where there is one, and the extra sets, by trajectory."""
+    folders: dict[str, Path] = {}
+    for text in args.extra:
+        name, _, folder = text.partition("=")
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not folder:
+            raise ValueError(f"--extra must be NAME=FOLDER, NAME of letters and digits, got {text}")
+        if name in (*SETS, CEILING, *folders):
+            raise ValueError(f"--extra {text}: there is a set '{name}' already")
+        folders[name] = Path(folder)
+    found = {}
+    for trajectory in args.trajectories:
+        ceiling = args.ceiling / f"{trajectory}.json"
+        paths = {CEILING: ceiling} if ceiling.exists() else {}
+        paths |= {name: folder / f"{trajectory}.json" for name, folder in folders.items()}
+        found[trajectory] = {name: load_weights(path) for name, path in paths.items()}
+    return found
+
+
+def make_table(
+    args: flags.Table, plants: Callable[[range], list[Imperfections]]
+) -> tuple[Path, dict[str, Verdict]]:
+    """Everything from the net to the files.
+
+    Args:
+        args: what is asked for.
+        plants: those of the verdict, by their seeds.
+
+    Returns:
+        report.md, and the verdict of each trajectory.
+
+    Raises:
+        ValueError: the flags ask for what cannot be, or a file is damaged.
+        OSError: a folder cannot be written.
+    """
+    plan, robot = _plan(args), load_robot()
+    out = args.out / "quick" if args.quick else args.out
+    shelf = args.kept or args.out / "kept"
+    for folder in (out / "pictures", shelf):
+        make_folder(folder)
+    made_with = environment()
+    with workers(args.processes) as pool:
+        net = pipeline.ground(pool, plan.tune, robot, args.data)
+        searches = _search(pool, plan, robot, shelf)
+        tunings, judged = {}, {}
+        for name, command in plan.commands.items():
+            problems = {"without": (command, None), "with": (command, net.params)}
+            tunings[name], judged[name] = _walk_sets(
+                pool, plan, robot, name, problems, searches[name], plants, shelf, made_with
+            )
+    verdicts = {name: _verdict(plan, found) for name, found in judged.items()}
+    commits = {tuned.commit for each in tunings.values() for tuned in each.values()}
+    commits |= {w.commit for found in judged.values() for ws in found.walks.values() for w in ws}
+    told = table.write_table(
+        out,
+        Table(
+            verdicts,
+            falls=[fall for name, one in judged.items() for fall in _falls(plan, name, one)],
+            tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tunings.items()},
+            searches={name: _told(plan, found) for name, found in searches.items()},
+            pictures=_draw(out, robot, verdicts, judged),
+            config={
+                "flags": flags.settings(args),
+                "tune": asdict(plan.tune),
+                "search": asdict(plan.search),
+            },
+            environment=made_with,
+            commits=sorted(commits),
+            command=flags.as_command("table", args),
+            earlier=plan.earlier,
+        ),
+    )
+    return told, verdicts
+
+
+def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str, Found]:
+    """The derivative-free baseline of all trajectories, in lock-step."""
+    settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
+    engine, model = pipeline.choose_engine("auto"), plan.tune.rollout
+    key = kept.digest(engine, model, plan.tune.loss, settings, robot, hfs(), nominal())
+    starts = dict.fromkeys(plan.commands, nominal())
+    folder = shelf / f"search-{key}"
+    return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)
+
+
+def _walk_sets(
+    pool: Executor,
+    plan: _Plan,
+    robot: Robot,
+    name: str,
+    problems: Mapping[str, tuple[Command, Params | None]],
+    searched: Found,
+    plants: Callable[[range], list[Imperfections]],
+    shelf: Path,
+    made_with: Mapping[str, str],
+) -> tuple[dict[str, Tuned], Judged]:
+    """The tunings of one trajectory, and the walks of all its sets."""
+    commit = made_with.get("commit", "")
+    tuned = kept.tune(
+        pool,
+        plan.tune,
+        robot,
+        problems,
+        shelf / name,
+        commit,
+        f"tuning {name} without and with GRFM-Net",
+    )
+    sets = {
+        "nominal": nominal(),
+        "expert": expert(),
+        "searched": searched.weights,
+        **{f"{which}_ten": one.tuning.ten for which, one in tuned.items()},
+        **{which: one.tuning.converged for which, one in tuned.items()},
+        **plan.extra[name],
+    }
+    title = f"judging {name} on {len(plan.seeds)} stand-in plants"
+    judged = kept.judge(
+        pool,
+        plan.tune,
+        robot,
+        sets,
+        plan.commands[name],
+        plants(plan.seeds),
+        plan.seeds,
+        shelf / name,
+        commit,
+        title,
+    )
+    return tuned, judged
+
+
+def _verdict(plan: _Plan, judged: Judged) -> Verdict:
+    scores = {name: [walk.score for walk in walks] for name, walks in judged.walks.items()}
+    return metrics.judge(plan.tune.loss, plan.seeds, scores)
+
+
+def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:
+    return [
+        Fall(
+            trajectory,
+            name,
+            seed,
+            float(walk.upright),
+            float(walk.last.position[2]),
+            *(float(angle) for angle in walk.last.euler[:2]),
+        )
+        for name, walks in judged.walks.items()
+        for seed, walk in zip(plan.seeds, walks, strict=True)
+        if walk.score.fallen
+    ]
+
+
+def _told(plan: _Plan, found: Found) -> Search:
+    walks = len(found.history) * plan.search.population
+    return Search(walks, found.walk, found.loss, found.stop)
+
+
+def _draw(
+    out: Path, robot: Robot, verdicts: Mapping[str, Verdict], judged: Mapping[str, Judged]
+) -> list[Picture]:
+    """All pictures, in the order of the report."""
+    say("drawing")
+    paper = {
+        (trajectory, name, baseline): table.paper_change(trajectory, name, baseline)
+        for trajectory in verdicts
+        for name in PAPER[trajectory]
+        for baseline in BASELINES
+        if name not in BASELINES
+    }
+    caption = plots.changes(out / "pictures" / "changes.png", verdicts, paper)
+    pictures = [Picture("pictures/changes.png", caption)]
+    for name, found in judged.items():
+        # the last one's footprints are drawn
+        walks = {key: walk for key, walk in found.shown.items() if key != "with"}
+        walks["with"] = found.shown["with"]
+        with tempfile.TemporaryDirectory() as folder:
+            strip = _snapshots(Path(folder), robot, found.shown)
+            file = f"pictures/{name}.png"
+            pictures.append(Picture(file, f"{name}: {plots.collective(out / file, walks, strip)}"))
+    return pictures
+
+
+def _snapshots(folder: Path, robot: Robot, shown: Mapping[str, Trajectory]) -> Path | None:
+    """A strip of both walks; None, with one line, where nothing can be drawn here."""
+    pair = {"nominal": shown["nominal"], "tuned with net": shown["with"]}
+    try:
+        write_video(folder / "film.mp4", robot, pair, folder / "strip.png", _SNAPSHOTS)
+    except VideoUnavailable as error:
+        say(f"no snapshots: {error}")
+        return None
+    return folder / "strip.png"

@@ -1,0 +1,150 @@
+"""What is kept is taken up, and only where the same is asked."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+from pretend import pretend_history, pretend_walk
+
+from hector_jax import kept, pipeline
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import bounds, expert, nominal
+from hector_jax.robot import load_robot
+from hector_jax.sim.world import hfs, ideal
+from hector_jax.tuning.difftune import TuneConfig, Tuning
+
+ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
+POOL = ThreadPoolExecutor(1)  # never asked
+TUNING = Tuning(pretend_history(12, refused=(3, 5)), expert(), bounds()[1], "12 iterations")
+
+
+def same(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+@pytest.fixture
+def tuned(monkeypatch):
+    """Names of the problems that are really tuned."""
+    names = []
+
+    def tune_many(pool, config, robot, problems, title):
+        names.extend(problems)
+        return dict.fromkeys(problems, TUNING)
+
+    monkeypatch.setattr(pipeline, "tune_many", tune_many)
+    return names
+
+
+@pytest.fixture
+def walked(monkeypatch):
+    """Seeds of the walks that are really walked; `cut` many walks at most."""
+    seeds = []
+
+    def walks_of(pool, config, robot, jobs, title):
+        for job in jobs:
+            if len(seeds) == walks_of.cut:
+                raise KeyboardInterrupt
+            seeds.append(job.seed)
+            fall_at = 0.5 if job.seed == 2 else None
+            yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0, fall_at=fall_at)
+
+    walks_of.cut = None
+    monkeypatch.setattr(pipeline, "walks_of", walks_of)
+    return seeds, walks_of
+
+
+def tune(folder, config=CONFIG, command=S):
+    problems = {"without": (command, None)}
+    return kept.tune(POOL, config, ROBOT, problems, folder, "abc", "")["without"]
+
+
+def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
+    plants = [plant or hfs()] * len(seeds)
+    return kept.judge(POOL, CONFIG, ROBOT, sets, S, plants, seeds, folder, commit, "")
+
+
+def test_a_tuning_comes_back_as_it_was(tmp_path):
+    path = tmp_path / "tuning.npz"
+    kept.save_tuning(path, TUNING, ROBOT, "abc")
+    back = kept.load_tuning(path, ROBOT)
+    assert back.commit == "abc"
+    assert back.tuning.stop == TUNING.stop
+    assert [i.reason for i in back.tuning.history] == [i.reason for i in TUNING.history]
+    assert [i.accepted for i in back.tuning.history] == [i.accepted for i in TUNING.history]
+    same(back.tuning._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
+    for one, other in zip(back.tuning.history, TUNING.history, strict=True):
+        assert one.iteration == other.iteration
+        assert one.step == other.step
+        same((one.weights, one.evaluation), (other.weights, other.evaluation))
+
+
+def test_a_tuning_is_made_once_and_again_for_other_settings(tmp_path, tuned):
+    first, second = tune(tmp_path), tune(tmp_path)
+    assert tuned == ["without"]
+    same(first.tuning.converged, second.tuning.converged)
+    tune(tmp_path, TuneConfig(iterations=20))
+    tune(tmp_path, command=named_command("c"))
+    assert len(tuned) == 3
+
+
+def test_a_damaged_tuning_is_made_anew(tmp_path, tuned, capsys):
+    tune(tmp_path)
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:-100])
+    tune(tmp_path)
+    assert len(tuned) == 2
+    assert path.name in "".join(capsys.readouterr().err.split())
+
+
+def test_walks_that_are_kept_are_not_walked_again(tmp_path, walked):
+    seeds, _ = walked
+    sets = {"nominal": nominal(), "expert": expert()}
+    first, second = judge(tmp_path, sets), judge(tmp_path, sets, commit="def")
+    assert len(seeds) == 6
+    same([w[:3] for w in first.walks["expert"]], [w[:3] for w in second.walks["expert"]])
+    same(first.shown, second.shown)
+    assert {w.commit for w in second.walks["nominal"]} == {"abc"}
+    more = judge(tmp_path, sets | {"mine": bounds()[1]}, seeds=(0, 1, 2, 3), commit="def")
+    assert sorted(seeds[6:]) == [0, 1, 2, 3, 3, 3]
+    assert [w.commit for w in more.walks["nominal"]] == ["abc"] * 3 + ["def"]
+
+
+def test_a_cut_judging_goes_on_where_it_was(tmp_path, walked):
+    seeds, walks_of = walked
+    sets = {"nominal": nominal(), "expert": expert()}
+    walks_of.cut = 4
+    with pytest.raises(KeyboardInterrupt):
+        judge(tmp_path / "cut", sets)
+    walks_of.cut = None
+    resumed = judge(tmp_path / "cut", sets)
+    assert len(seeds) == 6
+    at_once = judge(tmp_path / "whole", sets)
+    same([w[:3] for w in resumed.walks["expert"]], [w[:3] for w in at_once.walks["expert"]])
+
+
+def test_another_plant_or_other_weights_are_walked(tmp_path, walked):
+    seeds, _ = walked
+    judge(tmp_path, {"mine": nominal()})
+    judge(tmp_path, {"mine": expert()})
+    judge(tmp_path, {"mine": nominal()}, plant=ideal())
+    assert len(seeds) == 9
+
+
+def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
+    for _ in range(2):  # as walked, and as kept
+        walk = judge(tmp_path, {"mine": nominal()}).walks["mine"][2]
+        assert walk.score.fallen
+        assert float(walk.upright) == pytest.approx(0.5)
+        assert np.isfinite(np.concatenate(walk.last)).all()
+
+
+def test_the_digest_tells_settings_trees_and_seeds_apart():
+    found = {
+        kept.digest(CONFIG, ROBOT, nominal()),
+        kept.digest(CONFIG, ROBOT, expert()),
+        kept.digest(TuneConfig(iterations=20), ROBOT, nominal()),
+        kept.digest(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal()),
+        kept.digest(CONFIG, ROBOT, nominal(), None),
+    }
+    assert len(found) == 5

@@ -1,0 +1,139 @@
+"""The table from flags to files, on walks that no simulator made."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pretend import pretend_history, pretend_walk
+
+from hector_jax import commands, flags, kept, pipeline, study
+from hector_jax.control.weights import expert, nominal
+from hector_jax.evaluation.video import VideoUnavailable
+from hector_jax.flags import Table, as_command
+from hector_jax.sim.world import hfs
+from hector_jax.storage import save_weights
+from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.search import Found, Generation
+
+
+def plants(seeds):
+    return [hfs()] * len(seeds)
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the steps that take long were asked for; nothing is walked, tuned or drawn in 3D."""
+    told = {"walks": 0, "tunings": []}
+
+    def search(pool, config, tune, robot, starts, engine, folder):
+        told["search"] = config
+        generation = Generation(np.zeros((10, 18)), np.full(10, 2e6))
+        one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
+        return dict.fromkeys(starts, one)
+
+    def tune_many(pool, config, robot, problems, title):
+        told["tunings"].append((config.iterations, *problems))
+        return dict.fromkeys(problems, Tuning(pretend_history(12), nominal(), expert(), "done"))
+
+    def walks_of(pool, config, robot, jobs, title):
+        for job in jobs:
+            told["walks"] += 1
+            yield pretend_walk(job.seed, 0.02, 1.0, fall_at=0.5 if job.seed == 3 else None)
+
+    def write_video(*args):
+        raise VideoUnavailable("no film: none here")
+
+    class Net:
+        params = None
+
+    monkeypatch.setattr(pipeline, "ground", lambda *args: Net)
+    monkeypatch.setattr(pipeline, "search", search)
+    monkeypatch.setattr(pipeline, "tune_many", tune_many)
+    monkeypatch.setattr(pipeline, "walks_of", walks_of)
+    monkeypatch.setattr(kept, "load_tuning", lambda path, robot: None)
+    monkeypatch.setattr(study, "write_video", write_video)
+    return told
+
+
+def table(tmp_path, **changes):
+    return Table(**{"out": tmp_path / "out", "ceiling": tmp_path / "ceiling", **changes})
+
+
+def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, asked):
+    names = ("straight", "s")
+    told, verdicts = study.make_table(table(tmp_path, quick=True, trajectories=names), plants)
+    out = tmp_path / "out" / "quick"
+    assert told == out / "report.md"
+    assert tuple(verdicts) == names
+    assert asked["walks"] == 2 * 7 * 4
+    assert asked["search"].budget < 200
+    assert [rest for _, *rest in asked["tunings"]] == [["without", "with"]] * 2
+    text = told.read_text()
+    assert "hector table --" in text
+    assert "--quick" in text
+    assert "14 of 56 walks ended in a fall" in text
+    for name in ("changes", *names):
+        assert f"(pictures/{name}.png)" in text
+        assert (out / "pictures" / f"{name}.png").stat().st_size > 10_000
+    result = json.loads((out / "table.json").read_text())
+    assert list(result["trajectories"]["s"]["sets"]) == list(study.SETS)
+    for name in ("table.csv", "table.tex"):
+        assert (out / name).exists()
+
+
+def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
+    tmp_path, asked, monkeypatch
+):
+    monkeypatch.setattr(study, "_draw", lambda *args: [])
+    small = {"trajectories": ("s",), "seeds": 2}
+    study.make_table(table(tmp_path, **small), plants)
+    assert asked["walks"] == 14
+    for folder in ("ceiling", "other"):
+        save_weights(tmp_path / folder / "s.json", nominal())
+    found = table(tmp_path, **small, extra=(f"mine={tmp_path / 'other'}",))
+    told, verdicts = study.make_table(found, plants)
+    assert list(verdicts["s"].scores) == [*study.SETS, "ceiling", "mine"]
+    assert asked["walks"] == 14 + 4
+    assert "`with` against `ceiling`" in told.read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"seeds": 0}, "--seeds must be at least 1, got 0"),
+        ({"first_seed": -1}, "--first-seed must be at least 0, got -1"),
+        ({"iterations": 3}, "--iterations must be at least 10, got 3"),
+        ({"rollouts": 3}, "budget must be at least one generation"),
+        ({"trajectories": ("moon",)}, "unknown trajectory 'moon'"),
+        ({"trajectories": ("s", "s")}, "--trajectories must name each once, got s s"),
+        ({"extra": ("mine",)}, "--extra must be NAME=FOLDER.*got mine"),
+        ({"extra": ("my set=x",)}, "--extra must be NAME=FOLDER.*got my set=x"),
+        ({"extra": ("with=x",)}, "--extra with=x: there is a set 'with' already"),
+        ({"extra": ("a=x", "a=y")}, "--extra a=y: there is a set 'a' already"),
+        ({"extra": ("a=nowhere",)}, "cannot read nowhere/straight.json"),
+        ({"earlier": Path("nowhere.json")}, "cannot read nowhere.json"),
+        ({"processes": 0}, "processes must be at least 1, got 0"),
+    ],
+)
+def test_wrong_flags_are_told_before_anything_is_computed(tmp_path, changes, words):
+    with pytest.raises(ValueError, match=words):
+        study.make_table(table(tmp_path, **changes), plants)
+
+
+def test_the_line_that_asks_again_names_what_is_not_default():
+    assert as_command("table", Table()) == "hector table"
+    asked = Table(seeds=4, extra=("a=x", "b=y"), quick=True)
+    assert as_command("table", asked) == "hector table --seeds 4 --extra a=x b=y --quick"
+    assert as_command("tune", flags.Tune(video=False)) == "hector tune --no-video"
+
+
+def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(commands, "run", asked.append)
+    commands._tune(flags.Tune(traj="all", run=tmp_path, seeds=2))
+    assert [one.traj for one in asked] == ["straight", "c", "s"]
+    assert [one.run.name for one in asked] == ["straight", "c", "s"]
+    assert {one.seeds for one in asked} == {2}
+    commands._tune(flags.Tune(traj="all"))
+    assert asked[-1].run is None
