@@ -45,6 +45,7 @@ class Tune:
     seeds: int = 8  # stand-in plants in the verdict
     iterations: int = 100  # of the tuning, at most
     alpha: str = "paper"  # loss weights: the paper's, or auto (gradient norms aligned)
+    refresh: int = 0  # times to collect again at the tuned weights, train anew and tune again
     data: Path = Path("data")  # walks and net; made where missing
     runs: Path = Path("runs")  # results go to RUNS/TRAJ/TIME
     run: Path | None = None  # or to this folder, which must not exist

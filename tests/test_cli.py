@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -170,14 +171,16 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
 
 @pytest.mark.slow
 def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
-    """From nothing to a verdict, small: data, net, two tunings, judges, report."""
+    """From nothing to a verdict, small: data, net, two tunings, one refresh, judges, report."""
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
-    assert call(monkeypatch, "tune", "--seeds", "2", "--iterations", "11", "--run", "run") == 0
+    monkeypatch.setattr(commands.pipeline, "REFRESH", replace(small, walks=4))
+    flags = ("--seeds", "2", "--iterations", "11", "--refresh", "1")
+    assert call(monkeypatch, "tune", *flags, "--run", "run") == 0
     out = capsys.readouterr().out
     run = tmp_path / "run"
-    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with"]
+    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "with_refreshed"]
     for name in names:
         assert name in out
         assert (run / "weights" / f"{name}.json").exists()
@@ -190,14 +193,24 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         for part in ("L", "L_Eul", "L_pos", "L_ctrl"):
             assert standin[part]["low"] <= standin[part]["mean"] <= standin[part]["high"]
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert {line["set"] for line in lines} == {"without", "with"}
+    assert {line["set"] for line in lines} == {"without", "with", "with_refreshed"}
+    assert result["refresh"][0].keys() == {"old", "new"}
+    assert len(load_walks(run / "refresh-1" / "walks", load_robot()).job.seed) == 4
+    assert "### Refresh 1" in (run / "report.md").read_text()
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
-    "wrong", [("--processes", "0"), ("--iterations", "3"), ("--seeds", "0"), ("--alpha", "both")]
+    "wrong",
+    [
+        ("--processes", "0"),
+        ("--iterations", "3"),
+        ("--seeds", "0"),
+        ("--alpha", "both"),
+        ("--refresh", "-1"),
+    ],
 )
 def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
     line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)

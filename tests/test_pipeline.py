@@ -5,16 +5,19 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 import pytest
+from pretend import pretend_history
 from synthetic import synthetic_walk
 
 from hector_jax import pipeline
+from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
-from hector_jax.grfm.dataset import collect, draw_jobs
+from hector_jax.grfm.dataset import collect, draw_jobs, walked_with
 from hector_jax.grfm.network import NetParams, ResidualParams
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import load_robot
 from hector_jax.storage import read_card
-from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 QUICK = TrainConfig(epochs=1)
 
@@ -59,6 +62,47 @@ def test_a_net_is_trained_once_and_again_for_other_walks(tmp_path, robot):
     gather(tmp_path / "two", robot, seed=1)
     pipeline.learned(QUICK, robot, tmp_path / "two", path)
     assert read_card(path)["about"]["made_of"] != card["made_of"]
+
+
+def test_what_was_held_out_stays_held_out_beside_other_walks(tmp_path, robot):
+    one, two = tmp_path / "one", tmp_path / "two"
+    gather(one, robot)
+    gather(two, robot, seed=1)
+    alone = [pipeline.samples(robot, folder) for folder in (one, two)]
+    both = pipeline.samples(robot, one, two)
+    joined = jax.tree.map(lambda *x: np.concatenate(x), *(part[:3] for part in alone))
+    jax.tree.map(np.testing.assert_array_equal, tuple(both[:3]), joined)
+    assert both.dropped == sum(part.dropped for part in alone)
+
+
+def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, robot, monkeypatch):
+    gather(tmp_path / "walks", robot)
+    paper = TrainConfig("paper", epochs=1)
+    pipeline.train(paper, robot, tmp_path / "walks", tmp_path / "grfm.npz")
+    before = pipeline.learned(QUICK, robot, tmp_path / "walks", tmp_path / "grfm.npz")
+    history = pretend_history(14, refused=(12,))
+    tuning = Tuning(history, history[10].weights, history[-1].weights, "")
+    asked = []
+
+    def walk_many(pool, config, robot, jobs):
+        asked.extend(jobs)
+        return (synthetic_walk(100 + job.seed, 12) for job in jobs)
+
+    monkeypatch.setattr(pipeline, "walk_many", walk_many)
+    folder, few = tmp_path / "refresh-1", CollectConfig(walks=5, engine="c")
+    after, shift = pipeline.refresh(
+        ThreadPoolExecutor(1), few, TuneConfig(), robot, named_command("s"), tuning, before, folder
+    )
+    assert len(asked) == 5
+    assert after.folders == (tmp_path / "walks", folder / "walks")
+    assert after.config == before.config == paper  # trained as the net before it was
+    card = read_card(folder / "refreshed.npz")["about"]
+    one, two = (pipeline.samples(robot, place) for place in after.folders)
+    assert card["samples"]["training"] == len(one.training.walk) + len(two.training.walk)
+    assert card["and_of"] == [walked_with(folder / "walks")]
+    assert shift.keys() == {"old", "new"}
+    assert all(errors.keys() == {"raw", "before", "after"} for errors in shift.values())
+    assert shift["old"]["before"] == before.errors["net"]
 
 
 def test_the_variant_that_was_trained_is_the_one_that_is_used(tmp_path, robot):
