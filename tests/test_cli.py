@@ -13,10 +13,10 @@ import pytest
 from hector_jax import commands
 from hector_jax.cli import main
 from hector_jax.control.weights import expert
-from hector_jax.grfm.dataset import load_walks
+from hector_jax.grfm.dataset import load_walks, walked_with
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import MODEL_PATH, load_robot
-from hector_jax.storage import save_weights
+from hector_jax.storage import read_card, save_weights
 
 
 def call(monkeypatch, *arguments):
@@ -196,6 +196,9 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert {line["set"] for line in lines} == {"without", "with", "with_refreshed"}
     assert result["refresh"][0].keys() == {"old", "new"}
     assert len(load_walks(run / "refresh-1" / "walks", load_robot()).job.seed) == 4
+    card = read_card(run / "refresh-1" / "refreshed.npz")["about"]
+    assert card["made_of"] == walked_with(tmp_path / "data" / "walks")
+    assert card["and_of"] == [walked_with(run / "refresh-1" / "walks")]
     assert "### Refresh 1" in (run / "report.md").read_text()
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):

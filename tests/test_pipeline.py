@@ -11,7 +11,8 @@ from synthetic import synthetic_walk
 from hector_jax import pipeline
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
-from hector_jax.grfm.dataset import collect, draw_jobs, walked_with
+from hector_jax.control.weights import nominal
+from hector_jax.grfm.dataset import collect, draw_jobs, draw_jobs_near
 from hector_jax.grfm.network import NetParams, ResidualParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.pipeline import CollectConfig
@@ -76,33 +77,44 @@ def test_what_was_held_out_stays_held_out_beside_other_walks(tmp_path, robot):
 
 
 def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, robot, monkeypatch):
-    gather(tmp_path / "walks", robot)
-    paper = TrainConfig("paper", epochs=1)
-    pipeline.train(paper, robot, tmp_path / "walks", tmp_path / "grfm.npz")
-    before = pipeline.learned(QUICK, robot, tmp_path / "walks", tmp_path / "grfm.npz")
+    old, folder, few = tmp_path / "walks", tmp_path / "refresh-1", CollectConfig(5, engine="c")
+    gather(old, robot)
+    before = pipeline.train(TrainConfig("paper", epochs=1), robot, old, tmp_path / "grfm.npz")
     history = pretend_history(14, refused=(12,))
     tuning = Tuning(history, history[10].weights, history[-1].weights, "")
-    asked = []
+    walked, trained = [], []
 
     def walk_many(pool, config, robot, jobs):
-        asked.extend(jobs)
+        walked.extend(jobs)
         return (synthetic_walk(100 + job.seed, 12) for job in jobs)
 
+    def train(config, robot, folder, path, more):
+        trained.append((config, folder, path, *more))
+        return before._replace(folders=(folder, *more))
+
     monkeypatch.setattr(pipeline, "walk_many", walk_many)
-    folder, few = tmp_path / "refresh-1", CollectConfig(walks=5, engine="c")
-    after, shift = pipeline.refresh(
-        ThreadPoolExecutor(1), few, TuneConfig(), robot, named_command("s"), tuning, before, folder
-    )
-    assert len(asked) == 5
-    assert after.folders == (tmp_path / "walks", folder / "walks")
-    assert after.config == before.config == paper  # trained as the net before it was
-    card = read_card(folder / "refreshed.npz")["about"]
-    one, two = (pipeline.samples(robot, place) for place in after.folders)
-    assert card["samples"]["training"] == len(one.training.walk) + len(two.training.walk)
-    assert card["and_of"] == [walked_with(folder / "walks")]
+    monkeypatch.setattr(pipeline, "train", train)
+    for _ in range(2):  # the second time takes up the walks
+        after, shift = pipeline.refresh(
+            ThreadPoolExecutor(1),
+            few,
+            TuneConfig(),
+            robot,
+            named_command("s"),
+            tuning,
+            before,
+            folder,
+        )
+    new = folder / "walks"
+    path = jax.tree.map(lambda w: np.stack(4 * [w]), nominal())  # ten, 11, 13 and 14
+    jobs = draw_jobs_near(0, 5, named_command("s"), path)
+    jax.tree.map(np.testing.assert_array_equal, walked, jobs)
+    assert trained == 2 * [(before.config, old, folder / "refreshed.npz", new)]
+    assert after.folders == (old, new)
     assert shift.keys() == {"old", "new"}
     assert all(errors.keys() == {"raw", "before", "after"} for errors in shift.values())
     assert shift["old"]["before"] == before.errors["net"]
+    assert shift["new"]["before"] != shift["old"]["before"]
 
 
 def test_the_variant_that_was_trained_is_the_one_that_is_used(tmp_path, robot):
