@@ -9,7 +9,10 @@ disturbed weight sets. The feet share one R: 18 directions.
 
 Walks on the hfs are kept under OUT/hfs and taken up again: by MuJoCo C on the processes, or all at
 once in MJX where JAX sees an accelerator. Another controller (--effort-about, --stance-weight) has
-nets only where DATA was walked by it.
+nets of its own: name a DATA folder for it, and what is missing there is collected with that
+controller and trained. Over data that another one walked, the command alone is compared.
+
+    python experiments/transfer.py --effort-about weight --data data-weight --out runs/weight
 """
 
 import hashlib
@@ -104,7 +107,10 @@ def phis(
     effects = {"command": last_command}
     if (walks / "card.json").exists():
         if walked_with(walks).get("controller") != repr(config.rollout.walk):
-            say(f"{walks}: walked by another controller; only the command itself is compared")
+            say(
+                f"{walks}: walked by another controller; only the command itself is compared. "
+                "A --data folder of its own gives this one nets"
+            )
             return effects, None
     shared = TuneConfig(rollout=RolloutConfig(walk=config.rollout.walk))  # data know no lead
     net, paper = (pipeline.ground(pool, shared, robot, data, name) for name in (None, "paper"))

@@ -65,7 +65,7 @@ from hector_jax.storage import (
     write_json,
 )
 from hector_jax.trajectory import Trajectory, Wrench
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning, aligned
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.tuning.search import SearchConfig
@@ -221,7 +221,8 @@ def _tune(args: Tune) -> None:
     command, robot = named_command(args.traj), load_robot()
     if args.alpha not in ("paper", "auto"):
         raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
-    for name, least in (("seeds", 1), ("processes", 1), ("iterations", PAPER_ITERATIONS)):
+    least_of = {"seeds": 1, "processes": 1, "iterations": PAPER_ITERATIONS, "refresh": 0}
+    for name, least in least_of.items():
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     config, variant = TuneConfig(iterations=args.iterations), args.variant
@@ -238,21 +239,36 @@ def _tune(args: Tune) -> None:
         resolved = {"flags": settings(args), "tune": dataclasses.asdict(config)}
         write_json(folder / "config.json", resolved)
         write_json(folder / "versions.json", environment())
+        shifts: list[dict[str, Any]] = []
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
-            tunings = pipeline.tune_many(
-                pool,
-                config,
-                robot,
-                problems,
-                f"tuning {args.traj} without and with GRFM-Net",
-                lambda name, iteration: (
-                    metrics_file.write(pipeline.as_line(name, iteration)) and None
-                ),
-            )
+
+            def note(name: str, iteration: Iteration) -> None:
+                metrics_file.write(pipeline.as_line(name, iteration))
+
+            title = f"tuning {args.traj} without and with GRFM-Net"
+            tunings = pipeline.tune_many(pool, config, robot, problems, title, note)
+            newest, tuning = net, tunings["with"]
+            for count in range(1, args.refresh + 1):
+                newest, shift = pipeline.refresh(
+                    pool,
+                    replace(pipeline.REFRESH, seed=count),
+                    config,
+                    robot,
+                    command,
+                    tuning,
+                    newest,
+                    folder / f"refresh-{count}",
+                )
+                shifts.append(shift)
+                name = "with_refreshed" + (str(count) if count > 1 else "")
+                again = {name: (command, newest.params)}
+                title = f"tuning {args.traj} with the net refreshed"
+                tunings |= pipeline.tune_many(pool, config, robot, again, title, note)
+                tuning = tunings[name]
         sets = {
             "nominal": nominal(),
             "expert": expert(),
-            **{f"{name}_ten": tuning.ten for name, tuning in tunings.items()},
+            **{f"{name}_ten": tunings[name].ten for name in problems},
             **{name: tuning.converged for name, tuning in tunings.items()},
         }
         (folder / "weights").mkdir()
@@ -276,6 +292,8 @@ def _tune(args: Tune) -> None:
     result = metrics.as_result(verdict)
     for name, found in metrics.as_result(_verdict(config.loss, [0], on_hfs), "hfs")["sets"].items():
         result["sets"][name] |= found
+    if shifts:
+        result["refresh"] = shifts
     write_json(folder / "result.json", result)
     pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
     film: Picture | str = "left out (--no-video)"
@@ -294,12 +312,14 @@ def _tune(args: Tune) -> None:
             tunings=tunings,
             norms=norms,
             errors=net.errors,
+            shifts=shifts,
             pictures=pictures,
             film=film,
             config=resolved,
             environment=environment(),
             command=f"hector tune --traj {args.traj} --seeds {args.seeds} "
-            f"--iterations {args.iterations} --variant {variant} --alpha {args.alpha}",
+            f"--iterations {args.iterations} --variant {variant} --alpha {args.alpha}"
+            + (f" --refresh {args.refresh}" if args.refresh else ""),
         ),
     )
     print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")
@@ -330,7 +350,7 @@ def _draw(
     """All pictures of a run, in the order of the report."""
     four = {name: walks[name][0] for name in ("nominal", "expert", "without", "with")}
     flat = {name: np.asarray(weights_to_vector(sets[name])) for name in four}
-    histories = {name: tuning.history for name, tuning in tunings.items()}
+    histories = {name: tunings[name].history for name in ("without", "with")}
     sampled = at_interval(on_hfs, config.rollout.walk.gait.tick)
     effects = {"linear": linear_effect(net.linear), "residual": as_effect(net.params)}
     curves = _curves(robot, jax.tree.map(lambda x: np.asarray(x)[None], sampled), effects)

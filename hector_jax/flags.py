@@ -47,6 +47,7 @@ class Tune:
     iterations: int = 100  # of the tuning, at most
     variant: str = "residual"  # of the net, or paper
     alpha: str = "paper"  # loss weights: the paper's, or auto (gradient norms aligned)
+    refresh: int = 0  # times to collect again at the tuned weights, train anew and tune again
     data: Path = Path("data")  # walks and net; made where missing
     runs: Path = Path("runs")  # results go to RUNS/TRAJ/TIME
     run: Path | None = None  # or to this folder, which must not exist (all: to RUN/TRAJ)

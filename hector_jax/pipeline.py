@@ -18,6 +18,7 @@ from jaxtyping import Float
 from hector_jax.console import bar
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
+from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
@@ -32,7 +33,7 @@ from hector_jax.storage import as_json, fingerprint, make_folder
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune
 from hector_jax.tuning import search as searching
-from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import Losses, losses, total
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
 
@@ -74,6 +75,9 @@ class CollectConfig:
             )
 
 
+REFRESH = CollectConfig(walks=32)  # walks at the current weights, each time
+
+
 class Learned(NamedTuple):
     """A trained GRFM-Net with what there is to say about it."""
 
@@ -81,6 +85,8 @@ class Learned(NamedTuple):
     linear: LinearMap  # the baseline, fitted to the same samples
     errors: dict[str, Any]  # of raw command, linear map and net on walks that no training saw
     course: History
+    config: TrainConfig
+    folders: tuple[Path, ...]  # of the walks
 
 
 def _tune_job(
@@ -188,7 +194,21 @@ def collect(
         ValueError: it holds walks of other jobs, another robot, controller or engine.
     """
     make_folder(folder)
-    engine, walk_config = choose_engine(config.engine), tune.rollout.walk
+    jobs = dataset.draw_jobs(
+        config.seed, config.walks, tuning_paths(pool, tune, robot), config.seconds
+    )
+    _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, folder)
+
+
+def _keep_walks(
+    pool: Executor,
+    engine: str,
+    walk_config: WalkConfig,
+    robot: Robot,
+    jobs: Sequence[Job],
+    folder: Path,
+) -> None:
+    engine = choose_engine(engine)
     # On a GPU the physics is walked in 32 bits; on a CPU that gains nothing.
     single = engine == "mjx" and jax.default_backend() != "cpu"
 
@@ -197,10 +217,7 @@ def collect(
             return walk_many(pool, walk_config, robot, jobs)
         return walk_batch(walk_config, robot, jobs, single=single)
 
-    jobs = dataset.draw_jobs(
-        config.seed, config.walks, tuning_paths(pool, tune, robot), config.seconds
-    )
-    title = f"collecting {config.walks} walks on the high-fidelity simulator, engine {engine}"
+    title = f"collecting {len(jobs)} walks on the high-fidelity simulator, engine {engine}"
     with bar(title) as tell:
         dataset.collect(
             folder,
@@ -225,8 +242,23 @@ class Samples(NamedTuple):
     dropped: int  # by a fall, an unsolved QP or a push
 
 
-def samples(robot: Robot, folder: Path) -> Samples:
-    """Samples of the walks under `folder`: a fifth of the walks held out, of the rest another."""
+def samples(robot: Robot, *folders: Path) -> Samples:
+    """Samples of the walks under `folders`: a fifth of the walks held out, of the rest another.
+
+    Each folder is split by itself, so that what was held out stays held out beside other walks;
+    walks are numbered by folder.
+    """
+    each = [_samples(robot, folder) for folder in folders]
+    join = lambda *parts: jax.tree.map(lambda *x: np.concatenate(x), *parts)  # noqa: E731
+    return Samples(
+        join(*(one.training for one in each)),
+        join(*(one.validation for one in each)),
+        join(*(one.held_out for one in each)),
+        sum(one.dropped for one in each),
+    )
+
+
+def _samples(robot: Robot, folder: Path) -> Samples:
     walks = dataset.load_walks(folder, robot)
     found, dropped = dataset.make_dataset(
         robot, walks.trajectory, walks.job.start_tick, walks.job.push
@@ -263,12 +295,15 @@ def walk_all(
     return Walks(stack(jobs), stack(walks))
 
 
-def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
-    """Train a GRFM-Net on the walks under `folder` and keep it at `path`.
+def train(
+    config: TrainConfig, robot: Robot, folder: Path, path: Path, more: Sequence[Path] = ()
+) -> Learned:
+    """Train a GRFM-Net on the walks under `folder`, and under `more`, and keep it at `path`.
 
     Its card tells the walks and the controller that it belongs to.
     """
-    parts = samples(robot, folder)
+    folders = (folder, *more)
+    parts = samples(robot, *folders)
     with bar(f"training GRFM-Net ({config.variant}) on {len(parts.training.walk)} samples") as tell:
         tell(0, config.epochs, "compiling")
         params, course = training.train(
@@ -286,13 +321,14 @@ def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learne
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
         "made_of": dataset.walked_with(folder),
+        **({"and_of": [dataset.walked_with(each) for each in more]} if more else {}),
         "settings": asdict(config),
         "samples": {**sizes, "dropped": parts.dropped},
         "errors": training.report(effects, parts.held_out),
         "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
-    return Learned(params, linear, about["errors"], course)
+    return Learned(params, linear, about["errors"], course, config, folders)
 
 
 def net_path(data: Path, variant: str) -> Path:
@@ -319,7 +355,8 @@ def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Lear
     about = card["about"]
     course = History(**{name: np.array(about["course"][name]) for name in History._fields})
     linear = network.fit_linear(samples(robot, folder).training)
-    return Learned(params, linear, about["errors"], course)
+    config = TrainConfig(**about["settings"])
+    return Learned(params, linear, about["errors"], course, config, (folder,))
 
 
 def ground(
@@ -440,6 +477,54 @@ def search(
             )
 
         return searching.search(config, starts, walk, folder, about, on_generation)
+
+
+def refresh(
+    pool: Executor,
+    config: CollectConfig,
+    tune: TuneConfig,
+    robot: Robot,
+    command: Command,
+    tuning: Tuning,
+    before: Learned,
+    folder: Path,
+) -> tuple[Learned, dict[str, Any]]:
+    """Collect again where a tuning went, and train its net anew on the old and the new walks.
+
+    The walks are kept in `folder`/walks and the net in `folder`/refreshed.npz.
+
+    Args:
+        pool: worker processes.
+        config: how much to walk.
+        tune: of the tuning.
+        robot: the body.
+        command: that was tuned for.
+        tuning: whose weights, from ten iterations to converged, are walked.
+        before: the net that it went through; the new one is trained as this one was.
+        folder: where.
+
+    Returns:
+        The new net, and the shift: errors of the raw command and of the nets `before` and `after`
+        on held-out walks, `old` and `new`, as `training.report` gives them.
+    """
+    walks = folder / "walks"
+    make_folder(walks)
+    late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
+    path = jax.tree.map(lambda *w: np.stack(w), tuning.ten, *late)
+    jobs = dataset.draw_jobs_near(config.seed, config.walks, command, path, config.seconds)
+    _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, walks)
+    oldest, *newer = (*before.folders, walks)
+    after = train(before.config, robot, oldest, folder / "refreshed.npz", newer)
+    effects = {
+        "raw": last_command,
+        "before": network.as_effect(before.params),
+        "after": network.as_effect(after.params),
+    }
+    places = {"old": before.folders, "new": (walks,)}
+    return after, {
+        name: training.report(effects, samples(robot, *folders).held_out)
+        for name, folders in places.items()
+    }
 
 
 def judge(

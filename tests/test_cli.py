@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -13,11 +14,11 @@ from synthetic import synthetic_walk
 from hector_jax import commands
 from hector_jax.cli import main
 from hector_jax.control.weights import expert
-from hector_jax.grfm.dataset import at_interval, load_walks
+from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
 from hector_jax.model.effect import last_command
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import MODEL_PATH, load_robot
-from hector_jax.storage import load_weights, save_weights
+from hector_jax.storage import load_weights, read_card, save_weights
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -254,14 +255,16 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
 
 @pytest.mark.slow
 def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
-    """From nothing to a verdict, small: data, net, two tunings, judges, report."""
+    """From nothing to a verdict, small: data, net, two tunings, one refresh, judges, report."""
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
-    assert call(monkeypatch, "tune", "--seeds", "2", "--iterations", "11", "--run", "run") == 0
+    monkeypatch.setattr(commands.pipeline, "REFRESH", replace(small, walks=4))
+    flags = ("--seeds", "2", "--iterations", "11", "--refresh", "1")
+    assert call(monkeypatch, "tune", *flags, "--run", "run") == 0
     out = capsys.readouterr().out
     run = tmp_path / "run"
-    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with"]
+    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "with_refreshed"]
     for name in names:
         assert name in out
         assert (run / "weights" / f"{name}.json").exists()
@@ -274,7 +277,13 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         for part in ("L", "L_Eul", "L_pos", "L_ctrl"):
             assert standin[part]["low"] <= standin[part]["mean"] <= standin[part]["high"]
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert {line["set"] for line in lines} == {"without", "with"}
+    assert {line["set"] for line in lines} == {"without", "with", "with_refreshed"}
+    assert result["refresh"][0].keys() == {"old", "new"}
+    assert len(load_walks(run / "refresh-1" / "walks", load_robot()).job.seed) == 4
+    card = read_card(run / "refresh-1" / "refreshed.npz")["about"]
+    assert card["made_of"] == walked_with(tmp_path / "data" / "walks")
+    assert card["and_of"] == [walked_with(run / "refresh-1" / "walks")]
+    assert "### Refresh 1" in (run / "report.md").read_text()
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
@@ -315,6 +324,7 @@ def test_the_table_refuses_wrong_flags_in_one_line(monkeypatch, capsys, tmp_path
         ("--seeds", "0"),
         ("--alpha", "both"),
         ("--variant", "papier"),
+        ("--refresh", "-1"),
     ],
 )
 def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):

@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 import pytest
+from pretend import pretend_history
 from synthetic import synthetic_walk
 
 from hector_jax import pipeline
@@ -12,14 +13,15 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation.metrics import score
-from hector_jax.grfm.dataset import collect, draw_jobs
+from hector_jax.grfm.dataset import collect, draw_jobs, draw_jobs_near
 from hector_jax.grfm.network import NetParams
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import load_robot
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.storage import read_card
-from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.rollout import RolloutConfig
 
 QUICK = TrainConfig(epochs=1)
@@ -65,6 +67,58 @@ def test_a_net_is_trained_once_and_again_for_other_walks(tmp_path, robot):
     gather(tmp_path / "two", robot, seed=1)
     pipeline.learned(QUICK, robot, tmp_path / "two", path)
     assert read_card(path)["about"]["made_of"] != card["made_of"]
+
+
+def test_what_was_held_out_stays_held_out_beside_other_walks(tmp_path, robot):
+    one, two = tmp_path / "one", tmp_path / "two"
+    gather(one, robot)
+    gather(two, robot, seed=1)
+    alone = [pipeline.samples(robot, folder) for folder in (one, two)]
+    both = pipeline.samples(robot, one, two)
+    joined = jax.tree.map(lambda *x: np.concatenate(x), *(part[:3] for part in alone))
+    jax.tree.map(np.testing.assert_array_equal, tuple(both[:3]), joined)
+    assert both.dropped == sum(part.dropped for part in alone)
+
+
+def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, robot, monkeypatch):
+    old, folder, few = tmp_path / "walks", tmp_path / "refresh-1", CollectConfig(5, engine="c")
+    gather(old, robot)
+    before = pipeline.train(TrainConfig("paper", epochs=1), robot, old, tmp_path / "grfm.npz")
+    history = pretend_history(14, refused=(12,))
+    tuning = Tuning(history, history[10].weights, history[-1].weights, "")
+    walked, trained = [], []
+
+    def walk_many(pool, config, robot, jobs):
+        walked.extend(jobs)
+        return (synthetic_walk(100 + job.seed, 12) for job in jobs)
+
+    def train(config, robot, folder, path, more):
+        trained.append((config, folder, path, *more))
+        return before._replace(folders=(folder, *more))
+
+    monkeypatch.setattr(pipeline, "walk_many", walk_many)
+    monkeypatch.setattr(pipeline, "train", train)
+    for _ in range(2):  # the second time takes up the walks
+        after, shift = pipeline.refresh(
+            ThreadPoolExecutor(1),
+            few,
+            TuneConfig(),
+            robot,
+            named_command("s"),
+            tuning,
+            before,
+            folder,
+        )
+    new = folder / "walks"
+    path = jax.tree.map(lambda w: np.stack(4 * [w]), nominal())  # ten, 11, 13 and 14
+    jobs = draw_jobs_near(0, 5, named_command("s"), path)
+    jax.tree.map(np.testing.assert_array_equal, walked, jobs)
+    assert trained == 2 * [(before.config, old, folder / "refreshed.npz", new)]
+    assert after.folders == (old, new)
+    assert shift.keys() == {"old", "new"}
+    assert all(errors.keys() == {"raw", "before", "after"} for errors in shift.values())
+    assert shift["old"]["before"] == before.errors["net"]
+    assert shift["new"]["before"] != shift["old"]["before"]
 
 
 def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):

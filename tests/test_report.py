@@ -65,6 +65,14 @@ def test_the_table_fits_a_terminal_of_80_columns():
     assert "without_ten" in text
 
 
+def test_the_table_of_a_refresh_fits_too():
+    verdict = pretend_verdict()
+    whole = verdict._replace(scores=verdict.scores | {"with_refreshed": verdict.scores["with"]})
+    text = _printed(whole, force_terminal=True, width=80)
+    assert "…" not in text
+    assert "with_refreshed" in text
+
+
 def test_a_comparison_that_falls_make_void_is_shown_with_a_mark():
     assert "does not count" not in _printed(pretend_verdict())
     text = _printed(pretend_verdict(fallen={("without", 0)}))
@@ -117,6 +125,24 @@ def test_the_report_tells_everything_that_was_promised(tmp_path):
         "the paper's footnote".capitalize(),
     ):
         assert words in text, words
+
+
+def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_path):
+    plain = write_report(tmp_path, _report()).read_text()
+    assert "efresh" not in plain
+    error = lambda x: {"force": x, "moment": x / 100}  # noqa: E731
+    shift = {
+        "old": {"raw": error(180.0), "before": error(27.0), "after": error(28.0)},
+        "new": {"raw": error(220.0), "before": error(41.0), "after": error(30.0)},
+    }
+    verdict = pretend_verdict()
+    scores = verdict.scores | {"with_refreshed": verdict.scores["with"]}
+    told = _report(verdict._replace(scores=scores))._replace(shifts=[shift])
+    text = write_report(tmp_path, told).read_text()
+    assert "### Refresh 1" in text
+    assert "| new walks, force [N^2] | 220 | 41 | 30 |" in text
+    assert "| old walks, moment [(N m)^2] | 1.8 | 0.27 | 0.28 |" in text
+    assert "Tuned through the net refreshed (`with_refreshed`), the loss is" in text
 
 
 def test_every_table_of_the_report_is_well_formed(tmp_path):

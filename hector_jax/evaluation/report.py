@@ -72,7 +72,7 @@ class Report(NamedTuple):
 
     trajectory: str
     verdict: Verdict
-    tunings: Mapping[str, Tuning]  # `without` and `with`
+    tunings: Mapping[str, Tuning]  # `without`, `with` and, refreshed, `with_refreshed`
     norms: Mapping[str, Losses]  # of the parts' gradients in log-weights at nominal, by model
     errors: Mapping[str, Mapping[str, Any]]  # held-out, of `raw`, `linear`, `net`: training.report
     pictures: Sequence[Picture]
@@ -80,6 +80,7 @@ class Report(NamedTuple):
     config: Mapping[str, Any]  # resolved, as JSON values
     environment: Mapping[str, str]
     command: str  # that makes this run again
+    shifts: Sequence[Mapping[str, Any]] = ()  # of each refresh: pipeline.refresh
 
 
 def environment() -> dict[str, str]:
@@ -264,6 +265,7 @@ def write_report(folder: Path, report: Report) -> Path:
         _norms(report.verdict.alpha, report.norms),
         "## GRFM-Net on held-out walks",
         _net_errors(report.errors),
+        *(_shift(count, shift) for count, shift in enumerate(report.shifts, 1)),
         "## Pictures",
         *(f"![{p.caption}]({p.file})\n\n*{p.caption}*" for p in report.pictures),
         _film(report.film),
@@ -356,9 +358,14 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _summary(verdict: Verdict) -> str:
-    """What came out, in two sentences, whatever it is."""
+    """What came out, a sentence for each tuning, whatever it is."""
     told = []
-    for name in ("with", "without"):
+    how = {
+        "with": "through the net",
+        "without": "without the net",
+        "with_refreshed": "through the net refreshed",
+    }
+    for name in how:
         if name not in verdict.scores:
             continue
         clauses = [
@@ -367,8 +374,7 @@ def _summary(verdict: Verdict) -> str:
             if (comparison := _compared(verdict, name, baseline)) is not None
         ]
         fell = f"the robot fell on {falls(verdict, name)} of {len(verdict.seeds)} plants"
-        net = "through the net" if name == "with" else "without the net"
-        told.append(f"Tuned {net} (`{name}`), the loss is {' and '.join(clauses)}; {fell}.")
+        told.append(f"Tuned {how[name]} (`{name}`), the loss is {' and '.join(clauses)}; {fell}.")
     return " ".join(told)
 
 
@@ -534,6 +540,24 @@ def _error_cells(values: Sequence[float]) -> list[str]:
     raw, linear, net = values
     ratio = lambda a, b: f"{a / b:.2f}" if b > 0.0 else "-"  # noqa: E731
     return [*(f"{v:.3g}" for v in values), ratio(net, raw), ratio(net, linear)]
+
+
+def _shift(count: int, shift: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """What a net tells of the ground where the tuning went, before and after it saw that."""
+    names = ("raw", "before", "after")
+    rows = [
+        [f"{where} walks, {kind} [{unit}]", *(f"{errors[name][kind]:.3g}" for name in names)]
+        for where, errors in shift.items()
+        for kind, unit in (("force", "N^2"), ("moment", "(N m)^2"))
+    ]
+    return (
+        f"### Refresh {count}\n\n"
+        "Walks collected again at the weights that the tuning through the net passed through, "
+        "from ten iterations to converged, and the net trained anew on old and new walks. Mean "
+        "square errors on walks that neither net has seen: the shift is what the net before loses "
+        "from old walks to new.\n\n"
+        + markdown_table(("held out", "raw command", "net before", "net after"), rows)
+    )
 
 
 def _film(film: Picture | str) -> str:

@@ -36,6 +36,7 @@ from hector_jax.trajectory import Load, State, Trajectory, Wrench
 
 KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
+NEAR = 1.5  # and within x/NEAR of what a tuning went through
 ALONG = np.array([1.0, -1.0, 1.0])  # mirror, left for right: of positions, velocities, forces
 ACROSS = -ALONG  # and of angles, angular velocities, moments
 PIECES = 4  # of every command, so that jobs can be stacked
@@ -112,11 +113,45 @@ def _draw_job(rng: np.random.Generator, i: int, paths: Sequence[Weights], second
         point = rng.integers(len(path.Q.euler))
         weights = jax.tree.map(lambda w: np.asarray(w)[point], path)
     else:
-        weights = jax.tree.map(
-            lambda w: w * SPREAD ** rng.uniform(-1.0, 1.0, w.shape), (nominal(), expert())[centre]
-        )
+        weights = _draw_weights(rng, (nominal(), expert())[centre], SPREAD)
     plant = hfs_drawn(int(rng.integers(2**31)))
     return Job(weights, command, plant, seconds, seed=i, push=_draw_push(rng, seconds))
+
+
+def draw_jobs_near(
+    seed: int, count: int, command: Command, path: Weights, seconds: float = 4.0
+) -> list[Job]:
+    """What to walk so that phi knows the ground where one tuning trod.
+
+    Commands take turns: the given one, random velocities. Weights take turns too: each of the 24
+    log-uniform within x/NEAR of a point of the path, drawn, and of its last point. Plants and
+    pushes are drawn as in `draw_jobs`, and job i depends on the seed and on i alone.
+
+    Args:
+        seed: of everything drawn.
+        count: number of walks.
+        command: what was tuned for.
+        path: weights that the tuning went through, stacked along a first axis.
+        seconds: length of each walk.
+    """
+    return [
+        _draw_job_near(np.random.default_rng([seed, i]), i, command, path, seconds)
+        for i in range(count)
+    ]
+
+
+def _draw_job_near(
+    rng: np.random.Generator, i: int, command: Command, path: Weights, seconds: float
+) -> Job:
+    command = _random_command(rng) if i % 2 else _split_last(command)
+    point = -1 if i // 2 % 2 else int(rng.integers(len(path.Q.euler)))
+    weights = _draw_weights(rng, jax.tree.map(lambda w: np.asarray(w)[point], path), NEAR)
+    plant = hfs_drawn(int(rng.integers(2**31)))
+    return Job(weights, command, plant, seconds, seed=i, push=_draw_push(rng, seconds))
+
+
+def _draw_weights(rng: np.random.Generator, centre: Weights, spread: float) -> Weights:
+    return jax.tree.map(lambda w: w * spread ** rng.uniform(-1.0, 1.0, w.shape), centre)
 
 
 def _draw_push(rng: np.random.Generator, seconds: float) -> Push:
