@@ -10,6 +10,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot import load_robot
 from hector_jax.sim import sensing
+from hector_jax.sim.changes import Change
 from hector_jax.sim.parallel import batched_model, mjx, mjx_contacts, walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
@@ -119,6 +120,10 @@ ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
         ([job(expert()), job(expert())._replace(push=NO_PUSH)], "agree in pushes"),
         ([job(expert(), seconds=0.0)], "at least one tick"),
         ([job(expert()), job(expert(), start_tick=-110)], "start_tick -110 is not later"),
+        (
+            [job(expert()), job(expert())._replace(changes=(Change(payload=2.0),))],
+            r"do not change: jobs \[1\] have changes",
+        ),
         ([job(expert(), plant=hfs()._replace(mass=np.array(-1.0)))], "Imperfections.mass"),
     ],
 )

@@ -370,7 +370,8 @@ def walk_batch(
     Args:
         config: the controller.
         robot: its nominal body.
-        jobs: what to walk, all of one length; plants without errors of the estimator.
+        jobs: what to walk, all of one length; plants that do not change, without errors of the
+            estimator.
         chunk: walks at once, at most; by default 32 on a CPU and 4096 elsewhere.
         fine: samples of 1 ms; by default one per tick, its effect the mean over the tick.
         single: physics in 32 bits; the controller keeps the precision of JAX.
@@ -381,8 +382,8 @@ def walk_batch(
 
     Raises:
         ValueError: the jobs differ in length, in the pieces of their commands, in the number of
-            their pushes or in their joints, have errors of the estimator, or a number of one is
-            out of its range.
+            their pushes or in their joints, have errors of the estimator or changes, or a number
+            of one is out of its range.
     """
     if chunk is None:
         chunk = CPU_CHUNK if jax.default_backend() == "cpu" else DEVICE_CHUNK
@@ -399,6 +400,9 @@ def walk_batch(
             raise ValueError(f"walks of one batch must agree in {name}, got {sorted(found)}")
     if any(np.any(np.asarray(x)) for job in jobs for x in job.imperfections.estimator):
         raise ValueError("a batch in MJX knows its state exactly: estimator errors must be zero")
+    changing = [i for i, job in enumerate(jobs) if job.changes]
+    if changing:
+        raise ValueError(f"MJX walks plants that do not change: jobs {changing} have changes")
     ticks = [walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
     worlds = build_worlds([job.imperfections for job in jobs], path)
     model, varied = batched_model(worlds, single)

@@ -43,6 +43,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
+from hector_jax.sim.changes import Change, worlds_by_step
 from hector_jax.sim.sensing import Contacts, Reading
 from hector_jax.sim.world import (
     NO_PUSH,
@@ -67,6 +68,7 @@ class Job(NamedTuple):
     seed: int = 0  # of the estimator's errors
     start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
     push: Push = NO_PUSH
+    changes: tuple[Change, ...] = ()  # of the plant
 
 
 Retune = Callable[[int, Anchor, Measurement, Wrench], Weights]
@@ -293,6 +295,7 @@ def walk(
     seed: int = 0,
     start_tick: int = 0,
     push: Push = NO_PUSH,
+    changes: Sequence[Change] = (),
     path: Path | None = None,
     on_sample: Callable[[World, mujoco.MjData], None] | None = None,
     retune: Retune | None = None,
@@ -309,8 +312,9 @@ def walk(
         seed: of the estimator's errors.
         start_tick: gait tick of t = 0, for other start phases.
         push: on the trunk.
+        changes: of the plant, while it is walked on.
         path: the plant's XML, hector.xml by default.
-        on_sample: called after each millisecond, start-up included.
+        on_sample: called after each millisecond, start-up included, with the world of that moment.
         retune: asked at each tick from t = 0 on for the weights to plan with.
 
     Returns:
@@ -323,7 +327,7 @@ def walk(
     count, begin = substeps(config), first_tick(config)
     ticks = walk_ticks(config, seconds, start_tick)
     world = build_world(imperfections, path)
-    model, data = world.model, mujoco.MjData(world.model)
+    data = mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
 
     programs = _programs(config)
@@ -331,6 +335,7 @@ def walk(
     device_robot, device_weights, device_command, device_imperfections = fixed
     place = jax.device_put((np.array(world.floor), world.foot_of_geom))
     lead = (start_tick - begin) * count
+    worlds = worlds_by_step(world, changes, -lead, ticks * count)
     errors = sensing.draw_errors(imperfections.estimator, seed, lead, ticks * count)
     forces = np.asarray(_push_forces(push, np.arange(-lead, ticks * count)))
     anchor = jax.device_put(standing_anchor(robot, start_tick))
@@ -376,9 +381,11 @@ def walk(
                 rows[i],
                 error[i],
             )
+            step = (tick - begin) * count + i
+            world = worlds.get(step - lead, world)
             data.ctrl[world.actuator] = torque
-            data.xfrc_applied[world.trunk, :3] = forces[(tick - begin) * count + i]
-            mujoco.mj_step(model, data)
+            data.xfrc_applied[world.trunk, :3] = forces[step]
+            mujoco.mj_step(world.model, data)
             np.concatenate([data.qpos, data.qvel, nothing]).take(where, out=rows[i + 1])
             sensing.read_contacts(world, data, contacts, i)
             if on_sample is not None:
