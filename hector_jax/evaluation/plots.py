@@ -534,7 +534,7 @@ def while_walking(
             panel.set_xlabel("time [s]")
         for panel in panels[:, 0]:
             panel.set_ylabel(f"L of {times[1] - times[0]:.1f} s [10$^6$]")
-        _legend(figure, panels[0, 0])
+        _legend(figure, panels[0, 0], columns=len(columns))
     return "Loss along the walk, median over the plants; the line is where the plant changes."
 
 
