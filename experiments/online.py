@@ -16,7 +16,7 @@ for a verdict; nothing here was chosen by them.
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -247,13 +247,22 @@ def main() -> None:
     print(report(flags, found))
 
 
-def _change(found: Mapping[Case, Walked], case: Case, half: int) -> float:
-    """L of a half in % of that of the walk with fixed weights, less 100."""
-    return 100.0 * (found[case].halves[half] / found[case._replace(arm="fixed")].halves[half] - 1.0)
+SPANS: dict[str, Callable[[Walked], float]] = {
+    "before": lambda row: row.halves[0],
+    "after": lambda row: row.halves[1],
+    "end": lambda row: row.loss[-2:].sum(),
+}
 
 
-def _median(values: Sequence[float]) -> str:
-    values = np.asarray(values)
+def _changes(
+    found: Mapping[Case, Walked], cases: Sequence[Case], span: str, against: str
+) -> np.ndarray:
+    """By how many % L of a span is above that of the same walks by another arm."""
+    of = SPANS[span]
+    return np.array([100 * (of(found[c]) / of(found[c._replace(arm=against)]) - 1) for c in cases])
+
+
+def _median(values: np.ndarray) -> str:
     if len(values) == 1:
         return f"{values[0]:+.1f}"
     return f"{np.median(values):+.1f} [{values.min():+.1f}, {values.max():+.1f}]"
@@ -263,8 +272,8 @@ def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
     """L before and after the change by trajectory, start weights and arm."""
     names = list(plants(flags))
     lines = [
-        "| trajectory | start | arm | L before, 1e6 | L after, 1e6 | before, % of fixed "
-        "| after, % of fixed | z after, cm | falls | refused |",
+        "| trajectory | start | arm | L before, 1e6 | L after, 1e6 | before, % against fixed "
+        "| after, % against fixed | z after, cm | falls | refused |",
         "| :--- | :--- | :--- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for trajectory in flags.trajectories:
@@ -274,10 +283,10 @@ def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
                 rows = [found[case] for case in cases]
                 halves = np.median([row.halves for row in rows], axis=0) / 1e6
                 change = [
-                    _median([_change(found, case, half) for case in cases])
+                    _median(_changes(found, cases, span, "fixed"))
                     if arm != "fixed" and "fixed" in flags.arms
                     else ""
-                    for half in (0, 1)
+                    for span in ("before", "after")
                 ]
                 height = 100.0 * np.median([row.height[1] for row in rows])
                 falls = sum(bool(row.fallen) for row in rows)
@@ -290,32 +299,29 @@ def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
     return "\n".join(lines)
 
 
+def _spread(values: np.ndarray) -> str:
+    return (
+        f"{np.median(values):+.1f} % ({values.min():+.1f} to {values.max():+.1f}), "
+        f"lower in {int((values < 0).sum())} of {len(values)}"
+    )
+
+
 def verdicts(flags: Flags, found: Mapping[Case, Walked]) -> list[str]:
     """What each arm did after the change, over all walks, in a sentence each."""
     told = []
     for arm in flags.arms:
-        cases = [case for case in found if case.arm == arm]
         if arm == "fixed" or "fixed" not in flags.arms:
             continue
-        after = np.array([_change(found, case, 1) for case in cases])
+        cases = [case for case in found if case.arm == arm]
+        after, end = (_changes(found, cases, span, "fixed") for span in ("after", "end"))
         text = (
-            f"`{arm}` ({ARMS[arm]}): L after the change {np.median(after):+.1f} % of that with "
-            f"fixed weights (median of {len(after)} walks, {after.min():+.1f} to "
-            f"{after.max():+.1f}), lower in {int((after < 0).sum())}"
+            f"- `{arm}`, against weights that stay: L after the change {_spread(after)}; "
+            f"of the last {2 * WINDOW:g} s {_spread(end)}"
         )
         if arm != "until" and "until" in flags.arms:
-            stopped = np.array(
-                [
-                    100 * (found[c].halves[1] / found[c._replace(arm="until")].halves[1] - 1)
-                    for c in cases
-                ]
-            )
-            text += (
-                f"; against tuning until the change {np.median(stopped):+.1f} % "
-                f"({stopped.min():+.1f} to {stopped.max():+.1f}), lower in "
-                f"{int((stopped < 0).sum())}"
-            )
-        told.append(f"- {text}.")
+            stopped = _changes(found, cases, "after", "until")
+            text += f". Against tuning until the change: {_spread(stopped)}"
+        told.append(text + ".")
     return told
 
 
@@ -363,6 +369,7 @@ def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
         "window that it was computed from.",
         "\n".join(f"- `{arm}`: {ARMS[arm]}" for arm in flags.arms),
         "## What came out",
+        "Changes of L in %, median over the walks and, in brackets, the least and the largest:",
         "\n".join(verdicts(flags, found)),
         f"A gradient over {window:g} s of walking with its step took {1e3 * np.median(took):.0f} "
         f"ms of processor time in the median, {1e3 * np.percentile(took, 5):.0f} to "

@@ -558,7 +558,7 @@ def weight_courses(
     """
     colors = (_BLUE, _ORANGE, _GREEN, _PURPLE, "0.35", "black")
     marks = "osD^vP"
-    with _figure(path, 3.3 * len(courses) + 0.2, 3.0) as figure:
+    with _figure(path, 3.3 * len(courses) + 0.2, 3.4) as figure:
         panels = figure.subplots(1, len(courses), squeeze=False)[0]
         for panel, (trajectory, ratios) in zip(panels, courses.items(), strict=True):
             panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
@@ -573,6 +573,8 @@ def weight_courses(
             panel.set(title=trajectory, xlabel="time [s]", yscale="log")
             panel.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
             panel.yaxis.set_minor_formatter(lambda y, _: f"{y:g}")
-            panel.legend(ncols=2, fontsize=7.5, loc="best")
+            panel.legend(
+                ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.18), columnspacing=1.2
+            )
         panels[0].set_ylabel("weight / its start")
     return f"The {most} weights that moved most; both feet share one R."
