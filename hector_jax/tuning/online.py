@@ -9,7 +9,8 @@ the measured states settles at -(dk / dtheta) e / k, the derivative of d / k its
 rolled out from the measured state sees the error die away and with it the reason to stiffen.
 
 The sensitivities are carried on from window to window: a window is shorter than the answer of the
-closed loop to a weight, and a recursion begun anew in each would see the first of it only.
+closed loop to a weight, and a recursion begun anew in each would see the first of it only. On the
+hfs, from nominal weights, the three ways of `ESTIMATORS` gain about the same.
 """
 
 from collections.abc import Callable
