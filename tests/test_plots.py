@@ -110,6 +110,22 @@ def test_open_loop_errors_are_drawn_for_each_world(tmp_path):
         assert _has_ink(path)
 
 
+def test_tuning_while_walking_is_drawn_with_walks_that_ended_early(tmp_path):
+    times = 0.4 * np.arange(1, 21)
+    curves = {
+        (name, "nominal"): {arm: 1e5 * np.ones((2, 20)) for arm in ("fixed", "until", "carried")}
+        for name in ("straight", "s")
+    }
+    assert "median" in plots.while_walking(tmp_path / "loss.png", 4.0, times, curves)
+    ratios = np.exp(np.linspace(0.0, 1.0, 20)[:, None] * np.linspace(-1, 1, len(WEIGHT_NAMES)))
+    courses = {"straight": ratios, "c": ratios[:7], "s": ratios}
+    assert "6 weights" in plots.weight_courses(
+        tmp_path / "weights.png", 4.0, times, WEIGHT_NAMES, courses
+    )
+    assert _has_ink(tmp_path / "loss.png")
+    assert _has_ink(tmp_path / "weights.png")
+
+
 @pytest.mark.parametrize("ending", ["png", "svg", "pdf"])
 def test_the_same_picture_gives_the_same_bytes(tmp_path, walks, ending):
     pictures = []

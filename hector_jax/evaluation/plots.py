@@ -762,3 +762,85 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
         "Largest push [N] of 0.1 s that is survived together with all smaller ones, by where it "
         "pushes to; mean over plants and gait phases."
     )
+
+
+_ARMS = {
+    "fixed": ("weights stay", _LOOK["nominal"]),
+    "until": ("tuned until the change", _LOOK["without"]),
+    "carried": ("tuned all the way", _LOOK["with"]),
+}
+
+
+def while_walking(
+    path: Path,
+    change: float,
+    times: Float[np.ndarray, " windows"],
+    curves: Mapping[tuple[str, str], Mapping[str, Float[np.ndarray, "plants windows"]]],
+) -> str:
+    """Loss along walks on which the plant changes, with weights that stay or are tuned.
+
+    Args:
+        path: file to write.
+        change: when the plant changes [s].
+        times: middles of the windows of which the losses are [s].
+        curves: losses by trajectory and start weights, the columns and rows of panels, and by arm.
+    """
+    columns, rows = (list(dict.fromkeys(key[i] for key in curves)) for i in (0, 1))
+    size = (3.3 * len(columns) + 0.2, 2.0 * len(rows) + 0.5)
+    with _figure(path, *size) as figure:
+        panels = figure.subplots(len(rows), len(columns), sharex=True, squeeze=False)
+        for (trajectory, which), arms in curves.items():
+            panel = panels[rows.index(which), columns.index(trajectory)]
+            panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            for arm, found in arms.items():
+                label, look = _ARMS[arm]
+                panel.plot(times, np.median(found, axis=0) / 1e6, **look, label=label)
+            panel.set(title=f"{trajectory}, from {which}", ylim=(0, 1.05 * panel.get_ylim()[1]))
+        for panel in panels[-1]:
+            panel.set_xlabel("time [s]")
+        for panel in panels[:, 0]:
+            panel.set_ylabel(f"L of {times[1] - times[0]:.1f} s [10$^6$]")
+        _legend(figure, panels[0, 0], columns=len(columns))
+    return "Loss along the walk, median over the plants; the line is where the plant changes."
+
+
+def weight_courses(
+    path: Path,
+    change: float,
+    times: Float[np.ndarray, " steps"],
+    names: Sequence[str],
+    courses: Mapping[str, Float[np.ndarray, "steps weights"]],
+    most: int = 6,
+) -> str:
+    """How weights moved while walking: those that moved most, as ratios to where they started.
+
+    Args:
+        path: file to write.
+        change: when the plant changes [s].
+        times: of the steps [s].
+        names: of the weights.
+        courses: ratios by trajectory; a walk that ended early has fewer steps.
+        most: how many weights to draw in each panel.
+    """
+    colors = (_BLUE, _ORANGE, _GREEN, _PURPLE, "0.35", "black")
+    marks = "osD^vP"
+    with _figure(path, 3.3 * len(courses) + 0.2, 3.4) as figure:
+        panels = figure.subplots(1, len(courses), squeeze=False)[0]
+        for panel, (trajectory, ratios) in zip(panels, courses.items(), strict=True):
+            panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            single = [i for i, name in enumerate(names) if not name.endswith("_right")]
+            moved = np.abs(np.log(ratios[:, single])).max(axis=0)
+            for i, color, mark in zip(np.argsort(-moved)[:most], colors, marks, strict=False):
+                label = _weight_label(names[single[i]].removesuffix("_left"))
+                values = ratios[:, single[i]]
+                panel.plot(
+                    times[: len(values)], values, color=color, marker=mark, ms=2.6, label=label
+                )
+            panel.set(title=trajectory, xlabel="time [s]", yscale="log")
+            panel.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+            panel.yaxis.set_minor_formatter(lambda y, _: f"{y:g}")
+            panel.legend(
+                ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.18), columnspacing=1.2
+            )
+        panels[0].set_ylabel("weight / its start")
+    return f"The {most} weights that moved most; both feet share one R."

@@ -30,6 +30,7 @@ from hector_jax.control.reference import (
     standing_anchor,
 )
 from hector_jax.control.walking import (
+    Measurement,
     Memory,
     Plan,
     WalkConfig,
@@ -68,6 +69,10 @@ class Job(NamedTuple):
     start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
     push: Push = NO_PUSH
     changes: tuple[Change, ...] = ()  # of the plant
+
+
+Retune = Callable[[int, Anchor, Measurement, Wrench], Weights]
+"""Gait tick, anchor, what is measured, wrench commanded over the tick before -> weights."""
 
 
 class Observed(NamedTuple):
@@ -238,6 +243,7 @@ class _Programs:
     """The compiled parts of the loop; readings and their errors enter as flat rows."""
 
     begin: Callable
+    tell: Callable
     decide: dict[int, Callable]  # by slots
     drive: Callable
     observe: Callable
@@ -249,6 +255,9 @@ def _programs(config: WalkConfig) -> _Programs:
         reading = sensing.unpack_reading(row)
         no_error = jnp.zeros(sensing.ERRORS)
         return init_memory(robot, sensing.measure(robot, reading, jnp.zeros(()), no_error)[0])
+
+    def tell(robot: Robot, yaw: Array, row: Array, error: Array) -> Measurement:
+        return sensing.measure(robot, sensing.unpack_reading(row), yaw, error)[0]
 
     def decide_(slots, robot, weights, command, anchor, tick, memory, yaw, row, error):
         reading = sensing.unpack_reading(row)
@@ -272,6 +281,7 @@ def _programs(config: WalkConfig) -> _Programs:
 
     return _Programs(
         begin=jax.jit(begin),
+        tell=jax.jit(tell),
         decide={slots: jax.jit(partial(decide_, slots)) for slots in (1, 2)},
         drive=jax.jit(drive_),
         observe=jax.jit(observe_),
@@ -291,6 +301,7 @@ def walk(
     changes: Sequence[Change] = (),
     path: Path | None = None,
     on_sample: Callable[[World, mujoco.MjData], None] | None = None,
+    retune: Retune | None = None,
 ) -> Trajectory:
     """Walk once in MuJoCo C.
 
@@ -307,6 +318,7 @@ def walk(
         changes: of the plant, while it is walked on.
         path: the plant's XML, hector.xml by default.
         on_sample: called after each millisecond, start-up included, with the world of that moment.
+        retune: asked at each tick from t = 0 on for the weights to plan with.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they are held and `fallen`.
@@ -344,6 +356,10 @@ def walk(
             anchor = jax.device_put(anchor_at(robot, last, start_tick))
         error = errors[(tick - begin) * count :]
         now, yaw_before = np.array(tick, np.int32), yaw
+        if retune is not None and tick >= start_tick:
+            measurement = programs.tell(device_robot, yaw, rows[0], error[0])
+            chosen = retune(tick, anchor, measurement, told[-1][0].wrench)
+            device_weights = jax.device_put(chosen)
         plan_now = programs.decide[slots_needed(config, tick)]
         memory, plan = plan_now(
             device_robot,

@@ -10,10 +10,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import Weights, vector_to_weights, weights_to_vector
+from hector_jax.control.walking import Feet
+from hector_jax.control.weights import (
+    WEIGHT_NAMES,
+    Weights,
+    vector_to_weights,
+    weights_to_vector,
+)
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.loss import LossConfig, losses, total
@@ -34,6 +40,66 @@ class Sensitivities(NamedTuple):
     command: Wrench  # (24, T, 2, 3) each: du_j / dtheta
 
 
+class Varied(NamedTuple):
+    """What of a `Carry` the weights have a part in; of this shape are its tangents too."""
+
+    state: State
+    feet: Feet
+    commands: Wrench
+    position: Float[Array, "*batch 3"]  # of the anchor
+    yaw: Float[Array, "*batch"]
+
+
+def varied(carry: Carry) -> Varied:
+    """The part of a carry that the weights have a part in."""
+    return Varied(carry.state, carry.feet, carry.commands, carry.anchor.position, carry.anchor.yaw)
+
+
+def no_tangents(carry: Carry) -> Varied:
+    """Tangents of a start in which no weight has a part: dx_0 / dtheta = 0."""
+    return jax.tree.map(lambda x: jnp.zeros((len(WEIGHT_NAMES), *x.shape), x.dtype), varied(carry))
+
+
+def step_sensitivities(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    carry: Carry,
+    tangents: Varied,
+    tick: Int[Array, ""],
+) -> tuple[Carry, Varied, Trajectory, Sensitivities]:
+    """One tick of the closed loop with its tangents, all 24 at once.
+
+    Args:
+        config, robot, weights, command, effect, carry, tick: as for `step_carry`.
+        tangents: of the carry, the weights being their first axis.
+
+    Returns:
+        The next carry and its tangents, the tick's sample, and the sample's sensitivities (24, 3).
+
+    Source: Eq. 10.
+    """
+    theta = weights_to_vector(weights)
+
+    def move(parts: Varied, theta: Float[Array, "24"]) -> tuple:
+        place = Anchor(parts.position, parts.yaw, carry.anchor.tick)
+        now = Carry(parts.state, parts.feet, parts.commands, place, carry.fallen)
+        then, sample = step_carry(
+            config, robot, vector_to_weights(theta), command, effect, now, tick
+        )
+        return (varied(then), sample.state, sample.command), (then, sample)
+
+    def along(tangent: Varied, direction: Float[Array, "24"]) -> tuple:
+        return jax.jvp(move, (varied(carry), theta), (tangent, direction), has_aux=True)
+
+    _, (later, state, wrench), (then, sample) = jax.vmap(along, out_axes=(None, 0, None))(
+        tangents, jnp.eye(theta.size)
+    )
+    return then, later, sample, Sensitivities(state, wrench)
+
+
 def propagate(
     config: RolloutConfig,
     robot: Robot,
@@ -43,38 +109,16 @@ def propagate(
     effect: jax.tree_util.Partial,
 ) -> tuple[Trajectory, Sensitivities]:
     """Rollout and its sensitivities by forward recursion. Source: Eq. 10."""
-    theta = weights_to_vector(weights)
-    directions = jnp.eye(theta.size)
 
-    def split(carry: Carry) -> tuple:
-        place = carry.anchor.position, carry.anchor.yaw
-        return carry.state, carry.feet, carry.commands, place
-
-    def tick(carried, j):
-        carry, tangents = carried
-
-        def move(parts: tuple, theta: Float[Array, "24"]) -> tuple:
-            state, feet, commands, (position, yaw) = parts
-            place = Anchor(position, yaw, anchor.tick)
-            now = Carry(state, feet, commands, place, carry.fallen)
-            weights = vector_to_weights(theta)
-            then, sample = step_carry(config, robot, weights, command, effect, now, j)
-            return (split(then), sample.state, sample.command), (then, sample)
-
-        def along(tangent: tuple, direction: Float[Array, "24"]):
-            return jax.jvp(move, (split(carry), theta), (tangent, direction), has_aux=True)
-
-        _, (tangents, state, wrench), (then, sample) = jax.vmap(along, out_axes=(None, 0, None))(
-            tangents, directions
+    def tick(carried: tuple[Carry, Varied], j: Int[Array, ""]):
+        carry, tangents, *seen = step_sensitivities(
+            config, robot, weights, command, effect, *carried, j
         )
-        return (then, tangents), (sample, Sensitivities(state, wrench))
+        return (carry, tangents), seen
 
     carry = init_carry(robot, anchor)
-    still = jax.tree.map(
-        lambda x: jnp.zeros((theta.size, *x.shape), x.dtype), split(carry)
-    )  # dx_0 / dtheta = 0
     ticks = walked_ticks(config, anchor)
-    _, (samples, sensitivities) = jax.lax.scan(tick, (carry, still), ticks)
+    _, (samples, sensitivities) = jax.lax.scan(tick, (carry, no_tangents(carry)), ticks)
     later = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), sensitivities)
     return from_start(config, samples), later
 

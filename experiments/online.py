@@ -1,0 +1,404 @@
+"""Does tuning while walking help on a plant that changes under the robot?
+
+A payload is put on the trunk in the middle of a walk. Weights that stay are compared with weights
+that take a step of DiffTune after every window of measured states (`tuning.online`), on the hfs
+and plants around it, from several start weights; and with weights that are tuned until the change
+only, which tells adapting to the payload from tuning as such. Other ways to the gradient are
+walked beside: sensitivities begun anew in each window, the model's own walk from the window's first
+state, and the plain rigid body in the place of GRFM-Net.
+
+    python experiments/online.py --data data --tuned straight runs/.../weights/with.json c ... s ...
+
+Walks are kept under OUT/walks and taken up again. `--standin` adds plants of the hardware stand-in,
+for a verdict; nothing here was chosen by them.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import tyro
+
+from hector_jax import pipeline
+from hector_jax.console import bar
+from hector_jax.control.reference import COMMANDS, named_command
+from hector_jax.control.weights import (
+    WEIGHT_NAMES,
+    Weights,
+    expert,
+    nominal,
+    weights_to_vector,
+)
+from hector_jax.evaluation import plots
+from hector_jax.evaluation.report import environment
+from hector_jax.grfm.network import as_effect
+from hector_jax.model.effect import last_command
+from hector_jax.robot import Robot, load_robot
+from hector_jax.runtime import setup_jax, workers
+from hector_jax.sim.changes import Change
+from hector_jax.sim.standin import standin
+from hector_jax.sim.walk import Job, walk
+from hector_jax.sim.world import Imperfections, named_world
+from hector_jax.storage import fingerprint, load_tree, load_weights, save_tree, write_file
+from hector_jax.trajectory import Trajectory
+from hector_jax.tuning.difftune import Iteration, TuneConfig
+from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.online import OnlineConfig, retuner
+
+ARMS = {
+    "fixed": "weights stay",
+    "until": "tuned until the change",
+    "carried": "tuned all the way",
+    "cut": "sensitivities begun anew in each window",
+    "model": "the model's own walk from each window's first state",
+    "plain": "no net: the plain rigid body",
+}
+WINDOW = 0.4  # [s] by which losses are told
+
+
+@dataclass(frozen=True)
+class Flags:
+    """What to walk."""
+
+    data: Path = Path("data")  # walks and net; made where missing
+    out: Path = Path("runs/online")  # folder of the report
+    tuned: dict[str, Path] = field(default_factory=dict)  # TRAJ FILE of tuned start weights
+    trajectories: tuple[str, ...] = COMMANDS
+    sets: tuple[str, ...] = ("nominal", "expert", "tuned")
+    arms: tuple[str, ...] = tuple(ARMS)
+    varied: tuple[int, ...] = ()  # seeds of hfs-varied, beside the hfs
+    standin: tuple[int, ...] = ()  # seeds of the hardware stand-in
+    payload: float = 2.0  # [kg]
+    change: float = 4.0  # [s] when it is put on
+    seconds: float = 8.0  # length of a walk
+    window: int = 40  # ticks between steps
+    late: int = 20  # ticks after a window at which its step comes into force
+    processes: int = 2  # one core each
+
+    def __post_init__(self) -> None:
+        for name in self.arms:
+            if name not in ARMS:
+                raise ValueError(f"Flags.arms must be of {', '.join(ARMS)}, got {name!r}")
+        if not 0.0 < self.change < self.seconds:
+            raise ValueError(f"Flags.change must lie within the walk, got {self.change} s")
+
+
+class Case(NamedTuple):
+    """One walk."""
+
+    plant: str
+    trajectory: str
+    which: str  # start weights
+    arm: str
+
+
+class Walked(NamedTuple):
+    """What there is to say about it."""
+
+    halves: np.ndarray  # (2,) L before the change and after
+    parts: np.ndarray  # (2, 3) its parts
+    loss: np.ndarray  # (windows,) L of each 0.4 s
+    height: np.ndarray  # (2,) [m] mean error of the centre of mass
+    fallen: np.ndarray
+    weights: np.ndarray  # (steps, 24) in force at the end of each window
+    refused: np.ndarray  # (steps,)
+    seconds: np.ndarray  # (steps,) [s] of processor time that a window's gradient and step took
+
+
+def _loss(walk: Trajectory) -> tuple[float, np.ndarray]:
+    parts = losses(walk)
+    return float(total(LossConfig(), parts)), np.array([float(p) for p in parts])
+
+
+def _cut(walk: Trajectory, first: int, end: int) -> Trajectory:
+    samples = jax.tree.map(lambda x: x[first:end], walk._replace(period=None, initial=None))
+    initial = walk.initial if not first else jax.tree.map(lambda x: x[first - 1], walk.state)
+    return samples._replace(period=walk.period, initial=initial)
+
+
+def _walk_case(
+    config: OnlineConfig,
+    robot: Robot,
+    job: Job,
+    effect: jax.tree_util.Partial,
+    moment: float,
+    arm: str,
+) -> Walked:
+    """One walk of an arm; in a worker."""
+    steps: list[Iteration] = []
+    took: list[float] = []
+    step = retuner(config, robot, job.weights, job.command, effect, steps.append)
+    last_tick = round(moment / config.tune.rollout.walk.gait.tick)
+    kept: Weights = job.weights
+
+    def retune(tick, anchor, measurement, last):
+        nonlocal kept
+        if arm == "until" and tick >= last_tick:
+            return kept
+        count, start = len(steps), time.process_time()
+        kept = step(tick, anchor, measurement, last)
+        if len(steps) > count:
+            took.append(time.process_time() - start)
+        return kept
+
+    told = walk(config.tune.rollout.walk, robot, *job, retune=None if arm == "fixed" else retune)
+    middle, end = round(1e3 * moment), len(told.fallen)
+    found = [_loss(_cut(told, *span)) for span in ((0, middle), (middle, end))]
+    spans = [(i, i + round(1e3 * WINDOW)) for i in range(0, end, round(1e3 * WINDOW))]
+    error = (told.state.position - told.reference.position)[:, 2]
+    courses = [np.asarray(weights_to_vector(s.weights)) for s in steps]
+    return Walked(
+        halves=np.array([loss for loss, _ in found]),
+        parts=np.stack([parts for _, parts in found]),
+        loss=np.array([_loss(_cut(told, *span))[0] for span in spans]),
+        height=np.array([error[:middle].mean(), error[middle:].mean()]),
+        fallen=np.asarray(told.fallen.any()),
+        weights=np.array(courses).reshape(-1, len(WEIGHT_NAMES)),
+        refused=np.array([not s.accepted for s in steps], bool),
+        seconds=np.array(took),
+    )
+
+
+def plants(flags: Flags) -> dict[str, tuple[Imperfections, int]]:
+    """Plants by name, and the seeds of their estimators."""
+    found = {"hfs": (named_world("hfs"), 0)}
+    found |= {f"hfs-varied {seed}": (named_world("hfs-varied", seed), 0) for seed in flags.varied}
+    return found | {f"stand-in {seed}": (standin(seed), seed) for seed in flags.standin}
+
+
+def start_weights(flags: Flags, trajectory: str, which: str) -> Weights:
+    """Start weights by name.
+
+    Raises:
+        ValueError: tuned ones without a file.
+    """
+    if which != "tuned":
+        return {"nominal": nominal, "expert": expert}[which]()
+    if trajectory not in flags.tuned:
+        raise ValueError(f"--tuned: no weights file for {trajectory}, which --sets asks for")
+    return load_weights(flags.tuned[trajectory])
+
+
+def walk_cases(
+    pool: Executor,
+    flags: Flags,
+    robot: Robot,
+    effects: Mapping[str, jax.tree_util.Partial],
+) -> dict[Case, Walked]:
+    """All walks; those that are on disk are taken."""
+    config = OnlineConfig(window=flags.window, late=flags.late)
+    changes = (Change(start=flags.change, payload=flags.payload),)
+    host = partial(jax.tree.map, np.asarray)
+    cases: dict[Case, tuple] = {}
+    for plant, (imperfections, seed) in plants(flags).items():
+        for trajectory in flags.trajectories:
+            for which in flags.sets:
+                weights = host(start_weights(flags, trajectory, which))
+                for arm in flags.arms:
+                    estimator = arm if arm in ("cut", "model") else "carried"
+                    effect = effects["command" if arm == "plain" else "net"]
+                    job = Job(
+                        weights,
+                        host(named_command(trajectory)),
+                        host(imperfections),
+                        flags.seconds,
+                        seed,
+                        changes=changes,
+                    )
+                    how = replace(config, estimator=estimator)
+                    what = how, robot, job, effect, flags.change, arm
+                    cases[Case(plant, trajectory, which, arm)] = what
+
+    def path(case: Case) -> Path:
+        how, _, job, effect, moment, arm = cases[case]
+        numbers = fingerprint((robot, job._replace(changes=None), effect))
+        key = f"{how!r} {changes!r} {moment} {arm} {numbers}"
+        name = "-".join(case).replace(" ", "")
+        return flags.out / "walks" / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}.npz"
+
+    like = Walked(*(np.zeros((0,) * n) for n in (1, 2, 1, 1, 0, 2, 1, 1)))
+    running = {c: pool.submit(_walk_case, *w) for c, w in cases.items() if not path(c).exists()}
+    with bar("walks on plants that change") as tell:
+        for done, (case, future) in enumerate(running.items(), 1):
+            save_tree(path(case), future.result(), kind="online", robot=robot)
+            tell(done, len(running), " ".join(case))
+    return {case: load_tree(path(case), like, kind="online", robot=robot)[0] for case in cases}
+
+
+def main() -> None:
+    """Write report.md, online.json and the pictures."""
+    flags = tyro.cli(Flags)
+    setup_jax()
+    robot = jax.tree.map(np.asarray, load_robot())
+    flags.out.mkdir(parents=True, exist_ok=True)
+    with workers(flags.processes) as pool:
+        net = pipeline.ground(pool, TuneConfig(), robot, flags.data)
+        effects = {"command": last_command, "net": as_effect(net.params)}
+        effects = {name: jax.tree.map(np.asarray, effect) for name, effect in effects.items()}
+        found = walk_cases(pool, flags, robot, effects)
+    print(report(flags, found))
+
+
+SPANS: dict[str, Callable[[Walked], float]] = {
+    "before": lambda row: row.halves[0],
+    "after": lambda row: row.halves[1],
+    "end": lambda row: row.loss[-2:].sum(),
+}
+
+
+def _changes(
+    found: Mapping[Case, Walked], cases: Sequence[Case], span: str, against: str
+) -> np.ndarray:
+    """By how many % L of a span is above that of the same walks by another arm."""
+    of = SPANS[span]
+    return np.array([100 * (of(found[c]) / of(found[c._replace(arm=against)]) - 1) for c in cases])
+
+
+def _median(values: np.ndarray) -> str:
+    if len(values) == 1:
+        return f"{values[0]:+.1f}"
+    return f"{np.median(values):+.1f} [{values.min():+.1f}, {values.max():+.1f}]"
+
+
+def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
+    """L before and after the change by trajectory, start weights and arm."""
+    names = list(plants(flags))
+    lines = [
+        "| trajectory | start | arm | L before, 1e6 | L after, 1e6 | before, % against fixed "
+        "| after, % against fixed | z after, cm | falls | refused |",
+        "| :--- | :--- | :--- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for trajectory in flags.trajectories:
+        for which in flags.sets:
+            for arm in flags.arms:
+                cases = [Case(plant, trajectory, which, arm) for plant in names]
+                rows = [found[case] for case in cases]
+                halves = np.median([row.halves for row in rows], axis=0) / 1e6
+                change = [
+                    _median(_changes(found, cases, span, "fixed"))
+                    if arm != "fixed" and "fixed" in flags.arms
+                    else ""
+                    for span in ("before", "after")
+                ]
+                height = 100.0 * np.median([row.height[1] for row in rows])
+                falls = sum(bool(row.fallen) for row in rows)
+                refused = sum(int(row.refused.sum()) for row in rows)
+                lines.append(
+                    f"| {trajectory} | {which} | {arm} | {halves[0]:.2f} | {halves[1]:.2f} "
+                    f"| {change[0]} | {change[1]} | {height:+.1f} | {falls} of {len(rows)} "
+                    f"| {refused} |"
+                )
+    return "\n".join(lines)
+
+
+def _spread(values: np.ndarray) -> str:
+    return (
+        f"{np.median(values):+.1f} % ({values.min():+.1f} to {values.max():+.1f}), "
+        f"lower in {int((values < 0).sum())} of {len(values)}"
+    )
+
+
+def verdicts(flags: Flags, found: Mapping[Case, Walked]) -> list[str]:
+    """What each arm did after the change, over all walks, in a sentence each."""
+    told = []
+    for arm in flags.arms:
+        if arm == "fixed" or "fixed" not in flags.arms:
+            continue
+        cases = [case for case in found if case.arm == arm]
+        after, end = (_changes(found, cases, span, "fixed") for span in ("after", "end"))
+        text = (
+            f"- `{arm}`, against weights that stay: L after the change {_spread(after)}; "
+            f"of the last {2 * WINDOW:g} s {_spread(end)}"
+        )
+        if arm != "until" and "until" in flags.arms:
+            stopped = _changes(found, cases, "after", "until")
+            text += f". Against tuning until the change: {_spread(stopped)}"
+        told.append(text + ".")
+    return told
+
+
+def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
+    """Write the report with its pictures and its numbers as JSON.
+
+    Args:
+        flags: what was asked for.
+        found: the walks.
+    """
+    names = list(plants(flags))
+    took = np.concatenate([row.seconds for row in found.values()] or [np.zeros(0)])
+    window = flags.window * TuneConfig().rollout.walk.gait.tick
+    times = WINDOW * (np.arange(round(flags.seconds / WINDOW)) + 0.5)
+    pictures = []
+    shown = [arm for arm in ("fixed", "until", "carried") if arm in flags.arms]
+    curves = {
+        (trajectory, which): {
+            arm: np.stack([found[Case(p, trajectory, which, arm)].loss for p in names])
+            for arm in shown
+        }
+        for trajectory in flags.trajectories
+        for which in flags.sets
+    }
+    caption = plots.while_walking(flags.out / "loss.png", flags.change, times, curves)
+    pictures.append(("loss.png", caption))
+    if "carried" in flags.arms:
+        for which in flags.sets:
+            courses = {}
+            for trajectory in flags.trajectories:
+                row = found[Case(names[0], trajectory, which, "carried")]
+                if len(row.weights):
+                    courses[trajectory] = row.weights / row.weights[0]
+            ends = window * np.arange(1, 1 + max(len(c) for c in courses.values()))
+            file = f"weights-{which}.png"
+            caption = plots.weight_courses(
+                flags.out / file, flags.change, ends, WEIGHT_NAMES, courses
+            )
+            pictures.append((file, f"Start: {which}, plant {names[0]}. {caption}"))
+    text = [
+        "# Does tuning while walking help when the plant changes?",
+        f"A payload of {flags.payload:g} kg is put on the trunk {flags.change:g} s into walks of "
+        f"{flags.seconds:g} s, on {', '.join(names)}. The weights take a step of at most 5 % (Q) "
+        f"and 8 % (R) of themselves every {window:g} s, in force {10 * flags.late} ms after the "
+        "window that it was computed from.",
+        "\n".join(f"- `{arm}`: {ARMS[arm]}" for arm in flags.arms),
+        "## What came out",
+        "Changes of L in %, median over the walks and, in brackets, the least and the largest:",
+        "\n".join(verdicts(flags, found)),
+        f"A gradient over {window:g} s of walking with its step took {1e3 * np.median(took):.0f} "
+        f"ms of processor time in the median, {1e3 * np.percentile(took, 5):.0f} to "
+        f"{1e3 * np.percentile(took, 95):.0f} ms from the 5th to the 95th percentile; the first of "
+        "a process is compiled."
+        if len(took)
+        else "No arm was tuned.",
+        "Before is the walk until the change and after the rest; where there are several plants, "
+        "medians over them, and in brackets the least and the largest.",
+        table(flags, found),
+        "## Pictures",
+        *(f"![{name}]({name})\n\n{caption}" for name, caption in pictures),
+    ]
+    told = {
+        "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
+        "environment": environment(),
+        "weights": WEIGHT_NAMES,
+        "walks": {
+            " / ".join(case): {name: value.tolist() for name, value in row._asdict().items()}
+            for case, row in found.items()
+        },
+        "seconds": {"median": float(np.median(took)), "least": float(took.min())}
+        if len(took)
+        else None,
+    }
+    write_file(flags.out / "online.json", (json.dumps(told, indent=1) + "\n").encode())
+    write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
+    return flags.out / "report.md"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""DiffTune while walking: weights stepped by the gradient over the walk that was just measured.
+
+Every `window` ticks the loss of these ticks is differentiated by the weights in force, and the
+weights take one of DiffTune's steps, inside its guards. The states, feet and contacts along which
+dynamics and controller are differentiated are the measured ones (Eq. 9, 10), and so are the errors
+that enter the loss: what the model does not know, such as a load on the trunk, is in both. A
+sagging trunk is the example: under the error e = d / k that a load d leaves, the recursion along
+the measured states settles at -(dk / dtheta) e / k, the derivative of d / k itself; a model that is
+rolled out from the measured state sees the error die away and with it the reason to stiffen.
+
+The sensitivities are carried on from window to window: a window is shorter than the answer of the
+closed loop to a weight, and a recursion begun anew in each would see the first of it only. On the
+hfs, from nominal weights, the three ways of `ESTIMATORS` gain about the same.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from hector_jax.control.reference import Anchor, Command
+from hector_jax.control.walking import Feet, Measurement, measured_feet
+from hector_jax.control.weights import Weights
+from hector_jax.model.effect import HISTORY
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.tuning import sensitivity
+from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, refusal, step_weights
+from hector_jax.tuning.loss import losses
+from hector_jax.tuning.rollout import Carry
+from hector_jax.tuning.sensitivity import (
+    Sensitivities,
+    Varied,
+    no_tangents,
+    step_sensitivities,
+)
+
+ESTIMATORS = ("carried", "cut", "model")
+
+
+@dataclass(frozen=True)
+class OnlineConfig:
+    """How weights are tuned while walking."""
+
+    tune: TuneConfig = field(default_factory=TuneConfig)  # controller, loss, steps and guards
+    window: int = 40  # ticks between steps, and of the loss of a step; a gait cycle
+    late: int = 0  # ticks after a window's end at which its step comes into force
+    step: float = 1.0  # of the full step of `tune`
+    estimator: str = "carried"  # along measured states; "cut": begun anew in each window; "model"
+
+    def __post_init__(self) -> None:
+        if self.window < 2:
+            raise ValueError(f"OnlineConfig.window must be at least 2 ticks, got {self.window}")
+        if not 0 <= self.late < self.window:
+            raise ValueError(
+                f"OnlineConfig.late must be at least 0 and below window, got {self.late}"
+            )
+        if not 0.0 <= self.step <= 1.0:
+            raise ValueError(f"OnlineConfig.step must be between 0 and 1, got {self.step}")
+        if self.estimator not in ESTIMATORS:
+            raise ValueError(
+                f"OnlineConfig.estimator must be one of {', '.join(ESTIMATORS)}, "
+                f"got {self.estimator!r}"
+            )
+
+
+class Told(NamedTuple):
+    """What is measured at the start of a tick."""
+
+    state: State  # of the base
+    feet: Feet  # where the feet are; of one in the air it is not used
+
+
+class Trace(NamedTuple):
+    """What a window hands to the next."""
+
+    commands: Wrench  # (HISTORY, 2, 3) each, world frame, newest first
+    tangents: Varied  # of the carry at its end
+
+
+def init_trace(anchor: Anchor, told: Told, last: Wrench) -> Trace:
+    """No weight has a part in what was measured so far.
+
+    Args:
+        anchor: of the reference.
+        told: now.
+        last: wrench commanded over the last tick, taken for those before it too.
+    """
+    commands = jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), last)
+    return Trace(commands, no_tangents(_carry(anchor, told, commands)))
+
+
+def _carry(anchor: Anchor, told: Told, commands: Wrench) -> Carry:
+    return Carry(told.state, told.feet, commands, anchor, jnp.asarray(False))
+
+
+def window_gradient(
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+    trace: Trace,
+    weights: Weights,
+    tick: Int[Array, ""],
+    told: Told,
+    measured: bool = True,
+) -> tuple[Trace, Evaluation]:
+    """Loss of the ticks of a window and its gradient by the weights.
+
+    Args:
+        config: controller and loss.
+        robot: nominal body.
+        command, anchor: what was walked, from where.
+        effect: phi, `Window -> Effect`; its Jacobian is used.
+        trace: of the window before, see `init_trace`.
+        weights: in force over each of the n ticks, stacked.
+        tick: gait tick at the window's start, later than t = 0.
+        told: n + 1 measurements, stacked: at the start of each tick and at the end of the last.
+        measured: along what was measured; or along the model's own walk from the first measurement
+            on (static).
+
+    Returns:
+        The trace for the next window, and the evaluation. The change from the command before the
+        window to its first is priced in it.
+
+    Source: Eq. 9-11, along measured states.
+    """
+
+    def one(carried: tuple[Carry, Varied], inputs: tuple) -> tuple:
+        carry, tangents = carried
+        tick, weights, now, after = inputs
+        if measured:
+            carry = _carry(anchor, now, carry.commands)
+        then, tangents, sample, columns = step_sensitivities(
+            config.rollout, robot, weights, command, effect, carry, tangents, tick
+        )
+        if measured:
+            sample = sample._replace(state=after.state, fallen=has_fallen(after.state))
+        return (then, tangents), (sample, columns)
+
+    now, after = jax.tree.map(lambda x: x[:-1], told), jax.tree.map(lambda x: x[1:], told)
+    start = _carry(anchor, jax.tree.map(lambda x: x[0], told), trace.commands)
+    ticks = tick + jnp.arange(len(now.feet.yaw))
+    (last, tangents), (samples, columns) = jax.lax.scan(
+        one, (start, trace.tangents), (ticks, weights, now, after)
+    )
+    walk, columns = _with_command_before(samples, columns, trace)
+    loss, gradient = sensitivity.gradient(config.loss, walk, columns)
+    fallen, residual = jnp.mean(1.0 * samples.fallen), jnp.max(samples.residual)
+    found = Evaluation(loss, losses(walk), gradient, fallen, residual)
+    return Trace(last.commands, tangents), found
+
+
+follow = jax.jit(window_gradient, static_argnums=0, static_argnames="measured")
+"""`window_gradient`, compiled once per config."""
+
+
+def _with_command_before(
+    samples: Trajectory, columns: Sensitivities, trace: Trace
+) -> tuple[Trajectory, Sensitivities]:
+    """Samples after one that has no error and the command before the window."""
+
+    def after(first: Any, rest: Any) -> Any:
+        return jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, rest)
+
+    newest = jax.tree.map(lambda w: w[0], trace.commands)
+    first = jax.tree.map(lambda x: x[0], samples)
+    walk = after(first._replace(state=first.reference, command=newest), samples)
+    before = Sensitivities(
+        jax.tree.map(lambda s: jnp.zeros_like(s[0]), columns.state),
+        jax.tree.map(lambda w: w[:, 0], trace.tangents.commands),
+    )
+    columns = jax.tree.map(lambda s: jnp.swapaxes(s, 0, 1), after(before, columns))
+    return walk._replace(period=first.period, initial=first.initial), columns
+
+
+_feet = jax.jit(measured_feet)
+
+
+def retuner(
+    config: OnlineConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    on_step: Callable[[Iteration], None] = lambda iteration: None,
+) -> Callable[[int, Anchor, Measurement, Wrench], Weights]:
+    """What a walk asks every tick for the weights to plan with; see `sim.walk.walk`.
+
+    A window that fell, was not solved or is not finite is refused: the weights go back to those of
+    the last window that was sound, the step is halved and the sensitivities begin anew.
+
+    Args:
+        config: how.
+        robot: nominal body.
+        weights: where to start.
+        command: what is walked.
+        effect: phi.
+        on_step: called after each window, with the weights in force at its end.
+
+    Returns:
+        Function of one walk, which remembers it: gait tick from t = 0 on, anchor, what is measured
+        at the tick's start and the wrench commanded over the tick before -> weights.
+    """
+    sound = newest = in_force = jax.tree.map(np.asarray, weights)
+    seen: list[Told] = []
+    used: list[Weights] = []
+    share, led, count, trace, due = 1.0, 0.0, 0, None, 0
+
+    def stacked(rows: list) -> Any:
+        return jax.tree.map(lambda *x: np.stack(x), *rows)
+
+    def retune(tick: int, anchor: Anchor, measurement: Measurement, last: Wrench) -> Weights:
+        nonlocal sound, newest, in_force, share, led, count, trace, due
+        if tick == anchor.tick:  # the reference is anchored in this tick
+            return in_force
+        told = Told(measurement.state, _feet(robot, measurement))
+        seen.append(jax.tree.map(np.asarray, told))
+        trace = trace or init_trace(anchor, told, last)
+        if len(used) == config.window:
+            if config.estimator != "carried":
+                trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
+            start = np.asarray(tick - config.window, np.int32)
+            known = (config.tune, robot, command, anchor, effect, trace)
+            measured = config.estimator != "model"
+            found = follow(*known, stacked(used), start, stacked(seen), measured=measured)
+            trace, evaluation = jax.tree.map(np.asarray, found)
+            reason = refusal(config.tune, evaluation)
+            on_step(Iteration(count, in_force, evaluation, not reason, reason, led))
+            if reason:
+                newest, share, led = sound, share / 2.0, 0.0
+                trace = init_trace(anchor, told, last)
+            else:
+                sound, led = newest, config.step * share
+                newest = step_weights(config.tune, newest, evaluation.gradient, led)
+                share = min(1.0, 2.0 * share)
+            count, due = count + 1, tick + config.late
+            del seen[:-1], used[:]
+        if tick >= due:
+            in_force = newest
+        used.append(in_force)
+        return in_force
+
+    return retune

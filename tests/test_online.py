@@ -1,0 +1,232 @@
+"""Tuning while walking: the gradient of a window, the guards, a walk that asks for weights."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.walking import Measurement, WalkConfig
+from hector_jax.control.weights import bounds, nominal, vector_to_weights, weights_to_vector
+from hector_jax.model.effect import last_command
+from hector_jax.robot import load_robot
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import ideal
+from hector_jax.trajectory import State, zero_wrench
+from hector_jax.tuning import online
+from hector_jax.tuning.difftune import Evaluation, TuneConfig
+from hector_jax.tuning.loss import Losses, losses, total
+from hector_jax.tuning.online import OnlineConfig, Told, follow, init_trace, retuner
+from hector_jax.tuning.rollout import init_carry, step_carry
+
+ROBOT, TUNE, S = load_robot(), TuneConfig(), named_command("s")
+ANCHOR = standing_anchor(ROBOT)
+START, TICKS = 12, 20  # two windows of 10, with a change of stance in the first
+
+step = jax.jit(step_carry, static_argnums=0)
+
+
+def vector(weights):
+    return np.asarray(weights_to_vector(weights))
+
+
+def stack(trees):
+    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+
+# The gradient, where what is measured is the rigid body itself
+
+
+@pytest.fixture(scope="module")
+def carries():
+    """What the rigid body hands from tick to tick, over a change of stance."""
+    carry, found = init_carry(ROBOT, ANCHOR), []
+    for tick in range(START + TICKS + 1):
+        found.append(carry)
+        carry, _ = step(TUNE.rollout, ROBOT, nominal(), S, last_command, carry, jnp.asarray(tick))
+    return found[START:]
+
+
+def gradient(carries, trace, first, last, **how):
+    told = stack([Told(carry.state, carry.feet) for carry in carries[first : last + 1]])
+    weights = stack([nominal()] * (last - first))
+    tick = jnp.asarray(START + first)
+    return follow(TUNE, ROBOT, S, ANCHOR, last_command, trace, weights, tick, told, **how)
+
+
+def begun(carry):
+    trace = init_trace(ANCHOR, Told(carry.state, carry.feet), zero_wrench())
+    return trace._replace(commands=carry.commands)
+
+
+@jax.jit
+def _loss(theta, carry):
+    """Loss of the walk from a carry on, the change from the command before it included."""
+
+    def one(now, tick):
+        return step_carry(TUNE.rollout, ROBOT, vector_to_weights(theta), S, last_command, now, tick)
+
+    _, samples = jax.lax.scan(one, carry, START + jnp.arange(TICKS))
+    walk = samples._replace(period=samples.period[0], initial=carry.state)
+    change = jax.tree.map(lambda new, old: new[0] - old[0], samples.command, carry.commands)
+    change = sum(jnp.sum(x**2) for x in change)
+    return total(TUNE.loss, losses(walk)) + change
+
+
+_losses = jax.jit(lambda thetas, carry: jax.lax.map(lambda theta: _loss(theta, carry), thetas))
+
+
+def test_along_the_models_own_states_two_windows_have_the_gradient_of_differences(carries):
+    trace, one = gradient(carries, begun(carries[0]), 0, TICKS // 2)
+    _, other = gradient(carries, trace, TICKS // 2, TICKS)
+    theta = vector(nominal())
+    shift = np.exp(1e-5 * np.eye(24))
+    values = np.asarray(_losses(np.concatenate([theta * shift, theta / shift]), carries[0]))
+    expected = (values[:24] - values[24:]) / 2e-5
+    whole = float(_loss(theta, carries[0]))
+    assert float(one.loss + other.loss) == pytest.approx(whole, rel=1e-9)
+    error = (vector(one.gradient) + vector(other.gradient)) * theta - expected
+    assert np.linalg.norm(error) <= 1e-6 * np.linalg.norm(expected)
+
+
+@pytest.mark.slow  # two programs to compile
+def test_a_measured_sag_is_seen_as_long_as_it_is_measured(carries):
+    """A trunk that stays 2 cm low asks for a dearer height; the model's own walk would rise."""
+
+    def low(carry):
+        lower = carry.state.position - jnp.array([0.0, 0.0, 0.02])
+        return carry._replace(state=carry.state._replace(position=lower))
+
+    sagged = [low(carry) for carry in carries]
+    _, found = gradient(sagged, begun(sagged[0]), 0, TICKS)
+    _, free = gradient(sagged, begun(sagged[0]), 0, TICKS, measured=False)
+    assert found.gradient.Q.position[2] < 0.0
+    assert found.gradient.Q.position[2] < free.gradient.Q.position[2]
+    assert found.loss > free.loss
+
+
+# Guards, with gradients that nobody had to compute
+
+
+def toy(gradient=None, **wrong):
+    """`follow` that finds what it is told to, window by window."""
+    gradient = vector_to_weights(jnp.ones(24)) if gradient is None else gradient
+    told = {"loss": 1.0, "fallen": 0.0, "residual": 1e-12} | wrong
+
+    def found(config, robot, command, anchor, effect, trace, weights, tick, told_, measured):
+        loss, fallen, residual = (np.asarray(told[k], float) for k in told)
+        return trace, Evaluation(loss, Losses(loss, loss, loss), gradient, fallen, residual)
+
+    return found
+
+
+MEASURED = Measurement(
+    State(np.zeros(3), np.array([0.0, 0.0, 0.5]), np.zeros(3), np.zeros(3)),
+    np.asarray(ROBOT.standing_joints),
+    np.zeros(10),
+)
+
+
+def course(monkeypatch, config, follows, windows, start=None):
+    """Weights by tick, and the steps told; `follows` are used one after another."""
+    start, steps, turn = start or nominal(), [], iter(follows)
+    monkeypatch.setattr(online, "follow", lambda *a, **how: next(turn)(*a, **how))
+    retune = retuner(config, ROBOT, start, S, last_command, steps.append)
+    ticks = range(config.window * windows + 2)
+    return [retune(t, ANCHOR, MEASURED, zero_wrench()) for t in ticks], steps
+
+
+def test_weights_change_once_a_window_by_at_most_beta(monkeypatch):
+    config = OnlineConfig(window=5)
+    weights, steps = course(monkeypatch, config, [toy()] * 3, 3)
+    changed = [
+        t
+        for t in range(1, len(weights))
+        if not np.array_equal(*map(vector, weights[t - 1 : t + 1]))
+    ]
+    assert changed == [6, 11, 16]
+    assert [s.iteration for s in steps] == [0, 1, 2]
+    share = np.abs(vector(weights[6]) / vector(weights[5]) - 1.0)
+    assert share[:12].max() == pytest.approx(0.05)
+    assert share[12:].max() == pytest.approx(0.08)
+
+
+def test_a_late_step_comes_into_force_late(monkeypatch):
+    weights, _ = course(monkeypatch, OnlineConfig(window=5, late=3), [toy()], 1)
+    assert all(np.array_equal(vector(w), vector(nominal())) for w in weights)
+    longer, _ = course(monkeypatch, OnlineConfig(window=5, late=3), [toy()] * 2, 2)
+    assert np.array_equal(vector(longer[8]), vector(nominal()))
+    assert not np.array_equal(vector(longer[9]), vector(nominal()))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"fallen": 0.1}, "the robot fell"),
+        ({"residual": 1e-3}, "QP residual"),
+        ({"loss": np.nan}, "not finite"),
+        ({"gradient": vector_to_weights(jnp.full(24, jnp.nan))}, "not finite"),
+    ],
+)
+def test_a_window_that_cannot_be_believed_takes_the_last_step_back_and_halves(
+    monkeypatch, wrong, told
+):
+    config = OnlineConfig(window=5)
+    weights, steps = course(monkeypatch, config, [toy(), toy(**wrong), toy()], 3)
+    assert [s.accepted for s in steps] == [True, False, True]
+    assert told in steps[1].reason
+    np.testing.assert_array_equal(vector(weights[11]), vector(nominal()))
+    full, half = (vector(weights[t]) - vector(nominal()) for t in (6, 16))
+    np.testing.assert_allclose(half, full / 2, rtol=1e-9)
+
+
+def test_weights_stay_in_the_box(monkeypatch):
+    lower = bounds()[0]
+    weights, _ = course(monkeypatch, OnlineConfig(window=2), [toy()] * 4, 4, lower)
+    assert all((vector(w) == vector(lower)).all() for w in weights)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"window": 1}, {"late": 40}, {"late": -1}, {"step": 1.5}, {"estimator": "guess"}]
+)
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        OnlineConfig(**wrong)
+
+
+# The walk
+
+
+def same_bytes(one, other):
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
+
+
+def test_a_walk_with_steps_of_size_zero_is_the_plain_walk(monkeypatch):
+    args = WalkConfig(), ROBOT, nominal(), S, ideal(), 0.3
+    monkeypatch.setattr(online, "follow", toy())
+    still, moving = (
+        retuner(OnlineConfig(window=10, step=size), ROBOT, nominal(), S, last_command)
+        for size in (0.0, 1.0)
+    )
+    plain = walk(*args)
+    assert same_bytes(plain, walk(*args, retune=still))
+    assert not same_bytes(plain, walk(*args, retune=moving))
+
+
+@pytest.mark.slow
+def test_the_model_commands_along_the_measured_states_what_the_walk_commanded():
+    """What is differentiated is the controller that walked: its commands are found again."""
+    seen, told = [], []
+
+    def watch(tick, anchor, measurement, last):
+        seen.append((anchor, measurement, last))
+        return nominal()
+
+    walk(WalkConfig(), ROBOT, nominal(), S, ideal(), 0.45, retune=watch)
+    retune = retuner(OnlineConfig(), ROBOT, nominal(), S, last_command, told.append)
+    for tick, row in enumerate(seen):
+        retune(tick, *row)
+    commands = stack([last for _, _, last in seen[1:42]])
+    change = jax.tree.map(lambda w: jnp.sum(jnp.diff(w, axis=0) ** 2), commands)
+    assert float(told[0].evaluation.parts.control) == pytest.approx(float(sum(change)), rel=1e-6)
