@@ -21,8 +21,8 @@ from hector_jax.control import gait, qp
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
-from hector_jax.model import srbm
 from hector_jax.geometry import rotation_from_euler
+from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot

@@ -1,0 +1,151 @@
+"""Tuning in batches: beside single tunings, many at once, and over several devices.
+
+On a CPU, tunings of ten iterations one after the other against the same in one batch, every core a
+device; both compiled before. Many at once on whatever devices there are; and, with --devices, the
+same on some of them: the same number in all (strong) and the same number on each (weak).
+
+    python -m benchmarks.batch --many 1024 --devices 1 2 4 --net data/grfm.npz
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.measuring import Check, Report, show
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import Weights, nominal
+from hector_jax.evaluation.transfer import disturbed
+from hector_jax.grfm.network import as_effect, load_net
+from hector_jax.model.effect import last_command
+from hector_jax.robot import load_robot
+from hector_jax.runtime import all_devices, setup_jax
+from hector_jax.tuning.batch import Problem, Scenario, stack, tune_batch
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Stop, TuneConfig, tune
+from hector_jax.tuning.loss import Alpha
+from hector_jax.tuning.rollout import RolloutConfig
+
+NAME = "straight"
+DRAWN = 256  # different starts within x/1.5 of nominal; larger batches repeat them
+BAR, EFFICIENCY = 0.6, 0.9
+
+
+def _timed(run: Callable[[], Any]) -> tuple[float, Any]:
+    start = time.perf_counter()
+    found = run()
+    return time.perf_counter() - start, found
+
+
+def measure(
+    config: TuneConfig, net: Path | None, singles: int, many: int, counts: list[int]
+) -> Report:
+    """Time tunings.
+
+    Args:
+        config: of each.
+        net: GRFM-Net to tune through; None takes the plain rigid body.
+        singles: tunings to compare with as many single ones; 0 for no comparison.
+        many: tunings at once; 0 for none.
+        counts: numbers of devices for the table of efficiency.
+    """
+    robot, command = load_robot(), named_command(NAME)
+    anchor = standing_anchor(robot)
+    effect = last_command if net is None else as_effect(load_net(net, robot)[0])
+    starts = disturbed(nominal(), 1.5, min(DRAWN, max(singles, many, 1)))
+    alpha = Alpha(np.asarray(config.loss.euler), np.asarray(config.loss.position))
+    scenario = Scenario(command, anchor, np.asarray(0), alpha, np.asarray(1.0))
+
+    def start(i: int) -> Weights:
+        return starts[i % len(starts)]
+
+    def at_once(count: int, devices: list[jax.Device]) -> tuple[float, float, Any]:
+        """Seconds, those of the first call on top, and the tunings."""
+        problems = stack(
+            [Problem(start(i), stack([scenario]), np.asarray(1.0)) for i in range(count)]
+        )
+        run = lambda: tune_batch(config, robot, problems, stack([effect]), devices=devices)  # noqa: E731
+        first, _ = _timed(run)
+        spent, found = _timed(run)
+        return spent, first - spent, found
+
+    def row(what: str, used: int, count: int, spent: float, compiled: float, found: Any) -> list:
+        refused = np.mean(found.stop == Stop.BAD_START)
+        gain = np.median(found.course.loss[:, 0] / found.loss)
+        each = 1e3 * spent / count
+        told = [f"{spent:.2f}", f"{each:.2f}", f"{compiled:.0f}", f"{1 - 1 / gain:.0%}"]
+        return [what, str(used), str(count), *told, f"{refused:.0%}"]
+
+    devices, rows, checks = jax.devices(), [], []
+    if singles:
+        one = lambda i: tune(config, robot, start(i), command, anchor, effect)  # noqa: E731
+        compiled, _ = _timed(lambda: one(0))
+        spent, found = _timed(lambda: [one(i) for i in range(singles)])
+        then = np.array([t.history[0].evaluation.loss for t in found])
+        now = np.array([t.history[-1].evaluation.loss for t in found])
+        told = [f"{spent:.2f}", f"{1e3 * spent / singles:.2f}", f"{compiled:.0f}"]
+        drop = f"{1 - np.median(now / then):.0%}"
+        rows.append(["one after the other", "1", str(singles), *told, drop, "0%"])
+        batched, compiled, found = at_once(singles, devices)
+        rows.append(row("one batch", len(devices), singles, batched, compiled, found))
+        same = np.max(np.abs(found.loss / now - 1.0))
+        checks.append(
+            Check(f"batch of {singles} to {singles} single ones", batched / spent, "x", BAR)
+        )
+        checks.append(Check("largest relative difference of their losses", same))
+    if many and not counts:
+        rows.append(row("many", len(devices), many, *at_once(many, devices)))
+    alone = None
+    for used in counts:
+        if used > len(devices):
+            raise ValueError(f"--devices {used}: there are {len(devices)}")
+        strong = at_once(many, devices[:used])
+        weak = at_once(many * used, devices[:used]) if used > 1 else strong
+        alone = alone or strong[0] * used
+        rows.append(row("strong", used, many, *strong))
+        if used > 1:
+            rows.append(row("weak", used, many * used, *weak))
+            for name, share in (("strong", alone / (used * strong[0])), ("weak", alone / weak[0])):
+                what = f"efficiency on {used} devices, {name}; 1 over it"
+                checks.append(Check(what, 1.0 / share, "x", 1.0 / EFFICIENCY))
+    columns = (
+        "ten iterations",
+        "devices",
+        "tunings",
+        "s",
+        "ms each",
+        "compile s",
+        "L down",
+        "refused",
+    )
+    kind = devices[0].device_kind
+    notes = [
+        f"{config.rollout.ticks} ticks, {NAME}, starts within x/1.5 of nominal, {net or 'no net'}"
+    ]
+    return Report(f"Tuning in batches on {kind}", columns, rows, checks, notes)
+
+
+def main(arguments: list[str]) -> None:
+    """Measure and print JSON."""
+    setup_jax()
+    all_devices()
+    slow = jax.default_backend() == "cpu"
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--singles", type=int, default=64 if slow else 0)
+    parser.add_argument("--many", type=int, default=0 if slow else 1024)
+    parser.add_argument("--devices", type=int, nargs="*", default=[])
+    parser.add_argument("--ticks", type=int, default=400)
+    parser.add_argument("--net", type=Path)
+    chosen = parser.parse_args(arguments)
+    if chosen.devices and not chosen.many:
+        parser.error("--devices needs --many")
+    config = TuneConfig(rollout=RolloutConfig(ticks=chosen.ticks), iterations=PAPER_ITERATIONS)
+    show(measure(config, chosen.net, chosen.singles, chosen.many, chosen.devices))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
