@@ -5,6 +5,7 @@ device; both compiled before. Many at once on whatever devices there are; and, w
 same on some of them: the same number in all (strong) and the same number on each (weak).
 
     python -m benchmarks.batch --many 1024 --devices 1 2 4 --net data/grfm.npz
+    python -m benchmarks.batch --singles 64 --lanes 1 4 0     # problems side by side on a core
 """
 
 import argparse
@@ -25,7 +26,7 @@ from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.model.effect import last_command
 from hector_jax.robot import load_robot
 from hector_jax.runtime import all_devices, setup_jax
-from hector_jax.tuning.batch import Problem, Scenario, stack, tune_batch
+from hector_jax.tuning.batch import Problem, Scenario, lanes_of, stack, tune_batch
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Stop, TuneConfig, tune
 from hector_jax.tuning.loss import Alpha
 from hector_jax.tuning.rollout import RolloutConfig
@@ -42,7 +43,12 @@ def _timed(run: Callable[[], Any]) -> tuple[float, Any]:
 
 
 def measure(
-    config: TuneConfig, net: Path | None, singles: int, many: int, counts: list[int]
+    config: TuneConfig,
+    net: Path | None,
+    singles: int,
+    many: int,
+    counts: list[int],
+    lanes: list[int],
 ) -> Report:
     """Time tunings.
 
@@ -52,6 +58,8 @@ def measure(
         singles: tunings to compare with as many single ones; 0 for no comparison.
         many: tunings at once; 0 for none.
         counts: numbers of devices for the table of efficiency.
+        lanes: numbers of problems side by side that are compared with single ones; the first is
+            held against the bar.
     """
     robot, command = load_robot(), named_command(NAME)
     anchor = standing_anchor(robot)
@@ -63,12 +71,16 @@ def measure(
     def start(i: int) -> Weights:
         return starts[i % len(starts)]
 
-    def at_once(count: int, devices: list[jax.Device]) -> tuple[float, float, Any]:
+    def at_once(
+        count: int, devices: list[jax.Device], lanes: int | None = None
+    ) -> tuple[float, float, Any]:
         """Seconds, those of the first call on top, and the tunings."""
         problems = stack(
             [Problem(start(i), stack([scenario]), np.asarray(1.0)) for i in range(count)]
         )
-        run = lambda: tune_batch(config, robot, problems, stack([effect]), devices=devices)  # noqa: E731
+        run = lambda: tune_batch(
+            config, robot, problems, stack([effect]), devices=devices, lanes=lanes
+        )  # noqa: E731
         first, _ = _timed(run)
         spent, found = _timed(run)
         return spent, first - spent, found
@@ -90,13 +102,15 @@ def measure(
         told = [f"{spent:.2f}", f"{1e3 * spent / singles:.2f}", f"{compiled:.0f}"]
         drop = f"{1 - np.median(now / then):.0%}"
         rows.append(["one after the other", "1", str(singles), *told, drop, "0%"])
-        batched, compiled, found = at_once(singles, devices)
-        rows.append(row("one batch", len(devices), singles, batched, compiled, found))
-        same = np.max(np.abs(found.loss / now - 1.0))
-        checks.append(
-            Check(f"batch of {singles} to {singles} single ones", batched / spent, "x", BAR)
-        )
-        checks.append(Check("largest relative difference of their losses", same))
+        for i, side in enumerate(lanes):
+            told = at_once(singles, devices, side)
+            way = {0: "all", 1: "none"}.get(side, str(side))
+            rows.append(row(f"one batch, {way} side by side", len(devices), singles, *told))
+            bar = BAR if i == 0 else None
+            what = f"batch of {singles}, {way} side by side, to single ones"
+            checks.append(Check(what, told[0] / spent, "x", bar))
+            apart = np.max(np.abs(told[2].loss / now - 1.0))
+            checks.append(Check("largest relative difference of their losses", apart))
     if many and not counts:
         rows.append(row("many", len(devices), many, *at_once(many, devices)))
     alone = None
@@ -138,13 +152,15 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--singles", type=int, default=64 if slow else 0)
     parser.add_argument("--many", type=int, default=0 if slow else 1024)
     parser.add_argument("--devices", type=int, nargs="*", default=[])
+    parser.add_argument("--lanes", type=int, nargs="+", default=[lanes_of(jax.default_backend())])
     parser.add_argument("--ticks", type=int, default=400)
     parser.add_argument("--net", type=Path)
     chosen = parser.parse_args(arguments)
     if chosen.devices and not chosen.many:
         parser.error("--devices needs --many")
     config = TuneConfig(rollout=RolloutConfig(ticks=chosen.ticks), iterations=PAPER_ITERATIONS)
-    show(measure(config, chosen.net, chosen.singles, chosen.many, chosen.devices))
+    counts = chosen.singles, chosen.many, chosen.devices, chosen.lanes
+    show(measure(config, chosen.net, *counts))
 
 
 if __name__ == "__main__":
