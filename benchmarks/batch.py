@@ -12,6 +12,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,9 +79,8 @@ def measure(
         problems = stack(
             [Problem(start(i), stack([scenario]), np.asarray(1.0)) for i in range(count)]
         )
-        run = lambda: tune_batch(
-            config, robot, problems, stack([effect]), devices=devices, lanes=lanes
-        )  # noqa: E731
+        phis = stack([effect])
+        run = partial(tune_batch, config, robot, problems, phis, devices=devices, lanes=lanes)
         first, _ = _timed(run)
         spent, found = _timed(run)
         return spent, first - spent, found

@@ -1,6 +1,7 @@
 """Many tunings at once: each as if alone, on any number of devices; on a toy and the rigid body."""
 
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -200,6 +201,45 @@ def test_two_devices_give_the_numbers_of_one(kind):
     )
     assert ran.returncode == 0, ran.stderr[-2000:]
     assert ran.stdout.startswith("same")
+
+
+TWO_HOSTS = """
+from hector_jax.runtime import all_devices, setup_jax
+setup_jax()
+all_devices()
+import jax, numpy as np
+import test_batch as t
+t.difftune.evaluate = t.toy
+config, asked = t.shared_case("toy")
+assert jax.process_count() == 2 and len(jax.devices()) == 2 * len(jax.local_devices())
+found = t.tune_batch(config, t.ROBOT, asked, t.last_command)
+alone = t.tune_batch(config, t.ROBOT, asked, t.last_command, devices=jax.local_devices()[:1])
+jax.tree.map(np.testing.assert_array_equal, found, alone)
+print("same")
+"""
+
+
+@pytest.mark.slow  # two processes that wait for each other
+def test_two_hosts_give_the_numbers_of_one():
+    here = Path(__file__).parent
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    paths = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    shared = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": paths, "JAX_COORDINATOR_ADDRESS": address}
+    hosts = [
+        subprocess.Popen(
+            [sys.executable, "-c", TWO_HOSTS],
+            env={**os.environ, **shared, "JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": str(i)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for i in range(2)
+    ]
+    for host in hosts:
+        told, wrong = host.communicate(timeout=300)
+        assert told.strip() == "same", wrong[-2000:]
 
 
 @pytest.mark.slow  # minutes of compilation

@@ -97,8 +97,8 @@ def tail_weights(losses: Float[Array, " n"], tail: Float[Array, ""]) -> Float[Ar
 def lanes_of(backend: str) -> int:
     """Problems that walk side by side on a device: all (0) but on a CPU, one after the other.
 
-    On a CPU the slowest of the QPs that are solved side by side is waited for, and nothing is
-    gained in return.
+    Side by side, the slowest QP is waited for in every tick; a CPU gains nothing in return.
+    `python -m benchmarks.batch --lanes 1 4 0` tells.
     """
     return 1 if backend == "cpu" else 0
 
@@ -202,9 +202,8 @@ def _place(mesh: Mesh, tree: Any) -> Any:
 
 def _fetch(tree: Any) -> Any:
     """The whole of laid-out arrays on every host."""
-    if jax.process_count() > 1:
-        return multihost_utils.process_allgather(tree, tiled=True)
-    return jax.device_get(tree)
+    gather = partial(multihost_utils.process_allgather, tiled=True)
+    return jax.tree.map(lambda x: np.asarray(x if x.is_fully_addressable else gather(x)), tree)
 
 
 def tune_batch(
@@ -254,7 +253,7 @@ def tune_batch(
         stop, loss = _fetch((progress.stop, progress.loss))
         courses.append(_fetch(course))
         left = int(np.sum(stop[:count] == Stop.GOING))
-        tell(count - left, count, f"mean L {np.mean(loss[:count]):.4g}")
+        tell(count - left, count, f"median L {np.median(loss[:count]):.4g}")
     found = jax.tree.map(lambda x: x[:count], _fetch(progress))
     course = jax.tree.map(
         lambda *parts: np.concatenate(parts, axis=1)[:count, : config.iterations + 1], *courses
