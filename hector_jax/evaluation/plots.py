@@ -5,8 +5,9 @@ its caption. Weight sets keep their colour, line and marker through all pictures
 be told apart in grey too. Figures are made without pyplot: no display, no global state.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib
@@ -499,8 +500,15 @@ def ranks(
     return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."
 
 
-_ROW = (_GREY, _BLUE, _ORANGE, _GREEN, _PURPLE, "black")
-_MARKS = ("o", "D", "s", "^", "v", "P")
+_BASES = ("nominal", "expert")
+_OTHERS = ((_ORANGE, "s"), (_GREEN, "^"), (_PURPLE, "v"), ("black", "P"), ("#8a6d00", "X"))
+
+
+def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Colour and marker of weight sets of which only the baselines are known everywhere."""
+    others = cycle(_OTHERS)
+    pairs = {n: (_LOOK[n]["color"], _MARKER[n]) if n in _BASES else next(others) for n in names}
+    return {name: {"color": color, "marker": marker} for name, (color, marker) in pairs.items()}
 
 
 def ratios(path: Path, columns: Sequence[str], sets: Mapping[str, Sequence[float]]) -> str:
@@ -513,11 +521,10 @@ def ratios(path: Path, columns: Sequence[str], sets: Mapping[str, Sequence[float
     """
     at, width = np.arange(len(columns)), 0.7 / max(len(sets), 1)
     with _figure(path, 7.5, 3.2) as figure:
-        axes = figure.subplots()
+        axes, looks = figure.subplots(), _looks(sets)
         for i, (name, values) in enumerate(sets.items()):
             x = at + width * (i - (len(sets) - 1) / 2)
-            look = {"color": _ROW[i % len(_ROW)], "marker": _MARKS[i % len(_MARKS)]}
-            axes.plot(x, values, linestyle="none", markersize=6, label=name, **look)
+            axes.plot(x, values, linestyle="none", markersize=6, label=name, **looks[name])
         axes.axhline(1.0, color="black", linewidth=0.8)
         for edge in at[1:]:
             axes.axvline(edge - 0.5, color="0.8", linewidth=0.8)
@@ -547,11 +554,10 @@ def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> st
         sets: by name, a loss per plant.
     """
     with _figure(path, 6.0, 3.4) as figure:
-        axes = figure.subplots()
-        for i, (name, values) in enumerate(sets.items()):
+        axes, looks = figure.subplots(), _looks(sets)
+        for name, values in sets.items():
             share = 100 * (np.arange(len(values)) + 0.5) / len(values)
-            look = {"color": _ROW[i % len(_ROW)], "marker": _MARKS[i % len(_MARKS)]}
-            axes.plot(share, np.sort(values) / 1e6, label=name, **look)
+            axes.plot(share, np.sort(values) / 1e6, label=name, **looks[name])
         _log_axis(axes.yaxis, axes.set_yscale)
         axes.set(xlabel="plants [%], by their loss", ylabel="L [10$^6$]", xlim=(0, 100))
         _legend(figure, axes)
@@ -582,8 +588,8 @@ def front(
                     f"x{price:.2g}", (x, y), (4, 4), textcoords="offset points", fontsize=7
                 )
             if world == list(worlds)[-1]:
-                for name, (x, y) in beside.items():
-                    look = {"color": _LOOK[name]["color"], "marker": _MARKER[name]}
+                for name, look in _looks(beside).items():
+                    x, y = beside[name]
                     panel.plot(x / 1e6, y / 1e6, linestyle="none", label=name, **look)
             _log_axis(panel.xaxis, panel.set_xscale)
             panel.set(title=world, xlabel="tracking [10$^6$]")
@@ -614,6 +620,7 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
         right.plot(share[np.searchsorted(order, ends[0])], ends[0], "o", color=_GREEN)
         _log_axis(left.yaxis, left.set_yscale)
         left.set(xlabel="iteration", ylabel="L on the model [10$^6$]", title="on the way")
+        left.xaxis.get_major_locator().set_params(integer=True)
         right.set(xlabel="starts [%]", title="at the end", xlim=(0, 100))
         _legend(figure, left)
     return "Loss on the model by iteration from each start, and the losses at the end in order."
