@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -37,10 +37,20 @@ DRAWN = 256  # different starts within x/1.5 of nominal; larger batches repeat t
 BAR, EFFICIENCY = 0.6, 0.9
 
 
-def _timed(run: Callable[[], Any]) -> tuple[float, Any]:
+class _Run(NamedTuple):
+    wall: float  # [s]
+    cpu: float  # [s] on all cores
+    compiled: float  # [s] of the first call on top
+    found: Any
+
+
+def _timed(first: Callable[[], Any], run: Callable[[], Any]) -> _Run:
     start = time.perf_counter()
-    found = run()
-    return time.perf_counter() - start, found
+    first()
+    wall, cpu = time.perf_counter(), time.process_time()
+    before, found = wall - start, run()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    return _Run(wall, cpu, before, found)
 
 
 def measure(
@@ -72,65 +82,66 @@ def measure(
     def start(i: int) -> Weights:
         return starts[i % len(starts)]
 
-    def at_once(
-        count: int, devices: list[jax.Device], lanes: int | None = None
-    ) -> tuple[float, float, Any]:
-        """Seconds, those of the first call on top, and the tunings."""
+    def at_once(count: int, devices: list[jax.Device], lanes: int | None = None) -> _Run:
         problems = stack(
             [Problem(start(i), stack([scenario]), np.asarray(1.0)) for i in range(count)]
         )
         phis = stack([effect])
         run = partial(tune_batch, config, robot, problems, phis, devices=devices, lanes=lanes)
-        first, _ = _timed(run)
-        spent, found = _timed(run)
-        return spent, first - spent, found
+        told = _timed(run, run)
+        return told._replace(compiled=told.compiled - told.wall)
 
-    def row(what: str, used: int, count: int, spent: float, compiled: float, found: Any) -> list:
-        refused = np.mean(found.stop == Stop.BAD_START)
-        gain = np.median(found.course.loss[:, 0] / found.loss)
-        each = 1e3 * spent / count
-        told = [f"{spent:.2f}", f"{each:.2f}", f"{compiled:.0f}", f"{1 - 1 / gain:.0%}"]
-        return [what, str(used), str(count), *told, f"{refused:.0%}"]
+    def row(what: str, used: int, count: int, told: _Run, left: Any, refused: Any) -> list[str]:
+        """`left` are losses at the end by those at the start."""
+        times = f"{told.wall:.2f}", f"{told.cpu:.2f}", f"{1e3 * told.wall / count:.2f}"
+        down = f"{1 - np.median(left):.0%}"
+        return [what, str(used), str(count), *times, f"{told.compiled:.0f}", down, f"{refused:.0%}"]
+
+    def of_batch(what: str, used: int, count: int, told: _Run) -> list[str]:
+        found = told.found
+        left = np.where(found.stop == Stop.BAD_START, 1.0, found.loss / found.course.loss[:, 0])
+        return row(what, used, count, told, left, np.mean(found.stop == Stop.BAD_START))
 
     devices, rows, checks = jax.devices(), [], []
     if singles:
         one = lambda i: tune(config, robot, start(i), command, anchor, effect)  # noqa: E731
-        compiled, _ = _timed(lambda: one(0))
-        spent, found = _timed(lambda: [one(i) for i in range(singles)])
-        then = np.array([t.history[0].evaluation.loss for t in found])
-        now = np.array([t.history[-1].evaluation.loss for t in found])
-        told = [f"{spent:.2f}", f"{1e3 * spent / singles:.2f}", f"{compiled:.0f}"]
-        drop = f"{1 - np.median(now / then):.0%}"
-        rows.append(["one after the other", "1", str(singles), *told, drop, "0%"])
+        alone = _timed(lambda: one(0), lambda: [one(i) for i in range(singles)])
+        then, now = (np.array([t.history[i].evaluation.loss for t in alone.found]) for i in (0, -1))
+        rows.append(row("one after the other", 1, singles, alone, now / then, 0.0))
         for i, side in enumerate(lanes):
             told = at_once(singles, devices, side)
             way = {0: "all", 1: "none"}.get(side, str(side))
-            rows.append(row(f"one batch, {way} side by side", len(devices), singles, *told))
+            what = f"one batch, {way} side by side"
+            rows.append(of_batch(what, len(devices), singles, told))
             bar = BAR if i == 0 else None
             what = f"batch of {singles}, {way} side by side, to single ones"
-            checks.append(Check(what, told[0] / spent, "x", bar))
-            apart = np.max(np.abs(told[2].loss / now - 1.0))
+            checks.append(Check(what, told.wall / alone.wall, "x", bar))
+            apart = np.max(np.abs(told.found.loss / now - 1.0))
             checks.append(Check("largest relative difference of their losses", apart))
     if many and not counts:
-        rows.append(row("many", len(devices), many, *at_once(many, devices)))
-    alone = None
+        rows.append(of_batch("many", len(devices), many, at_once(many, devices)))
+    base = None
     for used in counts:
         if used > len(devices):
             raise ValueError(f"--devices {used}: there are {len(devices)}")
         strong = at_once(many, devices[:used])
         weak = at_once(many * used, devices[:used]) if used > 1 else strong
-        alone = alone or strong[0] * used
-        rows.append(row("strong", used, many, *strong))
+        base = base or strong.wall * used  # of one device, where the table begins with one
+        rows.append(of_batch("strong", used, many, strong))
         if used > 1:
-            rows.append(row("weak", used, many * used, *weak))
-            for name, share in (("strong", alone / (used * strong[0])), ("weak", alone / weak[0])):
-                what = f"efficiency on {used} devices, {name}; 1 over it"
-                checks.append(Check(what, 1.0 / share, "x", 1.0 / EFFICIENCY))
+            rows.append(of_batch("weak", used, many * used, weak))
+            for name, inverse in (
+                ("strong", used * strong.wall / base),
+                ("weak", weak.wall / base),
+            ):
+                what = f"1 / efficiency on {used} devices, {name}"
+                checks.append(Check(what, inverse, "x", 1.0 / EFFICIENCY))
     columns = (
         "ten iterations",
         "devices",
         "tunings",
         "s",
+        "CPU s",
         "ms each",
         "compile s",
         "L down",

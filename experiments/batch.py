@@ -253,7 +253,8 @@ def shared(flags: Shared) -> None:
         return [name, *cells, f"{max(beside):+.0f} %", ", ".join(fell[name]) or "none"]
 
     head = ["set", *scores, "worst, to the set tuned singly", "falls"]
-    changes = {n: [x / loss["nominal"][c] for c, x in loss[n].items()] for n in list(sets)[1:]}
+    base = np.array(list(loss["nominal"].values()))
+    changes = {n: np.array(list(loss[n].values())) / base for n in list(sets)[1:]}
     make_folder(flags.out)
     caption = plots.ratios(flags.out / "shared.png", list(scores), changes)
     ends = [f"{n} alone: {ended(flags, alone, i)}" for i, n in enumerate(names)]

@@ -239,7 +239,7 @@ def test_two_hosts_give_the_numbers_of_one():
     ]
     for host in hosts:
         told, wrong = host.communicate(timeout=300)
-        assert told.strip() == "same", wrong[-2000:]
+        assert told.strip().endswith("same"), wrong[-2000:]
 
 
 @pytest.mark.slow  # minutes of compilation

@@ -511,7 +511,9 @@ def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
     return {name: {"color": color, "marker": marker} for name, (color, marker) in pairs.items()}
 
 
-def ratios(path: Path, columns: Sequence[str], sets: Mapping[str, Sequence[float]]) -> str:
+def ratios(
+    path: Path, columns: Sequence[str], sets: Mapping[str, Float[np.ndarray, " columns"]]
+) -> str:
     """Losses of weight sets as ratios to nominal, by trajectory.
 
     Args:
