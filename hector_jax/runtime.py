@@ -47,6 +47,27 @@ def setup_jax() -> None:
     gc.set_threshold(100_000, 20, 100)
 
 
+def all_devices() -> None:
+    """Make every CPU core a device of its own, and join the hosts of a cluster.
+
+    Call after `setup_jax` and before the first array. Hosts are joined where the environment names
+    a coordinator (`JAX_COORDINATOR_ADDRESS`, with `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` where no
+    cluster that JAX knows tells them) or a step of Slurm or Open MPI runs.
+    """
+    import jax
+
+    if "host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        cores = getattr(os, "sched_getaffinity", lambda _: range(os.cpu_count() or 1))(0)
+        jax.config.update("jax_num_cpu_devices", len(cores))
+    clusters = ("JAX_COORDINATOR_ADDRESS", "SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
+    if any(name in os.environ for name in clusters):
+        count, own = (os.environ.get(f"JAX_{name}") for name in ("NUM_PROCESSES", "PROCESS_ID"))
+        jax.distributed.initialize(
+            num_processes=None if count is None else int(count),
+            process_id=None if own is None else int(own),
+        )
+
+
 def start_worker() -> None:
     """Set up a worker process as its parent is, with interrupts and accelerators left to it."""
     import jax

@@ -19,6 +19,7 @@ from hector_jax.grfm.network import (
     init_params,
     linear_effect,
     load_net,
+    member_effects,
     save_net,
 )
 from hector_jax.model.effect import HISTORY, Window
@@ -76,6 +77,16 @@ def test_the_effect_follows_the_dtype_of_the_window(either, window, dtype):
     assert {leaf.dtype for leaf in jax.tree.leaves(effect)} == {jnp.dtype(dtype)}
     assert effect.wrench.force.shape == (2, 3)
     assert bool(np.any(effect.spread.force)) == isinstance(either, ResidualParams)
+
+
+def test_the_members_alone_are_on_average_the_ensemble(data, window):
+    params = init_params(jax.random.key(0), data, "residual")
+    members = jax.vmap(lambda effect: effect(window).wrench)(member_effects(params))
+    whole = as_effect(params)(window).wrench
+    for each, mean in zip(members, whole, strict=True):
+        assert len(each) == 4
+        assert np.ptp(each, axis=0).max() > 0
+        np.testing.assert_allclose(each.mean(axis=0), mean, rtol=1e-5, atol=1e-9)
 
 
 def test_vmap_over_windows_equals_a_loop(either, data):

@@ -126,6 +126,26 @@ def test_tuning_while_walking_is_drawn_with_walks_that_ended_early(tmp_path):
     assert _has_ink(tmp_path / "weights.png")
 
 
+def test_pictures_of_batches_are_drawn(tmp_path):
+    rng = np.random.default_rng(0)
+    names = ("expert", "straight alone", "c alone", "s alone", "mean of all", "worst of all")
+    columns = ("straight", "c", "s", "unseen")
+    plots.ratios(tmp_path / "a.png", columns, {n: rng.uniform(0.3, 1.4, 4) for n in names})
+    losses = {n: 1e6 * rng.gamma(4.0, 0.5, 20) for n in names[:5]}
+    losses["nominal"] = np.r_[losses.pop("expert")[:19], 4e7]  # a fall
+    plots.by_plant(tmp_path / "b.png", losses)
+    prices = np.geomspace(0.01, 100, 9)
+    falling = 1e6 * np.stack([3 * prices**-0.4, 0.4 + 0.05 * prices**0.3], axis=1)
+    worlds = {"rigid body": falling, "hfs": 1.3 * falling}
+    worlds["rigid body"][0] = np.nan
+    plots.front(tmp_path / "c.png", prices, worlds, {"nominal": (3e6, 5e5), "expert": (2e6, 6e5)})
+    curves = 1e6 * (1 + np.exp(-np.arange(30) / 8) * rng.uniform(0.5, 20, (12, 1)))
+    curves[2, 4] = curves[3, 20:] = np.nan
+    assert "in order" in plots.starts(tmp_path / "d.png", curves)
+    for name in "abcd":
+        assert _has_ink(tmp_path / f"{name}.png")
+
+
 @pytest.mark.parametrize("ending", ["png", "svg", "pdf"])
 def test_the_same_picture_gives_the_same_bytes(tmp_path, walks, ending):
     pictures = []

@@ -5,7 +5,7 @@ its caption. Weight sets keep their colour, line and marker through all pictures
 be told apart in grey too. Figures are made without pyplot: no display, no global state.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -844,3 +844,131 @@ def weight_courses(
             )
         panels[0].set_ylabel("weight / its start")
     return f"The {most} weights that moved most; both feet share one R."
+
+
+_BASES = ("nominal", "expert")
+_TUNED = ((_ORANGE, "s"), (_GREEN, "^"), (_PURPLE, "v"), ("black", "P"), ("#8a6d00", "X"))
+
+
+def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Colour and marker of weight sets of which only the baselines are known everywhere."""
+    others = cycle(_TUNED)
+    pairs = {n: (_LOOK[n]["color"], _MARKER[n]) if n in _BASES else next(others) for n in names}
+    return {name: {"color": color, "marker": marker} for name, (color, marker) in pairs.items()}
+
+
+def ratios(
+    path: Path, columns: Sequence[str], sets: Mapping[str, Float[np.ndarray, " columns"]]
+) -> str:
+    """Losses of weight sets as ratios to nominal, by trajectory.
+
+    Args:
+        path: file to write.
+        columns: the trajectories.
+        sets: by name, a ratio per trajectory.
+    """
+    at, width = np.arange(len(columns)), 0.7 / max(len(sets), 1)
+    with _figure(path, 7.5, 3.2) as figure:
+        axes, looks = figure.subplots(), _looks(sets)
+        for i, (name, values) in enumerate(sets.items()):
+            x = at + width * (i - (len(sets) - 1) / 2)
+            axes.plot(x, values, linestyle="none", markersize=6, label=name, **looks[name])
+        axes.axhline(1.0, color="black", linewidth=0.8)
+        for edge in at[1:]:
+            axes.axvline(edge - 0.5, color="0.8", linewidth=0.8)
+        axes.grid(visible=False, axis="x")
+        axes.set_xticks(at, columns)
+        axes.tick_params(axis="x", length=0)
+        _log_axis(axes.yaxis, axes.set_yscale)
+        axes.set(ylabel="L / nominal", xlim=(-0.5, len(columns) - 0.5))
+        _legend(figure, axes)
+    return "Loss on the hfs as a ratio to that of the nominal weights (1)."
+
+
+def _log_axis(axis: Axis, set_scale: Callable[[str], None]) -> None:
+    """A logarithmic axis with plain numbers, and few where it spans much."""
+    set_scale("log")
+    low, high = axis.get_view_interval()
+    digits = "23456789" if high < 3 * low else "25" if high < 30 * low else ""
+    axis.set_major_formatter(lambda y, _: f"{y:g}")
+    axis.set_minor_formatter(lambda y, _: f"{y:g}" if f"{y:.0e}"[0] in digits else "")
+
+
+def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> str:
+    """Losses of weight sets on many plants, each set's in rising order.
+
+    Args:
+        path: file to write.
+        sets: by name, a loss per plant.
+    """
+    with _figure(path, 6.0, 3.4) as figure:
+        axes, looks = figure.subplots(), _looks(sets)
+        for name, values in sets.items():
+            share = 100 * (np.arange(len(values)) + 0.5) / len(values)
+            axes.plot(share, np.sort(values) / 1e6, label=name, **looks[name])
+        _log_axis(axes.yaxis, axes.set_yscale)
+        axes.set(xlabel="plants [%], by their loss", ylabel="L [10$^6$]", xlim=(0, 100))
+        _legend(figure, axes)
+    return "Loss on each plant, in rising order for each set: the right end is the tail."
+
+
+def front(
+    path: Path,
+    prices: Float[np.ndarray, " points"],
+    worlds: Mapping[str, Float[np.ndarray, "points 2"]],
+    beside: Mapping[str, tuple[float, float]],
+) -> str:
+    """Tracking against smoothness of weights tuned at several prices of tracking.
+
+    Args:
+        path: file to write.
+        prices: factors of the paper's loss weights.
+        worlds: by name, tracking and L_ctrl by price.
+        beside: the same of other weight sets, in the world named last.
+    """
+    with _figure(path, 4.0 * len(worlds), 3.6) as figure:
+        panels = figure.subplots(1, len(worlds), squeeze=False)[0]
+        for panel, (world, values) in zip(panels, worlds.items(), strict=True):
+            known = np.isfinite(values).all(axis=1)
+            panel.plot(*values[known].T / 1e6, "o-", color=_GREEN, label="tuned")
+            for price, (x, y) in zip(prices[known], values[known] / 1e6, strict=True):
+                panel.annotate(
+                    f"x{price:.2g}", (x, y), (4, 4), textcoords="offset points", fontsize=7
+                )
+            if world == list(worlds)[-1]:
+                for name, look in _looks(beside).items():
+                    x, y = beside[name]
+                    panel.plot(x / 1e6, y / 1e6, linestyle="none", label=name, **look)
+            _log_axis(panel.xaxis, panel.set_xscale)
+            panel.set(title=world, xlabel="tracking [10$^6$]")
+        panels[0].set_ylabel(r"$L_\mathrm{ctrl}$ [10$^6$]")
+        _legend(figure, panels[-1])
+    return "Each point is a tuning, its tracking priced as the label says; left and down is better."
+
+
+def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
+    """Loss by iteration from several starts, and where they end.
+
+    Args:
+        path: file to write.
+        curves: losses that were accepted, NaN elsewhere; the first row starts at nominal.
+    """
+    with _figure(path, 7.5, 3.4) as figure:
+        left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
+        ends = []
+        for i, row in enumerate(curves):
+            kept = np.flatnonzero(np.isfinite(row))
+            look = {"color": "0.7", "linewidth": 0.8} if i else _LOOK["with"] | {"zorder": 3}
+            label = {0: "from nominal", 1: "from elsewhere"}.get(i)
+            left.plot(kept, row[kept] / 1e6, label=label, **look)
+            ends.append(row[kept[-1]] / 1e6)
+        order = np.sort(ends)
+        share = 100 * (np.arange(len(ends)) + 0.5) / len(ends)
+        right.plot(share, order, "o", color="0.5", markersize=3)
+        right.plot(share[np.searchsorted(order, ends[0])], ends[0], "o", color=_GREEN)
+        _log_axis(left.yaxis, left.set_yscale)
+        left.set(xlabel="iteration", ylabel="L on the model [10$^6$]", title="on the way")
+        left.xaxis.get_major_locator().set_params(integer=True)
+        right.set(xlabel="starts [%]", title="at the end", xlim=(0, 100))
+        _legend(figure, left)
+    return "Loss on the model by iteration from each start, and the losses at the end in order."

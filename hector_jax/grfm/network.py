@@ -259,6 +259,15 @@ def as_effect(params: Params) -> jax.tree_util.Partial:
     return jax.tree_util.Partial(_net_effect if paper else _residual_effect, params)
 
 
+def member_effects(params: ResidualParams) -> jax.tree_util.Partial:
+    """Phi of each member of the residual nets' ensembles alone, stacked on a first axis."""
+    count = MEMBERS["residual"]
+    alone = lambda p: jnp.asarray(p)[:, None]  # noqa: E731  each an ensemble of one
+    shared = lambda p: jnp.broadcast_to(jnp.asarray(p), (count, *jnp.shape(p)))  # noqa: E731
+    nets = {name: jax.tree.map(alone, getattr(params, name)) for name in ("force", "moment")}
+    return as_effect(jax.tree.map(shared, params)._replace(**nets))
+
+
 def _residual_effect(params: ResidualParams, window: Window) -> Effect:
     params, window = in_dtype_of(window, params), in_dtype_of(window, window)
     seen = views(window)

@@ -8,10 +8,14 @@ the weights go back, the step is halved and the refusal is told.
 Two results come out of one run: the weights after the paper's `ten` iterations, each accepted
 unless it is refused, and the `converged` ones, for which steps that raise the loss are halved too
 until nothing is gained any more.
+
+The rule by which all that is decided is `init` and `update`, functions of arrays: `tune` asks them
+from Python, one iteration after the other; `batch` compiles them into its loop on the device.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,13 +23,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds
 from hector_jax.robot import Robot
-from hector_jax.tuning.loss import LossConfig, Losses, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.loss import Alpha, LossConfig, Losses, losses, total
+from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 
 PAPER_ITERATIONS = 10
 
@@ -68,6 +72,40 @@ class Evaluation(NamedTuple):
     residual: Float[Array, "*batch"]  # worst of the rollout
 
 
+class Reason(IntEnum):
+    """Why an iteration was refused."""
+
+    ACCEPTED = 0
+    NOT_FINITE = 1
+    FELL = 2
+    UNSOLVED = 3  # a QP of the rollout
+    ROSE = 4  # the loss, after the paper's ten iterations
+
+
+class Stop(IntEnum):
+    """Why a tuning ended."""
+
+    GOING = 0
+    LIMIT = 1  # of iterations
+    SMALL_STEP = 2
+    NO_GAIN = 3
+    BAD_START = 4  # refused
+
+
+class Progress(NamedTuple):
+    """Where a tuning stands between two rollouts: the state of the rule."""
+
+    trial: Weights  # to be evaluated next
+    share: Float[Array, "*batch"]  # of the full step that leads from `best` to `trial`
+    count: Int[Array, "*batch"]  # iteration of the trial; the start is 0
+    best: Weights  # the last that were accepted
+    loss: Float[Array, "*batch"]  # theirs
+    gradient: Weights  # theirs
+    recent: Float[Array, "*batch kept"]  # losses accepted last, newest first; NaN before the first
+    ten: Weights  # best after at most the paper's ten iterations
+    stop: Int[Array, "*batch"]  # a `Stop`
+
+
 class Iteration(NamedTuple):
     """What one iteration did; a line of metrics.jsonl."""
 
@@ -95,13 +133,23 @@ def evaluate(
     command: Command,
     anchor: Anchor,
     effect: jax.tree_util.Partial,
+    alpha: Alpha | None = None,
+    variation: Variation | None = None,
 ) -> Evaluation:
-    """Loss of a weight set on the model and its gradient, in one program. Source: Eq. 9, 11."""
+    """Loss of a weight set on the model and its gradient, in one program.
+
+    Args:
+        config: how; its loss weights count where `alpha` gives none.
+        robot, weights, command, anchor, effect, variation: see `rollout`.
+        alpha: weights of the loss's parts as arrays.
+
+    Source: Eq. 9, 11.
+    """
 
     def objective(weights: Weights) -> tuple[Array, tuple]:
-        trajectory = rollout(config.rollout, robot, weights, command, anchor, effect)
+        trajectory = rollout(config.rollout, robot, weights, command, anchor, effect, variation)
         parts = losses(trajectory)
-        loss = total(config.loss, parts)
+        loss = total(config.loss if alpha is None else alpha, parts)
         return loss, (parts, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual))
 
     (loss, (parts, fallen, residual)), gradient = jax.value_and_grad(objective, has_aux=True)(
@@ -147,27 +195,116 @@ def _tied(gradient: Weights) -> Weights:
     return Weights(gradient.Q, jax.tree.map(both, gradient.R))
 
 
-def step_weights(config: TuneConfig, weights: Weights, gradient: Weights, share: float) -> Weights:
+def step_weights(
+    config: TuneConfig, weights: Weights, gradient: Weights, share: float | Float[Array, ""]
+) -> Weights:
     """Weights after `share` of a full step downhill, projected onto the box."""
     if config.tie_feet:
         gradient = _tied(gradient)
     optimiser = _optimiser(config)
     updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
     moved = optax.apply_updates(weights, jax.tree.map(lambda u: share * u, updates))
-    return jax.tree.map(np.asarray, optax.projections.projection_box(moved, *bounds()))
+    return optax.projections.projection_box(moved, *bounds())
+
+
+def believed(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
+    """Whether an evaluation is to be believed: the `Reason` why not."""
+    numbers = [evaluation.loss, *jax.tree.leaves(evaluation.gradient)]
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
+    solved = jnp.asarray(evaluation.residual) <= config.residual
+    reason = jnp.where(solved, Reason.ACCEPTED, Reason.UNSOLVED)
+    reason = jnp.where(jnp.asarray(evaluation.fallen) > 0, Reason.FELL, reason)
+    return jnp.where(finite, reason, Reason.NOT_FINITE).astype(jnp.int32)
+
+
+def init(config: TuneConfig, weights: Weights) -> Progress:
+    """A tuning before its first rollout."""
+    weights = jax.tree.map(jnp.asarray, weights)
+    return Progress(
+        trial=weights,
+        share=jnp.asarray(1.0),
+        count=jnp.asarray(0, jnp.int32),
+        best=weights,
+        loss=jnp.asarray(jnp.inf),
+        gradient=jax.tree.map(jnp.zeros_like, weights),
+        recent=jnp.full(config.patience + 1, jnp.nan),
+        ten=weights,
+        stop=jnp.asarray(Stop.GOING, jnp.int32),
+    )
+
+
+def update(
+    config: TuneConfig, progress: Progress, evaluation: Evaluation
+) -> tuple[Progress, Int[Array, ""]]:
+    """What follows from the rollout of the trial: the next trial, and why this one was refused.
+
+    The first `PAPER_ITERATIONS` are accepted whatever the loss; later ones must lower it. A
+    refusal halves the step, an acceptance doubles it up to the full one. After the paper's
+    iterations the tuning stops where the step has become too small or `patience` accepted
+    iterations gained less than `gain`.
+    """
+    count, start = progress.count, progress.count == 0
+    late = count > PAPER_ITERATIONS
+    reason = believed(config, evaluation)
+    rose = late & ~(evaluation.loss < progress.loss)
+    reason = jnp.where((reason == Reason.ACCEPTED) & rose, Reason.ROSE, reason)
+    accepted = reason == Reason.ACCEPTED
+
+    def kept(new: Any, old: Any) -> Any:
+        return jax.tree.map(lambda x, y: jnp.where(accepted, x, y), new, old)
+
+    best = kept(progress.trial, progress.best)
+    gradient = kept(evaluation.gradient, progress.gradient)
+    recent = jnp.append(jnp.asarray(evaluation.loss), progress.recent[:-1])
+    recent = kept(recent, progress.recent)
+    share = jnp.where(accepted, jnp.minimum(1.0, 2.0 * progress.share), progress.share / 2.0)
+
+    little = recent[0] > (1 - config.gain) * recent[-1]  # false before there are enough
+    stop = jnp.where(count >= config.iterations, Stop.LIMIT, Stop.GOING)
+    stop = jnp.where(late & little, Stop.NO_GAIN, stop)
+    stop = jnp.where(late & (share < config.smallest_step), Stop.SMALL_STEP, stop)
+    stop = jnp.where(start & ~accepted, Stop.BAD_START, stop)
+    return Progress(
+        trial=step_weights(config, best, gradient, share),
+        share=share,
+        count=count + 1,
+        best=best,
+        loss=kept(evaluation.loss, progress.loss),
+        gradient=gradient,
+        recent=recent,
+        ten=jax.tree.map(lambda x, y: jnp.where(late, y, x), best, progress.ten),
+        stop=stop.astype(jnp.int32),
+    ), reason.astype(jnp.int32)
+
+
+def _in_words(config: TuneConfig, reason: Reason, evaluation: Evaluation) -> str:
+    return {
+        Reason.ACCEPTED: "",
+        Reason.NOT_FINITE: "loss or gradient not finite",
+        Reason.FELL: "the robot fell",
+        Reason.UNSOLVED: (
+            f"QP residual {float(evaluation.residual):.1e} above {config.residual:.0e}"
+        ),
+        Reason.ROSE: "the loss rose",
+    }[reason]
 
 
 def refusal(config: TuneConfig, evaluation: Evaluation) -> str:
     """Why an evaluation is not to be believed; empty when it is."""
-    if not np.isfinite(evaluation.loss) or not all(
-        np.isfinite(g).all() for g in jax.tree.leaves(evaluation.gradient)
-    ):
-        return "loss or gradient not finite"
-    if evaluation.fallen > 0:
-        return "the robot fell"
-    if not evaluation.residual <= config.residual:
-        return f"QP residual {float(evaluation.residual):.1e} above {config.residual:.0e}"
-    return ""
+    return _in_words(config, Reason(int(believed(config, evaluation))), evaluation)
+
+
+def stopped(config: TuneConfig, stop: Stop) -> str:
+    """Why a tuning ended, in words."""
+    return {
+        Stop.GOING: "not ended",
+        Stop.LIMIT: f"{config.iterations} iterations",
+        Stop.SMALL_STEP: "the step became too small to gain",
+        Stop.NO_GAIN: (
+            f"the loss fell by less than {config.gain:.1%} in {config.patience} iterations"
+        ),
+        Stop.BAD_START: "the starting weights were refused",
+    }[stop]
 
 
 def tune(
@@ -193,46 +330,20 @@ def tune(
     Source: problem P and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
     """
     history: list[Iteration] = []
-
-    def look(weights: Weights, step: float) -> Iteration:
-        found = jax.tree.map(np.asarray, tune_step(config, robot, weights, command, anchor, effect))
-        reason = refusal(config, found)
-        return Iteration(len(history), weights, found, not reason, reason, step)
-
-    def note(iteration: Iteration) -> None:
-        history.append(iteration)
-        on_iteration(iteration)
-
-    best = look(jax.tree.map(np.asarray, weights), 0.0)
-    if not best.accepted:
-        raise ValueError(f"the starting weights cannot be tuned from: {best.reason}")
-    note(best)
-    share, stop, ten = 1.0, f"{config.iterations} iterations", best.weights
-    for count in range(1, config.iterations + 1):
-        tried = look(step_weights(config, best.weights, best.evaluation.gradient, share), share)
-        if (
-            tried.accepted
-            and count > PAPER_ITERATIONS
-            and not tried.evaluation.loss < best.evaluation.loss
-        ):
-            tried = tried._replace(accepted=False, reason="the loss rose")
-        note(tried)
-        if tried.accepted:
-            best, share = tried, min(1.0, 2.0 * share)
-        else:
-            share /= 2.0
-        if count <= PAPER_ITERATIONS:
-            ten = best.weights
-            continue
-        if share < config.smallest_step:
-            stop = "the step became too small to gain"
-            break
-        losses_then = [float(i.evaluation.loss) for i in history if i.accepted]
-        window = losses_then[-config.patience - 1 :]
-        if len(window) > config.patience and window[-1] > (1 - config.gain) * window[0]:
-            stop = f"the loss fell by less than {config.gain:.1%} in {config.patience} iterations"
-            break
-    return Tuning(history, ten, best.weights, stop)
+    progress = init(config, weights)
+    while progress.stop == Stop.GOING:
+        trial = jax.tree.map(np.asarray, progress.trial)
+        found = tune_step(config, robot, trial, command, anchor, effect)
+        found = jax.tree.map(np.asarray, found)
+        step = float(progress.share) if history else 0.0
+        progress, code = update(config, progress, found)
+        reason = _in_words(config, Reason(int(code)), found)
+        if progress.stop == Stop.BAD_START:
+            raise ValueError(f"the starting weights cannot be tuned from: {reason}")
+        history.append(Iteration(len(history), trial, found, not reason, reason, step))
+        on_iteration(history[-1])
+    ten, converged = jax.tree.map(np.asarray, (progress.ten, progress.best))
+    return Tuning(history, ten, converged, stopped(config, Stop(int(progress.stop))))
 
 
 @partial(jax.jit, static_argnums=0)

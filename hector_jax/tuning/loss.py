@@ -34,6 +34,13 @@ class LossConfig:
             raise ValueError(f"LossConfig weights must be >= 0, got {self.euler}, {self.position}")
 
 
+class Alpha(NamedTuple):
+    """The same weights as arrays, where problems with different ones share a program."""
+
+    euler: Float[Array, "*batch"]  # alpha_1 [1/rad^2]
+    position: Float[Array, "*batch"]  # alpha_2 [1/m^2]
+
+
 class Losses(NamedTuple):
     """Unweighted parts of the loss."""
 
@@ -78,6 +85,6 @@ def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
     return jnp.sum(jnp.where(switched, _squared_changes(trajectory.command, trajectory.fallen), 0))
 
 
-def total(config: LossConfig, parts: Losses) -> Float[Array, "*batch"]:
+def total(config: LossConfig | Alpha, parts: Losses) -> Float[Array, "*batch"]:
     """L of its parts. Source: Eq. 11."""
     return config.euler * parts.euler + config.position * parts.position + parts.control

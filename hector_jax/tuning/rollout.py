@@ -3,6 +3,9 @@
 This is the only world that is differentiated. A tick solves the MPC, asks phi what the ground
 returns and moves the body; in between, nothing is remembered but what `Carry` holds. A foot in the
 air is carried at its planned touchdown point, where an early touchdown that phi predicts acts too.
+
+A `Variation` makes the body and its ground differ from what the controller believes, for weights
+that have to bear with that.
 """
 
 from dataclasses import dataclass
@@ -11,17 +14,19 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax.control import gait, qp
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
+from hector_jax.geometry import rotation_from_euler
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.trajectory import Load, State, Trajectory, Wrench, has_fallen
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,32 @@ class RolloutConfig:
             )
 
 
+class Variation(NamedTuple):
+    """How the world differs from what the controller believes; see `no_variation`."""
+
+    mass: Float[Array, "*batch"]  # times the robot's
+    inertia: Float[Array, "*batch"]  # likewise, all of it
+    com: Float[Array, "*batch 3"]  # true centre of mass from the believed one, trunk axes [m]
+    friction: Float[Array, "*batch"]  # of the ground: most horizontal by vertical force
+    delay: Float[Array, "*batch"]  # by which effects come late [s], at most a tick
+    noise: State  # standard deviations of what the controller sees, white from tick to tick
+    seed: Int[Array, "*batch"]  # of the noise
+
+
+def no_variation() -> Variation:
+    """The world is as the controller believes."""
+    one, zero, none = np.asarray(1.0), np.asarray(0.0), np.zeros(3)
+    grips = np.asarray(1e3)
+    return Variation(one, one, none, grips, zero, State(none, none, none, none), np.asarray(0))
+
+
+class Late(NamedTuple):
+    """What acted in the last tick, world frame; of it a delayed effect has a share."""
+
+    wrench: Wrench
+    legs: Load
+
+
 class Carry(NamedTuple):
     """What one tick hands to the next."""
 
@@ -55,6 +86,7 @@ class Carry(NamedTuple):
     commands: Wrench  # (HISTORY, 2, 3) each, world frame, newest first
     anchor: Anchor  # taken anew at t = 0
     fallen: Bool[Array, ""]
+    late: Late | None = None  # where there is a variation
 
 
 def init_carry(robot: Robot, anchor: Anchor) -> Carry:
@@ -73,6 +105,50 @@ def init_carry(robot: Robot, anchor: Anchor) -> Carry:
     )
 
 
+def _estimate_error(variation: Variation, state: State, tick: Int[Array, ""]) -> State:
+    """Error of what the controller sees of the base."""
+    key = jax.random.fold_in(jax.random.key(variation.seed), tick)
+    drawn = jax.random.normal(key, (4, 3), state.position.dtype)
+    return State(*(sigma * error for sigma, error in zip(variation.noise, drawn, strict=True)))
+
+
+def _within_friction(wrench: Wrench, friction: Float[Array, ""]) -> Wrench:
+    """A foot slips: its horizontal force is cut to what the ground can hold."""
+    across, load = wrench.force[:, :2], jnp.maximum(wrench.force[:, 2], 0.0)
+    square = jnp.sum(across**2, axis=-1)
+    slips = square > (friction * load) ** 2
+    share = jnp.where(slips, friction * load / jnp.sqrt(jnp.where(slips, square, 1.0)), 1.0)
+    return wrench._replace(force=wrench.force.at[:, :2].multiply(share[:, None]))
+
+
+def _moved_by(
+    variation: Variation,
+    robot: Robot,
+    state: State,
+    now: Late,
+    feet: Float[Array, "2 3"],
+    before: Late,
+    feet_before: Float[Array, "2 3"],
+    dt: float,
+) -> State:
+    """`srbm.step` of the body as it is; what is late acts where the feet were."""
+    share = variation.delay / dt
+    mixed = jax.tree.map(lambda new, old: (1.0 - share) * new + share * old, now, before)
+    lever = share * jnp.cross(feet_before - feet, before.wrench.force)
+    wrench = mixed.wrench._replace(moment=mixed.wrench.moment + lever)
+    body = robot._replace(
+        mass=variation.mass * robot.mass, inertia=variation.inertia * jnp.asarray(robot.inertia)
+    )
+
+    def seen_from(state: State, offset: Float[Array, "3"]) -> State:
+        arm = rotation_from_euler(state.euler) @ offset
+        velocity = state.velocity + jnp.cross(state.ang_velocity, arm)
+        return state._replace(position=state.position + arm, velocity=velocity)
+
+    moved = srbm.step(body, seen_from(state, variation.com), wrench, feet, dt, mixed.legs)
+    return seen_from(moved, -variation.com)
+
+
 def step_carry(
     config: RolloutConfig,
     robot: Robot,
@@ -81,6 +157,7 @@ def step_carry(
     effect: jax.tree_util.Partial,
     carry: Carry,
     tick: Int[Array, ""],
+    variation: Variation | None = None,
 ) -> tuple[Carry, Trajectory]:
     """One tick of the closed loop: plan, effect, motion.
 
@@ -91,8 +168,14 @@ def step_carry(
     state, feet = carry.state, carry.feet
     here = anchor_at(robot, state, carry.anchor.tick)
     anchor = jax.tree.map(lambda x, y: jnp.where(tick == here.tick, x, y), here, carry.anchor)
+    seen, standing = state, feet
+    if variation is not None:
+        error = _estimate_error(variation, state, tick)
+        seen = jax.tree.map(jnp.add, state, error)
+        # the legs know where the feet are from the body, not from the world
+        standing = feet._replace(position=feet.position + error.position)
     decided = plan(
-        walk, robot, weights, command, anchor, tick, state, feet, slots=slots_needed(walk, 0)
+        walk, robot, weights, command, anchor, tick, seen, standing, slots=slots_needed(walk, 0)
     )
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), decided.wrench, carry.commands
@@ -106,13 +189,29 @@ def step_carry(
         base=from_yaw_frame(state),
     )
     found = effect(window)
-    returned = turn(found.wrench, yaw)
-    stands = decided.contact
+    returned, legs = turn(found.wrench, yaw), turn(found.legs, yaw)
+    stands, touchdown = decided.contact, decided.touchdown
+    if variation is not None:
+        touchdown = touchdown._replace(position=touchdown.position - error.position)
+        returned = _within_friction(returned, variation.friction)
     feet = Feet(
-        jnp.where(stands[:, None], feet.position, decided.touchdown.position),
-        jnp.where(stands, feet.yaw, decided.touchdown.yaw),
+        jnp.where(stands[:, None], feet.position, touchdown.position),
+        jnp.where(stands, feet.yaw, touchdown.yaw),
     )
-    moved = srbm.step(robot, state, returned, feet.position, ticks.tick, turn(found.legs, yaw))
+    if variation is None:
+        late, moved = None, srbm.step(robot, state, returned, feet.position, ticks.tick, legs)
+    else:
+        late = Late(returned, legs)
+        moved = _moved_by(
+            variation,
+            robot,
+            state,
+            late,
+            feet.position,
+            carry.late,
+            carry.feet.position,
+            ticks.tick,
+        )
     fallen = carry.fallen | has_fallen(moved)
     sample = Trajectory(
         period=jnp.asarray(ticks.tick),
@@ -128,7 +227,7 @@ def step_carry(
         legs_touch=jnp.zeros_like(fallen),  # a rigid body has none
         residual=decided.residual,
     )
-    return Carry(moved, feet, commands, anchor, fallen), sample
+    return Carry(moved, feet, commands, anchor, fallen, late), sample
 
 
 def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
@@ -150,6 +249,7 @@ def rollout(
     command: Command,
     anchor: Anchor,
     effect: jax.tree_util.Partial,
+    variation: Variation | None = None,
 ) -> Trajectory:
     """Walk on the single rigid body: `lead` ticks in place from standing, then the command.
 
@@ -160,6 +260,7 @@ def rollout(
         command: what to walk.
         anchor: where it stands and the gait tick of t = 0, see `reference.standing_anchor`.
         effect: phi, `Window -> Effect`.
+        variation: what the controller does not know; None is compiled without any.
 
     Returns:
         Trajectory of T samples from t = 0. Nothing raises: read `fallen` and `residual` before
@@ -170,12 +271,15 @@ def rollout(
 
     @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
     def tick(carry: Carry, j: Int[Array, ""]) -> tuple[Carry, Trajectory]:
-        return step_carry(config, robot, weights, command, effect, carry, j)
+        return step_carry(config, robot, weights, command, effect, carry, j, variation)
 
     def walk(carry: Carry, ticks: Int[Array, " block"]) -> tuple[Carry, Trajectory]:
         return jax.lax.scan(tick, carry, ticks)
 
     start, ticks = init_carry(robot, anchor), walked_ticks(config, anchor)
+    if variation is not None:
+        standing = jax.tree.map(lambda w: w[0], start.commands)
+        start = start._replace(late=Late(standing, Load(jnp.zeros(3), jnp.zeros(3))))
     blocks = _blocks(config)
     if blocks == 1:
         _, samples = walk(start, ticks)

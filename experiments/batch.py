@@ -1,0 +1,484 @@
+"""What batches of tunings are good for; one sub-command per question, each writes a report.
+
+    python experiments/batch.py shared     one weight set for several trajectories
+    python experiments/batch.py robust     weights that bear with variations of the model
+    python experiments/batch.py front      what smoothness costs in tracking
+    python experiments/batch.py starts     how much the start matters
+    python experiments/batch.py verdict OUT    weights of a report on the hardware stand-in
+
+Tuned is on the rigid body, through a GRFM-Net where --net names one, on all devices there are
+(every CPU core is one). Judged is on the high-fidelity simulator or plants drawn around it; the
+stand-in is read by `verdict` alone, which tunes nothing.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tyro
+
+from hector_jax import pipeline
+from hector_jax.console import bar, say
+from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.evaluation import metrics, plots
+from hector_jax.evaluation.metrics import Score
+from hector_jax.evaluation.report import environment
+from hector_jax.evaluation.transfer import disturbed
+from hector_jax.grfm.network import as_effect, load_net, member_effects
+from hector_jax.model.effect import last_command
+from hector_jax.robot import Robot, load_robot
+from hector_jax.runtime import all_devices, setup_jax, workers
+from hector_jax.sim.standin import standin
+from hector_jax.sim.world import Imperfections, hfs, hfs_varied
+from hector_jax.storage import load_weights, make_folder, save_weights, write_file
+from hector_jax.tuning.batch import Problem, Scenario, Tunings, stack, tune_batch
+from hector_jax.tuning.difftune import Reason, Stop, TuneConfig, stopped
+from hector_jax.tuning.loss import Alpha, LossConfig, Losses
+from hector_jax.tuning.rollout import Variation, no_variation
+
+UNSEEN = Command(  # ahead, aside and into turns of another rate: no tuning walks it
+    np.array([1.0, 1.0, 2.0]),
+    np.array([[0.4, 0.0], [0.3, 0.1], [0.25, 0.0]]),
+    np.array([0.0, -0.3 * np.pi, 0.4 * np.pi]),
+)
+TAIL = 0.25  # share of the worst variations, and plants, that a CVaR counts
+
+
+@dataclass(frozen=True)
+class Flags:
+    """What all sub-commands ask."""
+
+    net: Path | None = None  # GRFM-Net to tune through; none: the plain rigid body
+    iterations: int = 100  # at most
+    processes: int = 2  # that walk in MuJoCo, one core each
+
+
+@dataclass(frozen=True)
+class Shared(Flags):
+    """One weight set for several trajectories: mean or worst of their losses."""
+
+    out: Path = Path("runs/batch/shared")  # folder of the report
+    trajectories: tuple[str, ...] = COMMANDS
+
+
+@dataclass(frozen=True)
+class Robust(Flags):
+    """Mean or CVaR over variations of the model, against the model as it is."""
+
+    out: Path = Path("runs/batch/robust")  # folder of the report
+    traj: str = "straight"
+    variations: int = 16
+    noise: bool = False  # the controller sees the state with white noise
+    plants: int = 20  # drawn around the hfs, to judge by
+
+
+@dataclass(frozen=True)
+class Front(Flags):
+    """Loss weights of tracking over decades."""
+
+    out: Path = Path("runs/batch/front")  # folder of the report
+    traj: str = "straight"
+    points: int = 9
+    decades: float = 2.0  # to either side of the paper's weights
+
+
+@dataclass(frozen=True)
+class Starts(Flags):
+    """Starts drawn log-uniformly about nominal."""
+
+    out: Path = Path("runs/batch/starts")  # folder of the report
+    traj: str = "straight"
+    starts: int = 32
+    factor: float = 3.0  # within which of nominal
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Weights of a report on the hardware stand-in, for a verdict: nothing is chosen by it."""
+
+    out: Path  # folder of the report
+    traj: str = "straight"
+    seeds: int = 8
+    first_seed: int = 0
+    processes: int = 2  # one core each
+
+
+def tuned(
+    flags: Flags, robot: Robot, effects: Any, problems: Sequence[Problem], title: str
+) -> Tunings:
+    """Tune problems as one batch."""
+    with bar(f"{title}: {len(problems)} tunings on {len(jax.devices())} devices") as tell:
+        config = TuneConfig(iterations=flags.iterations)
+        return tune_batch(config, robot, stack(problems), effects, tell=tell)
+
+
+def whole_net(flags: Flags, robot: Robot) -> jax.tree_util.Partial:
+    """The phi to tune through, as a batch takes it."""
+    return last_command if flags.net is None else stack([as_effect(load_net(flags.net, robot)[0])])
+
+
+def scenario(
+    robot: Robot,
+    command: Command,
+    *,
+    tracking: float = 1.0,
+    scale: float = 1.0,
+    effect: int = 0,
+    variation: Variation | None = None,
+) -> Scenario:
+    """A walk from standing, its tracking priced `tracking` times as in the paper."""
+    alpha = Alpha(*(np.asarray(tracking * a) for a in (LossConfig.euler, LossConfig.position)))
+    anchor, which = standing_anchor(robot), np.asarray(effect)
+    return Scenario(command, anchor, which, alpha, np.asarray(scale), variation)
+
+
+def problem(start: Weights, scenarios: Sequence[Scenario], tail: float = 1.0) -> Problem:
+    """A weight set to be tuned on scenarios."""
+    return Problem(start, stack(scenarios), np.asarray(tail))
+
+
+def one_of(tree: Any, row: int) -> Any:
+    """One problem's share of a batch's results."""
+    return jax.tree.map(lambda x: np.asarray(x)[row], tree)
+
+
+def final_parts(found: Tunings) -> Losses:
+    """Parts of the loss on the model of each converged set."""
+    rows = np.arange(found.course.loss.shape[1])
+    ran = rows <= np.asarray(found.iterations)[:, None]
+    last = np.max(np.where(ran & (found.course.reason == Reason.ACCEPTED), rows, 0), axis=1)
+    return jax.tree.map(lambda x: x[np.arange(len(last)), last], found.course.parts)
+
+
+def ended(flags: Flags, found: Tunings, row: int) -> str:
+    """Why a tuning ended, and when."""
+    words = stopped(TuneConfig(iterations=flags.iterations), Stop(int(found.stop[row])))
+    return f"{words} (after {found.iterations[row]})"
+
+
+def judged(
+    pool: Any,
+    robot: Robot,
+    sets: Mapping[str, Weights],
+    command: Command,
+    plants: Sequence[Imperfections],
+    title: str,
+    first_seed: int = 0,
+) -> dict[str, Score]:
+    """Scores of weight sets on plants, stacked over these."""
+    seeds = range(first_seed, first_seed + len(plants))
+    walks = pipeline.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title)
+    score = partial(metrics.score, LossConfig())
+    return {
+        name: jax.tree.map(lambda *rows: np.stack(rows), *map(score, each))
+        for name, each in walks.items()
+    }
+
+
+def tail_mean(losses: np.ndarray) -> float:
+    """Mean over the worst `TAIL` of some losses, of one at least."""
+    worst = np.sort(losses)[::-1]
+    return float(worst[: max(1, round(TAIL * len(worst)))].mean())
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown, its numbers to the right."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def million(x: Any) -> str:
+    """A loss in 1e6."""
+    return f"{float(x) / 1e6:.3f}"
+
+
+def written(
+    flags: Flags,
+    sets: Mapping[str, Weights],
+    told: Mapping[str, Any],
+    paragraphs: Sequence[str],
+    picture: tuple[str, str],
+) -> None:
+    """Write weights, numbers and report."""
+    out = flags.out  # pyright: ignore
+    make_folder(out / "weights")
+    for name, weights in sets.items():
+        save_weights(out / "weights" / f"{name.replace(' ', '-')}.json", weights)
+    plain = {name: str(x) if isinstance(x, Path) else x for name, x in vars(flags).items()}
+    whole = {"flags": plain, "environment": environment(), **told}
+    write_file(out / "result.json", (json.dumps(whole, indent=1) + "\n").encode())
+    model = f"through {flags.net.name}" if flags.net else "on the plain rigid body"
+    about = f"Tuned {model}, at most {flags.iterations} iterations. Losses in 1e6."
+    name, caption = picture
+    text = [paragraphs[0], about, *paragraphs[1:], f"![{caption}]({name})\n\n{caption}"]
+    write_file(out / "report.md", ("\n\n".join(text) + "\n").encode())
+    print(out / "report.md")
+
+
+def shared(flags: Shared) -> None:
+    """(a) One weight set for many trajectories, against one for each."""
+    robot, names = load_robot(), flags.trajectories
+    effects, commands = whole_net(flags, robot), {n: named_command(n) for n in names}
+    asked = [problem(nominal(), [scenario(robot, c)]) for c in commands.values()]
+    alone = tuned(flags, robot, effects, asked, "one set for each")
+    scales = alone.course.loss[:, 0]
+    walks = [scenario(robot, c, scale=k) for c, k in zip(commands.values(), scales, strict=True)]
+    tails = {"mean of all": 1.0, "worst of all": 0.0}
+    asked = [problem(nominal(), walks, tail) for tail in tails.values()]
+    together = tuned(flags, robot, effects, asked, "one set for all")
+
+    sets = {"nominal": nominal(), "expert": expert()}
+    sets |= {f"{n} alone": one_of(alone.converged, i) for i, n in enumerate(names)}
+    sets |= {n: one_of(together.converged, i) for i, n in enumerate(tails)}
+    with workers(flags.processes) as pool:
+        scores = {
+            name: judged(pool, robot, sets, command, [hfs()], f"{name} on the hfs")
+            for name, command in {**commands, "unseen": UNSEEN}.items()
+        }
+    loss = {n: {c: float(found[n].L[0]) for c, found in scores.items()} for n in sets}
+    fell = {n: [c for c, found in scores.items() if found[n].fallen.any()] for n in sets}
+
+    def row(name: str) -> list[str]:
+        cells = [
+            f"{million(x)} ({100 * (x / loss['nominal'][c] - 1):+.0f} %)"
+            for c, x in loss[name].items()
+        ]
+        beside = [100 * (loss[name][c] / loss[f"{c} alone"][c] - 1) for c in names]
+        return [name, *cells, f"{max(beside):+.0f} %", ", ".join(fell[name]) or "none"]
+
+    head = ["set", *scores, "worst, to the set tuned singly", "falls"]
+    base = np.array(list(loss["nominal"].values()))
+    changes = {n: np.array(list(loss[n].values())) / base for n in list(sets)[1:]}
+    make_folder(flags.out)
+    caption = plots.ratios(flags.out / "shared.png", list(scores), changes)
+    ends = [f"{n} alone: {ended(flags, alone, i)}" for i, n in enumerate(names)]
+    ends += [f"{n}: {ended(flags, together, i)}" for i, n in enumerate(tails)]
+    text = [
+        "# One weight set for several trajectories",
+        "Each trajectory's loss is divided by that of its nominal walk before the mean, or the "
+        "worst, of all is lowered. Judged by one walk on the high-fidelity simulator (hfs) each; "
+        "in brackets the change to nominal. `unseen` was tuned on by none.",
+        table(head, [row(n) for n in sets]),
+        "\n".join(f"- {line}" for line in ends),
+    ]
+    written(flags, sets, {"hfs": loss, "falls": fell}, text, ("shared.png", caption))
+
+
+def drawn_variations(count: int, noise: bool) -> list[Variation]:
+    """Bodies and grounds around the model, by the widths of hfs-varied where it has them."""
+    rng = np.random.default_rng(0)
+    sigmas = (5e-3, 3e-3, 3e-2, 3e-2) if noise else (0.0,) * 4  # rad, m, rad/s, m/s
+    like = no_variation()
+    return [
+        like._replace(
+            mass=np.asarray(1 + rng.uniform(-0.04, 0.04)),
+            inertia=np.asarray(1 + rng.uniform(-0.2, 0.2)),
+            com=rng.uniform(-0.01, 0.01, 3),
+            friction=np.asarray(rng.uniform(0.6, 1.0)),
+            delay=np.asarray(rng.uniform(0.0, 5e-3)),
+            noise=type(like.noise)(*(np.full(3, sigma) for sigma in sigmas)),
+            seed=np.asarray(seed),
+        )
+        for seed in range(count)
+    ]
+
+
+def robust(flags: Robust) -> None:
+    """(b) Weights that bear with variations, judged on plants drawn around the hfs."""
+    robot, command = load_robot(), named_command(flags.traj)
+    asked = [problem(nominal(), [scenario(robot, command)])]
+    plain = tuned(flags, robot, whole_net(flags, robot), asked, "the model as it is")
+    effects, members = last_command, 1
+    if flags.net is not None:
+        effects = member_effects(load_net(flags.net, robot, "residual")[0])
+        members = len(jax.tree.leaves(effects)[0])
+    variations = drawn_variations(flags.variations, flags.noise)
+    walks = [
+        scenario(robot, command, effect=i % members, variation=variation)
+        for i, variation in enumerate(variations)
+    ]
+    tails = {"mean": 1.0, "CVaR": TAIL}
+    asked = [problem(nominal(), walks, tail) for tail in tails.values()]
+    varied = tuned(flags, robot, effects, asked, f"{flags.variations} variations")
+
+    sets = {"nominal": nominal(), "expert": expert(), "as it is": one_of(plain.converged, 0)}
+    sets |= {n: one_of(varied.converged, i) for i, n in enumerate(tails)}
+    plants = [hfs_varied(seed) for seed in range(flags.plants)]
+    with workers(flags.processes) as pool:
+        scores = judged(pool, robot, sets, command, plants, "plants around the hfs")
+    make_folder(flags.out)
+    caption = plots.by_plant(flags.out / "robust.png", {n: s.L for n, s in scores.items()})
+    text = [
+        f"# Tuned over variations of the model: {flags.traj}",
+        f"{flags.variations} variations: mass within 4 %, inertia 20 %, centre of mass 1 cm, "
+        "friction 0.6 to 1, effects late by up to 5 ms"
+        + (", members of the net's ensemble in turn" if members > 1 else "")
+        + (", a noisy estimate" if flags.noise else "")
+        + f". CVaR: mean over the worst {TAIL:.0%}. Judged on {flags.plants} plants drawn around "
+        "the hfs (hfs-varied).",
+        plant_table(scores, "as it is"),
+        "\n".join(
+            f"- {n}: {ended(flags, found, i)}"
+            for n, found, i in [("as it is", plain, 0), ("mean", varied, 0), ("CVaR", varied, 1)]
+        ),
+    ]
+    told = {"hfs-varied": as_numbers(scores)}
+    written(flags, sets, told, text, ("robust.png", caption))
+
+
+def plant_table(scores: Mapping[str, Score], base: str) -> str:
+    """Weight sets over plants: falls, mean, tail, and the paired ratio to one of them."""
+    rows = []
+    for name, score in scores.items():
+        change = 100 * (metrics.bootstrap(score.L / scores[base].L, np.median).value - 1)
+        falls = f"{int(score.fallen.sum())} of {len(score.L)}"
+        rows.append(
+            [name, falls, million(score.L.mean()), million(tail_mean(score.L)), f"{change:+.1f} %"]
+        )
+    return table(["set", "falls", "mean L", f"worst {TAIL:.0%}", f"median, to {base}"], rows)
+
+
+def as_numbers(scores: Mapping[str, Score]) -> dict[str, Any]:
+    """Scores for JSON."""
+    return {n: {"L": s.L.tolist(), "fallen": s.fallen.tolist()} for n, s in scores.items()}
+
+
+def front(flags: Front) -> None:
+    """(c) Tracking against smoothness."""
+    robot, command = load_robot(), named_command(flags.traj)
+    prices = 10.0 ** np.linspace(-flags.decades, flags.decades, flags.points)
+    asked = [problem(nominal(), [scenario(robot, command, tracking=p)]) for p in prices]
+    found = tuned(flags, robot, whole_net(flags, robot), asked, "prices of tracking")
+    sets = {f"tracking x{p:.3g}": one_of(found.converged, i) for i, p in enumerate(prices)}
+    judged_sets = {"nominal": nominal(), "expert": expert(), **sets}
+    with workers(flags.processes) as pool:
+        scores = judged(pool, robot, judged_sets, command, [hfs()], "on the hfs")
+    paper = LossConfig()
+
+    def tracking(euler: Any, position: Any) -> Any:
+        return paper.euler * euler + paper.position * position
+
+    parts = final_parts(found)
+    model = np.stack([tracking(parts.euler, parts.position), parts.control], axis=1)
+    there = {
+        n: (float(tracking(s.L_Eul, s.L_pos)[0]), float(s.L_ctrl[0])) for n, s in scores.items()
+    }
+    rows = []
+    for name, (track, control) in there.items():
+        own = list(sets).index(name) if name in sets else None
+        cells = (
+            ["", "", ""] if own is None else [*map(million, model[own]), ended(flags, found, own)]
+        )
+        fell = "yes" if scores[name].fallen.any() else "no"
+        rows.append([name, *cells[:2], million(track), million(control), fell, cells[2]])
+    make_folder(flags.out)
+    caption = plots.front(
+        flags.out / "front.png",
+        prices,
+        {"rigid body": model, "hfs": np.array([there[n] for n in sets])},
+        {n: there[n] for n in ("nominal", "expert")},
+    )
+    head = [
+        "set",
+        "tracking, model",
+        "L_ctrl, model",
+        "tracking, hfs",
+        "L_ctrl, hfs",
+        "fell",
+        "end",
+    ]
+    text = [
+        f"# Tracking against smoothness: {flags.traj}",
+        "Both alphas are multiplied by one price; tracking is alpha_1 L_Eul + alpha_2 L_pos with "
+        "the paper's alphas, whatever the price.",
+        table(head, rows),
+    ]
+    told = {"prices": prices.tolist(), "model": model.tolist(), "hfs": there}
+    written(flags, sets, told, text, ("front.png", caption))
+
+
+def starts(flags: Starts) -> None:
+    """(d) How far the end depends on the start."""
+    robot, command = load_robot(), named_command(flags.traj)
+    begin = [nominal(), *disturbed(nominal(), flags.factor, flags.starts - 1)]
+    asked = [problem(w, [scenario(robot, command)]) for w in begin]
+    found = tuned(flags, robot, whole_net(flags, robot), asked, "starts")
+    sound = np.asarray(found.stop) != Stop.BAD_START
+    first, last = found.course.loss[sound, 0], found.loss[sound]
+    accepted = found.course.reason == Reason.ACCEPTED
+    ran = np.arange(accepted.shape[1]) <= np.asarray(found.iterations)[:, None]
+    curves = np.where(accepted & ran, found.course.loss, np.nan)[sound]
+    at = lambda x: [million(q) for q in np.quantile(x, (0, 0.25, 0.5, 0.75, 1))]  # noqa: E731
+    rows = [["at the start", *at(first)], ["at the end", *at(last)]]
+    kept = min(len(last), 3)
+    best = np.flatnonzero(sound)[np.argsort(last)[:kept]]
+    sets = {"from nominal": one_of(found.converged, 0)}
+    sets |= {f"best {i + 1}": one_of(found.converged, row) for i, row in enumerate(best)}
+    with workers(flags.processes) as pool:
+        scores = judged(pool, robot, sets, command, [hfs()], "on the hfs")
+    make_folder(flags.out)
+    caption = plots.starts(flags.out / "starts.png", curves)
+    text = [
+        f"# How much the start matters: {flags.traj}",
+        f"{flags.starts} starts, the first at nominal, the others log-uniform within "
+        f"x/{flags.factor:g} of it; {int((~sound).sum())} fall at once and are refused.",
+        table(["L on the model", "least", "25 %", "median", "75 %", "most"], rows),
+        f"From nominal: {million(last[0] if sound[0] else np.nan)}, "
+        f"{int(np.sum(last < last[0]))} of the others end lower.",
+        table(
+            ["set", "L on the hfs", "fell"],
+            [[n, million(s.L[0]), "yes" if s.fallen.any() else "no"] for n, s in scores.items()],
+        ),
+    ]
+    told = {"first": first.tolist(), "last": last.tolist(), "refused": int((~sound).sum())}
+    written(flags, sets, told | {"hfs": as_numbers(scores)}, text, ("starts.png", caption))
+
+
+def verdict(flags: Verdict) -> None:
+    """Walk the weights of a report on the hardware stand-in and write verdict.md beside it."""
+    paths = sorted((flags.out / "weights").glob("*.json"))
+    if not paths:
+        raise ValueError(f"{flags.out}: no weights/*.json; expected the folder of a report")
+    sets = {"nominal": nominal(), "expert": expert()}
+    sets |= {path.stem: load_weights(path) for path in paths}
+    plants = [standin(seed) for seed in range(flags.first_seed, flags.first_seed + flags.seeds)]
+    command = UNSEEN if flags.traj == "unseen" else named_command(flags.traj)
+    with workers(flags.processes) as pool:
+        title = f"{flags.traj} on the hardware stand-in"
+        scores = judged(pool, load_robot(), sets, command, plants, title, flags.first_seed)
+    last = flags.first_seed + flags.seeds - 1
+    text = [
+        f"# On the hardware stand-in: {flags.traj}",
+        f"Seeds {flags.first_seed} to {last}. Losses in 1e6.",
+        plant_table(scores, "nominal"),
+    ]
+    name = f"verdict-{flags.traj}"
+    write_file(flags.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
+    told = {"environment": environment(), "standin": as_numbers(scores)}
+    write_file(flags.out / f"{name}.json", (json.dumps(told, indent=1) + "\n").encode())
+    print(flags.out / f"{name}.md")
+
+
+def main() -> None:
+    """Do what one sub-command asks."""
+    does = {Shared: shared, Robust: robust, Front: front, Starts: starts, Verdict: verdict}
+    flags = tyro.extras.subcommand_cli_from_dict(
+        {kind.__name__.lower(): kind for kind in does}, description=__doc__
+    )
+    setup_jax()
+    all_devices()
+    try:
+        does[type(flags)](flags)
+    except ValueError as error:
+        say(f"batch: {error}")
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()

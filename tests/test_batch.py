@@ -1,0 +1,253 @@
+"""Many tunings at once: each as if alone, on any number of devices; on a toy and the rigid body."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
+from hector_jax.evaluation.transfer import disturbed
+from hector_jax.model.effect import last_command
+from hector_jax.robot import load_robot
+from hector_jax.tuning import difftune
+from hector_jax.tuning.batch import (
+    PER_CALL,
+    Problem,
+    Scenario,
+    lanes_of,
+    stack,
+    tail_weights,
+    tune_batch,
+)
+from hector_jax.tuning.difftune import Evaluation, Reason, Stop, TuneConfig, tune
+from hector_jax.tuning.loss import Alpha, Losses
+from hector_jax.tuning.rollout import RolloutConfig, no_variation
+
+ROBOT = load_robot()
+ANCHOR = standing_anchor(ROBOT)
+STARTS = [disturbed(nominal(), factor, 1)[0] for factor in (1.05, 1.2, 1.5, 2.0, 3.0)]
+TOY = TuneConfig(iterations=40, patience=5)
+NOMINAL = np.asarray(weights_to_vector(nominal()))
+PAPER = Alpha(np.asarray(1e5), np.asarray(2e5))
+
+
+def vector(weights):
+    return np.asarray(weights_to_vector(weights))
+
+
+def toy(config, robot, weights, command, anchor, effect, alpha=None, variation=None):
+    """A bowl in log-weights about a point that the command moves; with a floor under it."""
+    middle = np.log(NOMINAL) + 0.3 * jnp.asarray(command.yaw_rate)[0]
+    away = jnp.log(weights_to_vector(weights)) - middle
+    scale = 1e5 if alpha is None else alpha.euler
+    gradient = vector_to_weights(2.0 * scale * away / weights_to_vector(weights))
+    loss = scale * (1.0 + away @ away)
+    falls = 1.0 * (weights_to_vector(weights)[0] > 1e3)
+    return Evaluation(loss, Losses(loss, loss, loss), gradient, falls, jnp.asarray(1e-12))
+
+
+@pytest.fixture
+def on_toy(monkeypatch):
+    monkeypatch.setattr(difftune, "evaluate", toy)
+    monkeypatch.setattr(difftune, "tune_step", jax.jit(toy, static_argnums=0))
+
+
+def scenario(name="straight", alpha=PAPER, scale=1.0, effect=0, variation=None):
+    scale, effect = np.asarray(scale), np.asarray(effect)
+    return Scenario(named_command(name), ANCHOR, effect, alpha, scale, variation)
+
+
+def problem(start, scenarios, tail=1.0):
+    return Problem(start, stack(scenarios), np.asarray(tail))
+
+
+def test_each_tuning_of_a_batch_is_that_of_a_single_one(on_toy):
+    names = ["straight", "c", "s", "c", "s"]
+    asked = [problem(w, [scenario(n)]) for w, n in zip(STARTS, names, strict=True)]
+    found = tune_batch(TOY, ROBOT, stack(asked), last_command)
+    for i, (start, name) in enumerate(zip(STARTS, names, strict=True)):
+        alone = tune(TOY, ROBOT, start, named_command(name), ANCHOR, last_command)
+        for part in ("ten", "converged"):
+            ours = jax.tree.map(lambda x, i=i: x[i], getattr(found, part))
+            np.testing.assert_allclose(vector(ours), vector(getattr(alone, part)), rtol=1e-9)
+        assert difftune.stopped(TOY, Stop(int(found.stop[i]))) == alone.stop
+        assert found.iterations[i] == len(alone.history) - 1
+        ran = slice(len(alone.history))
+        losses = [i.evaluation.loss for i in alone.history]
+        np.testing.assert_allclose(found.course.loss[i, ran], losses, rtol=1e-9)
+        np.testing.assert_array_equal(
+            found.course.reason[i, ran] == Reason.ACCEPTED, [i.accepted for i in alone.history]
+        )
+    assert len(set(found.iterations)) > 1  # some ended and were frozen before others
+    assert max(found.iterations) >= PER_CALL
+
+
+def test_how_many_walk_side_by_side_does_not_matter(on_toy):
+    asked = stack([problem(w, [scenario("c")]) for w in STARTS])
+    one, *others = (tune_batch(TOY, ROBOT, asked, last_command, lanes=lanes) for lanes in (1, 2, 0))
+    for other in others:
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9), one, other)
+
+
+def test_a_start_that_falls_keeps_itself_and_says_so(on_toy):
+    bad = nominal()._replace(Q=nominal().Q._replace(euler=np.array([2e3, 1.0, 1.0])))
+    asked = stack([problem(w, [scenario("c")]) for w in (STARTS[0], bad)])
+    found = tune_batch(TOY, ROBOT, asked, last_command)
+    assert found.stop[1] == Stop.BAD_START
+    assert found.course.reason[1, 0] == Reason.FELL
+    np.testing.assert_array_equal(vector(found.converged)[1], vector(bad))
+    assert found.stop[0] != Stop.BAD_START
+
+
+def test_a_batch_has_loss_weights_of_its_own_and_scales_its_losses(on_toy):
+    heavy = Alpha(np.asarray(3e5), np.asarray(0.0))
+    asked = [
+        problem(STARTS[0], [scenario(alpha=a, scale=k)]) for a, k in ((PAPER, 1.0), (heavy, 2.0))
+    ]
+    found = tune_batch(TOY, ROBOT, stack(asked), last_command)
+    first = found.course.loss[:, 0]
+    assert first[1] == pytest.approx(1.5 * first[0])
+
+
+def test_several_scenarios_are_tuned_between_their_optima(on_toy):
+    asked = [problem(nominal(), [scenario("straight"), scenario("c")], tail) for tail in (1.0, 0.0)]
+    found = tune_batch(TuneConfig(iterations=60), ROBOT, stack(asked), last_command)
+    between = 0.3 * 0.25 * np.pi / 2
+    np.testing.assert_allclose(
+        np.log(vector(found.converged) / vector(nominal())), between, atol=0.03
+    )
+
+
+@pytest.mark.parametrize(
+    ("tail", "expected"),
+    [
+        (1.0, [0.25, 0.25, 0.25, 0.25]),
+        (0.5, [0.0, 0.5, 0.5, 0.0]),
+        (0.625, [0.2, 0.4, 0.4, 0.0]),
+        (0.25, [0.0, 1.0, 0.0, 0.0]),
+        (0.0, [0.0, 1.0, 0.0, 0.0]),
+    ],
+)
+def test_the_tail_is_the_mean_over_the_worst_share(tail, expected):
+    found = tail_weights(jnp.array([2.0, 9.0, 5.0, 1.0]), jnp.asarray(tail))
+    np.testing.assert_allclose(found, expected)
+
+
+def test_a_cpu_walks_them_one_by_one_and_others_all_at_once():
+    assert (lanes_of("cpu"), lanes_of("gpu")) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"tail": np.array([1.5])}, r"Problem.tail must be from 0 to 1, got 1.5"),
+        ({"tail": np.zeros(0)}, "stacked, one per problem"),
+        ({"effect": 3}, r"Scenario.effect must be below 1, got 3..3"),
+        ({"scale": 0.0}, "Scenario.scale must be positive"),
+        (
+            {"variation": no_variation()._replace(delay=np.asarray(0.02))},
+            "Variation.delay must be from 0 to a tick of 0.01 s, got 0.02",
+        ),
+    ],
+)
+def test_impossible_problems_are_refused(wrong, told):
+    tail = wrong.pop("tail", np.ones(1))
+    asked = stack([problem(nominal(), [scenario(**wrong)])])._replace(tail=tail)
+    with pytest.raises(ValueError, match=told):
+        tune_batch(TOY, ROBOT, asked, last_command)
+
+
+TWO_DEVICES = """
+import sys, numpy as np, jax
+from hector_jax.runtime import setup_jax
+setup_jax()
+import test_batch as t
+if sys.argv[1] == "toy":
+    t.difftune.evaluate = t.toy
+config, asked = t.shared_case(sys.argv[1])
+assert len(jax.devices()) == 2
+one, two = (
+    t.tune_batch(config, t.ROBOT, asked, t.last_command, devices=jax.devices()[:n]) for n in (1, 2)
+)
+jax.tree.map(np.testing.assert_array_equal, one, two)
+print("same", one.iterations.tolist())
+"""
+
+
+def shared_case(kind):
+    """An odd number of problems: one device has one more to do."""
+    asked = stack([problem(w, [scenario("s")]) for w in STARTS[:3]])
+    short = TuneConfig(rollout=RolloutConfig(ticks=40), iterations=2)
+    return (TOY if kind == "toy" else short), asked
+
+
+@pytest.mark.parametrize("kind", ["toy", pytest.param("rigid body", marks=pytest.mark.slow)])
+def test_two_devices_give_the_numbers_of_one(kind):
+    here = Path(__file__).parent
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    paths = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    ran = subprocess.run(
+        [sys.executable, "-c", TWO_DEVICES, kind],
+        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": paths},
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    assert ran.stdout.startswith("same")
+
+
+TWO_HOSTS = """
+from hector_jax.runtime import all_devices, setup_jax
+setup_jax()
+all_devices()
+import jax, numpy as np
+import test_batch as t
+t.difftune.evaluate = t.toy
+config, asked = t.shared_case("toy")
+assert jax.process_count() == 2 and len(jax.devices()) == 2 * len(jax.local_devices())
+found = t.tune_batch(config, t.ROBOT, asked, t.last_command)
+alone = t.tune_batch(config, t.ROBOT, asked, t.last_command, devices=jax.local_devices()[:1])
+jax.tree.map(np.testing.assert_array_equal, found, alone)
+print("same")
+"""
+
+
+@pytest.mark.slow  # two processes that wait for each other
+def test_two_hosts_give_the_numbers_of_one():
+    here = Path(__file__).parent
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    paths = os.pathsep.join([str(here), str(here.parent), os.environ.get("PYTHONPATH", "")])
+    shared = {"JAX_PLATFORMS": "cpu", "PYTHONPATH": paths, "JAX_COORDINATOR_ADDRESS": address}
+    hosts = [
+        subprocess.Popen(
+            [sys.executable, "-c", TWO_HOSTS],
+            env={**os.environ, **shared, "JAX_NUM_PROCESSES": "2", "JAX_PROCESS_ID": str(i)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for i in range(2)
+    ]
+    for host in hosts:
+        told, wrong = host.communicate(timeout=300)
+        assert told.strip().endswith("same"), wrong[-2000:]
+
+
+@pytest.mark.slow  # minutes of compilation
+def test_on_the_rigid_body_a_batch_is_its_single_tunings():
+    config = TuneConfig(rollout=RolloutConfig(ticks=40), iterations=2)
+    names = ("straight", "s")
+    asked = stack([problem(nominal(), [scenario(name)]) for name in names])
+    found = tune_batch(config, ROBOT, asked, last_command)
+    for i, name in enumerate(names):
+        alone = tune(config, ROBOT, nominal(), named_command(name), ANCHOR, last_command)
+        np.testing.assert_allclose(vector(found.ten)[i], vector(alone.ten), rtol=1e-9)

@@ -1,0 +1,116 @@
+"""What the controller does not know: a body, a ground and an estimate that are not as believed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import nominal
+from hector_jax.model import srbm
+from hector_jax.model.effect import last_command
+from hector_jax.robot import load_robot
+from hector_jax.trajectory import Load, State, Wrench
+from hector_jax.tuning.rollout import (
+    Late,
+    RolloutConfig,
+    _moved_by,
+    _within_friction,
+    rollout,
+)
+from hector_jax.tuning.rollout import no_variation as as_believed
+
+ROBOT = load_robot()
+NOTHING = Load(jnp.zeros(3), jnp.zeros(3))
+FEET = jnp.array([[0.02, 0.08, 0.0], [-0.01, -0.08, 0.0]])
+DT = 0.01
+
+
+def no_variation():
+    return jax.tree.map(jnp.asarray, as_believed())
+
+
+walk = jax.jit(rollout, static_argnums=0)
+
+
+def tilted():
+    rng = np.random.default_rng(0)
+    rows = [jnp.asarray(0.2 * rng.normal(size=3)) for _ in range(4)]
+    return State(rows[0], rows[1] + jnp.array([0.0, 0.0, 0.5]), rows[2], rows[3])
+
+
+def wrench(seed):
+    rng = np.random.default_rng(seed)
+    return Wrench(*(jnp.asarray(10.0 * rng.normal(size=(2, 3))) for _ in range(2)))
+
+
+def assert_same(one, other):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-12), one, other)
+
+
+def moved(variation, now, before=None, feet_before=FEET):
+    before = now if before is None else before
+    now, before = Late(now, NOTHING), Late(before, NOTHING)
+    return _moved_by(variation, ROBOT, tilted(), now, FEET, before, feet_before, DT)
+
+
+def test_without_a_variation_the_body_moves_as_the_rigid_body():
+    assert_same(moved(no_variation(), wrench(0)), srbm.step(ROBOT, tilted(), wrench(0), FEET, DT))
+
+
+def test_an_effect_late_by_a_tick_is_the_last_one_where_the_feet_were():
+    late, there = no_variation()._replace(delay=jnp.asarray(DT)), FEET + 0.1
+    expected = srbm.step(ROBOT, tilted(), wrench(1), there, DT)
+    assert_same(moved(late, wrench(0), wrench(1), there), expected)
+
+
+def test_a_heavier_body_falls_no_faster_and_is_pushed_less():
+    heavy = no_variation()._replace(mass=jnp.asarray(1.1), inertia=jnp.asarray(1.1))
+    nothing = jax.tree.map(jnp.zeros_like, wrench(0))
+    assert_same(moved(heavy, nothing), moved(no_variation(), nothing))
+    free = moved(no_variation(), nothing).velocity
+    pushed = moved(no_variation(), wrench(0)).velocity - free
+    less = moved(heavy, wrench(0)).velocity - free
+    np.testing.assert_allclose(less, pushed / 1.1, rtol=1e-9)
+
+
+def test_a_force_through_the_true_centre_of_mass_does_not_turn_the_body():
+    offset = jnp.array([0.01, -0.02, 0.005])
+    state = State(*(jnp.zeros(3) for _ in range(4)))
+    up = Wrench(jnp.zeros((2, 3)).at[0, 2].set(50.0), jnp.zeros((2, 3)))
+    under = jnp.array([[0.01, -0.02, -0.4]] * 2)
+    variation = no_variation()._replace(com=offset)
+    now = Late(up, NOTHING)
+    found = _moved_by(variation, ROBOT, state, now, under, now, under, DT)
+    np.testing.assert_allclose(found.ang_velocity, 0.0, atol=1e-12)
+    beside = _moved_by(no_variation(), ROBOT, state, now, under, now, under, DT)
+    assert np.abs(beside.ang_velocity).max() > 1e-3
+
+
+def test_a_foot_that_slips_keeps_its_direction_and_load():
+    force = jnp.array([[30.0, 40.0, 50.0], [3.0, 4.0, 50.0]])
+    found = _within_friction(Wrench(force, force), jnp.asarray(0.5)).force
+    np.testing.assert_allclose(found, [[15.0, 20.0, 50.0], [3.0, 4.0, 50.0]])
+
+
+def test_friction_has_a_slope_where_no_foot_carries_anything():
+    none = Wrench(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
+    slope = jax.grad(lambda f: _within_friction(none, f).force.sum())(0.5)
+    assert np.isfinite(slope)
+
+
+@pytest.mark.slow  # compiles two rollouts
+def test_a_walk_in_a_world_that_is_as_believed_is_the_plain_one():
+    config, anchor = RolloutConfig(ticks=40), standing_anchor(ROBOT)
+    arguments = config, ROBOT, nominal(), named_command("s"), anchor, last_command
+    plain, same = walk(*arguments), walk(*arguments, no_variation())
+    np.testing.assert_allclose(same.state.position, plain.state.position, atol=1e-9)
+    noise = State(*(jnp.full(3, 5e-3) for _ in range(4)))
+    noisy = [
+        walk(*arguments, no_variation()._replace(noise=noise, seed=jnp.asarray(seed)))
+        for seed in (1, 1, 2)
+    ]
+    np.testing.assert_array_equal(noisy[0].state.position, noisy[1].state.position)
+    apart = [np.abs(w.state.position - plain.state.position).max() for w in noisy[1:]]
+    assert all(1e-4 < a < 0.05 for a in apart)
+    assert apart[0] != apart[1]
