@@ -127,7 +127,7 @@ def walk_groups(
                 about = {"controller": repr(config)}
                 save_tree(path(name), stacked, kind="robustness", robot=robot, about=about)
     one, three = np.zeros(0), np.zeros((0, 3))
-    like = Score(*[one] * 5, rms_euler=three, rms_position=three, fallen=one, residual=one)
+    like = Score(one, one, one, one, one, three, three, one, one, one)
     return {n: load_tree(path(n), like, kind="robustness", robot=robot)[0] for n in groups}
 
 

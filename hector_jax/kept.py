@@ -167,7 +167,7 @@ def _walked(config: LossConfig, walk: Trajectory, commit: str) -> Walked:
 
 def _walked_like() -> tuple[Score, np.ndarray, State]:
     one, three = np.zeros(()), np.zeros(3)
-    score = Score(one, one, one, one, one, three, three, one, one)
+    score = Score(one, one, one, one, one, three, three, one, one, one)
     return score, one, State(three, three, three, three)
 
 
@@ -185,6 +185,7 @@ def _trajectory_like() -> Trajectory:
         feet=np.zeros((0, 2, 3)),
         joints=np.zeros((0, 10)),
         fallen=np.zeros(0),
+        legs_touch=np.zeros(0),
         residual=np.zeros(0),
     )
 

@@ -647,15 +647,6 @@ def ranks(
     return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."
 
 
-_OTHERS = (_PURPLE, "black", "#b8860b", "#c2569c")
-
-
-def _set_looks(names: Iterable[str]) -> dict[str, dict]:
-    """Look of each weight set; those without one of their own take the next free colour."""
-    free = ({"color": color, "linestyle": (0, (1.5, 1.2))} for color in cycle(_OTHERS))
-    return {name: _LOOK[name] if name in _MARKER else next(free) for name in names}
-
-
 def _plain_log(axis: Axis) -> None:
     """Ticks of a logarithmic axis at 1, 2 and 5, written out."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -677,7 +668,7 @@ def survival(path: Path, curves: Mapping[str, Mapping[float, Mapping[str, Cell]]
         for row, (kind, found) in zip(panels, curves.items(), strict=True):
             sizes = sorted(found)
             names = list(found[sizes[0]])
-            for name, look in _set_looks(names).items():
+            for name, look in _looks(names).items():
                 cells = [found[size][name] for size in sizes]
                 stood = np.array([cell.survived for cell in cells])
                 ratio = np.array([cell.ratio for cell in cells])
@@ -712,7 +703,7 @@ def scene_ratios(path: Path, rows: Mapping[str, Mapping[str, Cell]]) -> str:
     at = -np.arange(len(rows))
     with _figure(path, 7.0, 0.3 * len(rows) + 0.9) as figure:
         panels = figure.subplots(1, 2, sharey=True, width_ratios=(2, 1))
-        looks = _set_looks([baseline, *others])
+        looks = _looks([baseline, *others])
         for i, (name, look) in enumerate(looks.items()):
             y = at + 0.2 * ((len(looks) - 1) / 2 - i)
             dot = {
@@ -749,7 +740,7 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
     angles = np.deg2rad(np.append(DIRECTIONS, DIRECTIONS[0]))
     with _figure(path, 4.6, 4.4) as figure:
         axes = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
-        for name, look in _set_looks(endured).items():
+        for name, look in _looks(endured).items():
             closed = np.append(endured[name], endured[name][0])
             marker = {"marker": _MARKER.get(name, "^"), "markersize": 3.5}
             axes.plot(angles, closed, **look, **marker, label=_named(name))
@@ -850,7 +841,7 @@ _BASES = ("nominal", "expert")
 _TUNED = ((_ORANGE, "s"), (_GREEN, "^"), (_PURPLE, "v"), ("black", "P"), ("#8a6d00", "X"))
 
 
-def _looks(names: Iterable[str]) -> dict[str, dict[str, str]]:
+def _dots(names: Iterable[str]) -> dict[str, dict[str, str]]:
     """Colour and marker of weight sets of which only the baselines are known everywhere."""
     others = cycle(_TUNED)
     pairs = {n: (_LOOK[n]["color"], _MARKER[n]) if n in _BASES else next(others) for n in names}
@@ -869,7 +860,7 @@ def ratios(
     """
     at, width = np.arange(len(columns)), 0.7 / max(len(sets), 1)
     with _figure(path, 7.5, 3.2) as figure:
-        axes, looks = figure.subplots(), _looks(sets)
+        axes, looks = figure.subplots(), _dots(sets)
         for i, (name, values) in enumerate(sets.items()):
             x = at + width * (i - (len(sets) - 1) / 2)
             axes.plot(x, values, linestyle="none", markersize=6, label=name, **looks[name])
@@ -902,7 +893,7 @@ def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> st
         sets: by name, a loss per plant.
     """
     with _figure(path, 6.0, 3.4) as figure:
-        axes, looks = figure.subplots(), _looks(sets)
+        axes, looks = figure.subplots(), _dots(sets)
         for name, values in sets.items():
             share = 100 * (np.arange(len(values)) + 0.5) / len(values)
             axes.plot(share, np.sort(values) / 1e6, label=name, **looks[name])
@@ -936,7 +927,7 @@ def front(
                     f"x{price:.2g}", (x, y), (4, 4), textcoords="offset points", fontsize=7
                 )
             if world == list(worlds)[-1]:
-                for name, look in _looks(beside).items():
+                for name, look in _dots(beside).items():
                     x, y = beside[name]
                     panel.plot(x / 1e6, y / 1e6, linestyle="none", label=name, **look)
             _log_axis(panel.xaxis, panel.set_xscale)

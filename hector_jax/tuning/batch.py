@@ -212,7 +212,7 @@ def tune_batch(
     problems: Problem,
     effects: jax.tree_util.Partial,
     *,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     lanes: int | None = None,
     tell: Callable[[int, int, str], None] = lambda done, of, remark: None,
 ) -> Tunings:
