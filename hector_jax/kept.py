@@ -159,6 +159,29 @@ def tune(
     return {name: tuned for name, tuned in found.items() if tuned is not None}
 
 
+def tune_measured(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    params: Params | None,
+    plants: Sequence[Imperfections],
+    folder: Path,
+    commit: str,
+    title: str,
+) -> Tuned:
+    """`pipeline.tune_measured`, where its tuning is not in `folder` yet."""
+    key = digest(config, robot, weights, command, params, *plants)
+    path = folder / f"tuning-walks-{key}.npz"
+    found = load_tuning(path, robot)
+    if found is None:
+        known = (config, robot, weights, command, params, plants, title)
+        found = Tuned(pipeline.tune_measured(pool, *known), commit)
+        save_tuning(path, found.tuning, robot, commit)
+    return found
+
+
 def _walked(config: LossConfig, walk: Trajectory, commit: str) -> Walked:
     up = int(np.sum(~np.asarray(walk.fallen)))
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)

@@ -7,6 +7,8 @@ one long chain of small operations. A step that finds its result on disk takes i
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
 from dataclasses import asdict, dataclass
+from functools import partial
+from itertools import repeat
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,14 +29,15 @@ from hector_jax.grfm.training import History, TrainConfig
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
-from hector_jax.sim.walk import Job, walk_many
-from hector_jax.sim.world import Imperfections, hfs
+from hector_jax.sim.walk import Job, walk, walk_many
+from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.storage import as_json, fingerprint, make_folder
 from hector_jax.trajectory import Trajectory
-from hector_jax.tuning import difftune
+from hector_jax.tuning import difftune, measured
 from hector_jax.tuning import search as searching
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import Losses, losses, total
+from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
 
 
@@ -89,6 +92,11 @@ class Learned(NamedTuple):
     folders: tuple[Path, ...]  # of the walks
 
 
+def _effect(params: Params | None) -> jax.tree_util.Partial:
+    """Phi of a net, or of the plain rigid body."""
+    return last_command if params is None else network.as_effect(params)
+
+
 def _tune_job(
     config: TuneConfig,
     robot: Robot,
@@ -98,14 +106,13 @@ def _tune_job(
     tell: Any,
 ) -> Tuning:
     """One tuning in a worker; the queue `tell` hears of each iteration."""
-    effect = last_command if params is None else network.as_effect(params)
     return difftune.tune(
         config,
         robot,
         nominal(),
         command,
         standing_anchor(robot),
-        effect,
+        _effect(params),
         lambda iteration: tell.put((name, iteration)),
     )
 
@@ -148,10 +155,66 @@ def tune_many(
         return {name: future.result() for name, future in running.items()}
 
 
+def measured_plants(count: int) -> list[Imperfections]:
+    """The hfs and plants drawn around it as for collection, which tunings on walks go by."""
+    return [hfs(), *(hfs_drawn(seed) for seed in range(1, count))]
+
+
+def _measured_job(
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    params: Params | None,
+    weights: Weights,
+    plant: Imperfections,
+) -> Evaluation:
+    seconds = config.rollout.ticks * config.rollout.walk.gait.tick
+    walked = walk(config.rollout.walk, robot, weights, command, plant, seconds)
+    return evaluate_walk(config, robot, weights, command, _effect(params), walked)
+
+
+def tune_measured(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    params: Params | None,
+    plants: Sequence[Imperfections],
+    title: str,
+) -> Tuning:
+    """Tune on along walks on the high-fidelity simulator, one on each plant for every step.
+
+    Args:
+        pool: worker processes.
+        config: how.
+        robot: the body.
+        weights: where to start: those of a tuning on the model.
+        command: what to walk.
+        params: the net whose Jacobian is used; None: the plain rigid body.
+        plants: see `measured_plants`.
+        title: for the person who waits.
+
+    Raises:
+        ValueError: a walk with the starting weights falls or cannot be believed.
+    """
+    job = partial(_measured_job, config, robot, command, params)
+    with bar(title) as tell:
+        tell(0, config.iterations, "compiling")
+
+        def note(iteration: Iteration) -> None:
+            loss = float(iteration.evaluation.loss) / 1e6
+            tell(iteration.iteration, config.iterations, f"L {loss:.3f}e6")
+
+        def look(trial: Weights) -> list[Evaluation]:
+            return list(pool.map(job, repeat(trial), plants))
+
+        return measured.tune_measured(config, weights, look, note)
+
+
 def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
-    effect = last_command if params is None else network.as_effect(params)
     anchor = standing_anchor(robot)
-    norms = difftune.gradient_norms(config, robot, nominal(), command, anchor, effect)
+    norms = difftune.gradient_norms(config, robot, nominal(), command, anchor, _effect(params))
     return jax.device_get(norms)
 
 

@@ -30,11 +30,21 @@ from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
 from hector_jax.tuning.search import Found, SearchConfig
 
-SETS = ("nominal", "expert", "searched", "without_ten", "with_ten", "without", "with")
+WALKS = "with_walks"
+SETS = (
+    "nominal",
+    "expert",
+    "searched",
+    "without_ten",
+    "with_ten",
+    "without",
+    "with",
+    WALKS,
+)
 CEILING = "ceiling"
 
 # what `quick` cuts down to, so that all is done in under five minutes on two cores
-_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20}
+_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "walks": 2}
 
 _SNAPSHOTS = VideoConfig(width=640, height=214, rate=8)  # no film of it is kept
 
@@ -46,6 +56,8 @@ class _Plan:
     commands: Mapping[str, Command]
     seeds: range
     tune: TuneConfig
+    walks: TuneConfig | None  # of the tuning along walks
+    plants: int  # that it walks on
     search: SearchConfig
     extra: Mapping[str, Mapping[str, Weights]]  # by trajectory, the sets from files
     earlier: Earlier | None
@@ -55,7 +67,14 @@ def _plan(args: flags.Table) -> _Plan:
     """Raises ValueError, before anything is computed, where the flags ask for what cannot be."""
     if args.quick:
         args = replace(args, **{n: min(getattr(args, n), most) for n, most in _QUICK.items()})
-    for name, least in (("seeds", 1), ("first_seed", 0), ("iterations", PAPER_ITERATIONS)):
+    least_of = {
+        "seeds": 1,
+        "first_seed": 0,
+        "iterations": PAPER_ITERATIONS,
+        "walks": 0,
+        "plants": 1,
+    }
+    for name, least in least_of.items():
         if getattr(args, name) < least:
             flag = name.replace("_", "-")
             raise ValueError(f"--{flag} must be at least {least}, got {getattr(args, name)}")
@@ -66,6 +85,8 @@ def _plan(args: flags.Table) -> _Plan:
         commands,
         range(args.first_seed, args.first_seed + args.seeds),
         TuneConfig(iterations=args.iterations),
+        TuneConfig(iterations=PAPER_ITERATIONS + args.walks) if args.walks else None,
+        args.plants,
         SearchConfig(budget=args.rollouts),
         _sets_from_files(args),
         None if args.earlier is None else table.load_earlier(args.earlier),
@@ -179,11 +200,23 @@ def _walk_sets(
         commit,
         f"tuning {name} without and with GRFM-Net",
     )
+    if plan.walks is not None:
+        tuned[WALKS] = kept.tune_measured(
+            pool,
+            plan.walks,
+            robot,
+            tuned["with"].tuning.converged,
+            *problems["with"],
+            pipeline.measured_plants(plan.plants),
+            shelf / name,
+            commit,
+            f"tuning {name} on along walks on the simulator",
+        )
     sets = {
         "nominal": nominal(),
         "expert": expert(),
         "searched": searched.weights,
-        **{f"{which}_ten": one.tuning.ten for which, one in tuned.items()},
+        **{f"{which}_ten": tuned[which].tuning.ten for which in problems},
         **{which: one.tuning.converged for which, one in tuned.items()},
         **plan.extra[name],
     }

@@ -44,12 +44,17 @@ def asked(monkeypatch):
     def write_video(*args):
         raise VideoUnavailable("no film: none here")
 
+    def tune_measured(pool, config, robot, weights, command, params, plants, title):
+        told["steps"] = config.iterations - 10, len(plants)
+        return Tuning(pretend_history(3), nominal(), expert(), "done")
+
     class Net:
         params = None
 
     monkeypatch.setattr(pipeline, "ground", lambda *args: Net)
     monkeypatch.setattr(pipeline, "search", search)
     monkeypatch.setattr(pipeline, "tune_many", tune_many)
+    monkeypatch.setattr(pipeline, "tune_measured", tune_measured)
     monkeypatch.setattr(pipeline, "walks_of", walks_of)
     monkeypatch.setattr(kept, "load_tuning", lambda path, robot: None)
     monkeypatch.setattr(study, "write_video", write_video)
@@ -66,13 +71,13 @@ def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, as
     out = tmp_path / "out" / "quick"
     assert told == out / "report.md"
     assert tuple(verdicts) == names
-    assert asked["walks"] == 2 * 7 * 4
+    assert asked["walks"] == 2 * 8 * 4
     assert asked["search"].budget < 200
     assert [rest for _, *rest in asked["tunings"]] == [["without", "with"]] * 2
     text = told.read_text()
     assert "hector table --" in text
     assert "--quick" in text
-    assert "14 of 56 walks ended in a fall" in text
+    assert "16 of 64 walks ended in a fall" in text
     for name in ("changes", *names):
         assert f"(pictures/{name}.png)" in text
         assert (out / "pictures" / f"{name}.png").stat().st_size > 10_000
@@ -88,13 +93,13 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     monkeypatch.setattr(study, "_draw", lambda *args: [])
     small = {"trajectories": ("s",), "seeds": 2}
     study.make_table(table(tmp_path, **small), plants)
-    assert asked["walks"] == 14
+    assert asked["walks"] == 16
     for folder in ("ceiling", "other"):
         save_weights(tmp_path / folder / "s.json", nominal())
     found = table(tmp_path, **small, extra=(f"mine={tmp_path / 'other'}",))
     told, verdicts = study.make_table(found, plants)
     assert list(verdicts["s"].scores) == [*study.SETS, "ceiling", "mine"]
-    assert asked["walks"] == 14 + 4
+    assert asked["walks"] == 16 + 4
     assert "`with` against `ceiling`" in told.read_text()
 
 
@@ -103,6 +108,7 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     [
         ({"seeds": 0}, "--seeds must be at least 1, got 0"),
         ({"first_seed": -1}, "--first-seed must be at least 0, got -1"),
+        ({"walks": -1}, "--walks must be at least 0, got -1"),
         ({"iterations": 3}, "--iterations must be at least 10, got 3"),
         ({"rollouts": 3}, "budget must be at least one generation"),
         ({"trajectories": ("moon",)}, "unknown trajectory 'moon'"),

@@ -137,6 +137,7 @@ def lines(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Line]:
         for name in verdict.scores:
             others = [*BASELINES, *(_RIVALS if name == "with" else ())]
             others += ["without_ten"] if name == "with_ten" else []
+            others += ["with", "ceiling"] if name == "with_walks" else []
             found[trajectory, name] = Line(
                 {part: metrics.mean(verdict, name, part) for part in _ORDER},
                 metrics.falls(verdict, name),

@@ -217,13 +217,13 @@ def believed(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
     return jnp.where(finite, reason, Reason.NOT_FINITE).astype(jnp.int32)
 
 
-def init(config: TuneConfig, weights: Weights) -> Progress:
-    """A tuning before its first rollout."""
+def init(config: TuneConfig, weights: Weights, count: int = 0) -> Progress:
+    """A tuning before its first rollout, which is iteration `count`."""
     weights = jax.tree.map(jnp.asarray, weights)
     return Progress(
         trial=weights,
         share=jnp.asarray(1.0),
-        count=jnp.asarray(0, jnp.int32),
+        count=jnp.asarray(count, jnp.int32),
         best=weights,
         loss=jnp.asarray(jnp.inf),
         gradient=jax.tree.map(jnp.zeros_like, weights),
@@ -243,7 +243,7 @@ def update(
     iterations the tuning stops where the step has become too small or `patience` accepted
     iterations gained less than `gain`.
     """
-    count, start = progress.count, progress.count == 0
+    count, start = progress.count, jnp.isinf(progress.loss)  # nothing was accepted yet
     late = count > PAPER_ITERATIONS
     reason = believed(config, evaluation)
     rose = late & ~(evaluation.loss < progress.loss)
@@ -329,18 +329,44 @@ def tune(
 
     Source: problem P and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
     """
+    return descend(
+        config,
+        weights,
+        lambda trial: tune_step(config, robot, trial, command, anchor, effect),
+        on_iteration,
+    )
+
+
+def descend(
+    config: TuneConfig,
+    weights: Weights,
+    look: Callable[[Weights], Evaluation],
+    on_iteration: Callable[[Iteration], None] = lambda iteration: None,
+    first: int = 0,
+) -> Tuning:
+    """The rule, driven from Python: whatever `look` finds of weights is stepped down.
+
+    Args:
+        config: how.
+        weights: where to start.
+        look: loss and gradient of weights.
+        on_iteration: called after each iteration.
+        first: number of the first one; from the paper's ten on every step has to lower the loss.
+
+    Raises:
+        ValueError: the evaluation of the starting weights is not to be believed.
+    """
     history: list[Iteration] = []
-    progress = init(config, weights)
+    progress = init(config, weights, first)
     while progress.stop == Stop.GOING:
         trial = jax.tree.map(np.asarray, progress.trial)
-        found = tune_step(config, robot, trial, command, anchor, effect)
-        found = jax.tree.map(np.asarray, found)
+        found = jax.tree.map(np.asarray, look(trial))
         step = float(progress.share) if history else 0.0
         progress, code = update(config, progress, found)
         reason = _in_words(config, Reason(int(code)), found)
         if progress.stop == Stop.BAD_START:
             raise ValueError(f"the starting weights cannot be tuned from: {reason}")
-        history.append(Iteration(len(history), trial, found, not reason, reason, step))
+        history.append(Iteration(first + len(history), trial, found, not reason, reason, step))
         on_iteration(history[-1])
     ten, converged = jax.tree.map(np.asarray, (progress.ten, progress.best))
     return Tuning(history, ten, converged, stopped(config, Stop(int(progress.stop))))

@@ -1,0 +1,110 @@
+"""DiffTune along walks that were measured, on a better simulator or on the robot (Eq. 9, 10).
+
+The errors in the loss are the measured ones, and dynamics, phi and controller are differentiated at
+the measured states: the model is asked only how a state would have changed with the weights, not
+what it was. Tuning on the model's own walk ends where the model errs; from there this goes on, at
+the price of a walk for every step.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from hector_jax.control.reference import Command, anchor_at
+from hector_jax.control.walking import Measurement, measured_feet
+from hector_jax.control.weights import Weights
+from hector_jax.robot import Robot
+from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.tuning.difftune import (
+    PAPER_ITERATIONS,
+    Evaluation,
+    Iteration,
+    TuneConfig,
+    Tuning,
+    descend,
+)
+from hector_jax.tuning.online import Told, follow, init_trace
+
+
+@jax.jit
+def _told(robot: Robot, state: State, joints: Array) -> Told:
+    def one(state: State, joints: Array) -> Told:
+        return Told(state, measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints))))
+
+    return jax.vmap(one)(state, joints)
+
+
+def evaluate_walk(
+    config: TuneConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    walk: Trajectory,
+    start_tick: int = 0,
+) -> Evaluation:
+    """Loss of a measured walk, and its gradient through the model along what was measured.
+
+    The first tick is left out: the reference is anchored in it.
+
+    Args:
+        config: controller and loss.
+        robot: nominal body.
+        weights: that were walked with.
+        command: that was walked.
+        effect: phi; its Jacobian is used.
+        walk: of `config.rollout.ticks` ticks, sampled at the plan interval or finer.
+        start_tick: gait tick of t = 0.
+
+    Raises:
+        ValueError: the walk's samples do not fill the ticks.
+    """
+    ticks, samples = config.rollout.ticks, len(walk.fallen)
+    if samples % ticks:
+        raise ValueError(
+            f"a measured walk must have a whole number of samples in each of its {ticks} ticks, "
+            f"got {samples} samples"
+        )
+    ends = slice(samples // ticks - 1, None, samples // ticks)
+    told = _told(robot, jax.tree.map(lambda x: x[ends], walk.state), walk.joints[ends])
+    first = Wrench(*(w[0] for w in walk.command))
+    anchor = anchor_at(robot, walk.initial, start_tick)
+    trace = init_trace(anchor, jax.tree.map(lambda x: x[0], told), first)
+    used = jax.tree.map(lambda w: np.broadcast_to(w, (ticks - 1, *np.shape(w))), weights)
+    tick = np.asarray(start_tick + 1, np.int32)
+    _, found = follow(config, robot, command, anchor, effect, trace, used, tick, told)
+    fallen = jnp.maximum(found.fallen, jnp.mean(1.0 * jnp.asarray(walk.fallen)))
+    worst = jnp.maximum(found.residual, jnp.max(jnp.asarray(walk.residual)))
+    return jax.tree.map(np.asarray, found._replace(fallen=fallen, residual=worst))
+
+
+def tune_measured(
+    config: TuneConfig,
+    weights: Weights,
+    look: Callable[[Weights], Sequence[Evaluation]],
+    on_iteration: Callable[[Iteration], None] = lambda iteration: None,
+) -> Tuning:
+    """Tune on measured walks, from weights that have been tuned on the model.
+
+    A step is accepted only where the mean loss over the walks falls, as in every tuning after the
+    paper's ten iterations.
+
+    Args:
+        config: how; these iterations count from the paper's ten on.
+        weights: where to start.
+        look: walks with weights on each plant and differentiates, see `evaluate_walk`.
+        on_iteration: called after each iteration.
+
+    Raises:
+        ValueError: a walk with the starting weights falls or cannot be believed.
+    """
+
+    def mean(weights: Weights) -> Evaluation:
+        found = look(weights)
+        both = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
+        return both._replace(residual=np.max([one.residual for one in found]))
+
+    return descend(config, weights, mean, on_iteration, first=PAPER_ITERATIONS)
