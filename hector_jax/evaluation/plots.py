@@ -762,3 +762,65 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
         "Largest push [N] of 0.1 s that is survived together with all smaller ones, by where it "
         "pushes to; mean over plants and gait phases."
     )
+
+
+_RIVAL_LOOK = {
+    "without": _LOOK["without"],
+    "with": _LOOK["with"] | {"linewidth": 1.8},
+    "adam": {"color": "#63b89f", "linestyle": (0, (3, 1.2))},
+    "differences": {"color": "black", "linestyle": (0, (5, 1.5)), "linewidth": 1.1},
+    "cma-es": _LOOK["searched"],
+    "bayes": {"color": _BLUE, "linestyle": (0, (5, 1.5))},
+    "bayes near": {"color": _BLUE, "linestyle": "-"},
+    "random": {"color": _GREY, "linestyle": "-"},
+}
+RIVALS = {
+    "without": "DiffTune without net",
+    "with": "DiffTune with net",
+    "adam": "Adam with net",
+    "differences": "differences on the simulator",
+    "cma-es": "CMA-ES",
+    "bayes": "Bayesian, whole box",
+    "bayes near": "Bayesian, near the start",
+    "random": "random",
+}
+"""Names of the ways of tuning that race."""
+
+
+def race(
+    path: Path,
+    curves: Mapping[str, Sequence[tuple[Float[np.ndarray, " walks"], Float[np.ndarray, " walks"]]]],
+    abscissa: str,
+    log: bool = False,
+) -> str:
+    """Lowest loss so far of each way of tuning: median over its repeats, and their range.
+
+    Args:
+        path: file to write.
+        curves: by method, abscissa and loss of each repeat.
+        abscissa: what the losses are drawn against.
+        log: whether on a logarithmic axis.
+    """
+    with _figure(path, 7.0, 4.4) as figure:
+        axes = figure.subplots()
+        for name, repeats in curves.items():
+            count = min(len(losses) for _, losses in repeats)
+            x = np.median([at[:count] for at, _ in repeats], axis=0)
+            losses = np.array([losses[:count] for _, losses in repeats]) / 1e6
+            look = _RIVAL_LOOK[name]
+            if len(losses) > 1:
+                axes.fill_between(
+                    x, losses.min(axis=0), losses.max(axis=0), color=look["color"], alpha=0.13, lw=0
+                )
+            axes.plot(x, np.median(losses, axis=0), **look, label=RIVALS[name])
+            axes.plot(x[-1], np.median(losses[:, -1]), "o", color=look["color"], markersize=3)
+        axes.set(yscale="log", xlabel=abscissa, ylabel="lowest L on the simulator [10$^6$]")
+        _plain_log(axes.yaxis)
+        axes.yaxis.set_minor_locator(NullLocator())
+        if log:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        _legend(figure, axes, columns=3)
+    return (
+        "Lowest loss so far on the high-fidelity simulator: median of the repeats, and their range."
+    )
