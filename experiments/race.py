@@ -369,9 +369,7 @@ def report(
         "rollouts.png": plots.race(
             flags.out / "rollouts.png", count, "walks on the high-fidelity simulator"
         ),
-        "seconds.png": plots.race(
-            flags.out / "seconds.png", spent, "seconds of one core", log=True
-        ),
+        "seconds.png": plots.race(flags.out / "seconds.png", spent, "seconds of one core"),
     }
     write_json(
         flags.out / "race.json",

@@ -15,10 +15,10 @@ from hector_jax.tuning.search import Generation, SearchConfig, placed, room
 
 GOAL = np.linspace(-1.0, 1.0, 18)
 RIVALS = {
-    "cma-es": CmaEs(SearchConfig(40, 10, seed=1)),
-    "bayes": Bayes(1),
-    "bayes near": Bayes(1, reach=1.5),
-    "random": Random(1),
+    "cma-es": CmaEs(SearchConfig(60, 10, seed=1, spread=0.3)),
+    "bayes": Bayes(1, spread=0.3),
+    "bayes near": Bayes(1, reach=1.5, spread=0.3),
+    "random": Random(1, spread=0.3),
     "differences": Differences(TuneConfig()),
     "given": Given(tuple(tuple(share * GOAL) for share in np.linspace(0.1, 0.9, 12))),
 }
@@ -41,7 +41,7 @@ def think(asked):
     return {name: (rival.ask(*known), 0.5) for name, (rival, *known) in asked.items()}
 
 
-def run(folder, rivals=RIVALS, rollouts=40, think=think, walk=bowl):
+def run(folder, rivals=RIVALS, rollouts=60, think=think, walk=bowl):
     return race(rivals, nominal(), rollouts, think, walk, folder / "race.jsonl", ABOUT)
 
 
@@ -60,12 +60,11 @@ def raced(tmp_path_factory):
 @pytest.mark.parametrize("name", RIVALS)
 def test_every_rival_goes_downhill_within_its_budget(raced, name):
     turns = raced.turns[name]
-    assert walks(turns) == (12 if name == "given" else 40)
+    assert walks(turns) == (12 if name == "given" else 60)
     course = lowest(raced.start, turns)
     assert len(course) == walks(turns) + 1
     assert raced.start == course[0] == loss(nominal())
-    # few draws about the start fall nearer to the goal
-    assert course[-1] < (0.999 if name == "random" else 0.95) * course[0]
+    assert course[-1] < 0.95 * course[0]
 
 
 def test_a_model_of_the_losses_is_worth_more_than_chance(raced):
@@ -74,7 +73,7 @@ def test_a_model_of_the_losses_is_worth_more_than_chance(raced):
 
 
 def test_the_same_seed_gives_the_same_race_and_another_one_another(raced, tmp_path):
-    same(run(tmp_path, rollouts=40), raced)
+    same(run(tmp_path), raced)
     start = Generation(np.zeros((1, 18)), np.ones(1))
     for make in (Random, Bayes, lambda seed: CmaEs(SearchConfig(seed=seed))):
         one, other = (make(seed).ask(nominal(), [start]) for seed in (1, 2))
@@ -82,7 +81,7 @@ def test_the_same_seed_gives_the_same_race_and_another_one_another(raced, tmp_pa
 
 
 def test_all_stay_in_the_box_and_treat_both_feet_alike():
-    # a loss that falls towards corners far outside
+    # near one corner, with a loss that falls away from it
     low, high = (np.asarray(weights_to_vector(w)) for w in bounds())
     start = placed(nominal(), np.where(np.arange(18) % 2, *room(nominal()).T[::-1]) * 0.98)
     for rival in RIVALS.values():
@@ -113,10 +112,8 @@ def test_a_race_that_was_cut_ends_as_if_it_had_not_been(raced, tmp_path, cut):
     assert path.read_bytes() == kept
     done = run(tmp_path, rivals, walk=unasked)  # nothing is left to walk
     same(done, whole)
-    same(
-        whole._replace(turns={"random": whole.turns["random"]}),
-        raced._replace(turns={"random": raced.turns["random"]}),
-    )  # nobody looks at the others
+    for name, turns in whole.turns.items():  # nobody looks at the others
+        jax.tree.map(np.testing.assert_array_equal, turns, raced.turns[name])
 
 
 def test_a_record_of_another_race_is_refused(tmp_path):
@@ -180,5 +177,4 @@ def test_a_race_is_drawn(tmp_path):
         for name in plots.RIVALS
     }
     assert "median" in plots.race(tmp_path / "race.png", curves, "walks")
-    plots.race(tmp_path / "log.png", curves, "seconds", log=True)
-    assert (tmp_path / "log.png").stat().st_size > 10_000
+    assert (tmp_path / "race.png").stat().st_size > 10_000

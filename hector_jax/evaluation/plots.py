@@ -791,7 +791,6 @@ def race(
     path: Path,
     curves: Mapping[str, Sequence[tuple[Float[np.ndarray, " walks"], Float[np.ndarray, " walks"]]]],
     abscissa: str,
-    log: bool = False,
 ) -> str:
     """Lowest loss so far of each way of tuning: median over its repeats, and their range.
 
@@ -799,7 +798,6 @@ def race(
         path: file to write.
         curves: by method, abscissa and loss of each repeat.
         abscissa: what the losses are drawn against.
-        log: whether on a logarithmic axis.
     """
     with _figure(path, 7.0, 4.4) as figure:
         axes = figure.subplots()
@@ -809,17 +807,14 @@ def race(
             losses = np.array([losses[:count] for _, losses in repeats]) / 1e6
             look = _RIVAL_LOOK[name]
             if len(losses) > 1:
-                axes.fill_between(
-                    x, losses.min(axis=0), losses.max(axis=0), color=look["color"], alpha=0.13, lw=0
-                )
-            axes.plot(x, np.median(losses, axis=0), **look, label=RIVALS[name])
-            axes.plot(x[-1], np.median(losses[:, -1]), "o", color=look["color"], markersize=3)
+                low, high = losses.min(axis=0), losses.max(axis=0)
+                axes.fill_between(x, low, high, step="post", color=look["color"], alpha=0.1, lw=0)
+            middle = np.median(losses, axis=0)
+            axes.step(x, middle, where="post", **look, label=RIVALS[name])
+            axes.plot(x[-1], middle[-1], "o", color=look["color"], markersize=3)
         axes.set(yscale="log", xlabel=abscissa, ylabel="lowest L on the simulator [10$^6$]")
         _plain_log(axes.yaxis)
         axes.yaxis.set_minor_locator(NullLocator())
-        if log:
-            axes.set_xscale("log")
-            axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         _legend(figure, axes, columns=3)
     return (
         "Lowest loss so far on the high-fidelity simulator: median of the repeats, and their range."

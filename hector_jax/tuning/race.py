@@ -116,7 +116,7 @@ def walks(turns: Sequence[Turn]) -> int:
     return sum(len(turn.walked.losses) for turn in turns)
 
 
-def lowest(start: float, turns: Sequence[Turn]) -> Float[np.ndarray, " walks+1"]:
+def lowest(start: float, turns: Sequence[Turn]) -> Float[np.ndarray, " walked"]:
     """The lowest loss after each walk, that of the start first."""
     losses = [turn.walked.losses for turn in turns]
     return np.minimum.accumulate(np.concatenate([[start], *losses]))

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from typing import Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Float
@@ -214,7 +215,7 @@ class Differences:
     ) -> Float[np.ndarray, "18"]:
         weights = placed(start, at)
         flat = (gradient @ directions()) / np.asarray(weights_to_vector(weights))
-        tree = jax.tree.map(np.asarray, vector_to_weights(flat))
+        tree = jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(flat)))
         return steps_to(start, step_weights(self.tune, weights, tree, share))
 
 
