@@ -19,6 +19,7 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -165,11 +166,15 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
 
 
 def on_model(
-    pool: Executor, flags: Flags, config: TuneConfig, robot: Robot, params: Params
+    pool: Executor,
+    flags: Flags,
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    params: Params,
 ) -> tuple[dict[str, Course], float]:
     """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
-    command = named_command(flags.traj)
-    key = f"{config!r} {RATE} {flags.traj} {fingerprint(params)} {fingerprint(robot)}"
+    key = f"{config!r} {RATE} {fingerprint(command)} {fingerprint(params)} {fingerprint(robot)}"
     path = flags.out / f"model-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
@@ -212,10 +217,11 @@ def run(
     flags: Flags,
     config: TuneConfig,
     robot: Robot,
+    command: Command,
+    engine: str,
     rivals: Mapping[str, Rival],
-) -> tuple[Raced, str]:
-    """The race, and its engine."""
-    engine = pipeline.choose_engine(flags.engine)
+) -> Raced:
+    """The race, taking up its record."""
     size = sum(rival.most for rival in rivals.values())
     about = {
         "trajectory": flags.traj,
@@ -225,7 +231,7 @@ def run(
         "loss": repr(config.loss),
         "robot": fingerprint(robot),
         "plant": fingerprint(hfs()),
-        "command": fingerprint(named_command(flags.traj)),
+        "command": fingerprint(command),
         "settings": hashlib.sha256(repr(sorted(rivals.items())).encode()).hexdigest()[:12],
     }
 
@@ -251,8 +257,7 @@ def run(
             tell(done, flags.rollouts * len(rivals), remark)
 
         path = flags.out / "race.jsonl"
-        raced = race(rivals, nominal(), flags.rollouts, think, walk, path, about, on_round)
-    return raced, engine
+        return race(rivals, nominal(), flags.rollouts, think, walk, path, about, on_round)
 
 
 def paid(
@@ -276,16 +281,19 @@ def main() -> None:
     """Write report.md, race.json and the pictures."""
     flags = tyro.cli(Flags)
     setup_jax()
+    command, engine = named_command(flags.traj), pipeline.choose_engine(flags.engine)
+    if not all(find_spec(package) for package in ("cmaes", "sklearn")):
+        raise ValueError('the race needs its extra: pip install "hector-jax[race]"')
     make_folder(flags.out)
     robot = jax.tree.map(np.asarray, load_robot())
     config = TuneConfig(RolloutConfig(ticks=flags.ticks), iterations=flags.rollouts)
     with workers(flags.processes) as pool:
         params, took = prepare(pool, flags, robot)
         params = jax.tree.map(np.asarray, params)
-        courses, walk = on_model(pool, flags, config, robot, params)
+        courses, walk = on_model(pool, flags, config, robot, command, params)
         methods = entrants(flags, config, courses)
         rivals = {name: rival for each in methods.values() for name, rival in each.items()}
-        raced, engine = run(pool, flags, config, robot, rivals)
+        raced = run(pool, flags, config, robot, command, engine, rivals)
     full = RolloutConfig().ticks / flags.ticks  # data are walked, and their tunings run, 4 s each
     plain = courses["without"]
     prices = Prices(

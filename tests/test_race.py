@@ -69,7 +69,7 @@ def test_every_rival_goes_downhill_within_its_budget(raced, name):
 
 def test_a_model_of_the_losses_is_worth_more_than_chance(raced):
     best = {name: lowest(raced.start, turns)[-1] for name, turns in raced.turns.items()}
-    assert best["bayes near"] < 0.8 * best["random"]
+    assert max(best["bayes near"], best["cma-es"]) < 0.95 * best["random"]
 
 
 def test_the_same_seed_gives_the_same_race_and_another_one_another(raced, tmp_path):
@@ -129,14 +129,15 @@ def test_a_record_of_another_race_is_refused(tmp_path):
 def test_a_loss_without_a_number_is_the_worst_and_leaves_valid_json(tmp_path):
     def walk(sets):
         found = bowl(sets)
-        return {n: np.where(x > loss(nominal()), np.inf, x) for n, x in found.items()}
+        return {n: np.where(x > 1.1 * loss(nominal()), np.inf, x) for n, x in found.items()}
 
     rivals = {name: RIVALS[name] for name in ("bayes near", "cma-es", "differences")}
     found = run(tmp_path, rivals, 30, walk=walk)
     lines = [json.loads(line) for line in (tmp_path / "race.jsonl").read_text().splitlines()]
     assert None in lines[2]["cma-es"]["losses"]
     same(run(tmp_path, rivals, 30, walk=unasked), found)
-    assert all(lowest(found.start, turns)[-1] < found.start for turns in found.turns.values())
+    for name, turns in found.turns.items():
+        assert lowest(found.start, turns)[-1] < found.start, name
 
 
 def test_a_start_without_a_loss_and_no_rollouts_are_refused(tmp_path):
