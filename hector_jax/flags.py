@@ -80,10 +80,8 @@ class Table:
     first_seed: int = 0  # 0 in development, 1000 for the final verdict
     rollouts: int = 200  # walks of the search on the high-fidelity simulator
     iterations: int = 100  # of the tuning, at most
-    walks: int = (
-        40  # steps that `with` is tuned on for along walks on the simulator; 0: no such row
-    )
-    plants: int = 4  # that each of these steps walks on
+    walks: int = 30  # more steps of `with`, along walks on the simulator; 0: no such row
+    plants: int = 2  # that each of these steps walks on
     extra: tuple[str, ...] = ()  # NAME=FOLDER of straight.json, c.json, s.json: one more row each
     ceiling: Path = Path("docs/results/ceiling")  # such a folder too; row `ceiling` where it exists
     earlier: Path | None = None  # table.json of other plants: do the sets keep their order?

@@ -29,7 +29,17 @@ from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
 _DIGEST = 64  # hexadecimal digits of a sha256
-_PACKAGES = ("hector-jax", "jax", "jaxlib", "flax", "numpy", "mujoco", "mujoco-mjx", "cmaes")
+_PACKAGES = (
+    "hector-jax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "numpy",
+    "mujoco",
+    "mujoco-mjx",
+    "cmaes",
+    "scikit-learn",
+)
 
 Tree = TypeVar("Tree")
 

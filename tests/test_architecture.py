@@ -26,9 +26,10 @@ FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
     "mujoco": ("robot", "sim", "evaluation.video"),
     "flax": ("grfm.network",),
-    "optax": ("grfm.training", "tuning.difftune"),
+    "optax": ("grfm.training", "tuning.difftune", "tuning.rivals"),
     "jaxopt": ("control.qp",),
     "cmaes": ("tuning.search",),
+    "sklearn": ("tuning.rivals",),
     "matplotlib": ("evaluation.plots",),
     "tyro": ("cli",),
 }

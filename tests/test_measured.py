@@ -37,7 +37,8 @@ def test_a_measured_walk_is_judged_by_its_own_errors(robot):
     # the model stands on joints that do not move; the feet that are measured follow from them
     still = walked._replace(joints=np.broadcast_to(robot.standing_joints, (6, 10)))
     found = evaluate_walk(CONFIG, robot, nominal(), named_command("s"), last_command, still)
-    worse = still._replace(state=still.state._replace(position=still.state.position + 0.01))
+    ahead = still.state.position + np.array([0.1, 0.0, 0.0])
+    worse = still._replace(state=still.state._replace(position=ahead))
     told = evaluate_walk(CONFIG, robot, nominal(), named_command("s"), last_command, worse)
     assert found.fallen == 0.0
     assert told.parts.position > found.parts.position

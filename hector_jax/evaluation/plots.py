@@ -965,3 +965,60 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
         right.set(xlabel="starts [%]", title="at the end", xlim=(0, 100))
         _legend(figure, left)
     return "Loss on the model by iteration from each start, and the losses at the end in order."
+
+
+_RIVAL_LOOK = {
+    "without": _LOOK["without"],
+    "with": _LOOK["with"] | {"linewidth": 1.8},
+    "adam": {"color": "#63b89f", "linestyle": (0, (3, 1.2))},
+    "differences": {"color": "black", "linestyle": (0, (5, 1.5)), "linewidth": 1.1},
+    "cma-es": _LOOK["searched"],
+    "bayes": {"color": _BLUE, "linestyle": (0, (5, 1.5))},
+    "bayes near": {"color": _BLUE, "linestyle": "-"},
+    "random": {"color": _GREY, "linestyle": "-"},
+}
+RIVALS = {
+    "without": "DiffTune without net",
+    "with": "DiffTune with net",
+    "adam": "Adam with net",
+    "differences": "differences on the simulator",
+    "cma-es": "CMA-ES",
+    "bayes": "Bayesian, whole box",
+    "bayes near": "Bayesian, near the start",
+    "random": "random",
+}
+"""Names of the ways of tuning that race."""
+
+
+def race(
+    path: Path,
+    curves: Mapping[str, Sequence[tuple[Float[np.ndarray, " walks"], Float[np.ndarray, " walks"]]]],
+    abscissa: str,
+) -> str:
+    """Lowest loss so far of each way of tuning: median over its repeats, and their range.
+
+    Args:
+        path: file to write.
+        curves: by method, abscissa and loss of each repeat.
+        abscissa: what the losses are drawn against.
+    """
+    with _figure(path, 7.0, 4.4) as figure:
+        axes = figure.subplots()
+        for name, repeats in curves.items():
+            count = min(len(losses) for _, losses in repeats)
+            x = np.median([at[:count] for at, _ in repeats], axis=0)
+            losses = np.array([losses[:count] for _, losses in repeats]) / 1e6
+            look = _RIVAL_LOOK[name]
+            if len(losses) > 1:
+                low, high = losses.min(axis=0), losses.max(axis=0)
+                axes.fill_between(x, low, high, step="post", color=look["color"], alpha=0.1, lw=0)
+            middle = np.median(losses, axis=0)
+            axes.step(x, middle, where="post", **look, label=RIVALS[name])
+            axes.plot(x[-1], middle[-1], "o", color=look["color"], markersize=3)
+        axes.set(yscale="log", xlabel=abscissa, ylabel="lowest L on the simulator [10$^6$]")
+        _plain_log(axes.yaxis)
+        axes.yaxis.set_minor_locator(NullLocator())
+        _legend(figure, axes, columns=3)
+    return (
+        "Lowest loss so far on the high-fidelity simulator: median of the repeats, and their range."
+    )

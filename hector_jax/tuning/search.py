@@ -15,7 +15,7 @@ other draws.
 import json
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -121,7 +121,7 @@ def search(
         # a cut may have left one record a generation behind another
         turn = min(len(one.history) for one in waiting.values())
         asked = {n: one.ask() for n, one in waiting.items() if len(one.history) == turn}
-        losses = walk({n: [searches[n].weights(s) for s in steps] for n, steps in asked.items()})
+        losses = walk({n: [placed(starts[n], s) for s in steps] for n, steps in asked.items()})
         for name, steps in asked.items():
             searches[name].record(Generation(steps, np.asarray(losses[name], float)))
         on_generation(histories)
@@ -136,25 +136,52 @@ def best(history: list[Generation]) -> tuple[Float[np.ndarray, "18"], float, int
     return steps[which], float(losses[which]), which + 1
 
 
+class _Course:
+    """CMA-ES with all that it was told."""
+
+    def __init__(
+        self, config: SearchConfig, start: Weights, history: Sequence[Generation] = ()
+    ) -> None:
+        if find_spec("cmaes") is None:
+            raise ValueError('a search needs the package cmaes: pip install "hector-jax[search]"')
+        from cmaes import CMA
+
+        self.config, self.start = config, start
+        self.history: list[Generation] = []
+        self.optimiser = CMA(
+            mean=np.zeros(len(DIRECTION_NAMES)),
+            sigma=config.spread,
+            bounds=room(start),
+            seed=config.seed,
+            population_size=config.population,
+        )
+        for generation in history[: config.generations]:
+            self.ask()  # draws what was drawn then
+            self.tell(generation)
+
+    @property
+    def stop(self) -> str:
+        if len(self.history) >= self.config.generations:
+            return "the budget is spent"
+        return "CMA-ES has converged" if self.optimiser.should_stop() else ""
+
+    def ask(self) -> Float[np.ndarray, "population 18"]:
+        return np.stack([self.optimiser.ask() for _ in range(self.config.population)])
+
+    def tell(self, generation: Generation) -> None:
+        losses = np.where(np.isfinite(generation.losses), generation.losses, np.inf)
+        self.history.append(generation._replace(losses=losses))
+        self.optimiser.tell(list(zip(generation.steps, losses.tolist(), strict=True)))
+
+
 class _Search:
     """One search with its record."""
 
     def __init__(
         self, config: SearchConfig, start: Weights, path: Path, about: Mapping[str, Any]
     ) -> None:
-        if find_spec("cmaes") is None:
-            raise ValueError('a search needs the package cmaes: pip install "hector-jax[search]"')
-        from cmaes import CMA
-
-        self.config, self.start, self.path = config, start, path
-        self.history: list[Generation] = []
-        self.optimiser = CMA(
-            mean=np.zeros(len(DIRECTION_NAMES)),
-            sigma=config.spread,
-            bounds=_room(start),
-            seed=config.seed,
-            population_size=config.population,
-        )
+        self.start, self.path = start, path
+        _Course(config, start)  # refuses a wrong start before there is a record
         head = {
             "format": FORMAT,
             "name": path.stem,
@@ -168,22 +195,18 @@ class _Search:
         kept = _read(path, head)
         if kept is None:
             write_file(path, (json.dumps(head, allow_nan=False) + "\n").encode())
-        for generation in (kept or [])[: config.generations]:
-            self.ask()  # draws what was drawn then
-            self._tell(generation)
+        self.course = _Course(config, start, kept or ())
+
+    @property
+    def history(self) -> list[Generation]:
+        return self.course.history
 
     @property
     def stop(self) -> str:
-        if len(self.history) >= self.config.generations:
-            return "the budget is spent"
-        return "CMA-ES has converged" if self.optimiser.should_stop() else ""
+        return self.course.stop
 
     def ask(self) -> Float[np.ndarray, "population 18"]:
-        return np.stack([self.optimiser.ask() for _ in range(self.config.population)])
-
-    def weights(self, steps: Float[np.ndarray, "18"]) -> Weights:
-        """Inside the box to the last digit, whatever the logarithm rounds to."""
-        return jax.tree.map(np.clip, moved(self.start, steps), *bounds())
+        return self.course.ask()
 
     def record(self, generation: Generation) -> None:
         line = {
@@ -194,20 +217,36 @@ class _Search:
             file.write(json.dumps(line, allow_nan=False) + "\n")
             file.flush()
             os.fsync(file.fileno())
-        self._tell(generation)
-
-    def _tell(self, generation: Generation) -> None:
-        losses = np.where(np.isfinite(generation.losses), generation.losses, np.inf)
-        self.history.append(generation._replace(losses=losses))
-        self.optimiser.tell(list(zip(generation.steps, losses.tolist(), strict=True)))
+        self.course.tell(generation)
 
     def found(self) -> Found:
         steps, loss, walk = best(self.history)
-        return Found(self.weights(steps), loss, walk, self.history, self.stop)
+        return Found(placed(self.start, steps), loss, walk, self.history, self.stop)
 
 
-def _room(start: Weights) -> Float[np.ndarray, "18 2"]:
-    """Steps from the start to the box, down and up."""
+def next_generation(
+    config: SearchConfig, start: Weights, history: Sequence[Generation]
+) -> Float[np.ndarray, "walks 18"]:
+    """What a search walks after `history`; nothing once it has ended.
+
+    Raises:
+        ValueError: as `search`.
+    """
+    course = _Course(config, start, history)
+    return np.zeros((0, len(DIRECTION_NAMES))) if course.stop else course.ask()
+
+
+def placed(start: Weights, steps: Float[np.ndarray, "18"]) -> Weights:
+    """Weights after steps, inside the box to the last digit, whatever the logarithm rounds to."""
+    return jax.tree.map(np.clip, moved(start, steps), *bounds())
+
+
+def room(start: Weights) -> Float[np.ndarray, "18 2"]:
+    """Steps from a start to the box, down and up.
+
+    Raises:
+        ValueError: it lies outside the box, or its feet differ.
+    """
     tied = directions().argmax(axis=1)  # of the left foot, where there are two
     at, low, high = (np.asarray(weights_to_vector(w), float) for w in (start, *bounds()))
     if any(np.any(part[0] != part[1]) for part in start.R):
