@@ -164,13 +164,14 @@ def _most_promising(
         z = (least - mean) / np.maximum(deviation, 1e-12)
         return deviation * (z * norm.cdf(z) + norm.pdf(z))
 
+    low, high = box.T
     width = np.exp(rng.uniform(np.log(0.03), 0.0, (2048, 1)))
     about = near[rng.integers(len(near), size=2048)] + width * rng.normal(size=(2048, DIM))
-    tried = np.clip(np.vstack([rng.uniform(*box.T, (2048, DIM)), about]), *box.T)
+    tried = np.clip(np.vstack([rng.uniform(low, high, (2048, DIM)), about]), low, high)
     gains = gain(tried)
     for width in (0.3, 0.2, 0.1, 0.05, 0.02):
         best, most = tried[gains.argmax()], gains.max()
-        around = np.clip(best + width * rng.normal(size=(256, DIM)), *box.T)
+        around = np.clip(best + width * rng.normal(size=(256, DIM)), low, high)
         tried, gains = np.vstack([best, around]), np.append(most, gain(around))
     return tried[gains.argmax()]
 
