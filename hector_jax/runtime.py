@@ -72,16 +72,26 @@ def all_devices() -> None:
 def start_worker(cores: Any) -> None:
     """Set up a worker process as its parent is, with interrupts and accelerators left to it.
 
-    It stays on one core, the next of the queue `cores`: XLA's threads of several workers would
-    otherwise wait for each other, which costs several times the work.
+    Several workers stay on a core each, the next of the queue `cores`: XLA's threads of one would
+    otherwise wait for those of the others, which costs several times the work.
     """
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {cores.get()})
+    core = cores.get()
+    if core is not None:
+        os.sched_setaffinity(0, {core})
     import jax
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     jax.config.update("jax_platforms", "cpu")
     setup_jax()
+
+
+def _cores(processes: int) -> list[int | None]:
+    """A core for each of several processes; None where a process is alone or cannot be held."""
+    if processes < 2 or not hasattr(os, "sched_getaffinity"):
+        return [None] * processes
+    mine = sorted(os.sched_getaffinity(0))
+    first = os.getpid()  # two programs at once begin at different cores
+    return [mine[(first + i) % len(mine)] for i in range(processes)]
 
 
 @contextmanager
@@ -97,11 +107,9 @@ def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
     if processes < 1:
         raise ValueError(f"the number of processes must be at least 1, got {processes}")
     spawn = get_context("spawn")
-    known = hasattr(os, "sched_getaffinity")
-    mine = sorted(os.sched_getaffinity(0)) if known else list(range(os.cpu_count() or 1))
     cores = spawn.SimpleQueue()
-    for i in range(processes):
-        cores.put(mine[i % len(mine)])
+    for core in _cores(processes):
+        cores.put(core)
     with ProcessPoolExecutor(processes, spawn, initializer=start_worker, initargs=(cores,)) as pool:
         try:
             yield pool

@@ -1,5 +1,6 @@
 """The set-up of a process: where the cache lies, who turns on 64 bits, what a worker is."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,17 @@ def test_importing_the_library_leaves_jax_alone_and_computes_nothing():
 def test_a_worker_computes_in_64_bits():
     with runtime.workers(1) as pool:
         assert pool.submit(jnp.zeros, 3).result(timeout=60).dtype == jnp.float64
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
+def test_several_workers_stay_on_a_core_each_and_one_alone_has_them_all():
+    mine = os.sched_getaffinity(0)
+    assert runtime._cores(1) == [None]
+    for count in (2, len(mine), 2 * len(mine) + 1):
+        cores = runtime._cores(count)
+        assert len(cores) == count
+        assert set(cores) <= mine
+        assert len(set(cores)) == min(max(count, 2), len(mine))
 
 
 def test_a_failing_caller_ends_the_workers():
