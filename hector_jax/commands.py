@@ -42,6 +42,7 @@ from hector_jax.flags import (
     Train,
     Tune,
     Walk,
+    as_command,
     settings,
 )
 from hector_jax.grfm import training
@@ -200,23 +201,29 @@ def _curves(
     return {name: jax.tree.map(by_tick, wrench) for name, wrench in curves.items()}
 
 
+def _taken(folder: Path) -> str:
+    return f"run folder {folder} exists; name another by --run, nothing was touched"
+
+
 def _new_folder(args: Tune) -> Path:
     """The run's folder, made here; an existing one is never written into."""
     folder = args.run or args.runs / args.traj / f"{datetime.now():%Y%m%d-%H%M%S}"
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
-        raise ValueError(
-            f"run folder {folder} exists; name another by --run, nothing was touched"
-        ) from None
+        raise ValueError(_taken(folder)) from None
     return folder
 
 
 @run.register
 def _tune(args: Tune) -> None:
     if args.traj == "all":
-        for name in COMMANDS:
-            run(replace(args, traj=name, run=args.run and args.run / name))
+        several = [replace(args, traj=name, run=args.run and args.run / name) for name in COMMANDS]
+        for one in several:
+            if one.run is not None and one.run.exists():
+                raise ValueError(_taken(one.run))
+        for one in several:
+            run(one)
         return
     command, robot = named_command(args.traj), load_robot()
     if args.alpha not in ("paper", "auto"):
@@ -317,9 +324,7 @@ def _tune(args: Tune) -> None:
             film=film,
             config=resolved,
             environment=environment(),
-            command=f"hector tune --traj {args.traj} --seeds {args.seeds} "
-            f"--iterations {args.iterations} --variant {variant} --alpha {args.alpha}"
-            + (f" --refresh {args.refresh}" if args.refresh else ""),
+            command=as_command("tune", replace(args, run=None)),
         ),
     )
     print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")

@@ -1,5 +1,6 @@
 """The flags of each command; a field's comment is its help text."""
 
+import shlex
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -80,8 +81,8 @@ class Table:
     first_seed: int = 0  # 0 in development, 1000 for the final verdict
     rollouts: int = 200  # walks of the search on the high-fidelity simulator
     iterations: int = 100  # of the tuning, at most
-    walks: int = 30  # more steps of `with`, along walks on the simulator; 0: no such row
-    plants: int = 2  # that each of these steps walks on
+    steps: int = 30  # of `with` further, along walks on the simulator; 0: no such row
+    step_plants: int = 2  # that each of these steps walks on, hfs and drawn around it
     extra: tuple[str, ...] = ()  # NAME=FOLDER of straight.json, c.json, s.json: one more row each
     ceiling: Path = Path("docs/results/ceiling")  # such a folder too; row `ceiling` where it exists
     earlier: Path | None = None  # table.json of other plants: do the sets keep their order?
@@ -145,4 +146,4 @@ def as_command(name: str, flags: Any) -> str:
             words.append(f"--{'' if value else 'no-'}{flag}")
         else:
             words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
-    return " ".join(words)
+    return shlex.join(words)

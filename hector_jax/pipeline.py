@@ -518,7 +518,7 @@ def search(
         "loss": repr(tune.loss),
         "robot": fingerprint(robot),
         "plant": fingerprint(hfs()),
-        "commands": {name: fingerprint(named_command(name)) for name in COMMANDS},
+        "commands": {name: fingerprint(named_command(name)) for name in (*COMMANDS, *starts)},
     }
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:

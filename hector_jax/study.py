@@ -4,6 +4,7 @@ Each step takes up what is kept of it (kept.py, tuning/search.py), so that a run
 on where it was, and another set or more plants cost only what is new.
 """
 
+import json
 import re
 import tempfile
 from collections.abc import Callable, Mapping
@@ -13,7 +14,7 @@ from pathlib import Path
 
 from hector_jax import flags, kept, pipeline
 from hector_jax.console import say
-from hector_jax.control.reference import Command, named_command
+from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation import metrics, plots, table
 from hector_jax.evaluation.metrics import BASELINES, Verdict
@@ -44,7 +45,7 @@ SETS = (
 CEILING = "ceiling"
 
 # what `quick` cuts down to, so that all is done in under five minutes on two cores
-_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "walks": 2}
+_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "steps": 2}
 
 _SNAPSHOTS = VideoConfig(width=640, height=214, rate=8)  # no film of it is kept
 
@@ -60,24 +61,26 @@ class _Plan:
     plants: int  # that it walks on
     search: SearchConfig
     extra: Mapping[str, Mapping[str, Weights]]  # by trajectory, the sets from files
+    ceilings: Mapping[str, Search]  # what the long searches say of themselves
     earlier: Earlier | None
 
 
 def _plan(args: flags.Table) -> _Plan:
     """Raises ValueError, before anything is computed, where the flags ask for what cannot be."""
-    if args.quick:
-        args = replace(args, **{n: min(getattr(args, n), most) for n, most in _QUICK.items()})
     least_of = {
         "seeds": 1,
         "first_seed": 0,
         "iterations": PAPER_ITERATIONS,
-        "walks": 0,
-        "plants": 1,
+        "steps": 0,
+        "step_plants": 1,
     }
     for name, least in least_of.items():
         if getattr(args, name) < least:
             flag = name.replace("_", "-")
             raise ValueError(f"--{flag} must be at least {least}, got {getattr(args, name)}")
+    for name in args.trajectories:
+        if name not in COMMANDS:
+            raise ValueError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
     commands = {name: named_command(name) for name in args.trajectories}
     if len(commands) < len(args.trajectories) or not commands:
         raise ValueError(f"--trajectories must name each once, got {' '.join(args.trajectories)}")
@@ -85,10 +88,15 @@ def _plan(args: flags.Table) -> _Plan:
         commands,
         range(args.first_seed, args.first_seed + args.seeds),
         TuneConfig(iterations=args.iterations),
-        TuneConfig(iterations=PAPER_ITERATIONS + args.walks) if args.walks else None,
-        args.plants,
+        TuneConfig(iterations=PAPER_ITERATIONS + args.steps) if args.steps else None,
+        args.step_plants,
         SearchConfig(budget=args.rollouts),
         _sets_from_files(args),
+        {
+            name: _long_search(args.ceiling / f"{name}-card.json")
+            for name in args.trajectories
+            if (args.ceiling / f"{name}.json").exists()
+        },
         None if args.earlier is None else table.load_earlier(args.earlier),
     )
 
@@ -112,6 +120,17 @@ def _sets_from_files(args: flags.Table) -> dict[str, dict[str, Weights]]:
     return found
 
 
+def _long_search(card: Path) -> Search:
+    """What the card beside the ceiling's weights tells of its search."""
+    try:
+        told = json.loads(card.read_bytes())
+        return Search(told["walks"], told["best_at"], told["L"]["best"], told["stop"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{card}: no card of a search, so its weights are of none: {error}"
+        ) from None
+
+
 def make_table(
     args: flags.Table, plants: Callable[[range], list[Imperfections]]
 ) -> tuple[Path, dict[str, Verdict]]:
@@ -128,6 +147,9 @@ def make_table(
         ValueError: the flags ask for what cannot be, or a file is damaged.
         OSError: a folder cannot be written.
     """
+    asked = args
+    if args.quick:
+        args = replace(args, **{n: min(getattr(args, n), most) for n, most in _QUICK.items()})
     plan, robot = _plan(args), load_robot()
     out = args.out / "quick" if args.quick else args.out
     shelf = args.kept or args.out / "kept"
@@ -153,6 +175,7 @@ def make_table(
             falls=[fall for name, one in judged.items() for fall in _falls(plan, name, one)],
             tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tunings.items()},
             searches={name: _told(plan, found) for name, found in searches.items()},
+            ceilings=plan.ceilings,
             pictures=_draw(out, robot, verdicts, judged),
             config={
                 "flags": flags.settings(args),
@@ -161,7 +184,7 @@ def make_table(
             },
             environment=made_with,
             commits=sorted(commits),
-            command=flags.as_command("table", args),
+            command=flags.as_command("table", asked),
             earlier=plan.earlier,
         ),
     )
@@ -201,17 +224,20 @@ def _walk_sets(
         f"tuning {name} without and with GRFM-Net",
     )
     if plan.walks is not None:
-        tuned[WALKS] = kept.tune_measured(
-            pool,
-            plan.walks,
-            robot,
-            tuned["with"].tuning.converged,
-            *problems["with"],
-            pipeline.measured_plants(plan.plants),
-            shelf / name,
-            commit,
-            f"tuning {name} on along walks on the simulator",
-        )
+        try:
+            tuned[WALKS] = kept.tune_measured(
+                pool,
+                plan.walks,
+                robot,
+                tuned["with"].tuning.converged,
+                *problems["with"],
+                pipeline.measured_plants(plan.plants),
+                shelf / name,
+                commit,
+                f"tuning {name} further, along walks on the simulator",
+            )
+        except ValueError as error:  # a walk with the tuned weights falls
+            say(f"{name}: no row {WALKS}: {error}")
     sets = {
         "nominal": nominal(),
         "expert": expert(),

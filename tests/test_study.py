@@ -77,6 +77,7 @@ def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, as
     text = told.read_text()
     assert "hector table --" in text
     assert "--quick" in text
+    assert '"seeds": 4' in text  # those that were walked, not those of the whole table
     assert "16 of 64 walks ended in a fall" in text
     for name in ("changes", *names):
         assert f"(pictures/{name}.png)" in text
@@ -96,11 +97,17 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     assert asked["walks"] == 16
     for folder in ("ceiling", "other"):
         save_weights(tmp_path / folder / "s.json", nominal())
+    with pytest.raises(ValueError, match=r"s-card.json: no card of a search"):
+        study.make_table(table(tmp_path, **small), plants)
+    card = {"walks": 2000, "best_at": 1234, "L": {"best": 1e6}, "stop": "50 generations"}
+    (tmp_path / "ceiling" / "s-card.json").write_text(json.dumps(card))
     found = table(tmp_path, **small, extra=(f"mine={tmp_path / 'other'}",))
     told, verdicts = study.make_table(found, plants)
     assert list(verdicts["s"].scores) == [*study.SETS, "ceiling", "mine"]
     assert asked["walks"] == 16 + 4
-    assert "`with` against `ceiling`" in told.read_text()
+    text = told.read_text()
+    assert "`with` against `ceiling`" in text
+    assert "| s: `ceiling` | 2000 | 1234 | 1.000 | 50 generations |" in text
 
 
 @pytest.mark.parametrize(
@@ -108,10 +115,11 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     [
         ({"seeds": 0}, "--seeds must be at least 1, got 0"),
         ({"first_seed": -1}, "--first-seed must be at least 0, got -1"),
-        ({"walks": -1}, "--walks must be at least 0, got -1"),
+        ({"steps": -1}, "--steps must be at least 0, got -1"),
+        ({"trajectories": ("turn",)}, "--trajectories must be of straight, c, s, got turn"),
         ({"iterations": 3}, "--iterations must be at least 10, got 3"),
         ({"rollouts": 3}, "budget must be at least one generation"),
-        ({"trajectories": ("moon",)}, "unknown trajectory 'moon'"),
+        ({"trajectories": ("moon",)}, "--trajectories must be of straight, c, s, got moon"),
         ({"trajectories": ("s", "s")}, "--trajectories must name each once, got s s"),
         ({"extra": ("mine",)}, "--extra must be NAME=FOLDER.*got mine"),
         ({"extra": ("my set=x",)}, "--extra must be NAME=FOLDER.*got my set=x"),

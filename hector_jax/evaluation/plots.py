@@ -74,7 +74,7 @@ _NAMES = {
     "with": "tuned with net",
     "without_ten": "without net, ten iterations",
     "with_ten": "with net, ten iterations",
-    "with_walks": "with net, on along walks",
+    "with_walks": "with net, then along walks",
     "searched": "searched on the simulator",
     "ceiling": "long search",
     "predicted": "predicted by the net",

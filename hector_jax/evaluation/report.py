@@ -457,8 +457,10 @@ def _switching(verdict: Verdict) -> str:
 
 
 def tuning_section(name: str, tuning: Tuning) -> str:
-    """What a tuning did, under a heading of its name."""
+    """What a tuning did, under a heading of its name; one along walks begins after the paper's."""
     history = tuning.history
+    whole = history[0].iteration < PAPER_ITERATIONS
+    where = "on the model" if whole else "of its walks on the simulator, mean over their plants"
     refused = [i for i in history if not i.accepted]
     accepted = [i for i in history if i.accepted]
     early = [i for i in accepted if i.iteration <= PAPER_ITERATIONS]
@@ -467,10 +469,12 @@ def tuning_section(name: str, tuning: Tuning) -> str:
         f"### {name}",
         f"- {len(history) - 1} iterations, {len(refused)} refused{_reasons(refused)}",
         f"- ended because: {tuning.stop}",
-        f"- L on the model: {loss(history[0])} at the start, {loss(early[-1])} after "
-        f"{PAPER_ITERATIONS} iterations, {loss(accepted[-1])} at the end",
-        f"- at a bound of the box after {PAPER_ITERATIONS}: {_at_bounds(tuning.ten)}; "
-        f"at the end: {_at_bounds(tuning.converged)}",
+        f"- L {where}: {loss(history[0])} at the start, "
+        + (f"{loss(early[-1])} after {PAPER_ITERATIONS} iterations, " if whole else "")
+        + f"{loss(accepted[-1])} at the end",
+        "- at a bound of the box "
+        + (f"after {PAPER_ITERATIONS}: {_at_bounds(tuning.ten)}; " if whole else "")
+        + f"at the end: {_at_bounds(tuning.converged)}",
         f"- worst QP residual of an accepted step: "
         f"{max(float(i.evaluation.residual) for i in accepted):.1e}",
     ]
