@@ -363,7 +363,8 @@ def changes(
                 panel.set(xlabel=f"L against {baseline} [%]", title=trajectory)
         for row in panels:
             low, high = row[0].get_xlim()
-            ticks = [r for r in (_TENTHS if high < 3.0 * low else _RATIOS) if low <= r <= high]
+            few = _TENTHS if high < 3.0 * low else _RATIOS if high < 30.0 * low else _WIDE
+            ticks = [r for r in few if low <= r <= high]
             row[0].xaxis.set_minor_locator(NullLocator())
             row[0].set_xticks(ticks, [f"{100 * (r - 1):+.0f}" if r != 1 else "0" for r in ticks])
         panels[0, 0].set_yticks(range(len(names)), [_named(name) for name in names])
@@ -378,6 +379,7 @@ def changes(
 
 _RATIOS = (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
 _TENTHS = tuple(i / 10 for i in range(1, 30))
+_WIDE = (0.05, 0.2, 0.5, 1.0, 3.0, 10.0, 50.0, 200.0)
 
 
 def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline: str) -> None:
