@@ -389,7 +389,9 @@ def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
             )
             pictures.append((file, f"Start: {which}, plant {names[0]}. {caption}"))
     about = environment()
-    sizes = len(names), len(flags.trajectories), len(flags.sets)
+    counts = {"plant": len(names), "trajectory": len(flags.trajectories), "start": len(flags.sets)}
+    plural = {"plant": "plants", "trajectory": "trajectories", "start": "starts"}
+    crossed = " x ".join(f"{n} {name if n == 1 else plural[name]}" for name, n in counts.items())
     text = [
         "# Does tuning while walking help when the plant changes?",
         made_at(about),
@@ -400,8 +402,8 @@ def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
         "\n".join(f"- `{arm}`: {ARMS[arm]}" for arm in flags.arms),
         "## What came out",
         "Changes of L in %, median over the walks and, in brackets, the least and the largest. "
-        f"The {math.prod(sizes)} walks of an arm are {sizes[0]} plants x {sizes[1]} trajectories x "
-        f"{sizes[2]} starts, not independent of each other:",
+        f"The {math.prod(counts.values())} walks of an arm are {crossed}, not independent of each "
+        "other:",
         "\n".join(verdicts(flags, found)),
         f"A gradient over {window:g} s of walking with its step took {1e3 * np.median(took):.0f} "
         f"ms of processor time in the median, {1e3 * np.percentile(took, 5):.0f} to "

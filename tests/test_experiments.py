@@ -1,6 +1,8 @@
 """Scripts of experiments/ refuse what they cannot use, before anything is computed."""
 
 import importlib.util
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -72,3 +74,13 @@ def test_names_that_files_could_not_tell_apart_are_refused(tmp_path, name):
     assert "a_b" in robustness.weight_sets([f"a_b={tmp_path / 'w.json'}"])
     with pytest.raises(ValueError, match="NAME=FILE"):
         robustness.weight_sets([f"{name}={tmp_path / 'w.json'}"])
+
+
+def test_batch_sets_up_its_devices_and_refuses_a_missing_net(tmp_path):
+    arguments = [FOLDER / "batch.py", "robust", "--net", tmp_path / "none.npz"]
+    environment = os.environ | {"PYTHONPATH": str(FOLDER.parent)}
+    done = subprocess.run(
+        [sys.executable, *arguments], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("batch: cannot read")
