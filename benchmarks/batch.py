@@ -106,7 +106,8 @@ def measure(
     if singles:
         one = lambda i: tune(config, robot, start(i), command, anchor, effect)  # noqa: E731
         alone = _timed(lambda: one(0), lambda: [one(i) for i in range(singles)])
-        then, now = (np.array([t.history[i].evaluation.loss for t in alone.found]) for i in (0, -1))
+        told = [[i.evaluation.loss for i in t.history if i.accepted] for t in alone.found]
+        then, now = (np.array([losses[i] for losses in told]) for i in (0, -1))
         rows.append(row("one after the other", 1, singles, alone, now / then, 0.0))
         for i, side in enumerate(lanes):
             told = at_once(singles, devices, side)

@@ -11,7 +11,7 @@ Tuned is on the rigid body, through a GRFM-Net where --net names one, on all dev
 stand-in is read by `verdict` alone, which tunes nothing.
 """
 
-import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from hector_jax import pipeline
-from hector_jax.console import bar, say
+from hector_jax.console import bar, exit_code, made_at
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation import metrics, plots
@@ -36,13 +36,13 @@ from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import all_devices, setup_jax, workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
-from hector_jax.storage import load_weights, make_folder, save_weights, write_file
+from hector_jax.storage import load_weights, make_folder, save_weights, write_file, write_json
 from hector_jax.tuning.batch import Problem, Scenario, Tunings, stack, tune_batch
 from hector_jax.tuning.difftune import Reason, Stop, TuneConfig, stopped
 from hector_jax.tuning.loss import Alpha, LossConfig, Losses
 from hector_jax.tuning.rollout import Variation, no_variation
 
-UNSEEN = Command(  # ahead, aside and into turns of another rate: no tuning walks it
+HELD_BACK = Command(  # ahead, aside and into turns of another rate: no tuning walks it
     np.array([1.0, 1.0, 2.0]),
     np.array([[0.4, 0.0], [0.3, 0.1], [0.25, 0.0]]),
     np.array([0.0, -0.3 * np.pi, 0.4 * np.pi]),
@@ -143,6 +143,14 @@ def problem(start: Weights, scenarios: Sequence[Scenario], tail: float = 1.0) ->
     return Problem(start, stack(scenarios), np.asarray(tail))
 
 
+def first_host() -> bool:
+    """Whether this host judges and writes; the others of a cluster may end before it is done."""
+    first = jax.process_index() == 0
+    if jax.distributed.is_initialized():
+        jax.distributed.shutdown()  # at exit it would wait for the first host, and give up
+    return first
+
+
 def one_of(tree: Any, row: int) -> Any:
     """One problem's share of a batch's results."""
     return jax.tree.map(lambda x: np.asarray(x)[row], tree)
@@ -211,12 +219,18 @@ def written(
     for name, weights in sets.items():
         save_weights(out / "weights" / f"{name.replace(' ', '-')}.json", weights)
     plain = {name: str(x) if isinstance(x, Path) else x for name, x in vars(flags).items()}
-    whole = {"flags": plain, "environment": environment(), **told}
-    write_file(out / "result.json", (json.dumps(whole, indent=1) + "\n").encode())
+    made = environment()
+    write_json(out / "result.json", {"flags": plain, "environment": made, **told})
     model = f"through {flags.net.name}" if flags.net else "on the plain rigid body"
     about = f"Tuned {model}, at most {flags.iterations} iterations. Losses in 1e6."
     name, caption = picture
-    text = [paragraphs[0], about, *paragraphs[1:], f"![{caption}]({name})\n\n{caption}"]
+    text = [
+        paragraphs[0],
+        made_at(made),
+        about,
+        *paragraphs[1:],
+        f"![{caption}]({name})\n\n{caption}",
+    ]
     write_file(out / "report.md", ("\n\n".join(text) + "\n").encode())
     print(out / "report.md")
 
@@ -232,6 +246,8 @@ def shared(flags: Shared) -> None:
     tails = {"mean of all": 1.0, "worst of all": 0.0}
     asked = [problem(nominal(), walks, tail) for tail in tails.values()]
     together = tuned(flags, robot, effects, asked, "one set for all")
+    if not first_host():
+        return
 
     sets = {"nominal": nominal(), "expert": expert()}
     sets |= {f"{n} alone": one_of(alone.converged, i) for i, n in enumerate(names)}
@@ -239,7 +255,7 @@ def shared(flags: Shared) -> None:
     with workers(flags.processes) as pool:
         scores = {
             name: judged(pool, robot, sets, command, [hfs()], f"{name} on the hfs")
-            for name, command in {**commands, "unseen": UNSEEN}.items()
+            for name, command in {**commands, "unseen": HELD_BACK}.items()
         }
     loss = {n: {c: float(found[n].L[0]) for c, found in scores.items()} for n in sets}
     fell = {n: [c for c, found in scores.items() if found[n].fallen.any()] for n in sets}
@@ -292,12 +308,12 @@ def drawn_variations(count: int, noise: bool) -> list[Variation]:
 def robust(flags: Robust) -> None:
     """(b) Weights that bear with variations, judged on plants drawn around the hfs."""
     robot, command = load_robot(), named_command(flags.traj)
-    asked = [problem(nominal(), [scenario(robot, command)])]
-    plain = tuned(flags, robot, whole_net(flags, robot), asked, "the model as it is")
     effects, members = last_command, 1
-    if flags.net is not None:
+    if flags.net is not None:  # another variant's net is refused before anything is tuned
         effects = member_effects(load_net(flags.net, robot, "residual")[0])
         members = len(jax.tree.leaves(effects)[0])
+    asked = [problem(nominal(), [scenario(robot, command)])]
+    plain = tuned(flags, robot, whole_net(flags, robot), asked, "the model as it is")
     variations = drawn_variations(flags.variations, flags.noise)
     walks = [
         scenario(robot, command, effect=i % members, variation=variation)
@@ -306,6 +322,8 @@ def robust(flags: Robust) -> None:
     tails = {"mean": 1.0, "CVaR": TAIL}
     asked = [problem(nominal(), walks, tail) for tail in tails.values()]
     varied = tuned(flags, robot, effects, asked, f"{flags.variations} variations")
+    if not first_host():
+        return
 
     sets = {"nominal": nominal(), "expert": expert(), "as it is": one_of(plain.converged, 0)}
     sets |= {n: one_of(varied.converged, i) for i, n in enumerate(tails)}
@@ -318,7 +336,11 @@ def robust(flags: Robust) -> None:
         f"# Tuned over variations of the model: {flags.traj}",
         f"{flags.variations} variations: mass within 4 %, inertia 20 %, centre of mass 1 cm, "
         "friction 0.6 to 1, effects late by up to 5 ms"
-        + (", members of the net's ensemble in turn" if members > 1 else "")
+        + (
+            ", members of the net's ensemble in turn (`as it is`: through the mean of them all)"
+            if members > 1
+            else ""
+        )
         + (", a noisy estimate" if flags.noise else "")
         + f". CVaR: mean over the worst {TAIL:.0%}. Judged on {flags.plants} plants drawn around "
         "the hfs (hfs-varied).",
@@ -355,6 +377,8 @@ def front(flags: Front) -> None:
     prices = 10.0 ** np.linspace(-flags.decades, flags.decades, flags.points)
     asked = [problem(nominal(), [scenario(robot, command, tracking=p)]) for p in prices]
     found = tuned(flags, robot, whole_net(flags, robot), asked, "prices of tracking")
+    if not first_host():
+        return
     sets = {f"tracking x{p:.3g}": one_of(found.converged, i) for i, p in enumerate(prices)}
     judged_sets = {"nominal": nominal(), "expert": expert(), **sets}
     with workers(flags.processes) as pool:
@@ -409,6 +433,8 @@ def starts(flags: Starts) -> None:
     begin = [nominal(), *disturbed(nominal(), flags.factor, flags.starts - 1)]
     asked = [problem(w, [scenario(robot, command)]) for w in begin]
     found = tuned(flags, robot, whole_net(flags, robot), asked, "starts")
+    if not first_host():
+        return
     sound = np.asarray(found.stop) != Stop.BAD_START
     first, last = found.course.loss[sound, 0], found.loss[sound]
     accepted = found.course.reason == Reason.ACCEPTED
@@ -427,7 +453,8 @@ def starts(flags: Starts) -> None:
     text = [
         f"# How much the start matters: {flags.traj}",
         f"{flags.starts} starts, the first at nominal, the others log-uniform within "
-        f"x/{flags.factor:g} of it; {int((~sound).sum())} fall at once and are refused.",
+        f"x/{flags.factor:g} of it; {int((~sound).sum())} are refused at their "
+        "first walk: a fall, a plan that is not solved, or numbers that are not finite.",
         table(["L on the model", "least", "25 %", "median", "75 %", "most"], rows),
         f"From nominal: {million(last[0] if sound[0] else np.nan)}, "
         f"{int(np.sum(last < last[0]))} of the others end lower.",
@@ -448,20 +475,21 @@ def verdict(flags: Verdict) -> None:
     sets = {"nominal": nominal(), "expert": expert()}
     sets |= {path.stem: load_weights(path) for path in paths}
     plants = [standin(seed) for seed in range(flags.first_seed, flags.first_seed + flags.seeds)]
-    command = UNSEEN if flags.traj == "unseen" else named_command(flags.traj)
+    command = HELD_BACK if flags.traj == "unseen" else named_command(flags.traj)
     with workers(flags.processes) as pool:
         title = f"{flags.traj} on the hardware stand-in"
         scores = judged(pool, load_robot(), sets, command, plants, title, flags.first_seed)
     last = flags.first_seed + flags.seeds - 1
+    made = environment()
     text = [
         f"# On the hardware stand-in: {flags.traj}",
+        made_at(made),
         f"Seeds {flags.first_seed} to {last}. Losses in 1e6.",
         plant_table(scores, "nominal"),
     ]
     name = f"verdict-{flags.traj}"
     write_file(flags.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
-    told = {"environment": environment(), "standin": as_numbers(scores)}
-    write_file(flags.out / f"{name}.json", (json.dumps(told, indent=1) + "\n").encode())
+    write_json(flags.out / f"{name}.json", {"environment": made, "standin": as_numbers(scores)})
     print(flags.out / f"{name}.md")
 
 
@@ -473,12 +501,8 @@ def main() -> None:
     )
     setup_jax()
     all_devices()
-    try:
-        does[type(flags)](flags)
-    except ValueError as error:
-        say(f"batch: {error}")
-        raise SystemExit(2) from None
+    does[type(flags)](flags)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code("batch", main))

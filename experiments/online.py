@@ -3,18 +3,21 @@
 A payload is put on the trunk in the middle of a walk. Weights that stay are compared with weights
 that take a step of DiffTune after every window of measured states (`tuning.online`), on the hfs
 and plants around it, from several start weights; and with weights that are tuned until the change
-only, which tells adapting to the payload from tuning as such. Other ways to the gradient are
-walked beside: sensitivities begun anew in each window, the model's own walk from the window's first
-state, and the plain rigid body in the place of GRFM-Net.
+only. What tuning all the way has over these is adapting to the payload and, not told apart from it,
+the ordinary tuning that goes on after the change. Other ways to the gradient are walked beside:
+sensitivities begun anew in each window, the model's own walk from the window's first state, and the
+plain rigid body in the place of GRFM-Net.
 
-    python experiments/online.py --data data --tuned straight runs/.../weights/with.json c ... s ...
+    python experiments/online.py --sets nominal expert tuned \
+        --tuned straight runs/.../weights/with.json c ... s ...
 
 Walks are kept under OUT/walks and taken up again. `--standin` adds plants of the hardware stand-in,
 for a verdict; nothing here was chosen by them.
 """
 
 import hashlib
-import json
+import math
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -28,7 +31,7 @@ import numpy as np
 import tyro
 
 from hector_jax import pipeline
-from hector_jax.console import bar
+from hector_jax.console import bar, exit_code, made_at
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import (
     WEIGHT_NAMES,
@@ -47,7 +50,14 @@ from hector_jax.sim.changes import Change
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import fingerprint, load_tree, load_weights, save_tree, write_file
+from hector_jax.storage import (
+    fingerprint,
+    load_tree,
+    load_weights,
+    save_tree,
+    write_file,
+    write_json,
+)
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
@@ -61,6 +71,7 @@ ARMS = {
     "model": "the model's own walk from each window's first state",
     "plain": "no net: the plain rigid body",
 }
+SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] by which losses are told
 
 
@@ -72,7 +83,7 @@ class Flags:
     out: Path = Path("runs/online")  # folder of the report
     tuned: dict[str, Path] = field(default_factory=dict)  # TRAJ FILE of tuned start weights
     trajectories: tuple[str, ...] = COMMANDS
-    sets: tuple[str, ...] = ("nominal", "expert", "tuned")
+    sets: tuple[str, ...] = ("nominal", "expert")  # start weights; or tuned, which needs --tuned
     arms: tuple[str, ...] = tuple(ARMS)
     varied: tuple[int, ...] = ()  # seeds of hfs-varied, beside the hfs
     standin: tuple[int, ...] = ()  # seeds of the hardware stand-in
@@ -87,6 +98,15 @@ class Flags:
         for name in self.arms:
             if name not in ARMS:
                 raise ValueError(f"Flags.arms must be of {', '.join(ARMS)}, got {name!r}")
+        for name in self.sets:
+            if name not in SETS:
+                raise ValueError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
+        count = round(self.seconds / WINDOW)
+        if count < 2 or abs(self.seconds - count * WINDOW) > 1e-9:
+            raise ValueError(
+                f"Flags.seconds must be a multiple of {WINDOW:g} s, two at least, "
+                f"got {self.seconds:g}"
+            )
         if not 0.0 < self.change < self.seconds:
             raise ValueError(f"Flags.change must lie within the walk, got {self.change} s")
 
@@ -192,8 +212,9 @@ def walk_cases(
     flags: Flags,
     robot: Robot,
     effects: Mapping[str, jax.tree_util.Partial],
+    starts: Mapping[tuple[str, str], Weights],
 ) -> dict[Case, Walked]:
-    """All walks; those that are on disk are taken."""
+    """All walks, from start weights by trajectory and set; those that are on disk are taken."""
     config = OnlineConfig(window=flags.window, late=flags.late)
     changes = (Change(start=flags.change, payload=flags.payload),)
     host = partial(jax.tree.map, np.asarray)
@@ -201,7 +222,7 @@ def walk_cases(
     for plant, (imperfections, seed) in plants(flags).items():
         for trajectory in flags.trajectories:
             for which in flags.sets:
-                weights = host(start_weights(flags, trajectory, which))
+                weights = host(starts[trajectory, which])
                 for arm in flags.arms:
                     estimator = arm if arm in ("cut", "model") else "carried"
                     effect = effects["command" if arm == "plain" else "net"]
@@ -237,13 +258,14 @@ def main() -> None:
     """Write report.md, online.json and the pictures."""
     flags = tyro.cli(Flags)
     setup_jax()
+    starts = {(t, s): start_weights(flags, t, s) for t in flags.trajectories for s in flags.sets}
     robot = jax.tree.map(np.asarray, load_robot())
     flags.out.mkdir(parents=True, exist_ok=True)
     with workers(flags.processes) as pool:
         net = pipeline.ground(pool, TuneConfig(), robot, flags.data)
         effects = {"command": last_command, "net": as_effect(net.params)}
         effects = {name: jax.tree.map(np.asarray, effect) for name, effect in effects.items()}
-        found = walk_cases(pool, flags, robot, effects)
+        found = walk_cases(pool, flags, robot, effects, starts)
     print(report(flags, found))
 
 
@@ -320,7 +342,10 @@ def verdicts(flags: Flags, found: Mapping[Case, Walked]) -> list[str]:
         )
         if arm != "until" and "until" in flags.arms:
             stopped = _changes(found, cases, "after", "until")
-            text += f". Against tuning until the change: {_spread(stopped)}"
+            text += (
+                f". Against tuning until the change: {_spread(stopped)}; that is adapting to the "
+                f"payload and {flags.seconds - flags.change:g} s more of ordinary tuning"
+            )
         told.append(text + ".")
     return told
 
@@ -355,21 +380,30 @@ def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
                 row = found[Case(names[0], trajectory, which, "carried")]
                 if len(row.weights):
                     courses[trajectory] = row.weights / row.weights[0]
+            if not courses:  # no window ended within a walk
+                continue
             ends = window * np.arange(1, 1 + max(len(c) for c in courses.values()))
             file = f"weights-{which}.png"
             caption = plots.weight_courses(
                 flags.out / file, flags.change, ends, WEIGHT_NAMES, courses
             )
             pictures.append((file, f"Start: {which}, plant {names[0]}. {caption}"))
+    about = environment()
+    counts = {"plant": len(names), "trajectory": len(flags.trajectories), "start": len(flags.sets)}
+    plural = {"plant": "plants", "trajectory": "trajectories", "start": "starts"}
+    crossed = " x ".join(f"{n} {name if n == 1 else plural[name]}" for name, n in counts.items())
     text = [
         "# Does tuning while walking help when the plant changes?",
+        made_at(about),
         f"A payload of {flags.payload:g} kg is put on the trunk {flags.change:g} s into walks of "
         f"{flags.seconds:g} s, on {', '.join(names)}. The weights take a step of at most 5 % (Q) "
         f"and 8 % (R) of themselves every {window:g} s, in force {10 * flags.late} ms after the "
         "window that it was computed from.",
         "\n".join(f"- `{arm}`: {ARMS[arm]}" for arm in flags.arms),
         "## What came out",
-        "Changes of L in %, median over the walks and, in brackets, the least and the largest:",
+        "Changes of L in %, median over the walks and, in brackets, the least and the largest. "
+        f"The {math.prod(counts.values())} walks of an arm are {crossed}, not independent of each "
+        "other:",
         "\n".join(verdicts(flags, found)),
         f"A gradient over {window:g} s of walking with its step took {1e3 * np.median(took):.0f} "
         f"ms of processor time in the median, {1e3 * np.percentile(took, 5):.0f} to "
@@ -385,7 +419,7 @@ def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
     ]
     told = {
         "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
-        "environment": environment(),
+        "environment": about,
         "weights": WEIGHT_NAMES,
         "walks": {
             " / ".join(case): {name: value.tolist() for name, value in row._asdict().items()}
@@ -395,10 +429,10 @@ def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
         if len(took)
         else None,
     }
-    write_file(flags.out / "online.json", (json.dumps(told, indent=1) + "\n").encode())
+    write_json(flags.out / "online.json", told)
     write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
     return flags.out / "report.md"
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code("online", main))

@@ -15,6 +15,7 @@ import hashlib
 import json
 import shutil
 import statistics
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -28,7 +29,7 @@ import numpy as np
 import tyro
 
 from hector_jax import pipeline
-from hector_jax.console import bar, say
+from hector_jax.console import bar, exit_code, made_at, say
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.evaluation import plots
@@ -40,7 +41,7 @@ from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.walk import Job, walk_job
 from hector_jax.sim.world import hfs
-from hector_jax.storage import fingerprint, make_folder, write_file, write_json
+from hector_jax.storage import fingerprint, make_folder, versions, write_file, write_json
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.race import Raced, Turn, lowest, race, walks
@@ -161,8 +162,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
         write_json(part / "seconds.json", took)
         part.rename(folder)
     took = json.loads((folder / "seconds.json").read_text())
-    path = pipeline.net_path(folder, TrainConfig().variant)
-    return load_net(path, robot, TrainConfig().variant)[0], took
+    return pipeline.ground(pool, TuneConfig(), robot, folder).params, took
 
 
 def on_model(
@@ -175,6 +175,8 @@ def on_model(
 ) -> tuple[dict[str, Course], float]:
     """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
     key = f"{config!r} {RATE} {fingerprint(command)} {fingerprint(params)} {fingerprint(robot)}"
+    # seconds are kept too: they are of this code, these packages and so many at once
+    key += f" {versions()} {flags.processes} {environment().get('commit')}"
     path = flags.out / f"model-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
@@ -232,6 +234,8 @@ def run(
         "robot": fingerprint(robot),
         "plant": fingerprint(hfs()),
         "command": fingerprint(command),
+        "start": fingerprint(nominal()),
+        "versions": versions(),
         "settings": hashlib.sha256(repr(sorted(rivals.items())).encode()).hexdigest()[:12],
     }
 
@@ -379,12 +383,13 @@ def report(
         ),
         "seconds.png": plots.race(flags.out / "seconds.png", spent, "seconds of one core"),
     }
+    about = environment()
     write_json(
         flags.out / "race.json",
         {
             "flags": {n: str(v) for n, v in asdict(flags).items()},
             "engine": engine,
-            "environment": environment(),
+            "environment": about,
             "start": start,
             "prices": prices._asdict(),
             "took": took,
@@ -393,6 +398,7 @@ def report(
         },
     )
     text = _words(flags, engine, start, table, courses, prices, took)
+    text.insert(1, made_at(about))
     text += [f"![{name}]({name})\n\n{caption}" for name, caption in captions.items()]
     write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
     return flags.out / "report.md"
@@ -448,4 +454,4 @@ def _words(
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code("race", main))

@@ -11,6 +11,8 @@ scores of finished walks are kept under OUT/scores and taken up again.
 """
 
 import hashlib
+import re
+import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +23,7 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax.console import bar
+from hector_jax.console import bar, exit_code
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation import metrics, plots
@@ -95,8 +97,11 @@ def weight_sets(named: Sequence[str]) -> dict[str, Weights]:
     sets = {BASELINE: nominal(), "expert": expert()}
     for text in named:
         name, _, file = text.partition("=")
-        if not name or not file or name in sets:
-            raise ValueError(f"--set must be NAME=FILE with a new name, got {text!r}")
+        # names are parts of files' names, where other characters might make two of them one
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not file or name in sets:
+            raise ValueError(
+                f"--set must be NAME=FILE, a new NAME of letters, digits and _, got {text!r}"
+            )
         sets[name] = load_weights(Path(file))
     return sets
 
@@ -247,4 +252,4 @@ def report(flags: Flags, found: Found, folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code("robustness", main))

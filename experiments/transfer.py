@@ -16,6 +16,7 @@ controller and trained. Over data that another one walked, the command alone is 
 """
 
 import hashlib
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, field
@@ -28,7 +29,7 @@ import numpy as np
 import tyro
 
 from hector_jax import pipeline
-from hector_jax.console import bar, say
+from hector_jax.console import bar, exit_code, made_at, say
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
@@ -58,6 +59,7 @@ from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tu
 from hector_jax.tuning.loss import LossConfig, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
+SETS = ("nominal", "expert", "tuned")
 FACTORS = (1.5, 3.0)  # within which the weight sets of the rank correlation lie
 
 
@@ -69,13 +71,24 @@ class Flags:
     out: Path = Path("runs/transfer")  # folder of the report
     tuned: dict[str, Path] = field(default_factory=dict)  # TRAJ FILE; else tuned here, ten steps
     trajectories: tuple[str, ...] = COMMANDS
-    sets: tuple[str, ...] = ("nominal", "expert", "tuned")
+    sets: tuple[str, ...] = SETS
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
     lead: int = 40  # ticks in place before t = 0 on the model; told beside none
     ranks: int = 64  # weight sets about nominal for each rank correlation; 0 leaves them out
     effort_about: str = "zero"  # or weight: see MpcConfig
     stance_weight: bool = False  # see LegConfig
     processes: int = 2  # one core each
+
+    def __post_init__(self) -> None:
+        for name in self.sets:
+            if name not in SETS:
+                raise ValueError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
+        for name in self.tuned:
+            if name not in self.trajectories:
+                raise ValueError(
+                    f"Flags.tuned must be of the trajectories {', '.join(self.trajectories)}, "
+                    f"got {name!r}"
+                )
 
 
 class Walked(NamedTuple):
@@ -126,23 +139,29 @@ def phis(
 
 
 def tuned_sets(
-    pool: Executor, flags: Flags, config: TuneConfig, robot: Robot, params: Params | None
+    pool: Executor,
+    flags: Flags,
+    config: TuneConfig,
+    robot: Robot,
+    params: Params | None,
+    given: Mapping[str, Weights],
 ) -> dict[str, Weights]:
-    """Weights after the paper's ten iterations by trajectory, from files or tuned now."""
+    """Weights after the paper's ten iterations by trajectory: given ones, kept ones or made now."""
     key = f"{config!r} {fingerprint(params)} {fingerprint(robot)}".encode()
     digest = hashlib.sha256(key).hexdigest()[:12]
-    kept = {name: flags.out / f"tuned-{name}-{digest}.json" for name in flags.trajectories}
-    kept |= flags.tuned
-    missing = {
-        name: (named_command(name), params)
+    kept = {
+        name: flags.out / f"tuned-{name}-{digest}.json"
         for name in flags.trajectories
-        if not kept[name].exists()
+        if name not in given
+    }
+    missing = {
+        name: (named_command(name), params) for name, path in kept.items() if not path.exists()
     }
     if missing:
         found = pipeline.tune_many(pool, config, robot, missing, "tuning, ten iterations")
         for name, tuning in found.items():
             save_weights(kept[name], tuning.ten)
-    return {name: load_weights(kept[name]) for name in flags.trajectories}
+    return {**given, **{name: load_weights(path) for name, path in kept.items()}}
 
 
 _loss = jax.jit(lambda walk: total(LossConfig(), losses(walk)))
@@ -248,6 +267,7 @@ def main() -> None:
     """Write report.md, transfer.json and the pictures."""
     flags = tyro.cli(Flags)
     setup_jax()
+    given = {name: load_weights(path) for name, path in flags.tuned.items()}
     robot = jax.tree.map(np.asarray, load_robot())
     walk = WalkConfig(
         mpc=MpcConfig(effort_about=flags.effort_about),
@@ -262,7 +282,9 @@ def main() -> None:
     flags.out.mkdir(parents=True, exist_ok=True)
     with workers(flags.processes) as pool:
         effects, params = phis(pool, configs[""], robot, flags.data)
-        tuned = tuned_sets(pool, flags, configs[""], robot, params) if "tuned" in flags.sets else {}
+        tuned = {}
+        if "tuned" in flags.sets:
+            tuned = tuned_sets(pool, flags, configs[""], robot, params, given)
         spots = {
             (which, name): Point(
                 {"nominal": nominal(), "expert": expert(), "tuned": tuned.get(name)}[which],
@@ -368,8 +390,10 @@ def report(
     fell = {name: int(seen.fallen.sum()) for name, seen in walked.items() if seen.fallen.any()}
     worst = max(float(seen.residual.max()) for seen in walked.values())
     count, phases = sum(len(seen.loss) for seen in walked.values()), len(flags.phases)
+    about = environment()
     text = [
         "# Does the gradient transfer?",
+        made_at(about),
         f"The model's gradient of L in 18 log-weights against that of the high-fidelity simulator: "
         f"central differences of +-5 %, mean over the start phases (gait ticks "
         f"{', '.join(map(str, flags.phases))}). Controller: effort priced about "
@@ -407,7 +431,7 @@ def report(
     text += ["## Pictures", *(f"![{name}]({name})\n\n{caption}" for name, caption in pictures)]
     told = {
         "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
-        "environment": environment(),
+        "environment": about,
         "engine": engine,
         "weights": DIRECTION_NAMES,
         "rows": {
@@ -472,4 +496,4 @@ def _draw(
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(exit_code("transfer", main))

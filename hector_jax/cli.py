@@ -8,7 +8,7 @@ import sys
 
 import tyro
 
-from hector_jax.console import fail
+from hector_jax.console import exit_code
 from hector_jax.flags import Command
 from hector_jax.runtime import setup_jax
 
@@ -24,14 +24,7 @@ def main() -> int:
     setup_jax()
     from hector_jax import commands  # after the flags: `hector --help` answers at once
 
-    try:
-        commands.run(args)
-    except (ValueError, OSError) as error:
-        return fail(str(error))
-    except KeyboardInterrupt:
-        fail("interrupted")
-        return 130
-    return 0
+    return exit_code("hector", lambda: commands.run(args))
 
 
 if __name__ == "__main__":

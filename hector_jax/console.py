@@ -1,9 +1,11 @@
 """What a person sees while waiting: one line or one bar on stderr; stdout carries results only."""
 
+import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -57,7 +59,31 @@ def bar(title: str) -> Iterator[Tell]:
     say(f"{title}: done in {time.monotonic() - start:.0f} s")
 
 
-def fail(text: str) -> int:
-    """One line that says what is wrong, and the exit code for bad input."""
-    print(f"hector: {' '.join(str(text).split())}", file=sys.stderr)
-    return 2
+def exit_code(name: str, work: Callable[[], None]) -> int:
+    """Do the work of a program; its exit code, with one line on stderr where that is not 0.
+
+    Args:
+        name: of the program, before the line.
+        work: ValueError and OSError are told as bad input (2), an interrupt as such (130).
+    """
+    try:
+        work()
+    except (ValueError, OSError) as error:
+        code, text = 2, " ".join(str(error).split())
+    except KeyboardInterrupt:
+        code, text = 130, "interrupted"
+    else:
+        return 0
+    print(f"{name}: {text}", file=sys.stderr)
+    return code
+
+
+def made_at(environment: Mapping[str, str]) -> str:
+    """Line of a report that tells where it comes from: the commit, and the script with its flags.
+
+    Args:
+        environment: `evaluation.report.environment`; without a commit outside of a checkout.
+    """
+    script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
+    command = shlex.join(["python", script, *sys.argv[1:]])
+    return f"Made at {environment.get('commit', 'an unknown commit')} by `{command}`."

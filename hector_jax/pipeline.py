@@ -47,11 +47,15 @@ def choose_engine(asked: str) -> str:
     Raises:
         ValueError: none of the three.
     """
-    if asked not in ("auto", "c", "mjx"):
-        raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {asked!r}")
+    _check_engine(asked)
     if asked == "auto":
         return "c" if jax.default_backend() == "cpu" else "mjx"
     return asked
+
+
+def _check_engine(asked: str) -> None:
+    if asked not in ("auto", "c", "mjx"):
+        raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {asked!r}")
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class CollectConfig:
     engine: str = "auto"  # c: MuJoCo on the processes; mjx: all at once; auto: mjx on a GPU
 
     def __post_init__(self) -> None:
-        choose_engine(self.engine)
+        _check_engine(self.engine)  # devices stay unasked: their number may not be set up yet
         if self.walks < 3:
             raise ValueError(
                 "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "

@@ -35,21 +35,24 @@ DOORS = {
 }
 
 
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            for alias in node.names:
+                if (ROOT.parent / node.module.replace(".", "/") / f"{alias.name}.py").exists():
+                    yield f"{node.module}.{alias.name}"
+
+
 def modules():
     for path in sorted(ROOT.rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
-        if not name:
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                for alias in node.names:
-                    yield name, alias.name
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                yield name, node.module
-                for alias in node.names:
-                    if (ROOT.parent / node.module.replace(".", "/") / f"{alias.name}.py").exists():
-                        yield name, f"{node.module}.{alias.name}"
+        if name:
+            yield from ((name, target) for target in imported(path))
 
 
 IMPORTS = sorted(set(modules()))
@@ -83,3 +86,15 @@ def test_each_outside_package_has_its_door(package):
 def test_nothing_that_learns_or_searches_can_reach_the_stand_in():
     inside = {name for name, target in IMPORTS if target.startswith("hector_jax.sim.standin")}
     assert all(name.startswith("commands") for name in inside), inside
+
+
+def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
+    scripts = [
+        p for room in ("experiments", "benchmarks") for p in (ROOT.parent / room).glob("*.py")
+    ]
+    knowing = {
+        f"{path.parent.name}.{path.stem}"
+        for path in scripts
+        if any(name.startswith("hector_jax.sim.standin") for name in imported(path))
+    }
+    assert knowing == {f"experiments.{name}" for name in ("robustness", "online", "batch")}

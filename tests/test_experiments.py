@@ -1,0 +1,86 @@
+"""Scripts of experiments/ refuse what they cannot use, before anything is computed."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hector_jax.console import exit_code, made_at
+from hector_jax.control.weights import nominal
+from hector_jax.storage import save_weights
+
+FOLDER = Path(__file__).parents[1] / "experiments"
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(f"experiments_{name}", FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(ValueError, 2), (OSError, 2), (KeyboardInterrupt, 130)]
+)
+def test_a_script_ends_in_one_line_and_a_code(capsys, error, code):
+    def work():
+        raise error("no\nsuch thing")
+
+    assert exit_code("race", work) == code
+    assert capsys.readouterr().err.startswith("race: ")
+
+
+def test_a_report_tells_commit_and_command(monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(FOLDER / "race.py"), "--traj", "s"])
+    told = made_at({"commit": "abc"})
+    assert told == "Made at abc by `python experiments/race.py --traj s`."
+
+
+@pytest.mark.parametrize("name", ["online", "transfer"])
+def test_start_weights_of_no_known_name_are_refused(name):
+    with pytest.raises(ValueError, match="Flags.sets must be of nominal, expert, tuned, got 'foo'"):
+        script(name).Flags(sets=("foo",))
+
+
+def test_online_asks_for_no_file_by_itself_and_for_whole_windows():
+    online = script("online")
+    flags = online.Flags()
+    for trajectory in flags.trajectories:
+        for which in flags.sets:
+            online.start_weights(flags, trajectory, which)
+    with pytest.raises(ValueError, match="multiple of 0.4 s"):
+        online.Flags(seconds=5.0)
+
+
+def test_a_missing_file_of_tuned_weights_is_refused_and_not_written(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "mistyped.json"
+    transfer = script("transfer")
+    out = tmp_path / "out"
+    arguments = ["transfer.py", "--tuned", "straight", str(path), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert exit_code("transfer", transfer.main) == 2
+    assert str(path) in capsys.readouterr().err
+    assert not path.exists()
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("name", ["a b", "a-b", "a/b", "1"])
+def test_names_that_files_could_not_tell_apart_are_refused(tmp_path, name):
+    save_weights(tmp_path / "w.json", nominal())
+    robustness = script("robustness")
+    assert "a_b" in robustness.weight_sets([f"a_b={tmp_path / 'w.json'}"])
+    with pytest.raises(ValueError, match="NAME=FILE"):
+        robustness.weight_sets([f"{name}={tmp_path / 'w.json'}"])
+
+
+def test_batch_sets_up_its_devices_and_refuses_a_missing_net(tmp_path):
+    arguments = [FOLDER / "batch.py", "robust", "--net", tmp_path / "none.npz"]
+    environment = os.environ | {"PYTHONPATH": str(FOLDER.parent)}
+    done = subprocess.run(
+        [sys.executable, *arguments], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("batch: cannot read")
