@@ -166,6 +166,7 @@ def test_impossible_problems_are_refused(wrong, told):
 
 TWO_DEVICES = """
 import sys, numpy as np, jax
+from functools import partial
 from hector_jax.runtime import setup_jax
 setup_jax()
 import test_batch as t
@@ -176,7 +177,8 @@ assert len(jax.devices()) == 2
 one, two = (
     t.tune_batch(config, t.ROBOT, asked, t.last_command, devices=jax.devices()[:n]) for n in (1, 2)
 )
-jax.tree.map(np.testing.assert_array_equal, one, two)
+# a program of another batch size may round otherwise
+jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-12), one, two)
 print("same", one.iterations.tolist())
 """
 
