@@ -18,7 +18,7 @@ from jaxtyping import Float
 from hector_jax.control.weights import DIRECTION_NAMES, Weights
 from hector_jax.storage import as_json, write_file
 from hector_jax.tuning.rivals import Rival, Steps
-from hector_jax.tuning.search import Generation, Walk, placed
+from hector_jax.tuning.search import Generation, Walk, placed, read_record
 
 FORMAT = 1
 START = "start"
@@ -138,22 +138,9 @@ def _append(path: Path, line: Mapping[str, Any]) -> None:
 
 
 def _read(path: Path, head: Mapping[str, Any]) -> list[dict[str, Any]] | None:
-    """Lines of a record after its head; a last one that was cut short is dropped from the file."""
+    """Lines of a record after its head; None without one."""
+    lines = read_record(path, head, "race")
     try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return None
-    end = data.rfind(b"\n") + 1
-    try:
-        kept, *lines = [json.loads(line) for line in data[:end].splitlines()]
-        differs = [name for name in head | kept if kept.get(name) != head.get(name)]
-    except (ValueError, TypeError) as error:
+        return None if lines is None else [json.loads(line) for line in lines]
+    except ValueError as error:
         raise ValueError(f"{path}: no record of a race: {error}") from error
-    if differs:
-        name = differs[0]
-        raise ValueError(
-            f"{path}: record of another race, its {name} is {str(kept.get(name))[:80]}, asked for "
-            f"is {str(head.get(name))[:80]}; choose another folder"
-        )
-    os.truncate(path, end)
-    return lines

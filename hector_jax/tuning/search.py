@@ -256,8 +256,19 @@ def room(start: Weights) -> Float[np.ndarray, "18 2"]:
     return np.log(np.stack([low, high], axis=1) / at[:, None])[tied]
 
 
-def _read(path: Path, head: Mapping[str, Any]) -> list[Generation] | None:
-    """Generations of a record, which loses a last line that was cut short; None without one."""
+def read_record(path: Path, head: Mapping[str, Any], what: str) -> list[bytes] | None:
+    """Lines of a record after its head; None without a record.
+
+    A last line that was cut short is dropped from the file.
+
+    Args:
+        path: of the record.
+        head: settings that its first line has to hold.
+        what: it is a record of, for who reads the error.
+
+    Raises:
+        ValueError: it is no record, or one of other settings.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -268,13 +279,22 @@ def _read(path: Path, head: Mapping[str, Any]) -> list[Generation] | None:
         kept = json.loads(first)
         differs = [name for name in head | kept if kept.get(name) != head.get(name)]
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: no record of a search: {error}") from error
+        raise ValueError(f"{path}: no record of a {what}: {error}") from error
     if differs:
         name = differs[0]
         raise ValueError(
-            f"{path}: record of another search, its {name} is {str(kept.get(name))[:80]}, asked "
+            f"{path}: record of another {what}, its {name} is {str(kept.get(name))[:80]}, asked "
             f"for is {str(head.get(name))[:80]}; choose another folder"
         )
+    os.truncate(path, end)
+    return lines
+
+
+def _read(path: Path, head: Mapping[str, Any]) -> list[Generation] | None:
+    """Generations of a record; None without one."""
+    lines = read_record(path, head, "search")
+    if lines is None:
+        return None
     found = []
     for number, line in enumerate(lines, 2):
         try:
@@ -290,5 +310,4 @@ def _read(path: Path, head: Mapping[str, Any]) -> list[Generation] | None:
                 f"{losses.shape}, expected {shape} and {shape[:1]}"
             )
         found.append(Generation(steps, losses))
-    os.truncate(path, end)
     return found
