@@ -25,7 +25,7 @@ from hector_jax.evaluation import metrics
 from hector_jax.evaluation.metrics import Score
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import Params
-from hector_jax.robot import Robot
+from hector_jax.robot import MODEL_PATH, Robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import Imperfections
 from hector_jax.storage import fingerprint, load_tree, save_tree, versions
@@ -58,10 +58,11 @@ class Judged(NamedTuple):
 
 
 def digest(*parts: Any) -> str:
-    """Twelve digits that stand for settings (known by their repr) and trees of numbers."""
+    """Twelve digits for settings (known by their repr), trees of numbers and the plants' XML."""
     is_tree = lambda x: isinstance(x, tuple) or x is None  # noqa: E731
     told = [fingerprint(part) if is_tree(part) else repr(part) for part in parts]
-    return hashlib.sha256("\n".join([*told, repr(versions())]).encode()).hexdigest()[:12]
+    key = "\n".join([*told, repr(versions())]).encode() + MODEL_PATH.read_bytes()
+    return hashlib.sha256(key).hexdigest()[:12]
 
 
 def _taken(path: Path, like: Any, kind: str, robot: Robot) -> tuple[Any, dict[str, Any]] | None:

@@ -3,10 +3,12 @@
 import numpy as np
 
 from hector_jax.control.weights import nominal
-from hector_jax.evaluation.metrics import SETS, Score, Verdict
+from hector_jax.evaluation.metrics import Score, Verdict
 from hector_jax.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.difftune import Evaluation, Iteration
 from hector_jax.tuning.loss import LossConfig, Losses
+
+SETS = ("nominal", "expert", "without_ten", "with_ten", "without", "with")
 
 
 def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, turn=0.0):

@@ -5,12 +5,12 @@ import json
 
 import numpy as np
 import pytest
-from pretend import pretend_history, pretend_verdict
+from pretend import SETS, pretend_history, pretend_verdict
 from rich.console import Console
 
 from hector_jax.control.weights import bounds
 from hector_jax.evaluation import report
-from hector_jax.evaluation.metrics import SETS, Verdict
+from hector_jax.evaluation.metrics import Verdict
 from hector_jax.evaluation.report import Picture, Report, print_table, write_report
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import LossConfig, Losses

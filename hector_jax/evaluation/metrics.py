@@ -20,7 +20,6 @@ from jaxtyping import Bool, Float, Int
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.loss import LossConfig, losses, switch_loss, total
 
-SETS = ("nominal", "expert", "without_ten", "with_ten", "without", "with")
 BASELINES = ("nominal", "expert")
 PARTS = ("L", "L_Eul", "L_pos", "L_ctrl")
 
