@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import pipeline, study
+from hector_jax import pipeline, replay, study
 from hector_jax.console import say
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
@@ -37,6 +37,7 @@ from hector_jax.flags import (
     Doctor,
     Evaluate,
     Grfm,
+    Replay,
     Search,
     Table,
     Train,
@@ -247,13 +248,14 @@ def _tune(args: Tune) -> None:
         write_json(folder / "config.json", resolved)
         write_json(folder / "versions.json", environment())
         shifts: list[dict[str, Any]] = []
+        dumps = folder / "dumps"
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
 
             def note(name: str, iteration: Iteration) -> None:
                 metrics_file.write(pipeline.as_line(name, iteration))
 
             title = f"tuning {args.traj} without and with GRFM-Net"
-            tunings = pipeline.tune_many(pool, config, robot, problems, title, note)
+            tunings = pipeline.tune_many(pool, config, robot, problems, title, note, dumps)
             newest, tuning = net, tunings["with"]
             for count in range(1, args.refresh + 1):
                 newest, shift = pipeline.refresh(
@@ -270,7 +272,7 @@ def _tune(args: Tune) -> None:
                 name = "with_refreshed" + (str(count) if count > 1 else "")
                 again = {name: (command, newest.params)}
                 title = f"tuning {args.traj} with the net refreshed"
-                tunings |= pipeline.tune_many(pool, config, robot, again, title, note)
+                tunings |= pipeline.tune_many(pool, config, robot, again, title, note, dumps)
                 tuning = tunings[name]
         sets = {
             "nominal": nominal(),
@@ -529,3 +531,11 @@ def _doctor(args: Doctor) -> None:
         short = {name: walks["ideal"] for name in ("one", "other")}
         missing = _film(Path(folder) / "film.mp4", robot, short)
     print(f"{'video':12s} {missing or 'works'}")
+
+
+@run.register
+def _replay(args: Replay) -> None:
+    found = replay.again(args.dump)
+    print(as_json(found._asdict(), indent=2) if args.json else replay.in_words(found))
+    if not found.same:
+        raise ValueError(f"{args.dump}: {replay.verdict(found)}")

@@ -126,7 +126,15 @@ class Doctor:
     """Say what this machine offers: versions, device, precision, cache, video; and test it."""
 
 
-Command = Collect | Train | Grfm | Tune | Search | Table | Evaluate | Walk | Doctor
+@dataclass(frozen=True)
+class Replay:
+    """Do an evaluation again that a tuning refused; exit code 0 where the same bytes come out."""
+
+    dump: Path  # a file of RUN/dumps
+    json: bool = False  # print JSON instead of the table
+
+
+Command = Collect | Train | Grfm | Tune | Search | Table | Evaluate | Walk | Doctor | Replay
 
 
 def settings(flags: Any) -> dict[str, Any]:

@@ -16,6 +16,7 @@ FLOORS = [
     ["tuning", "sim"],
     ["grfm"],
     ["evaluation"],
+    ["replay"],
     ["flags", "pipeline"],
     ["kept"],
     ["study"],

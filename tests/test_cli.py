@@ -43,7 +43,7 @@ def test_help_names_the_commands():
         [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
     )
     assert shown.returncode == 0
-    names = ("collect", "train", "grfm", "tune", "search", "table", "evaluate", "walk", "doctor")
+    names = "collect train grfm tune search table evaluate walk doctor replay".split()
     for name in names:
         assert name in shown.stdout
     assert shown.stderr == ""
