@@ -5,6 +5,7 @@ dump of it holds all that the evaluation followed from (body, weights, command, 
 settings) and what it came to; `again` does it once more and says whether the same comes out.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -155,6 +156,12 @@ def _made(kind: type, tree: dict[str, Any]) -> Any:
 _walk = jax.jit(rollout, static_argnums=0)
 
 
+def _on_cpu() -> AbstractContextManager[Any]:
+    if jax.default_backend() == "cpu":
+        return nullcontext()  # naming the device would compile a tuning's program once more
+    return jax.default_device(jax.local_devices(backend="cpu")[0])
+
+
 def again(path: Path) -> Replayed:
     """Do the evaluation of a dump again, on the CPU, where tunings run.
 
@@ -164,7 +171,7 @@ def again(path: Path) -> Replayed:
     dump, config, about = load(path)
     effect = last_command if dump.params is None else as_effect(dump.params)
     problem = dump.robot, dump.weights, dump.command, dump.anchor, effect
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+    with _on_cpu():
         found = jax.device_get(tune_step(config, *problem))
         walked = jax.device_get(_walk(config.rollout, *problem))
     same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, found)

@@ -173,7 +173,7 @@ def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(tmp_path, params, fau
         assert done.changed == {}
 
 
-@pytest.mark.parametrize("fault", [Fault.STATE, Fault.FALL])
+@pytest.mark.parametrize("fault", [Fault.FALL])
 def test_where_every_step_is_refused_the_run_ends_with_the_reason(tmp_path, params, fault):
     found, lines = tune(tmp_path / "dumps", told(fault), params)
     assert not any(line["accepted"] for line in lines[1:])

@@ -361,8 +361,9 @@ def descend(
     history: list[Iteration] = []
     progress = init(config, weights, first)
     while progress.stop == Stop.GOING:
-        trial = jax.tree.map(np.asarray, progress.trial)
-        found = jax.tree.map(np.asarray, look(trial))
+        # copies, because a view would keep the device's array for as long as the history
+        trial = jax.tree.map(np.array, progress.trial)
+        found = jax.tree.map(np.array, look(trial))
         step = float(progress.share) if history else 0.0
         progress, code = update(config, progress, found)
         reason = _in_words(config, Reason(int(code)), found)
