@@ -1,6 +1,8 @@
 """Faults planted inside a tuning: refused, told, dumped, done again, and never in the weights."""
 
 import json
+import re
+import subprocess
 import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +22,7 @@ from hector_jax.evaluation.report import tuning_section
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import init_params
 from hector_jax.robot import load_robot
+from hector_jax.runtime import workers
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
 from hector_jax.tuning.loss import Losses
@@ -217,6 +220,23 @@ def test_a_start_that_cannot_be_believed_ends_the_run_and_leaves_a_dump(
     assert shown["first"][first] == 0
     assert shown["recorded"] == shown["again"]
     assert shown["again"]["reason"] == reason
+
+
+@pytest.mark.slow  # compiled in two processes
+def test_a_dump_of_a_worker_is_reproduced_by_the_console_script(tmp_path, params):
+    """A worker holds one core, the console script has all; the robot is asked to run."""
+    command = Command(np.array([0.2, 9.0]), np.array([[0.5, 0.0], [9.0, 0.0]]), np.zeros(2))
+    config = TuneConfig(rollout=RolloutConfig(ticks=80))
+    with workers(2) as pool, pytest.raises(ValueError, match="the robot fell"):
+        pipeline.tune_many(pool, config, ROBOT, {"with": (command, params)}, "", dumps=tmp_path)
+    (path,) = tmp_path.iterdir()
+    shown = subprocess.run(
+        [sys.executable, "-m", "hector_jax.cli", "replay", path], capture_output=True, text=True
+    )
+    assert shown.returncode == 0, shown.stderr
+    print(shown.stdout)
+    first = re.search(r"first fallen +tick (\d+)", shown.stdout)
+    assert 20 < int(first[1]) < 80
 
 
 # What replay says
