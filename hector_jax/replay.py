@@ -219,8 +219,7 @@ def in_words(found: Replayed) -> str:
     """A table of what was recorded and what came out, and the verdict."""
     labels = {"gradient": "largest gradient", "fallen": "share fallen", "residual": "QP residual"}
     cell = lambda x: x if isinstance(x, str) else f"{x:.17g}"  # noqa: E731
-    lines = [f"{found.name}, iteration {found.iteration}"]
-    lines += [f"{'':18s}{'recorded':32s}again"]
+    lines = [f"{found.name}, iteration {found.iteration}", f"{'':18s}{'recorded':32s}again"]
     for name, value in found.recorded.items():
         lines.append(f"{labels.get(name, name):18s}{cell(value):32s}{cell(found.again[name])}")
     for name, tick in found.first.items():
@@ -232,11 +231,8 @@ def verdict(found: Replayed) -> str:
     """Whether it is the same, and which versions or machines are not."""
     if found.same:
         return "the same to the last bit"
-    what = "the same reason" if found.recorded["reason"] == found.again["reason"] else "not refused"
-    if found.again["reason"] and what == "not refused":
-        what = "another reason"
-    changed = [
-        f"{name} {then or '-'} -> {now or '-'}" for name, (then, now) in found.changed.items()
-    ]
+    then, now = found.recorded["reason"], found.again["reason"]
+    what = "the same reason, other numbers" if then == now else f"now {now or 'not refused'}"
+    changed = [f"{name} {old or '-'} -> {new or '-'}" for name, (old, new) in found.changed.items()]
     made = f"changed since: {', '.join(changed)}" if changed else "same versions, same machine"
-    return f"not reproduced: {what}, other numbers; {made}"
+    return f"not reproduced: {what}; {made}"
