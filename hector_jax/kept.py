@@ -33,7 +33,8 @@ from hector_jax.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import LossConfig, Losses
 
-Key, Tree = TypeVar("Key"), TypeVar("Tree")
+Key = TypeVar("Key")
+Tree = TypeVar("Tree")
 
 
 class Tuned(NamedTuple):
