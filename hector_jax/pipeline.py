@@ -36,7 +36,7 @@ from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune, measured
 from hector_jax.tuning import search as searching
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
-from hector_jax.tuning.loss import Losses, losses, total
+from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
 
@@ -451,9 +451,6 @@ def ground(
     return learned(train_config, robot, walks, net_path(data, train_config.variant))
 
 
-_loss = jax.jit(lambda config, walk: total(config, losses(walk)), static_argnums=0)
-
-
 def losses_on_hfs(
     pool: Executor,
     config: TuneConfig,
@@ -484,7 +481,9 @@ def losses_on_hfs(
     else:
         filled = jobs + jobs[-1:] * (at_once - len(jobs))
         walks = walk_batch(walk, robot, filled, fine=True)
-    told = iter([float(_loss(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)])
+    told = iter(
+        [float(loss_of(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)]
+    )
     return {name: np.array([next(told) for _ in each]) for name, each in sets.items()}
 
 

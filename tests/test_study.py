@@ -61,6 +61,20 @@ def asked(monkeypatch):
     return told
 
 
+def test_the_plants_of_the_verdict_are_asked_for_once_and_after_all_that_tunes(tmp_path, asked):
+    seen = []
+
+    def late(seeds):
+        seen.append([names for _, *names in asked["tunings"]])
+        assert "search" in asked
+        assert asked["walks"] == 0
+        return plants(seeds)
+
+    names = ("straight", "c", "s")
+    study.make_table(table(tmp_path, quick=True, trajectories=names), late)
+    assert seen == [[["without", "with"]] * 3]
+
+
 def table(tmp_path, **changes):
     return Table(**{"out": tmp_path / "out", "ceiling": tmp_path / "ceiling", **changes})
 

@@ -18,6 +18,7 @@ from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import UNSEEN, Command, named_command
 from hector_jax.control.weights import Weights
 from hector_jax.evaluation.metrics import FALL_MARGIN, Interval, Score, bootstrap
+from hector_jax.evaluation.report import markdown_table
 from hector_jax.sim.changes import Change
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push
@@ -190,13 +191,13 @@ def table(cells: Mapping[Level, Mapping[str, Cell]], losses: Mapping[Level, floa
     baseline, *others = next(iter(cells.values()))
     head = ["", f"{baseline}: falls", "L [1e6]"]
     head += [text for name in others for text in (f"{name}: falls", f"L / {baseline}")]
-    rows = [head, ["---"] + ["---:"] * (len(head) - 1)]
+    rows = []
     for level, found in cells.items():
         row = [level.name, _falls(found[baseline]), f"{losses[level] / 1e6:.2f}"]
         for name in others:
             row += [_falls(found[name]), _ratio(found[name])]
         rows.append(row)
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown_table(head, rows)
 
 
 def _falls(cell: Cell) -> str:

@@ -9,6 +9,7 @@ the larger of the last error and a fixed one, and smoothness stops.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -88,3 +89,9 @@ def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
 def total(config: LossConfig | Alpha, parts: Losses) -> Float[Array, "*batch"]:
     """L of its parts. Source: Eq. 11."""
     return config.euler * parts.euler + config.position * parts.position + parts.control
+
+
+@partial(jax.jit, static_argnums=0)
+def loss_of(config: LossConfig, trajectory: Trajectory) -> Float[Array, ""]:
+    """L of one walk. Source: Eq. 11."""
+    return total(config, losses(trajectory))
