@@ -8,6 +8,7 @@ FOLDER is the one that `hector export` wrote. The recorded walk in it is gone th
 robot, a call every millisecond; what comes out must be what the live controller said.
 """
 
+import hashlib
 import json
 import sys
 import time
@@ -18,10 +19,14 @@ import numpy as np
 from jax import export
 
 
-def load(path: Path):
+def load(folder: Path, card: dict):
     """The compiled controller and its first carry, zeros."""
     jax.config.update("jax_enable_x64", True)
-    exported = export.deserialize(bytearray(path.read_bytes()))
+    name = "controller-cpu.jaxexport"
+    blob = (folder / name).read_bytes()
+    if hashlib.sha256(blob).hexdigest() != card["sha256"][name]:
+        sys.exit(f"{folder / name} is not the file that controller.json tells of")
+    exported = export.deserialize(bytearray(blob))
     arguments, _ = jax.tree.unflatten(exported.in_tree, exported.in_avals)
     control = jax.jit(exported.call).lower(*arguments).compile()
     return control, jax.tree.map(lambda a: np.zeros(a.shape, a.dtype), arguments[0])
@@ -30,7 +35,7 @@ def load(path: Path):
 def main(folder: Path) -> None:
     """Go through the recorded walk, compare and time."""
     card = json.loads((folder / "controller.json").read_text())
-    control, carry = load(folder / "controller-cpu.jaxexport")
+    control, carry = load(folder, card)
     with np.load(folder / "check.npz") as file:
         walk = {name: file[name] for name in file.files}
 

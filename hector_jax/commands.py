@@ -551,8 +551,6 @@ def _export(args: Export) -> None:
     differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
     print(f"largest difference from the live controller: {differences.format(**found)}")
     for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
-        times = (
-            "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f} ms; CPU {cpu_p50:.2f}, {cpu_p99:.2f} ms"
-        )
-        print(f"a call {text}: {times.format(**found[what])}")
+        times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+        print(f"a call {text} [ms]: {times.format(**found[what])}")
     say(f"all of it is in {folder}")

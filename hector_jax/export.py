@@ -218,7 +218,7 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, name: str) -
 
     return "\n".join(
         [
-            f"// Weights `{name}`, tuned with hector_jax, for DRCL-USC/Hector_Simulation, branch",
+            f"// Weights {name!r}, tuned with hector_jax, for DRCL-USC/Hector_Simulation, branch",
             "// ROS_Simulation: these take the place of Q and Alpha in updateMPCIfNeeded() of",
             "// hector_control/ConvexMPC/ConvexMPCLocomotion.cpp.",
             "//",
@@ -530,7 +530,7 @@ def export(
 
     Raises:
         ValueError: as `record` and `export_controller`; or the exported controller differs from the
-            live one by more than TOLERANCE, and then there is no card.
+            live one by more than TOLERANCE, and then nothing is written.
         OSError: the folder cannot be written.
     """
     make_folder(folder)
@@ -542,7 +542,7 @@ def export(
         raise ValueError(
             f"the exported controller differs from the live one by {found.force:.1e} N, "
             f"{found.moment:.1e} N m and {found.torque:.1e} N m at the joints, at most "
-            f"{TOLERANCE:g} was expected; {folder} is not complete"
+            f"{TOLERANCE:g} was expected; nothing was written"
         )
     save_weights(folder / "weights.json", weights, SCHEMA)
     write_json(folder / SCHEMA, weights_schema())

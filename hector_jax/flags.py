@@ -132,9 +132,7 @@ class Export:
 
     run: Path  # folder of a run, or a weights file
     set: str = "with"  # weight set of the run
-    out: Path | None = (
-        None  # folder of the files; `export` in the run or beside the file by default
-    )
+    out: Path | None = None  # folder; `export` in the run or beside the file by default
     traj: str = "straight"  # walked in the ideal world to check the exported controller
     seconds: float = 1.0  # of that walk, after the start-up
     json: bool = False  # print JSON instead of words

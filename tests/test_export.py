@@ -28,6 +28,7 @@ from hector_jax.export import (
     PLATFORMS,
     SCHEMA,
     TOLERANCE,
+    Check,
     check,
     controller,
     export_controller,
@@ -347,6 +348,19 @@ def test_the_command_writes_files_that_run_without_us(monkeypatch, capsys, run):
     spec.loader.exec_module(example)
     example.main(folder)
     assert "1200 calls" in capsys.readouterr().out
+    (folder / "controller-cpu.jaxexport").write_bytes(b"another")
+    with pytest.raises(SystemExit, match="not the file"):
+        example.main(folder)
+
+
+def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsys, run):
+    for part in ("export_controller", "record", "load_controller"):
+        monkeypatch.setattr(commands.export, part, lambda *known: None)
+    found = Check(2e-6, 0.0, 0.0, 0, {}, {})
+    monkeypatch.setattr(commands.export, "check", lambda *known: found)
+    assert call(monkeypatch, run) == 2
+    assert "2.0e-06 N" in capsys.readouterr().err
+    assert list((run / "export").iterdir()) == []
 
 
 def test_the_example_knows_nothing_of_us():
@@ -362,7 +376,7 @@ def test_the_example_knows_nothing_of_us():
             else []
         )
     }
-    assert names == {"json", "sys", "time", "pathlib", "jax", "numpy"}
+    assert names == {"hashlib", "json", "sys", "time", "pathlib", "jax", "numpy"}
 
 
 def test_a_run_is_exported_with_its_own_controller(run):
@@ -402,10 +416,10 @@ def test_a_run_without_settings_is_refused_by_name(run, text):
         find_weights(run, "with")
 
 
-def test_the_file_is_what_the_card_says(monkeypatch, tmp_path):
-    refused = []
-    monkeypatch.setattr(commands.export, "export", lambda *known, **kw: refused.append(kw) or {})
+def test_a_weights_file_is_exported_by_its_name(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(commands.export, "export", lambda *known, **kw: asked.append(kw) or {})
     path = tmp_path / "mine.json"
     save_weights(path, expert())
     assert call(monkeypatch, path, "--json") == 0
-    assert refused == [{"name": "mine.json/mine", "seconds": 1.0}]
+    assert asked == [{"name": "mine.json/mine", "seconds": 1.0}]
