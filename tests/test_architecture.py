@@ -24,14 +24,16 @@ FLOORS = [
 ]
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
-    "mujoco": ("robot", "sim", "evaluation.video"),
+    "mujoco": ("robot", "sim", "evaluation.video", "evaluation.view"),
+    "viser": ("evaluation.view",),
+    "trimesh": ("evaluation.view",),
     "flax": ("grfm.network",),
     "optax": ("grfm.training", "tuning.difftune", "tuning.rivals"),
     "jaxopt": ("control.qp",),
     "cmaes": ("tuning.search",),
     "sklearn": ("tuning.rivals",),
     "matplotlib": ("evaluation.plots",),
-    "tyro": ("cli",),
+    "tyro": ("cli", "flags"),
 }
 
 
