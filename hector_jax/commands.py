@@ -600,7 +600,9 @@ def _view_headless(
     plots.tracking(folder / "tracking.png", walks)
     plots.path_from_above(folder / "path.png", walks)
     after = list(shown.values())[-1]
-    plots.wrenches(folder / "wrenches.png", float(after.walk.period), after.ground)
+    period, ticks = float(after.walk.period), len(after.walk.fallen)
+    first = min(0.4, period * ticks)  # [s], two steps
+    plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
     tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
     if tuned:
         plots.losses(folder / "losses.png", loss, tuned)

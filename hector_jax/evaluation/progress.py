@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -73,7 +74,7 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
     """What `pipeline.as_line` wrote; null, which stands for what is not finite, becomes NaN."""
     number = lambda x: np.array(np.nan if x is None else x, float)  # noqa: E731
     vector = lambda table: np.array([number(table[name]) for name in WEIGHT_NAMES])  # noqa: E731
-    tree = lambda values: jax.tree.map(np.asarray, vector_to_weights(values))  # noqa: E731
+    tree = lambda values: jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(values)))  # noqa: E731
     weights = vector(row["weights"])
     return Iteration(
         iteration=int(row["iteration"]),

@@ -7,6 +7,7 @@ viser, of the extra `view`, and asks no other machine for anything.
 """
 
 import errno
+import logging
 import os
 import socket
 import time
@@ -53,13 +54,13 @@ class _Source(NamedTuple):
 
     words: str
     colour: tuple[int, int, int]
-    aside: float  # [m] to the robot's left of the foot point, so that arrows do not hide each other
+    aside: float  # [m] outwards from the foot point: legs and arrows do not hide each other
 
 
 _SOURCES = {
-    "commanded": _Source("commanded", (25, 25, 30), 0.03),
-    "measured": _Source("measured", (240, 120, 20), 0.0),
-    "predicted": _Source("predicted by the net", (80, 170, 255), -0.03),
+    "commanded": _Source("commanded", (25, 25, 30), 0.06),
+    "measured": _Source("measured", (240, 120, 20), 0.09),
+    "predicted": _Source("predicted by the net", (80, 170, 255), 0.12),
 }
 
 
@@ -102,9 +103,10 @@ def motion(robot: Robot, model: mujoco.MjModel, shown: Shown) -> Motion:
     # the yaw frame of a wrench is that as its tick starts
     yaw = np.concatenate([np.asarray(walk.initial.euler)[None], state.euler])[:-1, 2]
     R = np.asarray(jax.vmap(rot_z)(yaw))
+    outwards = np.stack([R[..., 1], -R[..., 1]], axis=1)  # of the left foot and of the right
     arrows = {}
     for source, wrench in shown.ground.items():
-        start = feet + _SOURCES[source].aside * R[:, None, :, 1]
+        start = feet + _SOURCES[source].aside * outwards
         for kind, scale in _SCALES.items():
             turned = np.einsum("tij,tfj->tfi", R, np.asarray(getattr(wrench, kind))[at])
             end = start + scale * turned
@@ -175,6 +177,8 @@ def serve(
     check_viser()
     import viser
 
+    # a browser that hangs up early would be told with a traceback
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):  # viser tells its own
         server = viser.ViserServer(host, _free_port(host, port), label="hector", verbose=False)
         try:
@@ -243,9 +247,8 @@ class Page:
 
     def _build_panel(self, story: str) -> None:
         gui = self._server.gui
-        gui.configure_theme(
-            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
-        )
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         gui.add_markdown(story)
         seconds = self._motions[0].seconds[: self._length]
         with gui.add_folder("Playback"):
@@ -288,7 +291,7 @@ class Page:
         across = np.array([-np.sin(heading), np.cos(heading), 0.0])
         side = heading - np.deg2rad(50.0)
         self._server.initial_camera.look_at = (0.0, 0.0, 0.32)
-        self._server.initial_camera.position = (1.75 * np.cos(side), 1.75 * np.sin(side), 0.8)
+        self._server.initial_camera.position = (1.6 * np.cos(side), 1.6 * np.sin(side), 0.75)
         self._world = scene.add_frame("/world", show_axes=False)
         scene.add_grid(
             "/world/floor",
@@ -305,8 +308,8 @@ class Page:
             scene.add_frame(root, show_axes=False, position=(0.5 - i) * _APART * across)
             lines = {
                 "footholds": (_on_floor(one.soles, 0.003), _pale(_COLOURS[i]), 0.03),
-                "path": (_on_floor(_pieces(one.path), 0.006), _COLOURS[i], 0.01),
-                "reference": (_on_floor(_pieces(one.reference)[::2], 0.008), _DARK, 0.008),
+                "path": (_on_floor(_pieces(one.path, 2), 0.006), _COLOURS[i], 0.008),
+                "reference": (_on_floor(_pieces(one.reference, 6)[::2], 0.008), _DARK, 0.01),
             }
             for line, (points, colour, thickness) in lines.items():
                 scene.add_line_segments(f"{root}/{line}", points, colour, thickness=thickness)
@@ -386,22 +389,22 @@ def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]
 
 
 def _legend(sources: Sequence[str]) -> str:
-    """Which colour is whose, as HTML."""
-    marks = (
-        f'<span style="color:rgb{_SOURCES[source].colour}">&#9650;</span>&nbsp;{_SOURCES[source].words}'
-        for source in sources
-    )
-    scale = " 35 cm: 120 N, 12 N m"  # of _SCALES
-    return f'<small style="padding:0 0.8em">{" &ensp;".join(marks)}; {scale}</small>'
+    """Which colour is whose, and the scale, as HTML."""
+    marks = []
+    for source in sources:
+        words, colour, _ = _SOURCES[source]
+        marks.append(f'<span style="color:rgb{colour}">&#9650;</span>&nbsp;{words}')
+    scale = "beside the foot that it acts on; 35 cm are 120 N or 12 N m"  # see _SCALES
+    return f'<div style="padding:0 1em; font-size:smaller">{" &ensp;".join(marks)}<br>{scale}</div>'
 
 
 def _pale(colour: tuple[int, int, int]) -> tuple[int, ...]:
     return tuple(int(c + 0.55 * (255 - c)) for c in colour)
 
 
-def _pieces(points: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "n 2 3"]:
-    """A path as short pieces from point to point."""
-    return np.stack([points[:-3:3], points[3::3]], axis=1)
+def _pieces(points: Float[np.ndarray, "T 3"], ticks: int) -> Float[np.ndarray, "n 2 3"]:
+    """A path as pieces of some ticks each."""
+    return np.stack([points[:-ticks:ticks], points[ticks::ticks]], axis=1)
 
 
 def _on_floor(pieces: Float[np.ndarray, "n 2 3"], height: float) -> Float[np.ndarray, "n 2 3"]:
