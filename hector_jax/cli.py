@@ -20,7 +20,9 @@ _ABOUT = (
 
 def main() -> int:
     """Entry of the console script."""
-    args = tyro.cli(Command, prog="hector", description=_ABOUT)
+    args = tyro.cli(
+        Command, prog="hector", description=_ABOUT, config=(tyro.conf.PositionalRequiredArgs,)
+    )
     setup_jax()
     from hector_jax import commands  # after the flags: `hector --help` answers at once
 

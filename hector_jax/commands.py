@@ -3,7 +3,7 @@
 import dataclasses
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from datetime import datetime
@@ -31,7 +31,7 @@ from hector_jax.evaluation.report import (
     write_fidelity,
     write_report,
 )
-from hector_jax.evaluation.video import VideoUnavailable, write_video
+from hector_jax.evaluation.video import Arrows, VideoUnavailable, write_video
 from hector_jax.flags import (
     Collect,
     Doctor,
@@ -539,12 +539,19 @@ def _doctor(args: Doctor) -> None:
 
 @run.register
 def _view(args: View) -> None:
-    headless = args.headless or args.out is not None
-    if not headless:
+    beside = args.run.with_name(f"{args.run.name}-view")
+    folder = args.out or (beside if args.headless else None)
+    if folder is None:
         view.check_viser()
     _check_seconds(args.seconds)
+    if args.sets[0] == args.sets[1]:
+        raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
     asked, robot = progress.read_asked(args.run), load_robot()
     command = named_command(asked.trajectory)
+    if folder is not None:
+        if folder.resolve() == args.run.resolve():
+            raise ValueError(f"--out must not be the folder of the run, got {folder}")
+        make_folder(folder)
     sets = {name: progress.weights_of(args.run, name) for name in args.sets}
     effect = _phi_of(args.data or asked.data, asked.variant, robot)
     story = [f"**{asked.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
@@ -559,16 +566,16 @@ def _view(args: View) -> None:
         stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
         effects = {} if effect is None else {"residual": effect}
         curves = _curves(robot, stacked, effects)
-        shown[f"{when}: {name}"] = view.Shown(walked, curves)
-    if headless:
-        folder = args.out or args.run.with_name(f"{args.run.name}-view")
-        _view_headless(folder, robot, progress.read_metrics(args.run), asked.loss, shown)
+        shown[name] = view.Shown(walked, curves)
+    model = load_model()
+    motions = [view.motion(robot, model, one) for one in shown.values()]
+    if folder is not None:
+        histories = progress.read_metrics(args.run)
+        _draw_view(folder, robot, histories, asked.loss, shown, view.film_arrows(motions))
         say(f"film and pictures are in {folder}")
         return
-    model = load_model()
-    motions = {name: view.motion(robot, model, one) for name, one in shown.items()}
     view.serve(
-        motions,
+        dict(zip(_titles(shown), motions, strict=True)),
         model,
         args.run,
         "\n\n".join(story),
@@ -587,15 +594,19 @@ def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | N
     return as_effect(load_net(path, robot, variant)[0])
 
 
-def _view_headless(
+def _titles(names: Iterable[str]) -> list[str]:
+    return [f"{when}: {name}" for when, name in zip(("before", "after"), names, strict=True)]
+
+
+def _draw_view(
     folder: Path,
     robot: Robot,
     histories: progress.Histories,
     loss: LossConfig,
     shown: Mapping[str, view.Shown],
+    arrows: Sequence[Arrows],
 ) -> None:
     """What the page shows, as a film and pictures."""
-    make_folder(folder)
     walks = {name: one.walk for name, one in shown.items()}
     plots.tracking(folder / "tracking.png", walks)
     plots.path_from_above(folder / "path.png", walks)
@@ -608,6 +619,7 @@ def _view_headless(
         plots.losses(folder / "losses.png", loss, tuned)
     say("drawing the film")
     try:
-        write_video(folder / "film.mp4", robot, walks, folder / "film.png")
+        titled = dict(zip(_titles(walks), walks.values(), strict=True))
+        write_video(folder / "film.mp4", robot, titled, folder / "film.png", arrows=arrows)
     except VideoUnavailable as error:
         raise ValueError(str(error)) from None

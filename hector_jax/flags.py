@@ -5,8 +5,6 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from tyro.conf import Positional
-
 
 @dataclass(frozen=True)
 class Collect:
@@ -132,7 +130,7 @@ class Doctor:
 class View:
     """Show a run on a local web page: before and after, the ground's forces, tuning as it goes."""
 
-    run: Positional[Path]  # folder of a run of `hector tune`, finished or going on
+    run: Path  # folder of a run of `hector tune`, finished or going on
     sets: tuple[str, str] = ("nominal", "with")  # before and after: of the run's weights
     world: str = "hfs"  # srbm, ideal, hfs, hfs-varied or standin; both are walked anew there
     seed: int = 0  # of the plant and of the estimator's noise

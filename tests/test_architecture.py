@@ -33,7 +33,7 @@ DOORS = {
     "cmaes": ("tuning.search",),
     "sklearn": ("tuning.rivals",),
     "matplotlib": ("evaluation.plots",),
-    "tyro": ("cli", "flags"),
+    "tyro": ("cli",),
 }
 
 

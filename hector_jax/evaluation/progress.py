@@ -37,7 +37,8 @@ def read_asked(folder: Path) -> Asked:
     """
     try:
         config = json.loads((Path(folder) / "config.json").read_text())
-        flags, loss = config["flags"], config["tune"]["loss"]
+        # a run that has only just begun knows its flags and nothing else
+        flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return Asked(
             trajectory=str(flags["traj"]),
             loss=LossConfig(**loss),

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.evaluation.progress import METRICS, RESULT, as_sentence, curves, read_metrics
-from hector_jax.evaluation.video import poses
+from hector_jax.evaluation.video import LEAST_ARROW, METRES_PER_NEWTON, Arrows, poses
 from hector_jax.geometry import rot_z
 from hector_jax.robot import Robot
 from hector_jax.trajectory import Trajectory, Wrench
@@ -34,8 +34,7 @@ HOST, PORT = "127.0.0.1", 8080
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between looks at the metrics
 _APART = 0.8  # [m] between the two walks
-_SCALES = {"force": 0.35 / 120.0, "moment": 0.35 / 12.0}  # [m/N], [m/(N m)] of the arrows
-_LEAST = 0.03  # [m] of an arrow that is drawn
+_SCALES = {"force": METRES_PER_NEWTON, "moment": 0.35 / 12.0}  # [m/N], [m/(N m)] of the arrows
 _COLOURS = ((184, 33, 51), (0, 122, 94))  # before and after, as in the film
 _DARK = (20, 20, 25)
 # before, after and what else there is: told apart by dashes too
@@ -125,6 +124,19 @@ def motion(robot: Robot, model: mujoco.MjModel, shown: Shown) -> Motion:
         soles=np.stack(soles, axis=1),
         fall=period * up if fallen.any() else np.inf,
     )
+
+
+def film_arrows(motions: Sequence[Motion]) -> list[Arrows]:
+    """The forces of two walks by source, for a film of them."""
+    return [
+        Arrows(
+            words=_SOURCES[source].words,
+            colour=_SOURCES[source].colour,
+            ends=tuple(one.arrows["force", source] for one in motions),
+        )
+        for kind, source in motions[0].arrows
+        if kind == "force"
+    ]
 
 
 def _body_frames(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -345,7 +357,7 @@ class Page:
                 handle.position, handle.wxyz = one.position[tick, body], one.wxyz[tick, body]
             for (kind, source), handle in handles["arrows"].items():
                 arrows = one.arrows[kind, source][tick]
-                seen = np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1) > _LEAST  # NaN: not
+                seen = np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1) > LEAST_ARROW  # NaN: not
                 shown = self._shown[kind].value and self._shown[source].value
                 handle.visible = bool(shown and seen.any())
                 if handle.visible:
