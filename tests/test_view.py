@@ -89,6 +89,13 @@ def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot, model):
     np.testing.assert_allclose(last, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-9)
 
 
+def test_the_film_has_the_force_arrows_of_the_page(robot, model):
+    motions = [motion(robot, model, shown(seed, seconds=0.5)) for seed in (0, 1)]
+    found = view.film_arrows(motions)
+    assert [one.words for one in found] == ["commanded", "measured"]
+    np.testing.assert_array_equal(found[1].ends[1], motions[1].arrows["force", "measured"])
+
+
 def test_each_touchdown_leaves_one_sole_of_the_feet_length(robot, model):
     found = motion(robot, model, shown(seconds=4.0))
     assert len(found.soles) == 20
@@ -165,6 +172,17 @@ def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
     assert "config.json was expected" in refused(monkeypatch, capsys, tmp_path, "--headless")
 
 
+def test_a_run_is_not_filmed_into_its_own_folder(monkeypatch, capsys, tmp_path):
+    line = refused(monkeypatch, capsys, pretend_run(tmp_path), "--out", tmp_path)
+    assert "--out must not be the folder of the run" in line
+
+
+def test_two_different_sets_are_asked_for(monkeypatch, capsys, tmp_path):
+    run = pretend_run(tmp_path)
+    line = refused(monkeypatch, capsys, run, "--headless", "--sets", "with", "with")
+    assert "two different weight sets" in line
+
+
 def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(view, "find_spec", lambda name: None)
     line = refused(monkeypatch, capsys, pretend_run(tmp_path))
@@ -173,7 +191,9 @@ def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys,
 
 def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
     filmed = []
-    monkeypatch.setattr(commands, "write_video", lambda *arguments: filmed.append(arguments))
+    monkeypatch.setattr(
+        commands, "write_video", lambda *film, arrows: filmed.append((film, arrows))
+    )
     monkeypatch.setattr(commands, "_walked", lambda *_: pretend_walk(seconds=0.3))
     monkeypatch.setattr(view, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
@@ -181,9 +201,10 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     monkeypatch.setattr(sys, "argv", ["hector", "view", *map(str, [run, "--out", out, *flags])])
     assert main() == 0
     assert "no net at" in capsys.readouterr().err
-    path, _, walks, strip = filmed[0]
+    (path, _, walks, strip), arrows = filmed[0]
     assert (path.name, strip.name) == ("film.mp4", "film.png")
     assert list(walks) == ["before: nominal", "after: expert"]
+    assert [one.words for one in arrows] == ["commanded", "measured"]
     pictures = {"losses.png", "path.png", "tracking.png", "wrenches.png"}
     assert {file.name for file in out.iterdir()} == pictures
 

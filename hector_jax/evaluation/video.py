@@ -315,6 +315,8 @@ def _between(
         geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(rgba, "f")
     )
     mujoco.mjv_connector(geom, kind, radius, start, end)
+    if kind == mujoco.mjtGeom.mjGEOM_ARROW:
+        geom.size[2] *= 2.0  # MuJoCo draws an arrow half as long as it was asked for
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     scene.ngeom += 1
 
