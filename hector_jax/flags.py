@@ -134,7 +134,7 @@ class View:
     sets: tuple[str, str] = ("nominal", "with")  # before and after: of the run's weights
     world: str = "hfs"  # srbm, ideal, hfs, hfs-varied or standin; both are walked anew there
     seed: int = 0  # of the plant and of the estimator's noise
-    seconds: float = 4.0
+    seconds: float = 4.0  # of each walk
     data: Path | None = None  # folder of the net that predicts the ground; by default the run's
     host: str = "127.0.0.1"  # to listen on; as it is, no other machine sees the page
     port: int = 8080  # where it is taken, another

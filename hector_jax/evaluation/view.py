@@ -35,6 +35,7 @@ _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between looks at the metrics
 _APART = 0.8  # [m] between the two walks
 _SCALES = {"force": METRES_PER_NEWTON, "moment": 0.35 / 12.0}  # [m/N], [m/(N m)] of the arrows
+_RADII = {"force": 0.008, "moment": 0.014}  # [m] of their shafts
 _COLOURS = ((184, 33, 51), (0, 122, 94))  # before and after, as in the film
 _DARK = (20, 20, 25)
 # before, after and what else there is: told apart by dashes too
@@ -340,8 +341,8 @@ class Page:
                             f"{root}/{kind}/{source}",
                             np.zeros((1, 2, 3), np.float32),
                             _SOURCES[source].colour,
-                            shaft_radius=0.008,
-                            head_radius=0.019,
+                            shaft_radius=_RADII[kind],
+                            head_radius=2.3 * _RADII[kind],
                             head_length=0.035,
                         )
                         for kind, source in one.arrows
@@ -406,7 +407,7 @@ def _legend(sources: Sequence[str]) -> str:
     for source in sources:
         words, colour, _ = _SOURCES[source]
         marks.append(f'<span style="color:rgb{colour}">&#9650;</span>&nbsp;{words}')
-    scale = "beside the foot that it acts on; 35 cm are 120 N or 12 N m"  # see _SCALES
+    scale = "thin: forces, 35 cm are 120 N; thick: moments, 35 cm are 12 N m"  # see _SCALES
     return f'<div style="padding:0 1em; font-size:smaller">{" &ensp;".join(marks)}<br>{scale}</div>'
 
 
