@@ -544,6 +544,8 @@ def _view(args: View) -> None:
     if folder is None:
         view.check_viser()
     _check_seconds(args.seconds)
+    if args.seconds < 0.1:
+        raise ValueError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
     if args.sets[0] == args.sets[1]:
         raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
     asked, robot = progress.read_asked(args.run), load_robot()

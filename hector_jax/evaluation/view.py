@@ -238,7 +238,7 @@ class Page:
         self._names, self._motions = list(motions), list(motions.values())
         self._length = min(len(one.seconds) for one in self._motions)
         self._playing, self._tick = True, -1  # the tick that is shown; -1: to be drawn anew
-        self._size, self._since = -1, np.inf  # [byte] of the metrics as last read, [s] ago
+        self._read, self._since = (-1, False), np.inf  # size of the metrics, run done; [s] ago
         self._build_panel(story)
         self._build_scene(model)
         self.advance(0.0)
@@ -369,18 +369,18 @@ class Page:
             handles["name"].text = name + fell
 
     def _look(self) -> None:
-        path = self._folder / METRICS
-        size = path.stat().st_size if path.exists() else 0
-        if size == self._size:
+        path, done = self._folder / METRICS, (self._folder / RESULT).exists()
+        now = (path.stat().st_size if path.exists() else 0, done)
+        if now == self._read:
             return
-        self._size = size
+        self._read = now
         histories = read_metrics(self._folder)
         found = curves(histories) or _NONE_YET
         iterations = np.arange(float(len(next(iter(found.values())))))
         with self._server.atomic():
             self._losses.series = _series("iteration", found)
             self._losses.data = (iterations, *found.values())
-            self._told.content = as_sentence(histories, (self._folder / RESULT).exists())
+            self._told.content = as_sentence(histories, done)
 
 
 def _plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
