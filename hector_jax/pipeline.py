@@ -26,6 +26,7 @@ from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
+from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
@@ -40,6 +41,8 @@ from hector_jax.tuning.loss import Losses, losses, total
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
 
+ENGINES = ("auto", "c", "mjx")
+
 
 def choose_engine(asked: str) -> str:
     """The engine of walks in MuJoCo: `c` or `mjx`; `auto` is mjx where JAX sees an accelerator.
@@ -47,15 +50,9 @@ def choose_engine(asked: str) -> str:
     Raises:
         ValueError: none of the three.
     """
-    _check_engine(asked)
-    if asked == "auto":
+    if choose("engine", asked, ENGINES) == "auto":
         return "c" if jax.default_backend() == "cpu" else "mjx"
     return asked
-
-
-def _check_engine(asked: str) -> None:
-    if asked not in ("auto", "c", "mjx"):
-        raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {asked!r}")
 
 
 @dataclass(frozen=True)
@@ -68,14 +65,15 @@ class CollectConfig:
     engine: str = "auto"  # c: MuJoCo on the processes; mjx: all at once; auto: mjx on a GPU
 
     def __post_init__(self) -> None:
-        _check_engine(self.engine)  # devices stay unasked: their number may not be set up yet
+        # devices stay unasked: their number may not be set up yet
+        check(self, walks=SOME, seconds=POSITIVE, seed=SEED, engine=ENGINES)
         if self.walks < 3:
             raise ValueError(
                 "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
                 f"by), got {self.walks}"
             )
         least = HISTORY * GaitConfig.tick
-        if not least <= self.seconds < np.inf:
+        if self.seconds < least:
             raise ValueError(
                 f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
                 f"sample, got {self.seconds:g}"
