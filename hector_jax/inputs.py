@@ -27,7 +27,7 @@ class Interval:
     high: int | float = math.inf
     above: bool = False  # low itself is not allowed
 
-    def __contains__(self, number: Real) -> bool:
+    def __contains__(self, number: Any) -> bool:
         over = number > self.low if self.above else number >= self.low
         return bool(over and number <= self.high and math.isfinite(number))
 

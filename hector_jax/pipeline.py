@@ -452,6 +452,10 @@ def ground(
 _loss = jax.jit(lambda config, walk: total(config, losses(walk)), static_argnums=0)
 
 
+def _command(name: str, own: Mapping[str, Command] | None) -> Command:
+    return own[name] if own and name in own else named_command(name)
+
+
 def losses_on_hfs(
     pool: Executor,
     config: TuneConfig,
@@ -459,6 +463,7 @@ def losses_on_hfs(
     engine: str,
     sets: Mapping[str, Sequence[Weights]],
     at_once: int,
+    own: Mapping[str, Command] | None = None,
 ) -> dict[str, Float[np.ndarray, " sets"]]:
     """L of weight sets on the high-fidelity simulator, one walk each, as long as the rollouts.
 
@@ -469,11 +474,12 @@ def losses_on_hfs(
         engine: c or mjx, in 64 bits.
         sets: by the trajectory that they walk.
         at_once: walks that MJX is compiled for; fewer are filled up to it.
+        own: commands of trajectories that are not built in, by their name.
     """
     walk = config.rollout.walk
     seconds = config.rollout.ticks * walk.gait.tick
     jobs = [
-        Job(weights, named_command(name), hfs(), seconds)
+        Job(weights, _command(name, own), hfs(), seconds)
         for name, each in sets.items()
         for weights in each
     ]
@@ -494,6 +500,7 @@ def search(
     starts: Mapping[str, Weights],
     engine: str,
     folder: Path,
+    own: Mapping[str, Command] | None = None,
 ) -> dict[str, Found]:
     """CMA-ES on the high-fidelity simulator, taking up the records under `folder`.
 
@@ -505,6 +512,7 @@ def search(
         starts: where to start, by the name of the trajectory; all go in lock-step.
         engine: auto, c or mjx.
         folder: of the records.
+        own: commands of trajectories that are not built in, by their name.
 
     Raises:
         ValueError: see `choose_engine`, `named_command` and `tuning.search.search`.
@@ -520,11 +528,11 @@ def search(
         "loss": repr(tune.loss),
         "robot": fingerprint(robot),
         "plant": fingerprint(hfs()),
-        "commands": {name: fingerprint(named_command(name)) for name in (*COMMANDS, *starts)},
+        "commands": {name: fingerprint(_command(name, own)) for name in (*COMMANDS, *starts)},
     }
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        return losses_on_hfs(pool, tune, robot, engine, sets, size)
+        return losses_on_hfs(pool, tune, robot, engine, sets, size, own)
 
     with bar(f"searching on the high-fidelity simulator, engine {engine}") as tell:
 

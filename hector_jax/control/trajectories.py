@@ -26,9 +26,6 @@ from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_comman
 from hector_jax.inputs import Interval, check, from_table, one_line, read_text, shown
 from hector_jax.robot import Robot
 
-SECONDS = 4.0
-"""Length of what is walked of the trajectories with a name, as in the paper."""
-
 _MOST_SECONDS = 600.0
 _GRID = 0.05  # [s]
 _MOST_SEGMENTS = 100
@@ -37,11 +34,11 @@ _FASTEST = Interval(-10.0, 10.0)  # [m/s], [rad/s]; more is another unit
 
 
 class Course(NamedTuple):
-    """What to walk, with its name and its length."""
+    """What to walk."""
 
     name: str
     command: Command
-    seconds: float
+    seconds: float | None = None  # its length, where a file says so
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ def course(text: str) -> Course:
     """
     if text.endswith(".toml"):
         return load_course(Path(text))
-    return Course(text, named_command(text), SECONDS)
+    return Course(text, named_command(text))
 
 
 class Limits(NamedTuple):
