@@ -61,8 +61,8 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def one_line(error: BaseException) -> str:
-    """What an error says, on one line of at most 300 characters."""
+def one_line(error: BaseException | str) -> str:
+    """What an error or a text says, on one line of at most 300 characters."""
     return " ".join(str(error).split())[:300]
 
 
@@ -181,8 +181,12 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
     for name, field in fields.items():
         if name not in table and field.default is dataclasses.MISSING:
             raise ValueError(f"{where}: missing field {name!r}; there are: {', '.join(fields)}")
+    values = {name: _as_float(fields[name].type, value) for name, value in table.items()}
+    for name, value in values.items():
+        if told := problem(value, fields[name].type):
+            raise ValueError(f"{where}: {name} {told}")
     try:
-        return kind(**{name: _as_float(fields[name].type, value) for name, value in table.items()})
+        return kind(**values)
     except ValueError as error:
         told = str(error).removeprefix(f"{kind.__name__}.")
         raise ValueError(f"{where}: {told}") from None

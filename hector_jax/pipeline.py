@@ -26,7 +26,7 @@ from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
-from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose
+from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose, from_table
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
@@ -418,10 +418,14 @@ def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Lear
         return train(config, robot, folder, path)
     params, _, card = network.load_net(path, robot, config.variant)
     about = card["about"]
-    course = History(**{name: np.array(about["course"][name]) for name in History._fields})
+    config = from_table(f"{path}: about.settings", TrainConfig, about.get("settings"))
+    try:
+        course = History(**{n: np.array(about["course"][n], float) for n in History._fields})
+        errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: its card does not tell its training: {error!r}") from None
     linear = network.fit_linear(samples(robot, folder).training)
-    config = TrainConfig(**about["settings"])
-    return Learned(params, linear, about["errors"], course, config, (folder,))
+    return Learned(params, linear, errors, course, config, (folder,))
 
 
 def ground(
