@@ -26,7 +26,7 @@ from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
-from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose, from_table
+from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose, from_table, shown
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
@@ -76,7 +76,7 @@ class CollectConfig:
         if self.seconds < least:
             raise ValueError(
                 f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
-                f"sample, got {self.seconds:g}"
+                f"sample, got {shown(self.seconds)}"
             )
 
 

@@ -377,15 +377,15 @@ def load_net(
             with a number that is not finite.
     """
     found, card = read_net_card(path, variant)
-    like = _like(found, tuple(card["about"]["hidden"]))
+    like = layout(found, tuple(card["about"]["hidden"]))
     params, card = load_tree(path, like, kind=card["kind"], robot=robot)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise ValueError(f"{path}: a parameter of the net is not finite")
     return params, found, card
 
 
-def _like(variant: str, hidden: tuple[int, ...]) -> Params:
-    """Layout of the parameters; nothing is computed. Axes of length 0 are ticks."""
+def layout(variant: str, hidden: tuple[int, ...]) -> Params:
+    """Zeros of the shapes of the parameters, as `load_tree` wants them; an axis 0 is of ticks."""
     inputs, outputs = _sizes(variant)
     shapes = jax.eval_shape(Net(hidden, outputs).init, jax.random.key(0), jnp.zeros(inputs))
     stack = (MEMBERS[variant],) if variant == "residual" else ()

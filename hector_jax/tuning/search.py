@@ -52,8 +52,8 @@ class SearchConfig:
         check(self, budget=SOME, population=Interval(4), seed=SEED, spread=POSITIVE)
         if self.budget < self.population:
             raise ValueError(
-                "SearchConfig.budget must be at least one generation of "
-                f"{self.population} walks, got {self.budget}"
+                f"SearchConfig.budget must be at least the population, {self.population} walks, "
+                f"got {self.budget}"
             )
 
     @property
