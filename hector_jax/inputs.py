@@ -163,7 +163,8 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
 
     Args:
         where: the file and the place in it, for the message.
-        kind: the dataclass, which checks itself; fields without a default have to be there.
+        kind: the dataclass, which checks itself; fields without a default have to be there. Its
+            `RULES`, where it has any, are told with values of a wrong type.
         table: what was read.
 
     Raises:
@@ -182,8 +183,9 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         if name not in table and field.default is dataclasses.MISSING:
             raise ValueError(f"{where}: missing field {name!r}; there are: {', '.join(fields)}")
     values = {name: _as_float(fields[name].type, value) for name, value in table.items()}
+    rules = getattr(kind, "RULES", {})
     for name, value in values.items():
-        if told := problem(value, fields[name].type):
+        if told := problem(value, fields[name].type, rules.get(name)):
             raise ValueError(f"{where}: {name} {told}")
     try:
         return kind(**values)

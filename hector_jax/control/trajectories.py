@@ -17,7 +17,7 @@ import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,7 @@ _MOST_SECONDS = 600.0
 _GRID = 0.05  # [s]
 _MOST_SEGMENTS = 100
 _MOST_BYTES = 100_000
-_FASTEST = Interval(-10.0, 10.0)  # [m/s], [rad/s]; more is another unit
+_FASTEST = 10.0  # [m/s], [rad/s]; more is another unit
 
 
 class Course(NamedTuple):
@@ -50,14 +50,13 @@ class Segment:
     v_y: float = 0.0  # [m/s] to the left
     yaw_rate: float = 0.0  # [rad/s]
 
+    RULES: ClassVar = {
+        "seconds": Interval(_GRID, _MOST_SECONDS),
+        **dict.fromkeys(("v_x", "v_y", "yaw_rate"), Interval(-_FASTEST, _FASTEST)),
+    }
+
     def __post_init__(self) -> None:
-        check(
-            self,
-            seconds=Interval(_GRID, _MOST_SECONDS),
-            v_x=_FASTEST,
-            v_y=_FASTEST,
-            yaw_rate=_FASTEST,
-        )
+        check(self, **self.RULES)
         if abs(self.seconds / _GRID - round(self.seconds / _GRID)) > 1e-6:
             raise ValueError(
                 f"Segment.seconds must be a multiple of {_GRID} s, got {self.seconds:g}"
