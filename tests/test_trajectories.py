@@ -80,7 +80,7 @@ HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
         (HEAD + "[[segment]]\nv_x = 1.0", ["segment 2: missing field 'seconds'"]),
         (HEAD + "[[segment]]\nseconds = -1", ["segment 2: seconds must be", "0.05", "got -1"]),
         (HEAD + "[[segment]]\nseconds = 0.07", ["multiple of 0.05 s, got 0.07"]),
-        (HEAD + "seconds = 2", ["no valid TOML", "line 4"]),
+        (HEAD + "v_x == 3", ["no valid TOML", "line 4"]),
         (HEAD + "[[segment]]\nseconds = 600", ["at most 600 s together, got 601"]),
         (HEAD + "x = " + "[" * 9000, ["no valid TOML"]),
         ("#" * 100_001, ["0.1 MB, expected at most 0.1 MB"]),

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import UNSEEN, Command, named_command
+from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
 from hector_jax.control.weights import Weights
 from hector_jax.evaluation.metrics import FALL_MARGIN, Interval, Score, bootstrap
 from hector_jax.inputs import POSITIVE, SOME, check, shown
@@ -74,7 +74,8 @@ class SceneConfig:
     phases: int = 3  # of the gait, at which a push or a slippery floor begins
 
     def __post_init__(self) -> None:
-        check(self, phases=SOME, forces=POSITIVE, frictions=POSITIVE)
+        trajectories = (*COMMANDS, *UNSEEN)
+        check(self, traj=trajectories, forces=POSITIVE, frictions=POSITIVE, phases=SOME)
         for name in ("forces", "frictions"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):

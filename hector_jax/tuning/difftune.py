@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds
-from hector_jax.inputs import POSITIVE, SOME, check
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, check
 from hector_jax.robot import Robot
 from hector_jax.tuning.loss import Alpha, LossConfig, Losses, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -59,6 +59,7 @@ class TuneConfig:
             update=("relative", "literal"),
             iterations=SOME,
             patience=SOME,
+            gain=NOT_NEGATIVE,
             smallest_step=POSITIVE,
             residual=POSITIVE,
         )
