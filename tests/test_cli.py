@@ -126,7 +126,7 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     [
         (("--engine", "warp"), "engine"),
         (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        (("--seconds", "nan"), "at least 0.03 s"),
+        (("--seconds", "nan"), "a number above 0, got nan"),
         (("--walks", "2"), "at least 3"),
     ],
 )
