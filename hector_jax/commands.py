@@ -51,6 +51,7 @@ from hector_jax.grfm.dataset import PIECES, SOLVED, Walks, at_interval, make_dat
 from hector_jax.grfm.gated import gated_effect
 from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
+from hector_jax.inputs import did_you_mean, shown
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import cache_folder, workers
@@ -86,6 +87,11 @@ def run(args: Any) -> None:
 def _weights(text: str) -> Weights:
     """A weight set by its name, or from a file."""
     named = {"nominal": nominal, "expert": expert}
+    if text not in named and not Path(text).suffix and not Path(text).exists():
+        raise ValueError(
+            f"no weights {shown(text)}{did_you_mean(text, named)}; there are: "
+            f"{', '.join(named)}, or a file"
+        )
     return named[text]() if text in named else load_weights(Path(text))
 
 

@@ -149,6 +149,8 @@ def read_text(path: Path, what: str, most: int) -> str:
     """
     try:
         size = path.stat().st_size
+        if not path.is_file():  # a pipe or a device might never end
+            raise ValueError(f"{path}: cannot read {what}: not a plain file")
         if size > most:
             raise ValueError(f"{path}: {size / 1e6:.1f} MB, expected at most {most / 1e6:g} MB")
         return path.read_text(encoding="utf-8")

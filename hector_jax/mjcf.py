@@ -37,7 +37,7 @@ _PARTS_FROM_ELSEWHERE = (
 )
 _FOLDERS = ("assetdir", "meshdir", "texturedir")
 
-_COUNT = Interval(0, 1_000_000)
+_COUNT = Interval(-1, 1_000_000)  # -1: as many as it takes
 _PIXELS = Interval(0, 8192)
 _RANGES: Mapping[str, Interval] = {
     "mass": NOT_NEGATIVE,
@@ -58,10 +58,12 @@ _RANGES: Mapping[str, Interval] = {
     "offheight": _PIXELS,
     "nrow": _PIXELS,
     "ncol": _PIXELS,
-    **dict.fromkeys(("njmax", "nconmax", "nkey", "nstack", "nuserdata"), Interval(-1, 1_000_000)),
+    "shadowsize": _PIXELS,
+    "offsamples": Interval(0, 64),
+    **dict.fromkeys(("njmax", "nconmax", "nkey", "nstack", "nuserdata"), _COUNT),
     **dict.fromkeys((f"nuser_{x}" for x in ("body", "jnt", "geom", "site", "actuator")), _COUNT),
 }
-_RANGES_OF = {("inertial", "mass"): POSITIVE}
+_RANGES_OF = {("inertial", "mass"): POSITIVE, ("numeric", "size"): _COUNT}
 _PAIRS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange")
 _MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
 _MOST_MEMORY = 2**30
@@ -150,7 +152,8 @@ def _problem(tag: str, name: str, value: str) -> str | None:
         return f"numbers {allowed}"
     if numbers and not all(number in Interval() for number in numbers):
         return "finite numbers"
-    if name in _PAIRS and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
+    paired = name in _PAIRS and tag != "light"  # whose range is a length
+    if paired and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
         return "two numbers, the lower one first"
     return None
 
@@ -165,7 +168,7 @@ def _numbers(text: str) -> list[float] | None:
 
 def _check_files(path: Path, root: ElementTree.Element) -> None:
     """Check that meshes and pictures lie in the file's folder or below, and are there."""
-    home = path.resolve().parent
+    home = path.parent.resolve()
     places = [home]
     for compiler in root.iter("compiler"):
         for name in _FOLDERS:

@@ -25,10 +25,11 @@ import jax
 import numpy as np
 
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import one_line, problem, shown
+from hector_jax.inputs import one_line, problem, read_text, shown
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
+_MOST_WEIGHTS = 1_000_000  # bytes
 _DIGEST = 64  # hexadecimal digits of a sha256
 _PACKAGES = (
     "hector-jax",
@@ -224,6 +225,8 @@ def _check_card(path: Path, card: Any) -> None:
 
 def _read_bytes(path: Path) -> bytes:
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device might never end
+            raise ValueError(f"cannot read {path}: not a plain file")
         return path.read_bytes()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
@@ -277,11 +280,10 @@ def load_weights(path: Path) -> Weights:
             shape, or not a positive number.
     """
     path = Path(path)
+    text = read_text(path, "weights", _MOST_WEIGHTS)
     try:
-        tree = json.loads(_read_bytes(path).decode(), object_pairs_hook=_no_twins)
-    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors too
-        if str(error).startswith("cannot read"):
-            raise
+        tree = json.loads(text, object_pairs_hook=_no_twins)
+    except ValueError as error:  # JSONDecodeError is one too
         raise ValueError(f"{path}: no valid JSON: {error}") from error
     except RecursionError as error:
         raise ValueError(f"{path}: no valid JSON: nested too deeply") from error

@@ -59,7 +59,7 @@ class Segment:
         check(self, **self.RULES)
         if abs(self.seconds / _GRID - round(self.seconds / _GRID)) > 1e-6:
             raise ValueError(
-                f"Segment.seconds must be a multiple of {_GRID} s, got {self.seconds:g}"
+                f"Segment.seconds must be a multiple of {_GRID} s, got {shown(self.seconds)}"
             )
 
 
@@ -121,7 +121,10 @@ def course(text: str) -> Course:
     """
     if text.endswith(".toml"):
         return load_course(Path(text))
-    return Course(text, named_command(text))
+    try:
+        return Course(text, named_command(text))
+    except ValueError as error:
+        raise ValueError(f"{error}, or a file NAME.toml") from None
 
 
 class Limits(NamedTuple):
