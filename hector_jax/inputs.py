@@ -57,7 +57,10 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
 
 def shown(value: Any) -> str:
     """A value as it came, on one line and not longer than a line."""
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python prints no integer of many thousand digits
+        text = "a number of too many digits"
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 

@@ -17,7 +17,11 @@ from hector_jax.control.reference import (
     standing_anchor,
 )
 from hector_jax.control.trajectories import beyond, course, limits, load_course
+from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import expert, nominal
 from hector_jax.robot import load_robot
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 
 SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
@@ -77,6 +81,7 @@ HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
         (HEAD + 'yaw_rate = "fast"', ["yaw_rate must be a number", "at most 10, got 'fast'"]),
         (HEAD + "yaw_rate = true", ["yaw_rate must be a number", "got True"]),
         (HEAD + f"v_x = {10**400}", ["v_x must be a number"]),
+        (HEAD + f"v_x = 0x{'f' * 9000}", ["v_x must be a number", "too many digits"]),
         (HEAD + "[[segment]]\nv_x = 1.0", ["segment 2: missing field 'seconds'"]),
         (HEAD + "[[segment]]\nseconds = -1", ["segment 2: seconds must be", "0.05", "got -1"]),
         (HEAD + "[[segment]]\nseconds = 0.07", ["multiple of 0.05 s, got 0.07"]),
@@ -192,3 +197,13 @@ def test_a_wrong_file_is_one_line_of_each_command(monkeypatch, capsys, tmp_path,
     assert err.count("\n") == 1
     assert "mine.toml: segment 1: unknown field 'vx'" in err
     assert [p.name for p in tmp_path.iterdir()] == ["mine.toml"]
+
+
+@pytest.mark.slow
+def test_the_example_is_walked_on_the_simulator_within_centimetres():
+    found = course(str(SLALOM))
+    for weights in (nominal(), expert()):
+        walked = walk(WalkConfig(), ROBOT, weights, found.command, hfs(), found.seconds)
+        assert not walked.fallen.any()
+        error = walked.state.position - walked.reference.position
+        assert np.abs(error).max() < 0.10
