@@ -1,7 +1,7 @@
 """What each command of `hector` does with its flags (flags.py)."""
 
 import dataclasses
-import tempfile
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import pipeline, study
-from hector_jax.console import say
-from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
+from hector_jax import doctor, pipeline, study
+from hector_jax.console import Broken, say
+from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
-from hector_jax.evaluation import fidelity, metrics, plots
+from hector_jax.evaluation import fidelity, metrics, plots, runs
 from hector_jax.evaluation.metrics import Verdict
 from hector_jax.evaluation.report import (
     WORLDS,
@@ -31,14 +31,17 @@ from hector_jax.evaluation.report import (
     write_fidelity,
     write_report,
 )
+from hector_jax.evaluation.tensorboard import write_events
 from hector_jax.evaluation.video import VideoUnavailable, write_video
 from hector_jax.flags import (
     Collect,
+    Compare,
     Doctor,
     Evaluate,
     Grfm,
     Search,
     Table,
+    Tensorboard,
     Train,
     Tune,
     Walk,
@@ -52,7 +55,7 @@ from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
-from hector_jax.runtime import cache_folder, workers
+from hector_jax.runtime import workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
@@ -66,9 +69,8 @@ from hector_jax.storage import (
     write_json,
 )
 from hector_jax.trajectory import Trajectory, Wrench
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, aligned
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
-from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.tuning.search import SearchConfig
 
 
@@ -91,10 +93,7 @@ def _weights(text: str) -> Weights:
 def _plants(world: str, seeds: range) -> list[Imperfections]:
     if world == "standin":
         return [standin(seed) for seed in seeds]
-    try:
-        return [named_world(world, seed) for seed in seeds]
-    except ValueError as error:
-        raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
+    return [named_world(world, seed) for seed in seeds]
 
 
 @run.register
@@ -110,19 +109,22 @@ def _train(args: Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     path = args.out or pipeline.net_path(args.data.parent, args.variant)
     found = pipeline.train(config, load_robot(), args.data, path)
-    for name, errors in found.errors.items():
-        print(
-            f"{name:7s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
-            "   (held-out walks)"
-        )
+    if args.json:
+        print(as_json({"net": str(path), "errors": found.errors}))
+    else:
+        _print_errors(found.errors)
     say(f"the net is in {path}")
+
+
+def _print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
+    print("mean square errors on held-out walks")
+    for name, of in errors.items():
+        print(f"{name:9s} force {of['force']:8.2f} N^2   moment {of['moment']:7.4f} (N m)^2")
 
 
 @run.register
 def _grfm(args: Grfm) -> None:
     robot, config = load_robot(), TuneConfig()
-    if args.seeds < 0:
-        raise ValueError(f"--seeds must be at least 0, got {args.seeds}")
     make_folder(args.out)
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, config, robot, args.data)
@@ -157,10 +159,10 @@ def _grfm(args: Grfm) -> None:
     }
     pictures = [Picture(f"{name}.png", caption) for name, caption in captions.items()]
     told = write_fidelity(args.out, found, pictures)
-    for name, errors in found["hfs"]["errors"].items():
-        print(
-            f"{name:9s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
-        )
+    if args.json:
+        print(as_json({"report": str(told), "worlds": found}))
+    else:
+        _print_errors(found["hfs"]["errors"])
     say(f"the whole story, with pictures: {told}")
 
 
@@ -226,15 +228,8 @@ def _tune(args: Tune) -> None:
             run(one)
         return
     command, robot = named_command(args.traj), load_robot()
-    if args.alpha not in ("paper", "auto"):
-        raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
-    least_of = {"seeds": 1, "processes": 1, "iterations": PAPER_ITERATIONS, "refresh": 0}
-    for name, least in least_of.items():
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
     config, variant = TuneConfig(iterations=args.iterations), args.variant
-    TrainConfig(variant)  # refuses an unknown one before a folder is made
-    folder = _new_folder(args)
+    folder, start = _new_folder(args), time.monotonic()
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, config, robot, args.data, variant)
@@ -243,9 +238,12 @@ def _tune(args: Tune) -> None:
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        resolved = {"flags": settings(args), "tune": dataclasses.asdict(config)}
+        # without the folder, so that `--config` can ask for the same in another one
+        asked = replace(args, run=None)
+        resolved = {"flags": settings(asked), "tune": dataclasses.asdict(config)}
+        made_with = environment()
         write_json(folder / "config.json", resolved)
-        write_json(folder / "versions.json", environment())
+        write_json(folder / "versions.json", made_with)
         shifts: list[dict[str, Any]] = []
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
 
@@ -302,6 +300,7 @@ def _tune(args: Tune) -> None:
     if shifts:
         result["refresh"] = shifts
     write_json(folder / "result.json", result)
+    write_json(folder / "versions.json", made_with | {"seconds": f"{time.monotonic() - start:.0f}"})
     pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
     film: Picture | str = "left out (--no-video)"
     if args.video:
@@ -323,11 +322,14 @@ def _tune(args: Tune) -> None:
             pictures=pictures,
             film=film,
             config=resolved,
-            environment=environment(),
-            command=as_command("tune", replace(args, run=None)),
+            environment=made_with,
+            command=as_command("tune", asked),
         ),
     )
-    print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")
+    if args.json:
+        print(as_json({"run": str(folder), "traj": args.traj, **result}))
+    else:
+        print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")
     say(f"the whole story, with pictures: {told}")
 
 
@@ -375,8 +377,12 @@ def _draw(
 @run.register
 def _table(args: Table) -> None:
     told, verdicts = study.make_table(args, partial(_plants, "standin"))
-    for name, verdict in verdicts.items():
-        print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
+    if args.json:
+        results = {name: metrics.as_result(verdict) for name, verdict in verdicts.items()}
+        print(as_json({"report": str(told), "trajectories": results}))
+    else:
+        for name, verdict in verdicts.items():
+            print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
     say(f"the whole story, with pictures: {told}")
 
 
@@ -397,13 +403,12 @@ def _search(args: Search) -> None:
         sets = {name: [start, expert(), found[name].weights] for name in names}
         at_once = config.population * len(names)
         compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once)
-    print("L in 1e6 on the high-fidelity simulator")
-    print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+    cards = {}
     for name, one in found.items():
         at_start, at_expert, again = compared[name].tolist()
         walks = len(one.history) * config.population
         losses = {"start": at_start, "best": one.loss, "best_again": again, "expert": at_expert}
-        card = {
+        cards[name] = {
             "trajectory": name,
             "L": losses,
             "walks": walks,
@@ -417,16 +422,21 @@ def _search(args: Search) -> None:
             "versions": versions(),
         }
         save_weights(args.out / f"{name}.json", one.weights)
-        write_json(args.out / f"{name}-card.json", card)
-        shown = "".join(f"{x / 1e6:9.3f}" for x in (at_start, one.loss, at_expert))
-        print(f"{name:10s}{shown}{walks:8d}{one.walk:9d}")
+        write_json(args.out / f"{name}-card.json", cards[name])
+    if args.json:
+        print(as_json({"weights": str(args.out), "cards": cards}))
+    else:
+        print("L in 1e6 on the high-fidelity simulator")
+        print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+        for name, card in cards.items():
+            shown = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
+            print(f"{name:10s}{shown}{card['walks']:8d}{card['best_at']:9d}")
     say(f"weights are in {args.out}")
 
 
 @run.register
 def _evaluate(args: Evaluate) -> None:
     command, robot = named_command(args.traj), load_robot()
-    _check_seconds(args.seconds)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
@@ -444,19 +454,13 @@ def _evaluate(args: Evaluate) -> None:
         print_table(verdict, f"{args.traj}, {count} plants", args.world)
 
 
-def _check_seconds(seconds: float) -> None:
-    if not 0.0 < seconds <= 600.0:
-        raise ValueError(f"--seconds must be above 0 and at most 600, got {seconds}")
-
-
 @run.register
 def _walk(args: Walk) -> None:
     command, weights, robot = named_command(args.traj), _weights(args.weights), load_robot()
-    _check_seconds(args.seconds)
 
     def walked(weights: Weights) -> Trajectory:
         if args.world == "srbm":
-            return _rigid_body(robot, weights, command, args.seconds)
+            return pipeline.walk_rigid_body(robot, weights, command, args.seconds)
         plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
         return walk(WalkConfig(), robot, weights, command, plant, args.seconds, args.seed)
 
@@ -486,13 +490,6 @@ def _walk(args: Walk) -> None:
         _film(args.video, robot, {beside: walked(other()), args.weights: trajectory})
 
 
-def _rigid_body(robot: Robot, weights: Weights, command: Any, seconds: float) -> Trajectory:
-    config = RolloutConfig(ticks=round(seconds / RolloutConfig().walk.gait.tick))
-    walked = jax.jit(rollout, static_argnums=0)
-    anchor = standing_anchor(robot)
-    return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
-
-
 def _film(
     path: Path, robot: Robot, walks: Mapping[str, Trajectory], strip: Path | None = None
 ) -> str:
@@ -507,25 +504,27 @@ def _film(
 
 @run.register
 def _doctor(args: Doctor) -> None:
-    rows = {
-        **versions(),
-        "device": ", ".join(str(device) for device in jax.devices()),
-        "precision": f"{64 if jax.config.read('jax_enable_x64') else 32} bits",
-        "cache": str(cache_folder()),
-    }
-    for name, text in rows.items():
-        print(f"{name:12s} {text}")
-    start = time.monotonic()
-    robot, command = load_robot(), named_command("straight")
-    walks = {
-        "srbm": _rigid_body(robot, expert(), command, 1.0),
-        "ideal": walk(WalkConfig(), robot, expert(), command, _plants("ideal", range(1))[0], 0.2),
-    }
-    for world, found in walks.items():
-        if found.fallen.any() or not found.residual.max() <= SOLVED:
-            raise ValueError(f"self-test failed: the robot does not walk in {world}")
-    print(f"{'self-test':12s} walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s")
-    with tempfile.TemporaryDirectory() as folder:
-        short = {name: walks["ideal"] for name in ("one", "other")}
-        missing = _film(Path(folder) / "film.mp4", robot, short)
-    print(f"{'video':12s} {missing or 'works'}")
+    told, faults = doctor.examine()
+    if args.json:
+        print(as_json({**told, "faults": faults}))
+    else:
+        for name, text in told.items():
+            print(f"{name:12s} {text}")
+    if faults:
+        raise Broken("; ".join(faults))
+
+
+@run.register
+def _compare(args: Compare) -> None:
+    told = runs.compare_runs([runs.load_run(folder) for folder in args.runs])
+    if args.json:
+        print(as_json(told))
+    else:
+        runs.print_comparison(told)
+
+
+@run.register
+def _tensorboard(args: Tensorboard) -> None:
+    out = args.out or args.run / "tensorboard"
+    write_events(args.run, out)
+    print(f"tensorboard --logdir {shlex.quote(str(out))}")

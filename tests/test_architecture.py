@@ -17,7 +17,7 @@ FLOORS = [
     ["grfm"],
     ["evaluation"],
     ["flags", "pipeline"],
-    ["kept"],
+    ["kept", "doctor"],
     ["study"],
     ["commands"],
     ["cli"],
@@ -31,6 +31,7 @@ DOORS = {
     "cmaes": ("tuning.search",),
     "sklearn": ("tuning.rivals",),
     "matplotlib": ("evaluation.plots",),
+    "tensorboardX": ("evaluation.tensorboard",),
     "tyro": ("cli",),
 }
 
