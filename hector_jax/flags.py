@@ -8,6 +8,7 @@ import difflib
 import json
 import math
 import shlex
+import sys
 import tomllib
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -42,11 +43,12 @@ class Range(NamedTuple):
     def __str__(self) -> str:
         """The range in words."""
         words = {"at least": self.least, "above": self.above, "at most": self.most}
-        return " and ".join(f"{word} {x:g}" for word, x in words.items() if math.isfinite(x))
+        return " and ".join(f"{word} {x:.10g}" for word, x in words.items() if math.isfinite(x))
 
 
 Count = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
+Seed = Annotated[int, Range(0, 2**32 - 1)]
 Iterations = Annotated[int, Range(10)]  # the paper's: its rows are told from the first ten
 Seconds = Annotated[float, Range(above=0, most=600)]
 Variant = Literal["residual", "paper"]
@@ -70,7 +72,7 @@ class Collect(Configured):
     out: Path = Path("data/walks")  # folder of the walks; what is there already is kept
     walks: int = 64  # how many
     seconds: float = 4.0  # length of each [s]
-    seed: Natural = 0  # of everything drawn: commands, weights, plants, pushes
+    seed: Seed = 0  # of everything drawn: commands, weights, plants, pushes
     engine: Engine = "auto"  # MuJoCo on the processes, MJX all at once; auto: mjx on a GPU
     processes: Count = 2  # one core each
 
@@ -86,7 +88,7 @@ class Train(Configured):
     out: Path | None = None  # the net; by default beside the walks, grfm.npz or grfm-paper.npz
     variant: Variant = "residual"  # of the net
     epochs: Count = 200  # over all samples
-    seed: Natural = 0  # of the net's first weights and of the order of the samples
+    seed: Seed = 0  # of the net's first weights and of the order of the samples
     json: bool = False  # print JSON instead of lines
 
 
@@ -135,7 +137,7 @@ class Search(Configured):
     traj: str = "straight"  # straight, c, s or all
     budget: int = 200  # walks for each trajectory, at most; whole generations are walked
     population: int = 10  # walks in a generation
-    seed: Natural = 0  # of what is drawn
+    seed: Seed = 0  # of what is drawn
     spread: float = 1.0  # first standard deviation of each log-weight
     start: str = "nominal"  # nominal, expert or a weights file
     engine: Engine = "auto"  # MuJoCo on the processes, MJX all at once; auto: mjx on a GPU
@@ -154,7 +156,7 @@ class Table(Configured):
 
     trajectories: tuple[str, ...] = ("straight", "c", "s")
     seeds: Count = 32  # stand-in plants
-    first_seed: Natural = 0  # 0 in development, 1000 for the final verdict
+    first_seed: Seed = 0  # 0 in development, 1000 for the final verdict
     rollouts: int = 200  # walks of the search on the high-fidelity simulator
     iterations: Iterations = 100  # of the tuning, at most
     steps: Natural = 30  # of `with` further, along walks on the simulator; 0: no such row
@@ -182,7 +184,7 @@ class Evaluate(Configured):
     world: Literal["ideal", "hfs", "hfs-varied", "standin"] = "standin"  # of the plants
     seconds: Seconds = 4.0  # of each walk [s]; an eight takes 8
     seeds: Count = 8  # plants, where the world has a family of them
-    first_seed: Natural = 0  # of the plants
+    first_seed: Seed = 0  # of the plants
     processes: Count = 2  # one core each
     json: bool = False  # print JSON instead of the table
 
@@ -196,7 +198,7 @@ class Walk(Configured):
 
     traj: str = "straight"  # straight, c, s, sideways, turn, eight or stop-and-go
     world: Literal["srbm", "ideal", "hfs", "hfs-varied", "standin"] = "hfs"  # where to walk
-    seed: Natural = 0  # of the plant and of the estimator's noise
+    seed: Seed = 0  # of the plant and of the estimator's noise
     weights: str = "nominal"  # nominal, expert or a weights file
     seconds: Seconds = 4.0  # of the walk [s]
     out: Path | None = None  # keep the trajectory (.npz)
@@ -311,22 +313,20 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
 
 
 def _table(path: Path) -> dict[str, Any]:
+    kind, read = ("JSON", json.loads) if path.suffix == ".json" else ("TOML", tomllib.loads)
     try:
-        text = path.read_bytes().decode()
-        if path.suffix == ".json":
-            found = json.loads(text)
-            found = found.get("flags") if isinstance(found, dict) else None
-            if not isinstance(found, dict):
-                raise ValueError(f"{path}: no `flags` inside; expected the config.json of a run")
-            return found
-        return tomllib.loads(text)
+        found = read(path.read_bytes().decode())
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from None
     except RecursionError:
-        raise ValueError(f"{path}: nested too deeply") from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
-        what = "JSON" if path.suffix == ".json" else "TOML"
-        raise ValueError(f"{path}: no valid {what}: {error}") from None
+        raise ValueError(f"{path}: no valid {kind}: nested too deeply") from None
+    except ValueError as error:  # those of both formats, of the encoding and of endless numbers
+        raise ValueError(f"{path}: no valid {kind}: {error}") from None
+    if kind == "JSON":
+        found = found.get("flags") if isinstance(found, dict) else None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: no `flags` inside; expected the config.json of a run")
+    return found
 
 
 def _hints(kind: type) -> dict[str, Any]:
@@ -341,7 +341,7 @@ def _of_kind(hint: Any, value: Any) -> Any:
     if Path in kinds and isinstance(value, str):
         return Path(value)
     if float in kinds and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        return float(value) if abs(value) < sys.float_info.max else value
     if get_origin(hint) is tuple and isinstance(value, list):
         return tuple(value)
     return value

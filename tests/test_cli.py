@@ -5,6 +5,8 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args
 
 import jax
@@ -15,7 +17,7 @@ from synthetic import synthetic_walk
 from hector_jax import commands, doctor
 from hector_jax.cli import main
 from hector_jax.control.weights import expert
-from hector_jax.flags import Command, command_name
+from hector_jax.flags import Command, Tune, command_name, from_file
 from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
 from hector_jax.model.effect import last_command
 from hector_jax.pipeline import CollectConfig
@@ -227,7 +229,7 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     [
         (("--budget", "9"), "budget"),
         (("--population", "2"), "population"),
-        (("--seed", "-1"), "--seed must be at least 0, got -1"),
+        (("--seed", "-1"), "--seed must be at least 0 and"),
         (("--start", "none.json"), "none.json"),
     ],
 )
@@ -259,8 +261,26 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
     assert call(monkeypatch, *flags, *folders) == 0
     assert capsys.readouterr().out == shown
     assert kept == {path: path.read_bytes() for path in tmp_path.rglob("*.json*")}
+    assert call(monkeypatch, *flags, *folders, "--json") == 0
+    cards = json.loads(capsys.readouterr().out)["cards"]
+    assert cards == {n: json.loads(kept[tmp_path / "found" / f"{n}-card.json"]) for n in cards}
     line = refused(monkeypatch, capsys, *flags, *folders, "--seed", "1")
     assert "another search" in line
+
+
+@pytest.mark.parametrize("asked", ["json", "words"])
+def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_path, asked):
+    errors = {"raw": {"force": 2.0, "moment": 1.0}, "net": {"force": 0.5, "moment": 0.25}}
+    monkeypatch.setattr(
+        commands.pipeline, "train", lambda *args: SimpleNamespace(errors=errors, args=args)
+    )
+    more = ("--json",) if asked == "json" else ()
+    assert call(monkeypatch, "train", "--out", tmp_path / "net.npz", *more) == 0
+    out = capsys.readouterr().out
+    if asked == "json":
+        assert json.loads(out) == {"net": str(tmp_path / "net.npz"), "errors": errors}
+    else:
+        assert [line.split()[0] for line in out.splitlines()[1:]] == ["raw", "net"]
 
 
 @pytest.mark.slow
@@ -271,9 +291,18 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
     monkeypatch.setattr(commands.pipeline, "REFRESH", replace(small, walks=4))
     flags = ("--seeds", "2", "--iterations", "11", "--refresh", "1")
-    assert call(monkeypatch, "tune", *flags, "--run", "run") == 0
+    assert call(monkeypatch, "tune", *flags, "--run", "run", "--json") == 0
     out = capsys.readouterr().out
     run = tmp_path / "run"
+    assert json.loads(out) == {
+        "run": "run",
+        "traj": "straight",
+        **json.loads((run / "result.json").read_text()),
+    }
+    assert from_file(Tune, run / "config.json") == Tune(
+        seeds=2, iterations=11, refresh=1, json=True
+    )
+    assert float(json.loads((run / "versions.json").read_text())["seconds"]) > 0.0
     names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "with_refreshed"]
     for name in names:
         assert name in out
@@ -317,6 +346,10 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     out = capsys.readouterr().out
     for name in commands.study.SETS:
         assert name in out
+    assert call(monkeypatch, "table", *flags, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert set(commands.study.SETS) <= told["trajectories"]["c"]["sets"].keys()
+    assert Path(told["report"]).exists()
     assert (tmp_path / "runs/table/pictures/c.png").stat().st_size > 50_000
 
 

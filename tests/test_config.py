@@ -95,7 +95,7 @@ def test_the_line_that_asks_again_needs_no_file(tmp_path):
         ("seeds = 3.0", "seeds must be a whole number, got 3.0"),
         ("seeds = true", "seeds must be a whole number, got True"),
         ("seeds = 0", "seeds must be at least 1, got 0"),
-        ("first-seed = -1", "first-seed must be at least 0, got -1"),
+        ("first-seed = -1", "first-seed must be at least 0 and at most 4294967295, got -1"),
         ("quick = 1", "quick must be true or false, got 1"),
         ("data = 1", "data must be a path, got 1"),
         ("kept = []", "kept must be a path or null, got []"),
@@ -123,6 +123,8 @@ def test_a_wrong_file_is_one_line_with_file_and_key(tmp_path, text, fault):
         ("seconds = 0", "seconds must be above 0 and at most 600, got 0"),
         ("seconds = 601.0", "seconds must be above 0 and at most 600, got 601"),
         ("seconds = nan", "seconds must be above 0 and at most 600, got nan"),
+        (f"seconds = 1{400 * '0'}", "seconds must be a number, got 1000"),
+        ("first-seed = 4294967296", "first-seed must be at least 0 and at most 4294967295, got 42"),
         ("seconds = inf", "seconds must be above 0 and at most 600, got inf"),
         ('seconds = "long"', "seconds must be a number, got 'long'"),
     ],
@@ -136,6 +138,7 @@ def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
     ("name", "data", "fault"),
     [
         ("run.toml", b"\xff\xfe", "no valid TOML"),
+        ("run.toml", b"seeds = 1" + b"0" * 5000, "no valid TOML"),
         ("run.json", b"{", "no valid JSON"),
         ("run.json", b"[]", "no `flags` inside"),
         ("run.json", b'{"tune": {}}', "no `flags` inside"),
@@ -165,7 +168,7 @@ def test_the_program_tells_a_wrong_file_in_one_line(monkeypatch, capsys, tmp_pat
     ("wrong", "fault"),
     [
         (Tune(seeds=0), "--seeds must be at least 1, got 0"),
-        (Evaluate(first_seed=-2), "--first-seed must be at least 0, got -2"),
+        (Evaluate(first_seed=-2), "--first-seed must be at least 0 and at most .* got -2"),
     ],
 )
 def test_flags_are_held_to_their_ranges(wrong, fault):
