@@ -19,6 +19,7 @@ from hector_jax.robot import MODEL_PATH, Robot, load_robot
 from hector_jax.runtime import cache_folder
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
+from hector_jax.storage import versions
 from hector_jax.trajectory import Trajectory
 
 _EXTRAS = {"search": "cmaes", "tensorboard": "tensorboardX", "view": "viser"}
@@ -32,10 +33,14 @@ def examine() -> tuple[dict[str, str], list[str]]:
         extra or video back end is told but breaks nothing: runs go on without.
     """
     faults: list[str] = []
+    try:
+        devices = jax.devices()
+    except RuntimeError as error:
+        return versions(), [f"JAX finds no device: {_one_line(error)}"]
     told = {name: text for name, text in environment().items() if name != "device"}
     if told.get("mujoco") != told.get("mujoco-mjx"):
         faults.append("mujoco and mujoco-mjx are of different releases")
-    told["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in jax.devices())
+    told["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in devices)
     if jnp.asarray(0.0).dtype != jnp.float64:
         faults.append("JAX computes in 32 bits")
     told["cache"] = str(cache_folder())
@@ -48,7 +53,7 @@ def examine() -> tuple[dict[str, str], list[str]]:
         walks = _walks(robot)
         told["self-test"] = f"walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s"
     except (ValueError, OSError, RuntimeError) as error:
-        faults.append(f"self-test: {' '.join(str(error).split())}")
+        faults.append(f"self-test: {_one_line(error)}")
         return told, faults
     faults += [
         f"self-test: the robot does not walk in {world}"
@@ -57,6 +62,10 @@ def examine() -> tuple[dict[str, str], list[str]]:
     ]
     told["video"] = _video(robot, walks["ideal"])
     return told, faults
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _walks(robot: Robot) -> dict[str, Trajectory]:

@@ -154,7 +154,7 @@ class Table(Configured):
     Example: hector table --quick
     """
 
-    trajectories: tuple[str, ...] = ("straight", "c", "s")
+    trajectories: tuple[str, ...] = ("straight", "c", "s")  # which of them
     seeds: Count = 32  # stand-in plants
     first_seed: Seed = 0  # 0 in development, 1000 for the final verdict
     rollouts: int = 200  # walks of the search on the high-fidelity simulator
@@ -245,7 +245,7 @@ class Completion:
     Example: hector completion bash > ~/.local/share/bash-completion/completions/hector
     """
 
-    shell: Literal["bash", "zsh", "fish"]
+    shell: Literal["bash", "zsh", "fish"]  # to write the script for
 
 
 Command = (

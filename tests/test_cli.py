@@ -1,6 +1,7 @@
 """The console script as a person meets it: plain words, exit codes, one line for bad input."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -444,6 +445,19 @@ def test_a_doctor_that_finds_a_fault_leaves_with_one(monkeypatch, capsys):
     faults = [f"self-test: the robot does not walk in {world}" for world in walks]
     assert json.loads(out)["faults"] == faults
     assert err == f"hector: {'; '.join(faults)}\n"
+
+
+def test_a_doctor_without_a_device_says_so():
+    shown = subprocess.run(
+        [sys.executable, "-m", "hector_jax.cli", "doctor"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "JAX_PLATFORMS": "abacus"},
+    )
+    assert shown.returncode == 1
+    assert "hector: JAX finds no device: " in shown.stderr
+    assert "abacus" in shown.stderr
+    assert "Traceback" not in shown.stderr
 
 
 def test_a_sound_machine_passes_the_doctor(monkeypatch, capsys):

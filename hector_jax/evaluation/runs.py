@@ -50,10 +50,11 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     for number, line in enumerate(data[: data.rfind(b"\n") + 1].splitlines(), 1):
         try:
             found = json.loads(line)
-            told = {"set", "iteration", "accepted"} <= found.keys()
-        except (ValueError, AttributeError):
-            told = False
-        if not told:
+            sound = isinstance(found["set"], str) and isinstance(found["iteration"], int)
+            sound &= {"accepted", "weights", "gradient_log"} <= found.keys()
+        except (ValueError, TypeError, KeyError):
+            sound = False
+        if not sound:
             raise ValueError(f"{path}: line {number} is no iteration of a tuning")
         lines.append(found)
     return lines
@@ -93,7 +94,7 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
     """Several runs side by side, as JSON values.
 
     `runs` is a list of `run`, `seconds` (null where the run did not say), `sets.<name>` (as the
-    verdict on the stand-in in result.json, without the single seeds) and
+    verdict on the stand-in in result.json, with the number of seeds), `versions` and
     `tuning.<name>.{iterations, refused}`; `differ.settings` and `differ.versions` hold what is not
     the same in all, a value for each run, null where a run does not know it.
 
@@ -108,6 +109,7 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
             "seconds": float(run.made_with["seconds"]) if "seconds" in run.made_with else None,
             "sets": {name: _verdict(run, name) for name in run.result["sets"]},
             "tuning": _tuning(run.metrics),
+            "versions": dict(run.made_with),
         }
         for run in runs
     ]
@@ -180,9 +182,13 @@ def print_comparison(told: Mapping[str, Any], console: Console | None = None) ->
         )
     seconds = [run["seconds"] for run in runs]
     table.add_row(Text("time [s]"), *("-" if one is None else f"{one:.0f}" for one in seconds))
+    commits = [run["versions"].get("commit", "-").split() for run in runs]
+    table.add_row("commit", *(" ".join([one[0][:10], *one[1:]]) for one in commits))
     for kind, rows in told["differ"].items():
         table.add_section()
         for name, values in rows.items():
+            if name == "commit":
+                continue
             shown = ("-" if value is None else str(value) for value in values)
             table.add_row(Text(f"{kind}: {name}"), *map(Text, shown))
     console.print(table)
