@@ -4,53 +4,28 @@ A range stands beside the type. Flags also come from a file (`from_file`), and g
 (`settings`) or as a command line (`as_command`).
 """
 
-import difflib
 import json
-import math
 import shlex
-import sys
 import tomllib
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    NamedTuple,
-    TypeVar,
-    get_args,
-    get_origin,
-    get_type_hints,
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from hector_jax.inputs import (
+    SEED,
+    Interval,
+    did_you_mean,
+    one_line,
+    problem,
+    read_text,
+    shown,
 )
 
-
-class Range(NamedTuple):
-    """Numbers that a flag may take."""
-
-    least: float = -math.inf
-    most: float = math.inf
-    above: float = -math.inf
-
-    def __contains__(self, number: object) -> bool:
-        """Whether `number` is one of them; NaN never is."""
-        return (
-            isinstance(number, int | float)
-            and self.least <= number <= self.most
-            and (number > self.above or self.above == -math.inf)
-        )
-
-    def __str__(self) -> str:
-        """The range in words."""
-        words = {"at least": self.least, "above": self.above, "at most": self.most}
-        return " and ".join(f"{word} {x:.10g}" for word, x in words.items() if math.isfinite(x))
-
-
-Count = Annotated[int, Range(1)]
-Natural = Annotated[int, Range(0)]
-Seed = Annotated[int, Range(0, 2**32 - 1)]
-Iterations = Annotated[int, Range(10)]  # the paper's: its rows are told from the first ten
-Seconds = Annotated[float, Range(above=0, most=600)]
+Count = Annotated[int, Interval(1)]
+Natural = Annotated[int, Interval(0)]
+Seed = Annotated[int, SEED]
+Iterations = Annotated[int, Interval(10)]  # the paper's: its rows are told from the first ten
+Seconds = Annotated[float, Interval(0, 600, above=True)]
 Variant = Literal["residual", "paper"]
 Engine = Literal["auto", "c", "mjx"]
 
@@ -278,8 +253,8 @@ def check(flags: Any) -> None:
         ValueError: one line with the flag, what was expected and what came.
     """
     for name, hint in _hints(type(flags)).items():
-        if fault := _fault(hint, getattr(flags, name)):
-            raise ValueError(f"--{name.replace('_', '-')} {fault}")
+        if told := problem(getattr(flags, name), *_rule(hint)):
+            raise ValueError(f"--{name.replace('_', '-')} {told}")
 
 
 def from_file(kind: type[Flags], path: Path) -> Flags:
@@ -300,28 +275,25 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         name = key.replace("-", "_")
         if name not in hints:
             known = sorted(flag.replace("_", "-") for flag in hints)
-            near = difflib.get_close_matches(name.replace("_", "-"), known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}"
-            raise ValueError(f"{path}: unknown key {key[:60]!r}; {hint}")
+            hint = did_you_mean(name.replace("_", "-"), known)
+            hint = hint or f"; known: {', '.join(known)}"
+            raise ValueError(f"{path}: unknown key {shown(key)}{hint}")
         if name in values:
             raise ValueError(f"{path}: {key} is given twice")
-        value = _of_kind(hints[name], value)
-        if fault := _fault(hints[name], value):
-            raise ValueError(f"{path}: {key} {fault}")
-        values[name] = value
+        values[name] = _value(hints[name], value)
+        if told := problem(values[name], *_rule(hints[name])):
+            told = told.replace("a tuple", "a list")
+            raise ValueError(f"{path}: {key} {told}")
     return kind(**values)
 
 
 def _table(path: Path) -> dict[str, Any]:
     kind, read = ("JSON", json.loads) if path.suffix == ".json" else ("TOML", tomllib.loads)
+    text = read_text(path, f"flags as {kind}", 1_000_000)
     try:
-        found = read(path.read_bytes().decode())
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from None
-    except RecursionError:
-        raise ValueError(f"{path}: no valid {kind}: nested too deeply") from None
-    except ValueError as error:  # those of both formats, of the encoding and of endless numbers
-        raise ValueError(f"{path}: no valid {kind}: {error}") from None
+        found = read(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: no valid {kind}: {one_line(error)}") from None
     if kind == "JSON":
         found = found.get("flags") if isinstance(found, dict) else None
     if not isinstance(found, dict):
@@ -335,56 +307,23 @@ def _hints(kind: type) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in fields(kind) if field.name != "config"}
 
 
-def _of_kind(hint: Any, value: Any) -> Any:
+def _rule(hint: Any) -> tuple[Any, Interval | tuple[str, ...] | None]:
+    """The plain type behind that of a flag, and what is allowed of it."""
+    if get_origin(hint) is Annotated:
+        return get_args(hint)
+    return (str, get_args(hint)) if get_origin(hint) is Literal else (hint, None)
+
+
+def _value(hint: Any, value: Any) -> Any:
     """A value of a file as the type of its flag, where there is no doubt; else as it is."""
-    kinds = _kinds(hint)
-    if Path in kinds and isinstance(value, str):
+    kind, _ = _rule(hint)
+    if kind in (Path, Path | None) and isinstance(value, str):
         return Path(value)
-    if float in kinds and isinstance(value, int) and not isinstance(value, bool):
-        return float(value) if abs(value) < sys.float_info.max else value
-    if get_origin(hint) is tuple and isinstance(value, list):
+    if kind is float and type(value) is int and abs(value) < 2**53:
+        return float(value)
+    if get_origin(kind) is tuple and isinstance(value, list):
         return tuple(value)
     return value
-
-
-def _kinds(hint: Any) -> tuple[Any, ...]:
-    """The plain types behind a hint."""
-    if get_origin(hint) is Annotated:
-        hint = get_args(hint)[0]
-    return get_args(hint) if isinstance(hint, UnionType) else (hint,)
-
-
-_NOUNS = {
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    str: "a text",
-    Path: "a path",
-    NoneType: "null",
-}
-
-
-def _fault(hint: Any, value: Any) -> str:
-    """What is wrong with the value of a flag; empty where nothing is."""
-    if get_origin(hint) is Annotated:
-        kind, allowed = get_args(hint)
-        fault = _fault(kind, value)
-        return fault or ("" if value in allowed else f"must be {allowed}, got {value}")
-    shown = "null" if value is None else repr(value)[:60]
-    if get_origin(hint) is Literal:
-        if value in get_args(hint):
-            return ""
-        near = difflib.get_close_matches(str(value), get_args(hint), n=1)
-        also = f"; did you mean {near[0]}?" if near else ""
-        return f"must be one of {', '.join(get_args(hint))}, got {shown}{also}"
-    if get_origin(hint) is tuple:
-        kind = get_args(hint)[0]
-        if isinstance(value, tuple) and not any(_fault(kind, one) for one in value):
-            return ""
-        return f"must be a list, each {_NOUNS[kind]}, got {shown}"
-    kinds = _kinds(hint)
-    right = bool in kinds if isinstance(value, bool) else isinstance(value, kinds)
-    return "" if right else f"must be {' or '.join(_NOUNS[kind] for kind in kinds)}, got {shown}"
 
 
 def settings(flags: Any) -> dict[str, Any]:

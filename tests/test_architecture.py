@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
-    ["console", "runtime", "geometry"],
+    ["console", "inputs", "runtime", "geometry"],
     ["trajectory"],
     ["robot"],
     ["model"],

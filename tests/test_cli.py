@@ -93,7 +93,7 @@ def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
 @pytest.mark.parametrize("command", ["walk", "evaluate"])
 def test_a_walk_of_no_length_is_refused(monkeypatch, capsys, command):
     line = refused(monkeypatch, capsys, command, "--traj", "eight", "--seconds", "0")
-    assert "--seconds must be above 0 and at most 600, got 0.0" in line
+    assert "--seconds must be a number above 0 and at most 600, got 0.0" in line
 
 
 def test_unknown_world(monkeypatch, capsys):
@@ -139,7 +139,7 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     ("wrong", "expected"),
     [
         (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        (("--seconds", "nan"), "at least 0.03 s"),
+        (("--seconds", "nan"), "--seconds must be a number that is finite, got nan"),
         (("--walks", "2"), "at least 3"),
     ],
 )
@@ -230,7 +230,7 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     [
         (("--budget", "9"), "budget"),
         (("--population", "2"), "population"),
-        (("--seed", "-1"), "--seed must be at least 0 and"),
+        (("--seed", "-1"), "--seed must be a whole number of at least 0 and"),
         (("--start", "none.json"), "none.json"),
     ],
 )

@@ -11,6 +11,7 @@ import pytest
 from hector_jax import cli, flags
 from hector_jax.evaluation.report import PAPER_ITERATIONS
 from hector_jax.flags import Command, Configured, Evaluate, Table, Tune, from_file, settings
+from hector_jax.inputs import Interval
 
 FILES = [kind for kind in get_args(Command) if issubclass(kind, Configured)]
 
@@ -86,23 +87,26 @@ def test_the_line_that_asks_again_needs_no_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
-        ("sedes = 3", "unknown key 'sedes'; did you mean seeds?"),
-        ("first-sede = 3", "unknown key 'first-sede'; did you mean first-seed?"),
+        ("sedes = 3", "unknown key 'sedes'; did you mean 'seeds'?"),
+        ("first-sede = 3", "unknown key 'first-sede'; did you mean 'first-seed'?"),
         ("moon = 3", "unknown key 'moon'; known: ceiling, data, "),
         ('config = "other.toml"', "unknown key 'config'"),
         ("[tune]\nseeds = 3", "unknown key 'tune'"),
-        ('seeds = "3"', "seeds must be a whole number, got '3'"),
-        ("seeds = 3.0", "seeds must be a whole number, got 3.0"),
-        ("seeds = true", "seeds must be a whole number, got True"),
-        ("seeds = 0", "seeds must be at least 1, got 0"),
-        ("first-seed = -1", "first-seed must be at least 0 and at most 4294967295, got -1"),
+        ('seeds = "3"', "seeds must be a whole number of at least 1, got '3'"),
+        ("seeds = 3.0", "seeds must be a whole number of at least 1, got 3.0"),
+        ("seeds = true", "seeds must be a whole number of at least 1, got True"),
+        ("seeds = 0", "seeds must be a whole number of at least 1, got 0"),
+        (
+            "first-seed = -1",
+            "first-seed must be a whole number of at least 0 and at most 4",
+        ),
         ("quick = 1", "quick must be true or false, got 1"),
-        ("data = 1", "data must be a path, got 1"),
-        ("kept = []", "kept must be a path or null, got []"),
-        ('trajectories = "c"', "trajectories must be a list, each a text, got 'c'"),
-        ("trajectories = [1]", "trajectories must be a list, each a text, got (1,)"),
-        ("iterations = 9", "iterations must be at least 10, got 9"),
-        ("seeds = 1979-05-27", "seeds must be a whole number, got datetime.date"),
+        ("data = 1", "data must be a Path, got 1"),
+        ("kept = []", "kept must be a Path, got []"),
+        ('trajectories = "c"', "trajectories must be a list, got 'c'"),
+        ("trajectories = [1]", "trajectories must be words, got 1 in (1,)"),
+        ("iterations = 9", "iterations must be a whole number of at least 10, got 9"),
+        ("seeds = 1979-05-27", "seeds must be a whole number of at least 1, got datetime.date"),
         ("seeds = ", "no valid TOML: "),
         ("seeds = 1\nseeds = 2", "no valid TOML: "),
     ],
@@ -118,15 +122,18 @@ def test_a_wrong_file_is_one_line_with_file_and_key(tmp_path, text, fault):
 @pytest.mark.parametrize(
     ("key", "fault"),
     [
-        ('world = "standing"', "must be one of ideal, hfs, .*did you mean standin"),
-        ("world = 3", "world must be one of ideal, .*got 3"),
-        ("seconds = 0", "seconds must be above 0 and at most 600, got 0"),
-        ("seconds = 601.0", "seconds must be above 0 and at most 600, got 601"),
-        ("seconds = nan", "seconds must be above 0 and at most 600, got nan"),
-        (f"seconds = 1{400 * '0'}", "seconds must be a number, got 1000"),
-        ("first-seed = 4294967296", "first-seed must be at least 0 and at most 4294967295, got 42"),
-        ("seconds = inf", "seconds must be above 0 and at most 600, got inf"),
-        ('seconds = "long"', "seconds must be a number, got 'long'"),
+        ('world = "standing"', "must be 'ideal', 'hfs', .*did you mean 'standin'"),
+        ("world = 3", "world must be 'ideal', .*got 3"),
+        ("seconds = 0", "seconds must be a number above 0 and at most 600, got 0"),
+        ("seconds = 601.0", "seconds must be a number above 0 and at most 600, got 601"),
+        ("seconds = nan", "seconds must be a number above 0 and at most 600, got nan"),
+        (f"seconds = 1{400 * '0'}", "seconds must be a number above 0 and at most 600, got 1000"),
+        (
+            "first-seed = 4294967296",
+            "first-seed must be a whole number of at least 0 and .*got 4294967296",
+        ),
+        ("seconds = inf", "seconds must be a number above 0 and at most 600, got inf"),
+        ('seconds = "long"', "seconds must be a number above 0 and at most 600, got 'long'"),
     ],
 )
 def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
@@ -137,14 +144,18 @@ def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
 @pytest.mark.parametrize(
     ("name", "data", "fault"),
     [
-        ("run.toml", b"\xff\xfe", "no valid TOML"),
+        ("run.toml", b"\xff\xfe", "not a text file"),
         ("run.toml", b"seeds = 1" + b"0" * 5000, "no valid TOML"),
         ("run.json", b"{", "no valid JSON"),
         ("run.json", b"[]", "no `flags` inside"),
         ("run.json", b'{"tune": {}}', "no `flags` inside"),
-        ("run.json", b'{"flags": {"seeds": null}}', "seeds must be a whole number, got null"),
-        ("run.json", b"[" * 100_000, "nested too deeply"),
-        ("run.toml", b"a = " + b"[" * 100_000, "nested too deeply"),
+        (
+            "run.json",
+            b'{"flags": {"seeds": null}}',
+            "seeds must be a whole number.*got None",
+        ),
+        ("run.json", b"[" * 100_000, "no valid"),
+        ("run.toml", b"a = " + b"[" * 100_000, "no valid"),
         ("none.toml", None, "No such file"),
     ],
 )
@@ -161,14 +172,20 @@ def test_the_program_tells_a_wrong_file_in_one_line(monkeypatch, capsys, tmp_pat
     monkeypatch.setattr(sys, "argv", ["hector", "tune", "--config", str(path)])
     assert cli.main() == 2
     out, err = capsys.readouterr()
-    assert (out, err) == ("", f"hector: {path}: seeds must be at least 1, got 0\n")
+    assert (out, err) == (
+        "",
+        f"hector: {path}: seeds must be a whole number of at least 1, got 0\n",
+    )
 
 
 @pytest.mark.parametrize(
     ("wrong", "fault"),
     [
-        (Tune(seeds=0), "--seeds must be at least 1, got 0"),
-        (Evaluate(first_seed=-2), "--first-seed must be at least 0 and at most .* got -2"),
+        (Tune(seeds=0), "--seeds must be a whole number of at least 1, got 0"),
+        (
+            Evaluate(first_seed=-2),
+            "--first-seed must be a whole number of at least 0 and .*got -2",
+        ),
     ],
 )
 def test_flags_are_held_to_their_ranges(wrong, fault):
@@ -182,4 +199,4 @@ def test_the_defaults_are_in_range(kind):
 
 
 def test_the_least_number_of_iterations_is_the_papers():
-    assert flags.Iterations.__metadata__ == (flags.Range(PAPER_ITERATIONS),)
+    assert flags.Iterations.__metadata__ == (Interval(PAPER_ITERATIONS),)
