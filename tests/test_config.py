@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from hypothesis import given
+from hypothesis import settings as settings_of
+from hypothesis import strategies as st
 
 from hector_jax import cli, flags
 from hector_jax.evaluation.report import PAPER_ITERATIONS
@@ -200,3 +203,30 @@ def test_the_defaults_are_in_range(kind):
 
 def test_the_least_number_of_iterations_is_the_papers():
     assert flags.Iterations.__metadata__ == (Interval(PAPER_ITERATIONS),)
+
+
+_VALUES = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=20)
+    | st.sampled_from(["s", "hfs", "auto", "paper", 1, 10, 2**32, 10**400, ["a"], [1], {"a": 1}])
+)
+_KEYS = st.text(max_size=20) | st.sampled_from(
+    sorted({field.name for kind in FILES for field in fields(kind)})
+)
+
+
+@settings_of(max_examples=300, derandomize=True, deadline=None, database=None)
+@given(st.sampled_from(FILES), st.dictionaries(_KEYS, _VALUES, max_size=4))
+def test_any_table_makes_flags_in_range_or_one_line_with_the_file(tmp_path_factory, kind, table):
+    path = tmp_path_factory.mktemp("any") / "config.json"
+    path.write_text(json.dumps({"flags": table}))
+    told = f"{path}: "
+    try:
+        flags.check(from_file(kind, path))
+    except ValueError as error:
+        told = str(error)
+    assert told.startswith(f"{path}: ")
+    assert len(told.splitlines()) == 1
