@@ -13,6 +13,7 @@ from typing import get_args
 import jax
 import numpy as np
 import pytest
+from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
 from hector_jax import commands, doctor
@@ -282,6 +283,17 @@ def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_pa
         assert json.loads(out) == {"net": str(tmp_path / "net.npz"), "errors": errors}
     else:
         assert [line.split()[0] for line in out.splitlines()[1:]] == ["raw", "net"]
+
+
+def test_a_table_prints_json_and_nothing_else(monkeypatch, capsys, tmp_path):
+    verdict = pretend_verdict()
+    made = (tmp_path / "report.md", {"c": verdict, "s": verdict})
+    monkeypatch.setattr(commands.study, "make_table", lambda *args: made)
+    assert call(monkeypatch, "table", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["report"] == str(made[0])
+    assert told["trajectories"].keys() == {"c", "s"}
+    assert told["trajectories"]["c"]["sets"].keys() == set(verdict.scores)
 
 
 @pytest.mark.slow
