@@ -1,7 +1,8 @@
 """The console script `hector`: flags in, exit code out.
 
 Results go to stdout, everything said while waiting to stderr. Exit codes: 0 done, 2 bad input (one
-line says what, where and what was expected), 130 interrupted.
+line says what, where and what was expected), 1 a worker process was killed, 130 interrupted, 143
+terminated.
 """
 
 import sys
@@ -21,10 +22,14 @@ _ABOUT = (
 def main() -> int:
     """Entry of the console script."""
     args = tyro.cli(Command, prog="hector", description=_ABOUT)
-    setup_jax()
-    from hector_jax import commands  # after the flags: `hector --help` answers at once
 
-    return exit_code("hector", lambda: commands.run(args))
+    def work() -> None:
+        setup_jax()
+        from hector_jax import commands  # after the flags: `hector --help` answers at once
+
+        commands.run(args)
+
+    return exit_code("hector", work)
 
 
 if __name__ == "__main__":

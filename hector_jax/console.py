@@ -1,11 +1,16 @@
 """What a person sees while waiting: one line or one bar on stderr; stdout carries results only."""
 
+import os
 import shlex
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -59,19 +64,62 @@ def bar(title: str) -> Iterator[Tell]:
     say(f"{title}: done in {time.monotonic() - start:.0f} s")
 
 
+_SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+
+
+class Stopped(KeyboardInterrupt):
+    """The first of `_SIGNALS`; its argument is the number."""
+
+
+@contextmanager
+def _stoppable(name: str) -> Iterator[None]:
+    """Raise `Stopped` at the first signal, end the process on the spot at the second.
+
+    Nothing is lost by the second: files appear whole, and workers leave with their parent.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may have handlers
+        return
+    came: list[int] = []
+
+    def stop(number: int, frame: Any) -> None:
+        came.append(number)
+        if len(came) == 1:
+            raise Stopped(number)
+        if console.is_terminal:
+            os.write(2, b"\x1b[?25h")  # the cursor, which a bar hides
+        os.write(2, f"{name}: {_SIGNALS[signal.Signals(number)]}, at once\n".encode())
+        os._exit(128 + number)
+
+    handlers = {number: signal.signal(number, stop) for number in _SIGNALS}
+    try:
+        yield
+    finally:
+        if not came:  # else a second one may come while the program ends
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+
 def exit_code(name: str, work: Callable[[], None]) -> int:
     """Do the work of a program; its exit code, with one line on stderr where that is not 0.
 
     Args:
         name: of the program, before the line.
-        work: ValueError and OSError are told as bad input (2), an interrupt as such (130).
+        work: ValueError and OSError are told as bad input (2), a worker process that was killed as
+            such (1), SIGINT (130) and SIGTERM (143) too; a second signal does not wait.
     """
     try:
-        work()
+        with _stoppable(name):
+            work()
     except (ValueError, OSError) as error:
         code, text = 2, " ".join(str(error).split())
+    except BrokenExecutor:
+        code, text = 1, "a worker process was killed, perhaps for want of memory"
+    except Stopped as stopped:
+        number = signal.Signals(stopped.args[0])
+        code, text = 128 + number, _SIGNALS[number]
     except KeyboardInterrupt:
-        code, text = 130, "interrupted"
+        code, text = 130, _SIGNALS[signal.SIGINT]
     else:
         return 0
     print(f"{name}: {text}", file=sys.stderr)

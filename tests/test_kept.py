@@ -12,6 +12,8 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import bounds, expert, nominal
 from hector_jax.robot import load_robot
 from hector_jax.sim.world import hfs, ideal
+from hector_jax.storage import Checkpoint
+from hector_jax.tuning.course import KIND, load_tuning, save_tuning
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
@@ -28,8 +30,11 @@ def tuned(monkeypatch):
     """Names of the problems that are really tuned."""
     names = []
 
-    def tune_many(pool, config, robot, problems, title):
-        names.extend(problems)
+    def tune_many(pool, config, robot, problems, title, records):
+        for name, record in records.items():
+            if not record.is_finished:
+                names.append(name)
+                save_tuning(record.kept, TUNING)
         return dict.fromkeys(problems, TUNING)
 
     monkeypatch.setattr(pipeline, "tune_many", tune_many)
@@ -66,14 +71,16 @@ def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
 
 def test_a_tuning_comes_back_as_it_was(tmp_path):
     path = tmp_path / "tuning.npz"
-    kept.save_tuning(path, TUNING, ROBOT, "abc")
-    back = kept.load_tuning(path, ROBOT)
-    assert back.commit == "abc"
-    assert back.tuning.stop == TUNING.stop
-    assert [i.reason for i in back.tuning.history] == [i.reason for i in TUNING.history]
-    assert [i.accepted for i in back.tuning.history] == [i.accepted for i in TUNING.history]
-    same(back.tuning._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
-    for one, other in zip(back.tuning.history, TUNING.history, strict=True):
+    record = Checkpoint(path, KIND, ROBOT, {"commit": "abc"})
+    save_tuning(record, TUNING)
+    back = load_tuning(record)
+    assert back.is_finished
+    assert back.notes["commit"] == "abc"
+    assert back.past.stop == TUNING.stop
+    assert [i.reason for i in back.past.history] == [i.reason for i in TUNING.history]
+    assert [i.accepted for i in back.past.history] == [i.accepted for i in TUNING.history]
+    same(back.past._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
+    for one, other in zip(back.past.history, TUNING.history, strict=True):
         assert one.iteration == other.iteration
         assert one.step == other.step
         same((one.weights, one.evaluation), (other.weights, other.evaluation))
@@ -90,7 +97,7 @@ def test_a_tuning_is_made_once_and_again_for_other_settings(tmp_path, tuned):
 
 def test_a_damaged_tuning_is_made_anew(tmp_path, tuned, capsys):
     tune(tmp_path)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("*.npz")
     path.write_bytes(path.read_bytes()[:-100])
     tune(tmp_path)
     assert len(tuned) == 2

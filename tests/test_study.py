@@ -13,6 +13,7 @@ from hector_jax.evaluation.video import VideoUnavailable
 from hector_jax.flags import Table, as_command
 from hector_jax.sim.world import hfs
 from hector_jax.storage import save_weights
+from hector_jax.tuning.course import Record
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.search import Found, Generation
 
@@ -32,7 +33,7 @@ def asked(monkeypatch):
         one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(starts, one)
 
-    def tune_many(pool, config, robot, problems, title):
+    def tune_many(pool, config, robot, problems, title, records):
         told["tunings"].append((config.iterations, *problems))
         return dict.fromkeys(problems, Tuning(pretend_history(12), nominal(), expert(), "done"))
 
@@ -44,7 +45,7 @@ def asked(monkeypatch):
     def write_video(*args):
         raise VideoUnavailable("no film: none here")
 
-    def tune_measured(pool, config, robot, weights, command, params, plants, title):
+    def tune_measured(pool, config, robot, weights, command, params, plants, title, record):
         told["steps"] = config.iterations - 10, len(plants)
         return Tuning(pretend_history(3), nominal(), expert(), "done")
 
@@ -56,7 +57,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(pipeline, "tune_many", tune_many)
     monkeypatch.setattr(pipeline, "tune_measured", tune_measured)
     monkeypatch.setattr(pipeline, "walks_of", walks_of)
-    monkeypatch.setattr(kept, "load_tuning", lambda path, robot: None)
+    monkeypatch.setattr(kept, "load_tuning", Record)
     monkeypatch.setattr(study, "write_video", write_video)
     return told
 
