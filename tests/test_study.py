@@ -145,10 +145,12 @@ def test_the_line_that_asks_again_names_what_is_not_default():
 
 def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(commands, "run", asked.append)
-    commands._tune(flags.Tune(traj="all", run=tmp_path, seeds=2))
-    assert [one.traj for one in asked] == ["straight", "c", "s"]
-    assert [one.run.name for one in asked] == ["straight", "c", "s"]
-    assert {one.seeds for one in asked} == {2}
-    commands._tune(flags.Tune(traj="all"))
-    assert asked[-1].run is None
+    monkeypatch.setattr(commands, "_tune_in", lambda folder, args: asked.append((folder, args)))
+    commands._tune(flags.Tune(traj="all", run=tmp_path / "run", seeds=2))
+    assert [one.traj for _, one in asked] == ["straight", "c", "s"]
+    assert [folder.name for folder, _ in asked] == ["straight", "c", "s"]
+    assert {one.seeds for _, one in asked} == {2}
+    commands._tune(flags.Tune(traj="all", resume=tmp_path / "run"))
+    assert [one.seeds for _, one in asked[3:]] == [2, 2, 2]
+    commands._tune(flags.Tune(traj="all", runs=tmp_path / "runs"))
+    assert [folder.parent.name for folder, _ in asked[6:]] == ["straight", "c", "s"]
