@@ -302,8 +302,8 @@ class Checkpoint:
     """How far something came, on disk: the newest state and the one before it.
 
     A file that is cut, changed, of another robot, layout or of other versions, under which the same
-    bytes cannot be promised, is named and not taken up. Of what else a state follows from, the
-    file's name is to hold a `digest`.
+    bytes cannot be promised, is named, not taken up, and put aside as `.refused`. Of what else a
+    state follows from, the file's name is to hold a `digest`.
     """
 
     path: Path  # of the newest state
@@ -314,7 +314,10 @@ class Checkpoint:
     @property
     def before(self) -> Path:
         """The file of the state before the newest."""
-        return self.path.with_name(f"{self.path.stem}.before{self.path.suffix}")
+        return self._beside("before")
+
+    def _beside(self, word: str) -> Path:
+        return self.path.with_name(f"{self.path.stem}.{word}{self.path.suffix}")
 
     def save(self, tree: Any, about: Mapping[str, Any] | None = None) -> None:
         """Keep a state, with more notes for its card.
@@ -333,9 +336,13 @@ class Checkpoint:
             try:
                 tree, card = load_tree(path, like, kind=self.kind, robot=self.robot)
                 check_versions(path, card["versions"])
-                return tree, card["about"]
             except ValueError as error:
                 say(f"not taken up: {error}")
+                continue
+            if path == self.before and self.path.exists():
+                # out of the way: the next save must not put it in the place of the sound one
+                os.replace(self.path, self._beside("refused"))
+            return tree, card["about"]
         return None
 
     def remove(self) -> None:

@@ -14,8 +14,10 @@ import pytest
 from killed import look
 
 from hector_jax import commands, flags, storage
+from hector_jax.console import exit_code
 from hector_jax.control.weights import nominal
 from hector_jax.robot import load_robot
+from hector_jax.runtime import workers
 from hector_jax.storage import Checkpoint, locked, write_file
 from hector_jax.tuning.course import KIND, load_tuning, save_tuning
 from hector_jax.tuning.difftune import TuneConfig, descend
@@ -110,6 +112,9 @@ def test_a_spoilt_state_is_named_and_the_one_before_is_taken(tmp_path, capsys, m
     told = "".join(capsys.readouterr().err.split())
     assert "nottakenup:" in told
     assert "state.npz:" in told
+    kept.save({"x": np.ones(3)})  # does not put the spoilt one in the place of the sound one
+    spoil(kept.path, "truncated")
+    assert kept.load(STATE)[0]["x"].tolist() == [0.0, 1.0, 2.0]
     spoil(kept.before, "truncated")
     assert kept.load(STATE) is None
 
@@ -206,7 +211,7 @@ def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, 
     )
     assert program.stdout is not None
     program.stdout.readline()
-    workers = children(program.pid)
+    helpers = children(program.pid)
     for number in signals:
         # an interrupt of the terminal reaches the workers too
         (os.killpg if number == signal.SIGINT else os.kill)(program.pid, number)
@@ -215,11 +220,21 @@ def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, 
     assert "Traceback" not in err
     assert err.startswith(line)
     for _ in range(100):
-        if all(map(is_gone, workers)):
+        if all(map(is_gone, helpers)):
             break
         time.sleep(0.1)
-    assert workers
-    assert all(map(is_gone, workers))
+    assert helpers
+    assert all(map(is_gone, helpers))
+
+
+def test_a_worker_that_is_killed_is_told_in_one_line(capsys):
+    def work():
+        with workers(1) as pool:
+            pool.submit(signal.raise_signal, signal.SIGKILL).result()
+
+    assert exit_code("toy", work) == 1
+    line = "toy: a worker process was killed, perhaps for want of memory\n"
+    assert capsys.readouterr().err == line
 
 
 def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
