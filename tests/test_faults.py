@@ -123,7 +123,7 @@ def tune(folder, command, params, config=CONFIG, robot=ROBOT):
             {"with": (command, params)},
             "tuning",
             lambda name, iteration: lines.append(pipeline.as_line(name, iteration)),
-            folder,
+            dumps=folder,
         )
     return found["with"], [json.loads(line) for line in lines]
 
