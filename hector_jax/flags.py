@@ -82,7 +82,7 @@ class Table:
     rollouts: int = 200  # walks of the search on the high-fidelity simulator
     iterations: int = 100  # of the tuning, at most
     steps: int = 30  # of `with` further, along walks on the simulator; 0: no such row
-    step_plants: int = 2  # that each of these steps walks on, hfs and drawn around it
+    step_plants: int = 8  # that each of these steps walks on, hfs and drawn around it
     extra: tuple[str, ...] = ()  # NAME=FOLDER of straight.json, c.json, s.json: one more row each
     ceiling: Path = Path("docs/results/ceiling")  # such a folder too; row `ceiling` where it exists
     earlier: Path | None = None  # table.json of other plants: do the sets keep their order?
