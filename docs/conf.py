@@ -65,6 +65,8 @@ def _plain(text: str) -> str:
     for i in range(0, len(parts), 2):
         parts[i] = re.sub(r"([*|\\])", r"\\\1", parts[i])
         parts[i] = re.sub(r"(?<=\w)_(?!\w)", r"\\_", parts[i])
+        if i and re.match(r"\w", parts[i]):  # `Net`s
+            parts[i] = "\\ " + parts[i]
     return "".join(parts)
 
 

@@ -1,0 +1,152 @@
+"""What the documentation says can be done: examples run, commands parse, the site needs no network."""
+
+import doctest
+import importlib
+import pkgutil
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import hector_jax
+from hector_jax import cli
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)
+READ = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *PAGES]
+MODULES = sorted(
+    module.name
+    for module in pkgutil.walk_packages(hector_jax.__path__, "hector_jax.")
+    if not module.ispkg
+)
+HOW = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+def blocks(text, language=""):
+    """Fenced blocks of a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def with_examples(paths):
+    return [path for path in paths if ">>>" in path.read_text()]
+
+
+def source(name):
+    return ROOT / f"{name.replace('.', '/')}.py"
+
+
+@pytest.mark.parametrize("name", [m for m in MODULES if ">>>" in source(m).read_text()])
+def test_examples_in_docstrings_say_what_comes_out(name):
+    failed, tried = doctest.testmod(importlib.import_module(name), optionflags=HOW)
+    assert tried
+    assert not failed
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        # a gradient has to be compiled
+        pytest.param(
+            page,
+            id=page.stem,
+            marks=pytest.mark.slow if page.stem in ("tutorial", "loss") else (),
+        )
+        for page in with_examples(PAGES)
+    ],
+)
+def test_examples_in_pages_say_what_comes_out(page):
+    text = "\n".join(blocks(page.read_text(), "python"))
+    example = doctest.DocTestParser().get_doctest(text, {}, page.stem, str(page), 0)
+    runner = doctest.DocTestRunner(optionflags=HOW)
+    runner.run(example)
+    assert runner.tries
+    assert not runner.failures
+
+
+def lines_of(path, program):
+    """Calls of a program in a page: lines of plain blocks, and whole spans of code."""
+    text = path.read_text()
+    lines = [line for block in blocks(text) for line in block.replace("\\\n", " ").splitlines()]
+    lines += re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.M | re.S))
+    lines = [line.strip().removeprefix(".venv/bin/") for line in lines]
+    found = [line for line in lines if re.match(rf"{program} [a-z]", line)]
+    return [line for line in found if not re.search(r"[<|]|\.\.\.", line)]
+
+
+CALLS = sorted({(path.name, line) for path in READ for line in lines_of(path, "hector")})
+
+
+def test_pages_show_commands():
+    assert len(CALLS) > 20
+
+
+@pytest.mark.parametrize(("page", "line"), CALLS)
+def test_commands_in_pages_parse(page, line, capsys):
+    words = shlex.split(line, comments=True)[1:]
+    if "--config" in words:  # a file of the reader's
+        at = words.index("--config")
+        del words[at : at + 2]
+    try:
+        cli.parsed(words)
+    except SystemExit as left:
+        assert left.code == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
+def test_targets_of_make_in_pages_are_there(path):
+    there = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for line in lines_of(path, "make"):
+        words = shlex.split(line, comments=True)[1:]
+        assert {word for word in words if "=" not in word} <= there, line
+
+
+@pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
+def test_files_that_pages_name_are_there(path):
+    named = re.findall(r"\b(?:experiments|examples|assets)/[\w/.-]+\.\w+", path.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_every_module_is_in_the_reference():
+    told = [p.read_text() for p in (DOCS / "reference").glob("*.md")]
+    assert sorted(re.findall(r"automodule:: (\S+)", "\n".join(told))) == MODULES
+
+
+def test_equations_carry_the_papers_numbers():
+    labels = re.findall(r"\$\$ \(eq(\d+)\)", (DOCS / "theory.md").read_text())
+    assert [int(label) for label in labels] == list(range(1, 17))
+
+
+def test_the_citation_is_of_this_version():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_and_asks_nobody_for_anything(tmp_path):
+    build = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", DOCS, tmp_path / "site"]
+    done = subprocess.run(build, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    outside = re.compile(r"<(?:script|link|img|iframe)[^>]+(?:src|href)=\"(?:https?:)?//", re.I)
+    for path in (tmp_path / "site").rglob("*.html"):
+        assert not outside.search(path.read_text()), path
+    for path in (tmp_path / "site").rglob("*.css"):
+        assert not re.search(r"@import|url\([\"']?(?:https?:)?//", path.read_text()), path
+    theory = (tmp_path / "site" / "theory.html").read_text()
+    assert theory.count("<math") > 40
+    numbers = re.findall(r'class="eqno">\((\d+)\)', theory)
+    assert numbers == [str(n) for n in range(1, 17)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tune", "phi"])
+def test_notebooks_run_to_their_end(name, tmp_path):
+    nbclient, nbformat = (pytest.importorskip(module) for module in ("nbclient", "nbformat"))
+    notebook = nbformat.read(DOCS / "notebooks" / f"{name}.ipynb", as_version=4)
+    assert any(cell.get("outputs") for cell in notebook.cells)  # the site shows these
+    where = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=900, resources=where).execute()
