@@ -20,7 +20,8 @@ _ABOUT = (
 
 def main() -> int:
     """Entry of the console script."""
-    args = tyro.cli(Command, prog="hector", description=_ABOUT)
+    positional = (tyro.conf.PositionalRequiredArgs,)  # `hector export RUN`
+    args = tyro.cli(Command, prog="hector", description=_ABOUT, config=positional)
     setup_jax()
     from hector_jax import commands  # after the flags: `hector --help` answers at once
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import pipeline, study
+from hector_jax import export, pipeline, study
 from hector_jax.console import say
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
@@ -36,6 +36,7 @@ from hector_jax.flags import (
     Collect,
     Doctor,
     Evaluate,
+    Export,
     Grfm,
     Search,
     Table,
@@ -529,3 +530,27 @@ def _doctor(args: Doctor) -> None:
         short = {name: walks["ideal"] for name in ("one", "other")}
         missing = _film(Path(folder) / "film.mp4", robot, short)
     print(f"{'video':12s} {missing or 'works'}")
+
+
+@run.register
+def _export(args: Export) -> None:
+    # before the first array: see hector_jax.export
+    jax.config.update("jax_platforms", "cpu")
+    command = named_command(args.traj)
+    _check_seconds(args.seconds)
+    path, config = export.find_weights(args.run, args.set)
+    weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
+    folder = args.out or (args.run if args.run.is_dir() else args.run.parent) / "export"
+    say("exporting, walking once and asking both controllers")
+    known = (config, load_robot(), weights, command, folder)
+    card = export.export(*known, name=name, seconds=args.seconds)
+    if args.json:
+        print(as_json(card))
+        return
+    found = card["check"]
+    differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
+    print(f"largest difference from the live controller: {differences.format(**found)}")
+    for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
+        times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+        print(f"a call {text} [ms]: {times.format(**found[what])}")
+    say(f"all of it is in {folder}")

@@ -126,7 +126,19 @@ class Doctor:
     """Say what this machine offers: versions, device, precision, cache, video; and test it."""
 
 
-Command = Collect | Train | Grfm | Tune | Search | Table | Evaluate | Walk | Doctor
+@dataclass(frozen=True)
+class Export:
+    """Write what goes to a robot: weights, lines for the C++ controller, the controller."""
+
+    run: Path  # folder of a run, or a weights file
+    set: str = "with"  # weight set of the run
+    out: Path | None = None  # folder; `export` in the run or beside the file by default
+    traj: str = "straight"  # walked in the ideal world to check the exported controller
+    seconds: float = 1.0  # of that walk, after the start-up
+    json: bool = False  # print JSON instead of words
+
+
+Command = Collect | Train | Grfm | Tune | Search | Table | Evaluate | Walk | Doctor | Export
 
 
 def settings(flags: Any) -> dict[str, Any]:

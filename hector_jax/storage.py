@@ -237,17 +237,22 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def save_weights(path: Path, weights: Weights) -> None:
-    """Write weights as JSON, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`.
+def weights_tree(weights: Weights) -> dict[str, Any]:
+    """Weights as JSON values, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`."""
+    return {
+        part: {name: np.asarray(value).tolist() for name, value in tree._asdict().items()}
+        for part, tree in weights._asdict().items()
+    }
+
+
+def save_weights(path: Path, weights: Weights, schema: str | None = None) -> None:
+    """Write weights as JSON, as `weights_tree`; with the place of a schema it names that first.
 
     Raises:
         OSError: where the file cannot be written.
     """
-    tree = {
-        "Q": {name: np.asarray(value).tolist() for name, value in weights.Q._asdict().items()},
-        "R": {name: np.asarray(value).tolist() for name, value in weights.R._asdict().items()},
-    }
-    write_file(path, (json.dumps(tree, indent=2) + "\n").encode())
+    tree = {} if schema is None else {"$schema": schema}
+    write_file(path, (json.dumps(tree | weights_tree(weights), indent=2) + "\n").encode())
 
 
 def load_weights(path: Path) -> Weights:
@@ -266,6 +271,8 @@ def load_weights(path: Path) -> Weights:
         raise ValueError(f"{path}: no valid JSON: {error}") from error
     except RecursionError as error:
         raise ValueError(f"{path}: no valid JSON: nested too deeply") from error
+    if isinstance(tree, dict):
+        tree.pop("$schema", None)  # for editors; what is in a file is checked here
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
         "Q": dict.fromkeys(State._fields, (3,)),
         "R": dict.fromkeys(Wrench._fields, (2, 3)),

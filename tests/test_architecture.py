@@ -16,7 +16,7 @@ FLOORS = [
     ["tuning", "sim"],
     ["grfm"],
     ["evaluation"],
-    ["flags", "pipeline"],
+    ["flags", "pipeline", "export"],
     ["kept"],
     ["study"],
     ["commands"],
