@@ -1,11 +1,15 @@
 """The site: Markdown and docstrings in, pages that need no network out (`make docs`)."""
 
 import inspect
+import pkgutil
 import re
 from importlib import metadata
+from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+
+import hector_jax
 
 project = "hector_jax"
 author = "hector_jax"
@@ -39,6 +43,22 @@ html_math_renderer = "mathml"
 
 _FIELD = re.compile(r"^    (\w+): [^#]*?  # (.+)$", re.MULTILINE)
 _CODE = re.compile(r"(`[^`]*`)")
+
+
+def _write_reference(app) -> None:
+    """A page for each room and one for what stands above them, made by each build: none is missing."""
+    rooms: dict[str, list[str]] = {}
+    for module in pkgutil.walk_packages(hector_jax.__path__, "hector_jax."):
+        _, room, *inside = module.name.split(".")
+        rooms.setdefault(room if inside or module.ispkg else "hector_jax", []).append(module.name)
+    folder = Path(app.srcdir) / "reference"
+    folder.mkdir(exist_ok=True)
+    for room, names in rooms.items():
+        parts = [f"## `{n}`\n\n```{{eval-rst}}\n.. automodule:: {n}\n```\n" for n in sorted(names)]
+        text = "\n".join([f"# {room}\n", *parts])
+        path = folder / f"{room}.md"
+        if not path.exists() or path.read_text() != text:  # an unchanged page is not read again
+            path.write_text(text)
 
 
 def _math(tex: str, block: bool) -> str:
@@ -101,7 +121,8 @@ def _skip(app, what, name, obj, skip, options) -> bool | None:
 
 
 def setup(app) -> None:
-    """Register the renderer of formulas and the two hooks on docstrings."""
+    """Register the reference, the renderer of formulas and the two hooks on docstrings."""
+    app.connect("builder-inited", _write_reference)
     nothing = lambda translator, node: None  # noqa: E731
     app.add_html_math_renderer("mathml", (_inline, nothing), (_block, nothing))
     app.connect("autodoc-process-docstring", _as_rst, priority=400)
