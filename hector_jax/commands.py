@@ -3,7 +3,7 @@
 import dataclasses
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from datetime import datetime
@@ -20,7 +20,7 @@ from hector_jax.console import say
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
-from hector_jax.evaluation import fidelity, metrics, plots
+from hector_jax.evaluation import fidelity, metrics, plots, progress, view
 from hector_jax.evaluation.metrics import Verdict
 from hector_jax.evaluation.report import (
     WORLDS,
@@ -31,7 +31,7 @@ from hector_jax.evaluation.report import (
     write_fidelity,
     write_report,
 )
-from hector_jax.evaluation.video import VideoUnavailable, write_video
+from hector_jax.evaluation.video import Arrows, VideoUnavailable, write_video
 from hector_jax.flags import (
     Collect,
     Doctor,
@@ -42,6 +42,7 @@ from hector_jax.flags import (
     Table,
     Train,
     Tune,
+    View,
     Walk,
     as_command,
     settings,
@@ -49,10 +50,10 @@ from hector_jax.flags import (
 from hector_jax.grfm import training
 from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
-from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.grfm.network import as_effect, linear_effect, load_net
 from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.model.effect import last_command
-from hector_jax.robot import Robot, load_robot
+from hector_jax.robot import Robot, load_model, load_robot
 from hector_jax.runtime import cache_folder, workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
@@ -454,15 +455,8 @@ def _check_seconds(seconds: float) -> None:
 def _walk(args: Walk) -> None:
     command, weights, robot = named_command(args.traj), _weights(args.weights), load_robot()
     _check_seconds(args.seconds)
-
-    def walked(weights: Weights) -> Trajectory:
-        if args.world == "srbm":
-            return _rigid_body(robot, weights, command, args.seconds)
-        plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
-        return walk(WalkConfig(), robot, weights, command, plant, args.seconds, args.seed)
-
     say("compiling (only the first time on a machine) and walking")
-    trajectory = walked(weights)
+    trajectory = _walked(args, robot, command, weights)
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     if args.out is not None:
@@ -484,7 +478,19 @@ def _walk(args: Walk) -> None:
         print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
-        _film(args.video, robot, {beside: walked(other()), args.weights: trajectory})
+        _film(
+            args.video,
+            robot,
+            {beside: _walked(args, robot, command, other()), args.weights: trajectory},
+        )
+
+
+def _walked(args: Walk | View, robot: Robot, command: Any, weights: Weights) -> Trajectory:
+    """One walk in the world of the flags."""
+    if args.world == "srbm":
+        return _rigid_body(robot, weights, command, args.seconds)
+    plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
+    return walk(WalkConfig(), robot, weights, command, plant, args.seconds, args.seed)
 
 
 def _rigid_body(robot: Robot, weights: Weights, command: Any, seconds: float) -> Trajectory:
@@ -554,3 +560,92 @@ def _export(args: Export) -> None:
         times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
         print(f"a call {text} [ms]: {times.format(**found[what])}")
     say(f"all of it is in {folder}")
+
+
+def _view(args: View) -> None:
+    beside = args.run.with_name(f"{args.run.name}-view")
+    folder = args.out or (beside if args.headless else None)
+    if folder is None:
+        view.check_viser()
+    _check_seconds(args.seconds)
+    if args.seconds < 0.1:
+        raise ValueError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
+    if args.sets[0] == args.sets[1]:
+        raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
+    asked, robot = progress.read_asked(args.run), load_robot()
+    command = named_command(asked.trajectory)
+    if folder is not None:
+        if folder.resolve() == args.run.resolve():
+            raise ValueError(f"--out must not be the folder of the run, got {folder}")
+        make_folder(folder)
+    sets = {name: progress.weights_of(args.run, name) for name in args.sets}
+    effect = _phi_of(args.data or asked.data, asked.variant, robot)
+    story = [f"**{asked.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
+    shown: dict[str, view.Shown] = {}
+    say(f"walking anew in {args.world}, seed {args.seed}")
+    for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
+        walked = _walked(args, robot, command, weights)
+        loss = metrics.score(asked.loss, walked).L / 1e6
+        story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
+        say(f"  {story[-1]}")
+        walked = at_interval(walked, WalkConfig().gait.tick)
+        stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
+        effects = {} if effect is None else {"residual": effect}
+        curves = _curves(robot, stacked, effects)
+        shown[name] = view.Shown(walked, curves)
+    model = load_model()
+    motions = [view.motion(robot, model, one) for one in shown.values()]
+    if folder is not None:
+        histories = progress.read_metrics(args.run)
+        _draw_view(folder, robot, histories, asked.loss, shown, view.film_arrows(motions))
+        say(f"film and pictures are in {folder}")
+        return
+    view.serve(
+        dict(zip(_titles(shown), motions, strict=True)),
+        model,
+        args.run,
+        "\n\n".join(story),
+        lambda address: say(f"open {address} in a browser; Ctrl-C ends it"),
+        args.host,
+        args.port,
+    )
+
+
+def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
+    """Phi of the net that is kept under `data`; where there is none, a line says so."""
+    path = pipeline.net_path(data, variant)
+    if not path.exists():
+        say(f"no net at {path}, so none of its predictions; --data names another folder")
+        return None
+    return as_effect(load_net(path, robot, variant)[0])
+
+
+def _titles(names: Iterable[str]) -> list[str]:
+    return [f"{when}: {name}" for when, name in zip(("before", "after"), names, strict=True)]
+
+
+def _draw_view(
+    folder: Path,
+    robot: Robot,
+    histories: progress.Histories,
+    loss: LossConfig,
+    shown: Mapping[str, view.Shown],
+    arrows: Sequence[Arrows],
+) -> None:
+    """What the page shows, as a film and pictures."""
+    walks = {name: one.walk for name, one in shown.items()}
+    plots.tracking(folder / "tracking.png", walks)
+    plots.path_from_above(folder / "path.png", walks)
+    after = list(shown.values())[-1]
+    period, ticks = float(after.walk.period), len(after.walk.fallen)
+    first = min(0.4, period * ticks)  # [s], two steps
+    plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
+    tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
+    if tuned:
+        plots.losses(folder / "losses.png", loss, tuned)
+    say("drawing the film")
+    try:
+        titled = dict(zip(_titles(walks), walks.values(), strict=True))
+        write_video(folder / "film.mp4", robot, titled, folder / "film.png", arrows=arrows)
+    except VideoUnavailable as error:
+        raise ValueError(str(error)) from None

@@ -138,7 +138,23 @@ class Export:
     json: bool = False  # print JSON instead of words
 
 
-Command = Collect | Train | Grfm | Tune | Search | Table | Evaluate | Walk | Doctor | Export
+@dataclass(frozen=True)
+class View:
+    """Show a run on a local web page: before and after, the ground's forces, tuning as it goes."""
+
+    run: Path  # folder of a run of `hector tune`, finished or going on
+    sets: tuple[str, str] = ("nominal", "with")  # before and after: of the run's weights
+    world: str = "hfs"  # srbm, ideal, hfs, hfs-varied or standin; both are walked anew there
+    seed: int = 0  # of the plant and of the estimator's noise
+    seconds: float = 4.0  # of each walk
+    data: Path | None = None  # folder of the net that predicts the ground; by default the run's
+    host: str = "127.0.0.1"  # to listen on; as it is, no other machine sees the page
+    port: int = 8080  # where it is taken, another
+    headless: bool = False  # write a film and pictures instead of opening a page
+    out: Path | None = None  # to this folder, which implies --headless; else to RUN-view
+
+
+Command = Collect | Train | Grfm | Tune | Search | Table | Evaluate | Walk | Doctor | Export | View
 
 
 def settings(flags: Any) -> dict[str, Any]:

@@ -24,7 +24,9 @@ FLOORS = [
 ]
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
-    "mujoco": ("robot", "sim", "evaluation.video"),
+    "mujoco": ("robot", "sim", "evaluation.video", "evaluation.view"),
+    "viser": ("evaluation.view",),
+    "trimesh": ("evaluation.view",),
     "flax": ("grfm.network",),
     "optax": ("grfm.training", "tuning.difftune", "tuning.rivals"),
     "jaxopt": ("control.qp",),
