@@ -46,7 +46,7 @@ _CODE = re.compile(r"(`[^`]*`)")
 
 
 def _write_reference(app) -> None:
-    """A page for each room and one for what stands above them, made by each build: none is missing."""
+    """A page for each room and one for what stands above them; none is missing."""
     rooms: dict[str, list[str]] = {}
     for module in pkgutil.walk_packages(hector_jax.__path__, "hector_jax."):
         _, room, *inside = module.name.split(".")
@@ -72,10 +72,11 @@ def _inline(translator, node) -> None:
 
 
 def _block(translator, node) -> None:
-    number = f'<span class="eqno">({node["number"]})</span>' if node["number"] else ""
+    number = f'<span class="eqno" style="float: right">({node["number"]})</span>'
     ids = "".join(f' id="{name}"' for name in node["ids"][:1])
     formula = _math(node.astext(), block=True)
-    translator.body.append(f'<div class="math"{ids}>{number}{formula}</div>')
+    style = ' style="overflow-x: auto; overflow-y: hidden"'
+    translator.body.append(f"<div{ids}{style}>{number * bool(node['number'])}{formula}</div>")
     raise nodes.SkipNode
 
 
@@ -116,14 +117,21 @@ def _as_rst(app, what, name, obj, options, lines: list[str]) -> None:
     lines[:] = found
 
 
+def _short(app, what, name, obj, options, signature, returns) -> tuple:
+    """Arrays are called what the code calls them."""
+    short = lambda text: text and text.replace("jaxlib._jax.Array", "Array")  # noqa: E731
+    return short(signature), short(returns)
+
+
 def _skip(app, what, name, obj, skip, options) -> bool | None:
     return True if type(obj).__name__ == "_tuplegetter" else None
 
 
 def setup(app) -> None:
-    """Register the reference, the renderer of formulas and the two hooks on docstrings."""
+    """Register the reference, the renderer of formulas and the hooks on docstrings."""
     app.connect("builder-inited", _write_reference)
     nothing = lambda translator, node: None  # noqa: E731
     app.add_html_math_renderer("mathml", (_inline, nothing), (_block, nothing))
     app.connect("autodoc-process-docstring", _as_rst, priority=400)
+    app.connect("autodoc-process-signature", _short)
     app.connect("autodoc-skip-member", _skip)
