@@ -18,6 +18,7 @@ import numpy as np
 from hector_jax import export, pipeline, study
 from hector_jax.console import say
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
+from hector_jax.control.trajectories import Course, beyond, course, limits
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
 from hector_jax.evaluation import fidelity, metrics, plots, progress, view
@@ -48,10 +49,11 @@ from hector_jax.flags import (
     settings,
 )
 from hector_jax.grfm import training
-from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
+from hector_jax.grfm.dataset import PIECES, SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
 from hector_jax.grfm.network import as_effect, linear_effect, load_net
 from hector_jax.grfm.training import TrainConfig, predict
+from hector_jax.inputs import did_you_mean, shown
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_model, load_robot
 from hector_jax.runtime import cache_folder, workers
@@ -87,6 +89,11 @@ def run(args: Any) -> None:
 def _weights(text: str) -> Weights:
     """A weight set by its name, or from a file."""
     named = {"nominal": nominal, "expert": expert}
+    if text not in named and not Path(text).suffix and not Path(text).exists():
+        raise ValueError(
+            f"no weights {shown(text)}{did_you_mean(text, named)}; there are: "
+            f"{', '.join(named)}, or a file"
+        )
     return named[text]() if text in named else load_weights(Path(text))
 
 
@@ -97,6 +104,34 @@ def _plants(world: str, seeds: range) -> list[Imperfections]:
         return [named_world(world, seed) for seed in seeds]
     except ValueError as error:
         raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
+
+
+def _course(text: str, robot: Robot) -> Course:
+    """What to walk; one line says where a file asks for more than the robot may be able to."""
+    found = course(text)
+    if found.seconds and (told := beyond(limits(robot, WalkConfig().gait), found.command)):
+        say(f"warning: {text}: {told}")
+    return found
+
+
+def _seconds(asked: float, wanted: Course) -> float:
+    """Length of a walk: what the trajectory's file says, else what the flag does."""
+    if wanted.seconds is None:
+        return asked
+    if asked != Walk.seconds:
+        raise ValueError(
+            f"--seconds is for built-in trajectories: {wanted.name} lasts {wanted.seconds:g} s, "
+            f"as its file says, got {asked:g}"
+        )
+    return wanted.seconds
+
+
+def _lasting(config: TuneConfig, wanted: Course) -> TuneConfig:
+    """The tuning with rollouts as long as the trajectory, where its file says how long."""
+    if wanted.seconds is None:
+        return config
+    ticks = round(wanted.seconds / config.rollout.walk.gait.tick)
+    return replace(config, rollout=replace(config.rollout, ticks=ticks))
 
 
 @run.register
@@ -207,9 +242,9 @@ def _taken(folder: Path) -> str:
     return f"run folder {folder} exists; name another by --run, nothing was touched"
 
 
-def _new_folder(args: Tune) -> Path:
+def _new_folder(args: Tune, trajectory: str) -> Path:
     """The run's folder, made here; an existing one is never written into."""
-    folder = args.run or args.runs / args.traj / f"{datetime.now():%Y%m%d-%H%M%S}"
+    folder = args.run or args.runs / trajectory / f"{datetime.now():%Y%m%d-%H%M%S}"
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
@@ -227,19 +262,27 @@ def _tune(args: Tune) -> None:
         for one in several:
             run(one)
         return
-    command, robot = named_command(args.traj), load_robot()
+    robot = load_robot()
+    wanted = _course(args.traj, robot)
+    command, lasts = wanted.command, wanted.seconds or Walk.seconds
+    if args.refresh and len(command.duration) > PIECES:
+        raise ValueError(
+            f"--refresh takes trajectories of at most {PIECES} segments, {wanted.name} has "
+            f"{len(command.duration)}"
+        )
     if args.alpha not in ("paper", "auto"):
         raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
     least_of = {"seeds": 1, "processes": 1, "iterations": PAPER_ITERATIONS, "refresh": 0}
-    for name, least in least_of.items():
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
-    config, variant = TuneConfig(iterations=args.iterations), args.variant
+    for flag, least in least_of.items():
+        if getattr(args, flag) < least:
+            raise ValueError(f"--{flag} must be at least {least}, got {getattr(args, flag)}")
+    shared, variant = TuneConfig(iterations=args.iterations), args.variant
+    config = _lasting(shared, wanted)
     TrainConfig(variant)  # refuses an unknown one before a folder is made
-    folder = _new_folder(args)
+    folder = _new_folder(args, wanted.name)
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, config, robot, args.data, variant)
+        net = pipeline.ground(pool, shared, robot, args.data, variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
@@ -254,13 +297,13 @@ def _tune(args: Tune) -> None:
             def note(name: str, iteration: Iteration) -> None:
                 metrics_file.write(pipeline.as_line(name, iteration))
 
-            title = f"tuning {args.traj} without and with GRFM-Net"
+            title = f"tuning {wanted.name} without and with GRFM-Net"
             tunings = pipeline.tune_many(pool, config, robot, problems, title, note)
             newest, tuning = net, tunings["with"]
             for count in range(1, args.refresh + 1):
                 newest, shift = pipeline.refresh(
                     pool,
-                    replace(pipeline.REFRESH, seed=count),
+                    replace(pipeline.REFRESH, seed=count, seconds=lasts),
                     config,
                     robot,
                     command,
@@ -271,7 +314,7 @@ def _tune(args: Tune) -> None:
                 shifts.append(shift)
                 name = "with_refreshed" + (str(count) if count > 1 else "")
                 again = {name: (command, newest.params)}
-                title = f"tuning {args.traj} with the net refreshed"
+                title = f"tuning {wanted.name} with the net refreshed"
                 tunings |= pipeline.tune_many(pool, config, robot, again, title, note)
                 tuning = tunings[name]
         sets = {
@@ -293,10 +336,10 @@ def _tune(args: Tune) -> None:
             _plants("standin", seeds),
             seeds,
             f"judging on {args.seeds} stand-in plants",
+            lasts,
         )
-        on_hfs = pipeline.judge(
-            pool, config, robot, sets, command, [hfs()], [0], "walking on the simulator of the data"
-        )
+        title = "walking on the simulator of the data"
+        on_hfs = pipeline.judge(pool, config, robot, sets, command, [hfs()], [0], title, lasts)
     verdict = _verdict(config.loss, seeds, walks)
     result = metrics.as_result(verdict)
     for name, found in metrics.as_result(_verdict(config.loss, [0], on_hfs), "hfs")["sets"].items():
@@ -316,7 +359,7 @@ def _tune(args: Tune) -> None:
     told = write_report(
         folder,
         Report(
-            trajectory=args.traj,
+            trajectory=wanted.name,
             verdict=verdict,
             tunings=tunings,
             norms=norms,
@@ -329,7 +372,7 @@ def _tune(args: Tune) -> None:
             command=as_command("tune", replace(args, run=None)),
         ),
     )
-    print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")
+    print_table(verdict, f"{wanted.name}, {args.seeds} stand-in plants")
     say(f"the whole story, with pictures: {told}")
 
 
@@ -384,21 +427,28 @@ def _table(args: Table) -> None:
 
 @run.register
 def _search(args: Search) -> None:
-    names = COMMANDS if args.traj == "all" else (args.traj,)
-    for name in names:
-        named_command(name)
+    robot = load_robot()
+    wanted = [_course(text, robot) for text in (COMMANDS if args.traj == "all" else (args.traj,))]
+    own = {one.name: one.command for one in wanted}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = pipeline.choose_engine(args.engine)
-    robot, tune, start = load_robot(), TuneConfig(), _weights(args.start)
+    tune, start = _lasting(TuneConfig(), wanted[0]), _weights(args.start)
     make_folder(args.out)
     with workers(args.processes) as pool:
         found = pipeline.search(
-            pool, config, tune, robot, dict.fromkeys(names, start), engine, args.record or args.out
+            pool,
+            config,
+            tune,
+            robot,
+            dict.fromkeys(own, start),
+            engine,
+            args.record or args.out,
+            own,
         )
         say("walking start, expert and the best once more")
-        sets = {name: [start, expert(), found[name].weights] for name in names}
-        at_once = config.population * len(names)
-        compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once)
+        sets = {name: [start, expert(), found[name].weights] for name in own}
+        at_once = config.population * len(own)
+        compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once, own)
     print("L in 1e6 on the high-fidelity simulator")
     print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
     for name, one in found.items():
@@ -427,8 +477,10 @@ def _search(args: Search) -> None:
 
 @run.register
 def _evaluate(args: Evaluate) -> None:
-    command, robot = named_command(args.traj), load_robot()
     _check_seconds(args.seconds)
+    robot = load_robot()
+    wanted = _course(args.traj, robot)
+    seconds = _seconds(args.seconds, wanted)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
@@ -437,13 +489,13 @@ def _evaluate(args: Evaluate) -> None:
     with workers(args.processes) as pool:
         title = f"judging on {args.world}, {count} plants"
         walks = pipeline.judge(
-            pool, TuneConfig(), robot, sets, command, plants, seeds, title, args.seconds
+            pool, TuneConfig(), robot, sets, wanted.command, plants, seeds, title, seconds
         )
     verdict = _verdict(LossConfig(), seeds, walks)
     if args.json:
         print(as_json(metrics.as_result(verdict, args.world)))
     else:
-        print_table(verdict, f"{args.traj}, {count} plants", args.world)
+        print_table(verdict, f"{wanted.name}, {count} plants", args.world)
 
 
 def _check_seconds(seconds: float) -> None:
@@ -453,10 +505,11 @@ def _check_seconds(seconds: float) -> None:
 
 @run.register
 def _walk(args: Walk) -> None:
-    command, weights, robot = named_command(args.traj), _weights(args.weights), load_robot()
     _check_seconds(args.seconds)
+    weights, robot = _weights(args.weights), load_robot()
+    wanted = _course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = _walked(args, robot, command, weights)
+    trajectory = _walked(args, robot, wanted, weights)
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     if args.out is not None:
@@ -468,7 +521,7 @@ def _walk(args: Walk) -> None:
         print(as_json(told))  # a walk that falls at once has no errors
     else:
         print(
-            f"{args.traj} in {args.world}, {args.weights} weights: "
+            f"{wanted.name} in {args.world}, {args.weights} weights: "
             + (f"fell after {upright:.2f} s" if found.fallen else f"walked {upright:.2f} s")
             + f"; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
             f"L_pos {found.L_pos:.2f} m^2, L_ctrl {found.L_ctrl / 1e6:.3f}e6)"
@@ -481,16 +534,17 @@ def _walk(args: Walk) -> None:
         _film(
             args.video,
             robot,
-            {beside: _walked(args, robot, command, other()), args.weights: trajectory},
+            {beside: _walked(args, robot, wanted, other()), args.weights: trajectory},
         )
 
 
-def _walked(args: Walk | View, robot: Robot, command: Any, weights: Weights) -> Trajectory:
+def _walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) -> Trajectory:
     """One walk in the world of the flags."""
+    seconds = _seconds(args.seconds, wanted)
     if args.world == "srbm":
-        return _rigid_body(robot, weights, command, args.seconds)
+        return _rigid_body(robot, weights, wanted.command, seconds)
     plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
-    return walk(WalkConfig(), robot, weights, command, plant, args.seconds, args.seed)
+    return walk(WalkConfig(), robot, weights, wanted.command, plant, seconds, args.seed)
 
 
 def _rigid_body(robot: Robot, weights: Weights, command: Any, seconds: float) -> Trajectory:
@@ -573,7 +627,7 @@ def _view(args: View) -> None:
     if args.sets[0] == args.sets[1]:
         raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
     asked, robot = progress.read_asked(args.run), load_robot()
-    command = named_command(asked.trajectory)
+    wanted = _course(asked.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
             raise ValueError(f"--out must not be the folder of the run, got {folder}")
@@ -584,7 +638,7 @@ def _view(args: View) -> None:
     shown: dict[str, view.Shown] = {}
     say(f"walking anew in {args.world}, seed {args.seed}")
     for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
-        walked = _walked(args, robot, command, weights)
+        walked = _walked(args, robot, wanted, weights)
         loss = metrics.score(asked.loss, walked).L / 1e6
         story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
         say(f"  {story[-1]}")

@@ -43,7 +43,7 @@ class Grfm:
 class Tune:
     """Tune the MPC weights for a trajectory, with and without the net, and judge them."""
 
-    traj: str = "straight"  # straight, c, s, or all: one after the other
+    traj: str = "straight"  # straight, c, s, all (one after the other) or a TOML file
     seeds: int = 8  # stand-in plants in the verdict
     iterations: int = 100  # of the tuning, at most
     variant: str = "residual"  # of the net, or paper
@@ -60,7 +60,7 @@ class Tune:
 class Search:
     """Search weights on the high-fidelity simulator without derivatives (CMA-ES)."""
 
-    traj: str = "straight"  # straight, c, s or all
+    traj: str = "straight"  # straight, c, s, all or a TOML file
     budget: int = 200  # walks for each trajectory, at most; whole generations are walked
     population: int = 10  # walks in a generation
     seed: int = 0
@@ -98,7 +98,7 @@ class Evaluate:
     """Judge weight sets on plants of a world and print one table."""
 
     weights: tuple[str, ...] = ("nominal", "expert")  # names or files
-    traj: str = "straight"  # straight, c, s, sideways, turn, eight or stop-and-go
+    traj: str = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
     world: str = "standin"  # ideal, hfs, hfs-varied or standin
     seconds: float = 4.0  # of each walk; an eight takes 8
     seeds: int = 8  # plants
@@ -111,7 +111,7 @@ class Evaluate:
 class Walk:
     """Walk once and say how it went."""
 
-    traj: str = "straight"  # straight, c, s, sideways, turn, eight or stop-and-go
+    traj: str = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
     world: str = "hfs"  # srbm, ideal, hfs, hfs-varied or standin
     seed: int = 0  # of the plant and of the estimator's noise
     weights: str = "nominal"  # nominal, expert or a weights file

@@ -26,6 +26,7 @@ from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
+from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose, from_table, shown
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
@@ -40,6 +41,8 @@ from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
 
+ENGINES = ("auto", "c", "mjx")
+
 
 def choose_engine(asked: str) -> str:
     """The engine of walks in MuJoCo: `c` or `mjx`; `auto` is mjx where JAX sees an accelerator.
@@ -47,15 +50,9 @@ def choose_engine(asked: str) -> str:
     Raises:
         ValueError: none of the three.
     """
-    _check_engine(asked)
-    if asked == "auto":
+    if choose("engine", asked, ENGINES) == "auto":
         return "c" if jax.default_backend() == "cpu" else "mjx"
     return asked
-
-
-def _check_engine(asked: str) -> None:
-    if asked not in ("auto", "c", "mjx"):
-        raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {asked!r}")
 
 
 @dataclass(frozen=True)
@@ -68,17 +65,18 @@ class CollectConfig:
     engine: str = "auto"  # c: MuJoCo on the processes; mjx: all at once; auto: mjx on a GPU
 
     def __post_init__(self) -> None:
-        _check_engine(self.engine)  # devices stay unasked: their number may not be set up yet
+        # devices stay unasked: their number may not be set up yet
+        check(self, walks=SOME, seconds=POSITIVE, seed=SEED, engine=ENGINES)
         if self.walks < 3:
             raise ValueError(
                 "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
                 f"by), got {self.walks}"
             )
         least = HISTORY * GaitConfig.tick
-        if not least <= self.seconds < np.inf:
+        if self.seconds < least:
             raise ValueError(
                 f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
-                f"sample, got {self.seconds:g}"
+                f"sample, got {shown(self.seconds)}"
             )
 
 
@@ -420,10 +418,14 @@ def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Lear
         return train(config, robot, folder, path)
     params, _, card = network.load_net(path, robot, config.variant)
     about = card["about"]
-    course = History(**{name: np.array(about["course"][name]) for name in History._fields})
+    config = from_table(f"{path}: about.settings", TrainConfig, about.get("settings"))
+    try:
+        course = History(**{n: np.array(about["course"][n], float) for n in History._fields})
+        errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: its card does not tell its training: {error!r}") from None
     linear = network.fit_linear(samples(robot, folder).training)
-    config = TrainConfig(**about["settings"])
-    return Learned(params, linear, about["errors"], course, config, (folder,))
+    return Learned(params, linear, errors, course, config, (folder,))
 
 
 def ground(
@@ -451,6 +453,10 @@ def ground(
     return learned(train_config, robot, walks, net_path(data, train_config.variant))
 
 
+def _command(name: str, own: Mapping[str, Command] | None) -> Command:
+    return own[name] if own and name in own else named_command(name)
+
+
 def losses_on_hfs(
     pool: Executor,
     config: TuneConfig,
@@ -458,6 +464,7 @@ def losses_on_hfs(
     engine: str,
     sets: Mapping[str, Sequence[Weights]],
     at_once: int,
+    own: Mapping[str, Command] | None = None,
 ) -> dict[str, Float[np.ndarray, " sets"]]:
     """L of weight sets on the high-fidelity simulator, one walk each, as long as the rollouts.
 
@@ -468,11 +475,12 @@ def losses_on_hfs(
         engine: c or mjx, in 64 bits.
         sets: by the trajectory that they walk.
         at_once: walks that MJX is compiled for; fewer are filled up to it.
+        own: commands of trajectories that are not built in, by their name.
     """
     walk = config.rollout.walk
     seconds = config.rollout.ticks * walk.gait.tick
     jobs = [
-        Job(weights, named_command(name), hfs(), seconds)
+        Job(weights, _command(name, own), hfs(), seconds)
         for name, each in sets.items()
         for weights in each
     ]
@@ -495,6 +503,7 @@ def search(
     starts: Mapping[str, Weights],
     engine: str,
     folder: Path,
+    own: Mapping[str, Command] | None = None,
 ) -> dict[str, Found]:
     """CMA-ES on the high-fidelity simulator, taking up the records under `folder`.
 
@@ -506,6 +515,7 @@ def search(
         starts: where to start, by the name of the trajectory; all go in lock-step.
         engine: auto, c or mjx.
         folder: of the records.
+        own: commands of trajectories that are not built in, by their name.
 
     Raises:
         ValueError: see `choose_engine`, `named_command` and `tuning.search.search`.
@@ -520,11 +530,11 @@ def search(
         "loss": repr(tune.loss),
         "robot": fingerprint(robot),
         "plant": fingerprint(hfs()),
-        "commands": {name: fingerprint(named_command(name)) for name in (*COMMANDS, *starts)},
+        "commands": {name: fingerprint(_command(name, own)) for name in (*COMMANDS, *starts)},
     }
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        return losses_on_hfs(pool, tune, robot, engine, sets, size)
+        return losses_on_hfs(pool, tune, robot, engine, sets, size, own)
 
     with bar(f"searching on the high-fidelity simulator, engine {engine}") as tell:
 

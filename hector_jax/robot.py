@@ -10,8 +10,6 @@ joint that moves it, parallel to the trunk's when all joints are zero.
 """
 
 import difflib
-import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +17,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 from jaxtyping import Float
+
+from hector_jax.mjcf import read_mjcf, refusal
 
 _PACKAGE = Path(__file__).parent
 _INSTALLED = _PACKAGE / "assets" / "hector.xml"  # where a wheel puts it
@@ -33,8 +33,11 @@ HEELS = tuple(f"{side}_heel" for side in SIDES)
 STANDING = "standing"  # the keyframe of the standing pose
 
 _LEG_AXES = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0]], dtype=float)
-_MAX_BYTES = 1_000_000
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
+
+# MuJoCo writes its warnings into a file of the working directory; the counters in MjData, which
+# every walk reads, tell the same.
+mujoco.set_mju_user_warning(lambda message: None)
 
 
 class Robot(NamedTuple):
@@ -115,53 +118,20 @@ def load_model(path: Path | None = None) -> mujoco.MjModel:
 
     Raises:
         ValueError: one line saying what came, what was expected and what there is. The file must be
-            one self-contained XML of at most 1 MB, without DOCTYPE, that compiles to the biped of
-            this module's docstring.
+            one that `mjcf.read_mjcf` lets pass and that compiles to the biped of this module's
+            docstring.
     """
     path = MODEL_PATH if path is None else Path(path)
-    text = _read(path)
+    root = read_mjcf(path)
     try:
-        model = mujoco.MjModel.from_xml_string(text)
+        model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"{path}: MuJoCo refuses it: {_one_line(error)}") from None
+        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
     _check_base(path, model)
     _check_joints(path, model)
     _check_motors(path, model)
     _check_feet(path, model)
     return model
-
-
-def _read(path: Path) -> str:
-    """Text of a description that is small, self-contained and well-formed."""
-    try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise ValueError(
-                f"{path}: {size / 1e6:.1f} MB, expected at most {_MAX_BYTES / 1e6:.0f} MB"
-            )
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot read the robot description: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ValueError(
-            f"{path}: not a text file, expected an MJCF description in UTF-8"
-        ) from None
-    found = re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE)
-    if found:
-        raise ValueError(f"{path}: {found[1].upper()} is not accepted, expected plain MJCF")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path}: malformed XML: {_one_line(error)}") from None
-    if root.tag != "mujoco":
-        raise ValueError(f"{path}: root element is <{root.tag}>, expected <mujoco>")
-    for element in root.iter():
-        if element.tag == "include" or "file" in element.attrib:
-            raise ValueError(
-                f"{path}: <{element.tag}> refers to {element.get('file')!r}, "
-                "expected one self-contained file"
-            )
-    return text
 
 
 def _check_base(path: Path, model: mujoco.MjModel) -> None:
@@ -300,7 +270,3 @@ def _missing(kind: str, name: str, names: Sequence[str]) -> str:
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(name for name in names if name) or "none"
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

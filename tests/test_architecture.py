@@ -7,8 +7,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
-    ["console", "runtime", "geometry"],
-    ["trajectory"],
+    ["console", "runtime", "geometry", "inputs"],
+    ["trajectory", "mjcf"],
     ["robot"],
     ["model"],
     ["control"],

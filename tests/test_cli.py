@@ -113,6 +113,11 @@ def test_missing_weights_file(monkeypatch, capsys, tmp_path):
     assert "none.json" in line
 
 
+def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, capsys):
+    line = refused(monkeypatch, capsys, "walk", "--weights", "exprt")
+    assert "no weights 'exprt'; did you mean 'expert'?; there are: nominal, expert, or" in line
+
+
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("mine")
@@ -126,7 +131,7 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     [
         (("--engine", "warp"), "engine"),
         (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        (("--seconds", "nan"), "at least 0.03 s"),
+        (("--seconds", "nan"), "a number above 0, got nan"),
         (("--walks", "2"), "at least 3"),
     ],
 )

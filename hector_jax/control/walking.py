@@ -20,6 +20,7 @@ from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.geometry import rotation_from_euler, wrap_angle
+from hector_jax.inputs import check
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
@@ -35,9 +36,10 @@ class WalkConfig:
     legs: LegConfig = LegConfig()
 
     def __post_init__(self) -> None:
+        check(self)
         if 2 * self.gait.tick > self.mpc_step + 1e-12:
             raise ValueError(
-                "the plan interval must be at most half the MPC step, "
+                "WalkConfig.gait.tick must be at most half the MPC step, "
                 f"got tick {self.gait.tick} s and step {self.mpc_step} s"
             )
 

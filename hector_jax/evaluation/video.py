@@ -26,6 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from hector_jax.geometry import rotation_from_euler
+from hector_jax.inputs import POSITIVE, SOME, Interval, check
 from hector_jax.robot import MODEL_PATH, Robot
 from hector_jax.trajectory import State, Trajectory
 
@@ -62,16 +63,13 @@ class VideoConfig:
     tiles: int = 6  # pictures in a row of the strip
 
     def __post_init__(self) -> None:
-        if self.width % 4 or self.height % 2 or min(self.width, self.height) < 64:
-            raise ValueError(
-                f"VideoConfig needs a width in fours and a height in twos of 64 pixels or more, "
-                f"got {self.width} x {self.height}"
-            )
-        if self.rate < 1 or self.tiles < 1 or not self.speed > 0.0:
-            raise ValueError(
-                f"VideoConfig needs rate, tiles and speed above zero, "
-                f"got {self.rate}, {self.tiles}, {self.speed}"
-            )
+        size = Interval(64, 8192)
+        check(self, width=size, height=size, rate=SOME, speed=POSITIVE, tiles=SOME)
+        for name, of in (("width", 4), ("height", 2)):
+            if getattr(self, name) % of:
+                raise ValueError(
+                    f"VideoConfig.{name} must be a multiple of {of}, got {getattr(self, name)}"
+                )
 
 
 def poses(

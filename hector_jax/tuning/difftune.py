@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, check
 from hector_jax.robot import Robot
 from hector_jax.tuning.loss import Alpha, LossConfig, Losses, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -51,15 +52,17 @@ class TuneConfig:
     residual: float = 1e-8  # worst relative KKT residual that is believed: that of a solved QP
 
     def __post_init__(self) -> None:
-        if self.update not in ("relative", "literal"):
-            raise ValueError(
-                f"TuneConfig.update must be 'relative' or 'literal', got {self.update!r}"
-            )
-        for name in ("beta_q", "beta_r", "residual", "smallest_step"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"TuneConfig.{name} must be positive, got {getattr(self, name)}")
-        if self.iterations < 1 or self.patience < 1:
-            raise ValueError("TuneConfig.iterations and patience must be at least 1")
+        check(
+            self,
+            beta_q=POSITIVE,
+            beta_r=POSITIVE,
+            update=("relative", "literal"),
+            iterations=SOME,
+            patience=SOME,
+            gain=NOT_NEGATIVE,
+            smallest_step=POSITIVE,
+            residual=POSITIVE,
+        )
 
 
 class Evaluation(NamedTuple):

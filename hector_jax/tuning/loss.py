@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from hector_jax.inputs import NOT_NEGATIVE, check
 from hector_jax.trajectory import Trajectory, Wrench
 
 SAMPLE = 1e-3  # [s] the rate at which the paper sums
@@ -31,8 +32,7 @@ class LossConfig:
     position: float = 2e5  # alpha_2 [1/m^2]
 
     def __post_init__(self) -> None:
-        if not (self.euler >= 0.0 and self.position >= 0.0):
-            raise ValueError(f"LossConfig weights must be >= 0, got {self.euler}, {self.position}")
+        check(self, euler=NOT_NEGATIVE, position=NOT_NEGATIVE)
 
 
 class Alpha(NamedTuple):
