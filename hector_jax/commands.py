@@ -1,7 +1,7 @@
 """What each command of `hector` does with its flags (flags.py)."""
 
 import dataclasses
-import tempfile
+import shlex
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -15,13 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import export, pipeline, study
-from hector_jax.console import say
-from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
+from hector_jax import doctor, export, pipeline, study
+from hector_jax.console import Broken, say
+from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.trajectories import Course, beyond, course, limits
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
-from hector_jax.evaluation import fidelity, metrics, plots, progress, view
+from hector_jax.evaluation import fidelity, metrics, plots, progress, runs, view
 from hector_jax.evaluation.metrics import Verdict
 from hector_jax.evaluation.report import (
     WORLDS,
@@ -32,15 +32,18 @@ from hector_jax.evaluation.report import (
     write_fidelity,
     write_report,
 )
+from hector_jax.evaluation.tensorboard import write_events
 from hector_jax.evaluation.video import Arrows, VideoUnavailable, write_video
 from hector_jax.flags import (
     Collect,
+    Compare,
     Doctor,
     Evaluate,
     Export,
     Grfm,
     Search,
     Table,
+    Tensorboard,
     Train,
     Tune,
     View,
@@ -56,7 +59,7 @@ from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.inputs import did_you_mean, shown
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_model, load_robot
-from hector_jax.runtime import cache_folder, workers
+from hector_jax.runtime import workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
@@ -70,9 +73,8 @@ from hector_jax.storage import (
     write_json,
 )
 from hector_jax.trajectory import Trajectory, Wrench
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, aligned
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
-from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.tuning.search import SearchConfig
 
 
@@ -100,10 +102,7 @@ def _weights(text: str) -> Weights:
 def _plants(world: str, seeds: range) -> list[Imperfections]:
     if world == "standin":
         return [standin(seed) for seed in seeds]
-    try:
-        return [named_world(world, seed) for seed in seeds]
-    except ValueError as error:
-        raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
+    return [named_world(world, seed) for seed in seeds]
 
 
 def _course(text: str, robot: Robot) -> Course:
@@ -147,19 +146,22 @@ def _train(args: Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     path = args.out or pipeline.net_path(args.data.parent, args.variant)
     found = pipeline.train(config, load_robot(), args.data, path)
-    for name, errors in found.errors.items():
-        print(
-            f"{name:7s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
-            "   (held-out walks)"
-        )
+    if args.json:
+        print(as_json({"net": str(path), "errors": found.errors}))
+    else:
+        _print_errors(found.errors)
     say(f"the net is in {path}")
+
+
+def _print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
+    print("mean square errors on held-out walks")
+    for name, of in errors.items():
+        print(f"{name:9s} force {of['force']:8.2f} N^2   moment {of['moment']:7.4f} (N m)^2")
 
 
 @run.register
 def _grfm(args: Grfm) -> None:
     robot, config = load_robot(), TuneConfig()
-    if args.seeds < 0:
-        raise ValueError(f"--seeds must be at least 0, got {args.seeds}")
     make_folder(args.out)
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, config, robot, args.data)
@@ -194,10 +196,10 @@ def _grfm(args: Grfm) -> None:
     }
     pictures = [Picture(f"{name}.png", caption) for name, caption in captions.items()]
     told = write_fidelity(args.out, found, pictures)
-    for name, errors in found["hfs"]["errors"].items():
-        print(
-            f"{name:9s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
-        )
+    if args.json:
+        print(as_json({"report": str(told), "worlds": found}))
+    else:
+        _print_errors(found["hfs"]["errors"])
     say(f"the whole story, with pictures: {told}")
 
 
@@ -270,16 +272,9 @@ def _tune(args: Tune) -> None:
             f"--refresh takes trajectories of at most {PIECES} segments, {wanted.name} has "
             f"{len(command.duration)}"
         )
-    if args.alpha not in ("paper", "auto"):
-        raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
-    least_of = {"seeds": 1, "processes": 1, "iterations": PAPER_ITERATIONS, "refresh": 0}
-    for flag, least in least_of.items():
-        if getattr(args, flag) < least:
-            raise ValueError(f"--{flag} must be at least {least}, got {getattr(args, flag)}")
     shared, variant = TuneConfig(iterations=args.iterations), args.variant
     config = _lasting(shared, wanted)
-    TrainConfig(variant)  # refuses an unknown one before a folder is made
-    folder = _new_folder(args, wanted.name)
+    folder, start = _new_folder(args, wanted.name), time.monotonic()
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, shared, robot, args.data, variant)
@@ -288,9 +283,12 @@ def _tune(args: Tune) -> None:
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        resolved = {"flags": settings(args), "tune": dataclasses.asdict(config)}
+        # without the folder, so that `--config` can ask for the same in another one
+        asked = replace(args, run=None)
+        resolved = {"flags": settings(asked), "tune": dataclasses.asdict(config)}
+        made_with = environment()
         write_json(folder / "config.json", resolved)
-        write_json(folder / "versions.json", environment())
+        write_json(folder / "versions.json", made_with)
         shifts: list[dict[str, Any]] = []
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
 
@@ -347,6 +345,7 @@ def _tune(args: Tune) -> None:
     if shifts:
         result["refresh"] = shifts
     write_json(folder / "result.json", result)
+    write_json(folder / "versions.json", made_with | {"seconds": f"{time.monotonic() - start:.0f}"})
     pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
     film: Picture | str = "left out (--no-video)"
     if args.video:
@@ -368,11 +367,14 @@ def _tune(args: Tune) -> None:
             pictures=pictures,
             film=film,
             config=resolved,
-            environment=environment(),
-            command=as_command("tune", replace(args, run=None)),
+            environment=made_with,
+            command=as_command("tune", asked),
         ),
     )
-    print_table(verdict, f"{wanted.name}, {args.seeds} stand-in plants")
+    if args.json:
+        print(as_json({"run": str(folder), "traj": wanted.name, **result}))
+    else:
+        print_table(verdict, f"{wanted.name}, {args.seeds} stand-in plants")
     say(f"the whole story, with pictures: {told}")
 
 
@@ -420,8 +422,12 @@ def _draw(
 @run.register
 def _table(args: Table) -> None:
     told, verdicts = study.make_table(args, partial(_plants, "standin"))
-    for name, verdict in verdicts.items():
-        print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
+    if args.json:
+        results = {name: metrics.as_result(verdict) for name, verdict in verdicts.items()}
+        print(as_json({"report": str(told), "trajectories": results}))
+    else:
+        for name, verdict in verdicts.items():
+            print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
     say(f"the whole story, with pictures: {told}")
 
 
@@ -449,13 +455,12 @@ def _search(args: Search) -> None:
         sets = {name: [start, expert(), found[name].weights] for name in own}
         at_once = config.population * len(own)
         compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once, own)
-    print("L in 1e6 on the high-fidelity simulator")
-    print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+    cards = {}
     for name, one in found.items():
         at_start, at_expert, again = compared[name].tolist()
         walks = len(one.history) * config.population
         losses = {"start": at_start, "best": one.loss, "best_again": again, "expert": at_expert}
-        card = {
+        cards[name] = {
             "trajectory": name,
             "L": losses,
             "walks": walks,
@@ -469,15 +474,20 @@ def _search(args: Search) -> None:
             "versions": versions(),
         }
         save_weights(args.out / f"{name}.json", one.weights)
-        write_json(args.out / f"{name}-card.json", card)
-        shown = "".join(f"{x / 1e6:9.3f}" for x in (at_start, one.loss, at_expert))
-        print(f"{name:10s}{shown}{walks:8d}{one.walk:9d}")
+        write_json(args.out / f"{name}-card.json", cards[name])
+    if args.json:
+        print(as_json({"weights": str(args.out), "cards": cards}))
+    else:
+        print("L in 1e6 on the high-fidelity simulator")
+        print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+        for name, card in cards.items():
+            shown = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
+            print(f"{name:10s}{shown}{card['walks']:8d}{card['best_at']:9d}")
     say(f"weights are in {args.out}")
 
 
 @run.register
 def _evaluate(args: Evaluate) -> None:
-    _check_seconds(args.seconds)
     robot = load_robot()
     wanted = _course(args.traj, robot)
     seconds = _seconds(args.seconds, wanted)
@@ -498,14 +508,8 @@ def _evaluate(args: Evaluate) -> None:
         print_table(verdict, f"{wanted.name}, {count} plants", args.world)
 
 
-def _check_seconds(seconds: float) -> None:
-    if not 0.0 < seconds <= 600.0:
-        raise ValueError(f"--seconds must be above 0 and at most 600, got {seconds}")
-
-
 @run.register
 def _walk(args: Walk) -> None:
-    _check_seconds(args.seconds)
     weights, robot = _weights(args.weights), load_robot()
     wanted = _course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
@@ -542,16 +546,9 @@ def _walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) -
     """One walk in the world of the flags."""
     seconds = _seconds(args.seconds, wanted)
     if args.world == "srbm":
-        return _rigid_body(robot, weights, wanted.command, seconds)
+        return pipeline.walk_rigid_body(robot, weights, wanted.command, seconds)
     plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
     return walk(WalkConfig(), robot, weights, wanted.command, plant, seconds, args.seed)
-
-
-def _rigid_body(robot: Robot, weights: Weights, command: Any, seconds: float) -> Trajectory:
-    config = RolloutConfig(ticks=round(seconds / RolloutConfig().walk.gait.tick))
-    walked = jax.jit(rollout, static_argnums=0)
-    anchor = standing_anchor(robot)
-    return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
 def _film(
@@ -568,28 +565,30 @@ def _film(
 
 @run.register
 def _doctor(args: Doctor) -> None:
-    rows = {
-        **versions(),
-        "device": ", ".join(str(device) for device in jax.devices()),
-        "precision": f"{64 if jax.config.read('jax_enable_x64') else 32} bits",
-        "cache": str(cache_folder()),
-    }
-    for name, text in rows.items():
-        print(f"{name:12s} {text}")
-    start = time.monotonic()
-    robot, command = load_robot(), named_command("straight")
-    walks = {
-        "srbm": _rigid_body(robot, expert(), command, 1.0),
-        "ideal": walk(WalkConfig(), robot, expert(), command, _plants("ideal", range(1))[0], 0.2),
-    }
-    for world, found in walks.items():
-        if found.fallen.any() or not found.residual.max() <= SOLVED:
-            raise ValueError(f"self-test failed: the robot does not walk in {world}")
-    print(f"{'self-test':12s} walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s")
-    with tempfile.TemporaryDirectory() as folder:
-        short = {name: walks["ideal"] for name in ("one", "other")}
-        missing = _film(Path(folder) / "film.mp4", robot, short)
-    print(f"{'video':12s} {missing or 'works'}")
+    told, faults = doctor.examine()
+    if args.json:
+        print(as_json({**told, "faults": faults}))
+    else:
+        for name, text in told.items():
+            print(f"{name:12s} {text}")
+    if faults:
+        raise Broken("; ".join(faults))
+
+
+@run.register
+def _compare(args: Compare) -> None:
+    told = runs.compare_runs([runs.load_run(folder) for folder in args.runs])
+    if args.json:
+        print(as_json(told))
+    else:
+        runs.print_comparison(told)
+
+
+@run.register
+def _tensorboard(args: Tensorboard) -> None:
+    out = args.out or args.run / "tensorboard"
+    write_events(args.run, out)
+    print(f"tensorboard --logdir {shlex.quote(str(out))}")
 
 
 @run.register
@@ -597,7 +596,6 @@ def _export(args: Export) -> None:
     # before the first array: see hector_jax.export
     jax.config.update("jax_platforms", "cpu")
     command = named_command(args.traj)
-    _check_seconds(args.seconds)
     path, config = export.find_weights(args.run, args.set)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
     folder = args.out or (args.run if args.run.is_dir() else args.run.parent) / "export"
@@ -616,12 +614,12 @@ def _export(args: Export) -> None:
     say(f"all of it is in {folder}")
 
 
+@run.register
 def _view(args: View) -> None:
     beside = args.run.with_name(f"{args.run.name}-view")
     folder = args.out or (beside if args.headless else None)
     if folder is None:
         view.check_viser()
-    _check_seconds(args.seconds)
     if args.seconds < 0.1:
         raise ValueError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
     if args.sets[0] == args.sets[1]:

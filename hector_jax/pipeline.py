@@ -39,6 +39,7 @@ from hector_jax.tuning import search as searching
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
 
 ENGINES = ("auto", "c", "mjx")
@@ -296,6 +297,14 @@ def _keep_walks(
             },
             progress=lambda done, of: tell(done, of, "" if done else "compiling"),
         )
+
+
+def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
+    """A walk on the plain single rigid body, `seconds` long, from standing."""
+    config = RolloutConfig(ticks=round(seconds / RolloutConfig().walk.gait.tick))
+    walked = jax.jit(rollout, static_argnums=0)
+    anchor = standing_anchor(robot)
+    return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
 class Samples(NamedTuple):

@@ -67,17 +67,7 @@ class _Plan:
 
 def _plan(args: flags.Table) -> _Plan:
     """Raises ValueError, before anything is computed, where the flags ask for what cannot be."""
-    least_of = {
-        "seeds": 1,
-        "first_seed": 0,
-        "iterations": PAPER_ITERATIONS,
-        "steps": 0,
-        "step_plants": 1,
-    }
-    for name, least in least_of.items():
-        if getattr(args, name) < least:
-            flag = name.replace("_", "-")
-            raise ValueError(f"--{flag} must be at least {least}, got {getattr(args, name)}")
+    flags.check(args)
     for name in args.trajectories:
         if name not in COMMANDS:
             raise ValueError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")

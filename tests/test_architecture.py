@@ -17,7 +17,7 @@ FLOORS = [
     ["grfm"],
     ["evaluation"],
     ["flags", "pipeline", "export"],
-    ["kept"],
+    ["kept", "doctor"],
     ["study"],
     ["commands"],
     ["cli"],
@@ -33,6 +33,7 @@ DOORS = {
     "cmaes": ("tuning.search",),
     "sklearn": ("tuning.rivals",),
     "matplotlib": ("evaluation.plots",),
+    "tensorboardX": ("evaluation.tensorboard",),
     "tyro": ("cli",),
 }
 

@@ -127,11 +127,11 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"seeds": 0}, "--seeds must be at least 1, got 0"),
-        ({"first_seed": -1}, "--first-seed must be at least 0, got -1"),
-        ({"steps": -1}, "--steps must be at least 0, got -1"),
+        ({"seeds": 0}, "--seeds must be a whole number of at least 1, got 0"),
+        ({"first_seed": -1}, "--first-seed must be a whole number of at least 0 and .*got -1"),
+        ({"steps": -1}, "--steps must be a whole number of at least 0, got -1"),
         ({"trajectories": ("turn",)}, "--trajectories must be of straight, c, s, got turn"),
-        ({"iterations": 3}, "--iterations must be at least 10, got 3"),
+        ({"iterations": 3}, "--iterations must be a whole number of at least 10, got 3"),
         ({"rollouts": 3}, "budget must be at least one generation"),
         ({"trajectories": ("moon",)}, "--trajectories must be of straight, c, s, got moon"),
         ({"trajectories": ("s", "s")}, "--trajectories must name each once, got s s"),
@@ -141,7 +141,7 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
         ({"extra": ("a=x", "a=y")}, "--extra a=y: there is a set 'a' already"),
         ({"extra": ("a=nowhere",)}, "cannot read nowhere/straight.json"),
         ({"earlier": Path("nowhere.json")}, "cannot read nowhere.json"),
-        ({"processes": 0}, "processes must be at least 1, got 0"),
+        ({"processes": 0}, "--processes must be a whole number of at least 1, got 0"),
     ],
 )
 def test_wrong_flags_are_told_before_anything_is_computed(tmp_path, changes, words):
