@@ -240,8 +240,8 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
 def as_json(value: Any, indent: int | None = None) -> str:
     """JSON of nested values; numbers that are not finite, which JSON does not have, are null.
 
-    >>> as_json({"L": [1.0, float("nan")], "folder": Path("runs")})
-    '{"L": [1.0, null], "folder": "runs"}'
+    >>> as_json({"L": [1.0, float("nan")]})
+    '{"L": [1.0, null]}'
     """
     return json.dumps(_known(value), indent=indent, allow_nan=False)
 
