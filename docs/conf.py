@@ -26,9 +26,8 @@ html_show_sphinx = False
 exclude_patterns = ["_build", "**.ipynb_checkpoints"]
 
 nb_execution_mode = "off"  # tests execute the notebooks; the site shows what is committed
-myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
-numfig = False
 
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True}
@@ -39,7 +38,7 @@ napoleon_use_ivar = True
 napoleon_attr_annotations = False
 default_role = "code"  # docstrings put names between single backticks
 
-html_math_renderer = "mathml"
+html_math_renderer = "mathml"  # drawn by the browser itself: no script, no font from elsewhere
 
 _FIELD = re.compile(r"^    (\w+): [^#]*?  # (.+)$", re.MULTILINE)
 _CODE = re.compile(r"(`[^`]*`)")
@@ -53,6 +52,9 @@ def _write_reference(app) -> None:
         rooms.setdefault(room if inside or module.ispkg else "hector_jax", []).append(module.name)
     folder = Path(app.srcdir) / "reference"
     folder.mkdir(exist_ok=True)
+    for path in folder.glob("*.md"):
+        if path.stem not in rooms:
+            path.unlink()
     for room, names in rooms.items():
         parts = [f"## `{n}`\n\n```{{eval-rst}}\n.. automodule:: {n}\n```\n" for n in sorted(names)]
         text = "\n".join([f"# {room}\n", *parts])
@@ -61,20 +63,15 @@ def _write_reference(app) -> None:
             path.write_text(text)
 
 
-def _math(tex: str, block: bool) -> str:
-    """Formulas are drawn by the browser itself: no script, no font from elsewhere."""
-    return tex2mathml(tex, as_block=block)
-
-
 def _inline(translator, node) -> None:
-    translator.body.append(_math(node.astext(), block=False))
+    translator.body.append(tex2mathml(node.astext(), as_block=False))
     raise nodes.SkipNode
 
 
 def _block(translator, node) -> None:
     number = f'<span class="eqno" style="float: right">({node["number"]})</span>'
     ids = "".join(f' id="{name}"' for name in node["ids"][:1])
-    formula = _math(node.astext(), block=True)
+    formula = tex2mathml(node.astext(), as_block=True)
     style = ' style="overflow-x: auto; overflow-y: hidden"'
     translator.body.append(f"<div{ids}{style}>{number * bool(node['number'])}{formula}</div>")
     raise nodes.SkipNode
