@@ -202,11 +202,15 @@ def changed(data, tree):
     return tree
 
 
+PRINTABLE = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=8).map(str.encode)
+
+
 def torn(data, content):
     """The bytes cut, or a stretch of them replaced."""
     begin = data.draw(st.integers(0, len(content)))
     length = data.draw(st.integers(0, 20))
-    return content[:begin] + data.draw(st.binary(max_size=8)) + content[begin + length :]
+    put = data.draw(st.one_of(PRINTABLE, PRINTABLE, st.binary(max_size=8)))
+    return content[:begin] + put + content[begin + length :]
 
 
 def refused_or(load, path):
