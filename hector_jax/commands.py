@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import doctor, export, pipeline, study
+from hector_jax import doctor, export, pipeline, replay, study
 from hector_jax.console import Broken, say
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.trajectories import Course, beyond, course, limits
@@ -41,6 +41,7 @@ from hector_jax.flags import (
     Evaluate,
     Export,
     Grfm,
+    Replay,
     Search,
     Table,
     Tensorboard,
@@ -290,13 +291,14 @@ def _tune(args: Tune) -> None:
         write_json(folder / "config.json", resolved)
         write_json(folder / "versions.json", made_with)
         shifts: list[dict[str, Any]] = []
+        dumps = folder / "dumps"
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
 
             def note(name: str, iteration: Iteration) -> None:
                 metrics_file.write(pipeline.as_line(name, iteration))
 
             title = f"tuning {wanted.name} without and with GRFM-Net"
-            tunings = pipeline.tune_many(pool, config, robot, problems, title, note)
+            tunings = pipeline.tune_many(pool, config, robot, problems, title, note, dumps)
             newest, tuning = net, tunings["with"]
             for count in range(1, args.refresh + 1):
                 newest, shift = pipeline.refresh(
@@ -313,7 +315,7 @@ def _tune(args: Tune) -> None:
                 name = "with_refreshed" + (str(count) if count > 1 else "")
                 again = {name: (command, newest.params)}
                 title = f"tuning {wanted.name} with the net refreshed"
-                tunings |= pipeline.tune_many(pool, config, robot, again, title, note)
+                tunings |= pipeline.tune_many(pool, config, robot, again, title, note, dumps)
                 tuning = tunings[name]
         sets = {
             "nominal": nominal(),
@@ -701,3 +703,11 @@ def _draw_view(
         write_video(folder / "film.mp4", robot, titled, folder / "film.png", arrows=arrows)
     except VideoUnavailable as error:
         raise ValueError(str(error)) from None
+
+
+@run.register
+def _replay(args: Replay) -> None:
+    found = replay.again(args.dump)
+    print(as_json(found._asdict(), indent=2) if args.json else replay.in_words(found))
+    if not found.same:
+        raise Broken(f"{args.dump}: {replay.verdict(found)}")

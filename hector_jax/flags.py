@@ -257,6 +257,17 @@ class Completion:
     shell: Literal["bash", "zsh", "fish"]  # to write the script for
 
 
+@dataclass(frozen=True)
+class Replay:
+    """Do an evaluation again that a tuning refused: 0 where the same bytes come out, else 1.
+
+    Example: hector replay runs/s/20261121-093442/dumps/with-007-fell.npz
+    """
+
+    dump: Path  # a file of RUN/dumps
+    json: bool = False  # print JSON instead of the table
+
+
 Command = (
     Collect
     | Train
@@ -272,6 +283,7 @@ Command = (
     | Compare
     | Tensorboard
     | Completion
+    | Replay
 )
 
 Flags = TypeVar("Flags")

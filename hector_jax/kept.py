@@ -157,7 +157,9 @@ def tune(
     found = {name: load_tuning(path, robot) for name, path in paths.items()}
     missing = {name: problems[name] for name, tuned in found.items() if tuned is None}
     if missing:
-        for name, tuning in pipeline.tune_many(pool, config, robot, missing, title).items():
+        dumps = folder / "dumps"
+        tunings = pipeline.tune_many(pool, config, robot, missing, title, dumps=dumps)
+        for name, tuning in tunings.items():
             save_tuning(paths[name], tuning, robot, commit)
             found[name] = Tuned(tuning, commit)
     return {name: tuned for name, tuned in found.items() if tuned is not None}

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax import replay
 from hector_jax.console import bar
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
@@ -127,6 +128,7 @@ def tune_many(
     problems: Mapping[str, tuple[Command, Params | None]],
     title: str,
     on_iteration: Callable[[str, Iteration], None] = lambda name, iteration: None,
+    dumps: Path | None = None,
 ) -> dict[str, Tuning]:
     """Tune several problems side by side from the nominal weights.
 
@@ -137,6 +139,10 @@ def tune_many(
         problems: by name, the command and the net to tune through (None: the plain rigid body).
         title: for the person who waits.
         on_iteration: called with name and iteration as they happen.
+        dumps: folder for what was refused, see `replay.keep`; None: nothing is kept.
+
+    Raises:
+        ValueError: the starting weights fall or cannot be solved on the model.
     """
     with get_context("spawn").Manager() as manager, bar(title) as tell:
         heard = manager.Queue()
@@ -155,6 +161,10 @@ def tune_many(
             loss = float(iteration.evaluation.loss) / 1e6
             tell(done, config.iterations * len(problems), f"{name}: L {loss:.3f}e6")
             on_iteration(name, iteration)
+            if dumps is not None:
+                command, params = problems[name]
+                anchor = standing_anchor(robot)
+                replay.keep(dumps, name, config, robot, command, anchor, params, iteration)
         return {name: future.result() for name, future in running.items()}
 
 

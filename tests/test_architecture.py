@@ -16,6 +16,7 @@ FLOORS = [
     ["tuning", "sim"],
     ["grfm"],
     ["evaluation"],
+    ["replay"],
     ["flags", "pipeline", "export"],
     ["kept", "doctor"],
     ["study"],

@@ -31,7 +31,7 @@ def tuned(monkeypatch):
     """Names of the problems that are really tuned."""
     names = []
 
-    def tune_many(pool, config, robot, problems, title):
+    def tune_many(pool, config, robot, problems, title, dumps):
         names.extend(problems)
         return dict.fromkeys(problems, TUNING)
 

@@ -32,7 +32,7 @@ def asked(monkeypatch):
         one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(starts, one)
 
-    def tune_many(pool, config, robot, problems, title):
+    def tune_many(pool, config, robot, problems, title, dumps):
         told["tunings"].append((config.iterations, *problems))
         return dict.fromkeys(problems, Tuning(pretend_history(12), nominal(), expert(), "done"))
 

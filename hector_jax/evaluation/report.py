@@ -491,7 +491,7 @@ def _reasons(refused: Sequence[Iteration]) -> str:
     """Why steps were refused, and which."""
     steps: dict[str, list[str]] = {}
     for i in refused:
-        steps.setdefault(re.sub(r" \d.*", "", i.reason), []).append(str(i.iteration))
+        steps.setdefault(re.sub(r" (\d|inf|nan).*", "", i.reason), []).append(str(i.iteration))
     told = [f"{reason} (iteration {', '.join(which)})" for reason, which in steps.items()]
     return ": " + "; ".join(told) if told else ""
 
