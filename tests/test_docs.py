@@ -112,6 +112,12 @@ def test_commands_in_pages_parse(page, line, capsys):
     assert code == 0, capsys.readouterr().err
 
 
+def test_settings_in_pages_are_read(tmp_path):
+    (told,) = blocks((DOCS / "howto" / "outputs.md").read_text(), "toml")
+    (tmp_path / "night.toml").write_text(told)
+    assert flags.from_file(flags.Tune, tmp_path / "night.toml").seeds == 32
+
+
 @pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
 def test_targets_of_make_in_pages_are_there(path):
     there = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
