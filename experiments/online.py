@@ -49,7 +49,7 @@ from hector_jax.sim.changes import Change
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import load_weights, write_file, write_json
+from hector_jax.storage import digest, load_weights, write_file, write_json
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
@@ -233,7 +233,7 @@ def walk_cases(
     def path(case: Case) -> Path:
         how, _, job, effect, moment, arm = cases[case]
         name = "-".join(case).replace(" ", "")
-        ending = kept.digest(how, robot, job, (effect,), moment, arm)
+        ending = digest(how, robot, job, (effect,), moment, arm)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
     def walked(missing: Sequence[Case]) -> Iterator[Walked]:

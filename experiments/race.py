@@ -27,7 +27,7 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import kept, pipeline
+from hector_jax import pipeline
 from hector_jax.console import bar, exit_code, made_at, say
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
@@ -40,7 +40,7 @@ from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.walk import Job, walk_job
 from hector_jax.sim.world import hfs
-from hector_jax.storage import fingerprint, make_folder, versions, write_file, write_json
+from hector_jax.storage import digest, fingerprint, make_folder, versions, write_file, write_json
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.race import Raced, Turn, lowest, race, walks
@@ -175,7 +175,7 @@ def on_model(
     """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
     # seconds are kept too: they are of this code and so many at once
     made = flags.processes, environment().get("commit")
-    key = kept.digest(config, RATE, command, params, robot, repr(made))
+    key = digest(config, RATE, command, params, robot, repr(made))
     path = flags.out / f"model-{key}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
@@ -235,7 +235,7 @@ def run(
         "command": fingerprint(command),
         "start": fingerprint(nominal()),
         "versions": versions(),
-        "settings": kept.digest(sorted(rivals.items())),
+        "settings": digest(sorted(rivals.items())),
     }
 
     def think(

@@ -2,9 +2,9 @@
 
 Flags come from the line, else from the file that `--config` names, else from their defaults.
 Results go to stdout, everything said while waiting to stderr. Exit codes: 0 done; 1 something is
-broken: `hector doctor` found it, or a fault of this program with its traceback; 2 bad input, with
-what came, where, and what was expected: one line, or a box where a flag does not parse; 130
-interrupted; 141 nobody reads standard output any more.
+broken: `hector doctor` found it, a worker process was killed, or a fault of this program with its
+traceback; 2 bad input, with what came, where, and what was expected: one line, or a box where a
+flag does not parse; 130 interrupted; 141 nobody reads standard output any more; 143 terminated.
 """
 
 import argparse

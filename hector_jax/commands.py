@@ -1,7 +1,9 @@
 """What each command of `hector` does with its flags (flags.py)."""
 
 import dataclasses
+import json
 import shlex
+import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -15,14 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import doctor, export, pipeline, replay, study
+from hector_jax import doctor, export, kept, pipeline, replay, study
 from hector_jax.console import Broken, say
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.trajectories import Course, beyond, course, limits
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
 from hector_jax.evaluation import fidelity, metrics, plots, progress, runs, view
-from hector_jax.evaluation.metrics import Verdict
+from hector_jax.evaluation.metrics import Score, Verdict
 from hector_jax.evaluation.report import (
     WORLDS,
     Picture,
@@ -50,6 +52,7 @@ from hector_jax.flags import (
     View,
     Walk,
     as_command,
+    from_file,
     settings,
 )
 from hector_jax.grfm import training
@@ -58,6 +61,7 @@ from hector_jax.grfm.gated import gated_effect
 from hector_jax.grfm.network import as_effect, linear_effect, load_net
 from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.inputs import did_you_mean, shown
+from hector_jax.kept import Journal, Judged
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_model, load_robot
 from hector_jax.runtime import workers
@@ -66,7 +70,10 @@ from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
 from hector_jax.storage import (
     as_json,
+    check_versions,
+    fingerprint,
     load_weights,
+    locked,
     make_folder,
     save_tree,
     save_weights,
@@ -74,7 +81,7 @@ from hector_jax.storage import (
     write_json,
 )
 from hector_jax.trajectory import Trajectory, Wrench
-from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, aligned
+from hector_jax.tuning.difftune import TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.search import SearchConfig
 
@@ -241,118 +248,200 @@ def _curves(
     return {name: jax.tree.map(by_tick, wrench) for name, wrench in curves.items()}
 
 
+_FREE = ("config", "json", "processes", "resume", "run", "runs", "video")  # change no number
+
+
 def _taken(folder: Path) -> str:
-    return f"run folder {folder} exists; name another by --run, nothing was touched"
+    return f"run folder {folder} exists; take it up by --resume or name another by --run"
 
 
-def _new_folder(args: Tune, trajectory: str) -> Path:
-    """The run's folder, made here; an existing one is never written into."""
-    folder = args.run or args.runs / trajectory / f"{datetime.now():%Y%m%d-%H%M%S}"
+def _begin(folder: Path, args: Tune) -> None:
+    """Make the folder of a new run, at once with its flags: one that is there can be resumed."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
+        new = Path(part) / "run"
+        write_json(new / "versions.json", environment())
+        # without the folder, so that `--config` can ask for the same in another one
+        asked = settings(replace(args, run=None, resume=None))
+        write_json(new / "config.json", {"flags": asked, "robot": _body()})
+        try:
+            new.rename(folder)
+        except OSError:
+            raise ValueError(_taken(folder)) from None
+
+
+def _body() -> str:
+    return fingerprint(load_robot())
+
+
+def _as_begun(folder: Path, args: Tune) -> Tune:
+    """The flags of the run in `folder`; those given beside --resume have to agree.
+
+    Raises:
+        ValueError: one line naming the file: no run, one of other flags, versions or another robot.
+    """
+    as_asked = _read_json(folder / "config.json")
+    check_versions(folder / "versions.json", _read_json(folder / "versions.json"))
+    _agree(folder, as_asked, {"robot": _body()})
+    begun, taken = from_file(Tune, folder / "config.json"), {}
+    for field in dataclasses.fields(Tune):
+        name = field.name
+        if name in _FREE:
+            continue
+        before, given = getattr(begun, name), getattr(args, name)
+        if given not in (before, field.default):
+            raise ValueError(f"{folder}: begun with --{name} {before}, got {given}")
+        taken[name] = before
+    return replace(args, **taken)
+
+
+def _read_json(path: Path) -> dict[str, Any]:
     try:
-        folder.mkdir(parents=True)
-    except FileExistsError:
-        raise ValueError(_taken(folder)) from None
-    return folder
+        found = json.loads(path.read_bytes())
+    except OSError as error:
+        raise ValueError(f"{path}: no run to take up: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: no run to take up: {error}") from None
+    if not isinstance(found, dict):
+        raise ValueError(f"{path}: no run to take up: expected an object")
+    return found
+
+
+def _agree(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Hold what a run follows from against what it followed from when it was begun."""
+    for name, value in now.items():
+        if isinstance(value, dict):
+            _agree(folder, begun.get(name, {}), value)
+        elif begun.get(name, value) != value:
+            raise ValueError(f"{folder}: begun with {name} {begun[name]}, here is {value}")
 
 
 @run.register
 def _tune(args: Tune) -> None:
-    if args.traj == "all":
-        several = [replace(args, traj=name, run=args.run and args.run / name) for name in COMMANDS]
-        for one in several:
-            if one.run is not None and one.run.exists():
-                raise ValueError(_taken(one.run))
-        for one in several:
-            run(one)
-        return
-    robot = load_robot()
+    if args.run and args.resume:
+        raise ValueError(f"--run {args.run} and --resume {args.resume}: only one can be given")
+    asked = COMMANDS if args.traj == "all" else (args.traj,)
+    wanted = {text: _asked_for(replace(args, traj=text), load_robot()) for text in asked}
+    base = args.resume or args.run
+    if base is None:
+        now = f"{datetime.now():%Y%m%d-%H%M%S}"
+        folders = {text: args.runs / course.name / now for text, course in wanted.items()}
+    else:
+        folders = {text: base / text if args.traj == "all" else base for text in asked}
+    runs = {folder: replace(args, traj=text) for text, folder in folders.items()}
+    if args.resume:
+        runs = {folder: _as_begun(folder, one) for folder, one in runs.items()}
+    else:
+        for folder in runs:
+            if folder.exists():
+                raise ValueError(_taken(folder))
+        for folder, one in runs.items():
+            _begin(folder, one)
+    for folder, one in runs.items():
+        with locked(folder):
+            _tune_in(folder, one)
+
+
+def _asked_for(args: Tune, robot: Robot) -> Course:
+    """What a tuning is to walk.
+
+    Raises:
+        ValueError: there is no such trajectory, or none that --refresh can take.
+    """
     wanted = _course(args.traj, robot)
-    command, lasts = wanted.command, wanted.seconds or Walk.seconds
-    if args.refresh and len(command.duration) > PIECES:
+    if args.refresh and len(wanted.command.duration) > PIECES:
         raise ValueError(
             f"--refresh takes trajectories of at most {PIECES} segments, {wanted.name} has "
-            f"{len(command.duration)}"
+            f"{len(wanted.command.duration)}"
         )
-    shared, variant = TuneConfig(iterations=args.iterations), args.variant
+    return wanted
+
+
+def _tune_in(folder: Path, args: Tune) -> None:
+    """All of a run, taking up what is in its folder."""
+    robot, start = load_robot(), time.monotonic()
+    wanted = _asked_for(args, robot)
+    command, lasts = wanted.command, wanted.seconds or Walk.seconds
+    shared, shelf = TuneConfig(iterations=args.iterations), folder / "kept"
     config = _lasting(shared, wanted)
-    folder, start = _new_folder(args, wanted.name), time.monotonic()
+    made_with = environment()
+    commit = made_with.get("commit", "")
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, shared, robot, args.data, variant)
+        net = pipeline.ground(pool, shared, robot, args.data, args.variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        # without the folder, so that `--config` can ask for the same in another one
-        asked = replace(args, run=None)
-        resolved = {"flags": settings(asked), "tune": dataclasses.asdict(config)}
-        made_with = environment()
+        begun = _read_json(folder / "config.json")
+        now = {"tune": dataclasses.asdict(config), "net": fingerprint(net.params)}
+        _agree(folder, begun, json.loads(as_json(now)))
+        resolved = {**begun, **now}
         write_json(folder / "config.json", resolved)
-        write_json(folder / "versions.json", made_with)
         shifts: list[dict[str, Any]] = []
-        dumps = folder / "dumps"
-        with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
+        journal, dumps = Journal(folder / "metrics.jsonl"), folder / "dumps"
+        known = (pool, config, robot)
+        title = f"tuning {wanted.name} without and with GRFM-Net"
+        tunings = kept.tune(*known, problems, shelf, commit, title, journal, dumps)
+        newest, tuning = net, tunings["with"].tuning
+        for count in range(1, args.refresh + 1):
+            newest, shift = pipeline.refresh(
+                pool,
+                replace(pipeline.REFRESH, seed=count, seconds=lasts),
+                config,
+                robot,
+                command,
+                tuning,
+                newest,
+                folder / f"refresh-{count}",
+            )
+            shifts.append(shift)
+            name = "with_refreshed" + (str(count) if count > 1 else "")
+            again = {name: (command, newest.params)}
+            title = f"tuning {wanted.name} with the net refreshed"
+            tunings |= kept.tune(*known, again, shelf, commit, title, journal, dumps)
+            tuning = tunings[name].tuning
 
-            def note(name: str, iteration: Iteration) -> None:
-                metrics_file.write(pipeline.as_line(name, iteration))
-
-            title = f"tuning {wanted.name} without and with GRFM-Net"
-            tunings = pipeline.tune_many(pool, config, robot, problems, title, note, dumps)
-            newest, tuning = net, tunings["with"]
-            for count in range(1, args.refresh + 1):
-                newest, shift = pipeline.refresh(
-                    pool,
-                    replace(pipeline.REFRESH, seed=count, seconds=lasts),
-                    config,
-                    robot,
-                    command,
-                    tuning,
-                    newest,
-                    folder / f"refresh-{count}",
-                )
-                shifts.append(shift)
-                name = "with_refreshed" + (str(count) if count > 1 else "")
-                again = {name: (command, newest.params)}
-                title = f"tuning {wanted.name} with the net refreshed"
-                tunings |= pipeline.tune_many(pool, config, robot, again, title, note, dumps)
-                tuning = tunings[name]
         sets = {
             "nominal": nominal(),
             "expert": expert(),
-            **{f"{name}_ten": tunings[name].ten for name in problems},
-            **{name: tuning.converged for name, tuning in tunings.items()},
+            **{f"{name}_ten": tunings[name].tuning.ten for name in problems},
+            **{name: tuned.tuning.converged for name, tuned in tunings.items()},
         }
-        (folder / "weights").mkdir()
         for name, weights in sets.items():
             save_weights(folder / "weights" / f"{name}.json", weights)
         seeds = range(args.seeds)
-        walks = pipeline.judge(
-            pool,
-            config,
-            robot,
+        judged = kept.judge(
+            *known,
             sets,
             command,
             _plants("standin", seeds),
             seeds,
+            shelf / "standin",
+            commit,
             f"judging on {args.seeds} stand-in plants",
             lasts,
         )
         title = "walking on the simulator of the data"
-        on_hfs = pipeline.judge(pool, config, robot, sets, command, [hfs()], [0], title, lasts)
-    verdict = _verdict(config.loss, seeds, walks)
+        there = (command, [hfs()], [0], shelf / "hfs")
+        on_hfs = kept.judge(*known, sets, *there, commit, title, lasts)
+    verdict = _verdict(config.loss, seeds, _scores(judged))
     result = metrics.as_result(verdict)
-    for name, found in metrics.as_result(_verdict(config.loss, [0], on_hfs), "hfs")["sets"].items():
+    told_hfs = metrics.as_result(_verdict(config.loss, [0], _scores(on_hfs)), "hfs")
+    for name, found in told_hfs["sets"].items():
         result["sets"][name] |= found
     if shifts:
         result["refresh"] = shifts
     write_json(folder / "result.json", result)
     write_json(folder / "versions.json", made_with | {"seconds": f"{time.monotonic() - start:.0f}"})
-    pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
+    histories = {name: tuned.tuning for name, tuned in tunings.items()}
+    walks, sampled = judged.shown, on_hfs.shown["nominal"]
+    pictures = _draw(folder, config, robot, net, sets, histories, walks, sampled)
     film: Picture | str = "left out (--no-video)"
     if args.video:
         say("drawing the film")
-        pair = {"nominal": walks["nominal"][0], "tuned with net": walks["with"][0]}
+        pair = {"nominal": walks["nominal"], "tuned with net": walks["with"]}
         caption = "Nominal and tuned weights on the first stand-in plant."
         film = _film(folder / "film.mp4", robot, pair, folder / "film.png") or Picture(
             "film.mp4", caption
@@ -362,7 +451,7 @@ def _tune(args: Tune) -> None:
         Report(
             trajectory=wanted.name,
             verdict=verdict,
-            tunings=tunings,
+            tunings=histories,
             norms=norms,
             errors=net.errors,
             shifts=shifts,
@@ -370,7 +459,7 @@ def _tune(args: Tune) -> None:
             film=film,
             config=resolved,
             environment=made_with,
-            command=as_command("tune", asked),
+            command=as_command("tune", replace(args, run=None, resume=None)),
         ),
     )
     if args.json:
@@ -380,10 +469,13 @@ def _tune(args: Tune) -> None:
     say(f"the whole story, with pictures: {told}")
 
 
+def _scores(judged: Judged) -> dict[str, list[Score]]:
+    return {name: [walk.score for walk in walks] for name, walks in judged.walks.items()}
+
+
 def _verdict(
-    loss: LossConfig, seeds: Sequence[int], walks: Mapping[str, Sequence[Trajectory]]
+    loss: LossConfig, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
 ) -> Verdict:
-    scores = {name: [metrics.score(loss, walk) for walk in each] for name, each in walks.items()}
     verdict = metrics.judge(loss, seeds, scores)
     for name, score in verdict.scores.items():
         if score.residual.max() > SOLVED:
@@ -398,18 +490,17 @@ def _draw(
     net: pipeline.Learned,
     sets: Mapping[str, Weights],
     tunings: Mapping[str, Tuning],
-    walks: Mapping[str, Sequence[Trajectory]],
-    on_hfs: Trajectory,
+    walks: Mapping[str, Trajectory],
+    sampled: Trajectory,
 ) -> list[Picture]:
-    """All pictures of a run, in the order of the report."""
-    four = {name: walks[name][0] for name in ("nominal", "expert", "without", "with")}
+    """All pictures of a run, in the order of the report, from walks at the plan interval."""
+    four = {name: walks[name] for name in ("nominal", "expert", "without", "with")}
     flat = {name: np.asarray(weights_to_vector(sets[name])) for name in four}
     histories = {name: tunings[name].history for name in ("without", "with")}
-    sampled = at_interval(on_hfs, config.rollout.walk.gait.tick)
     effects = {"linear": linear_effect(net.linear), "residual": as_effect(net.params)}
     curves = _curves(robot, jax.tree.map(lambda x: np.asarray(x)[None], sampled), effects)
     path = folder / "pictures"
-    path.mkdir()
+    path.mkdir(exist_ok=True)
     captions = {
         "tracking": plots.tracking(path / "tracking.png", four),
         "path": plots.path_from_above(path / "path.png", four),
@@ -503,7 +594,8 @@ def _evaluate(args: Evaluate) -> None:
         walks = pipeline.judge(
             pool, TuneConfig(), robot, sets, wanted.command, plants, seeds, title, seconds
         )
-    verdict = _verdict(LossConfig(), seeds, walks)
+    scores = {n: [metrics.score(LossConfig(), walk) for walk in each] for n, each in walks.items()}
+    verdict = _verdict(LossConfig(), seeds, scores)
     if args.json:
         print(as_json(metrics.as_result(verdict, args.world)))
     else:

@@ -2,11 +2,15 @@
 
 import os
 import shlex
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -64,17 +68,55 @@ class Broken(RuntimeError):  # noqa: N818, it is no fault of the program
     """What was to be found out is bad news, such as a machine that fails the doctor's tests."""
 
 
+_SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+
+
+class Stopped(KeyboardInterrupt):
+    """The first of `_SIGNALS`; its argument is the number."""
+
+
+@contextmanager
+def _stoppable(name: str) -> Iterator[None]:
+    """Raise `Stopped` at the first signal, end the process on the spot at the second.
+
+    Nothing is lost by the second: files appear whole, and workers leave with their parent.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may have handlers
+        return
+    came: list[int] = []
+
+    def stop(number: int, frame: Any) -> None:
+        came.append(number)
+        if len(came) == 1:
+            raise Stopped(number)
+        if console.is_terminal:
+            os.write(2, b"\x1b[?25h")  # the cursor, which a bar hides
+        os.write(2, f"{name}: {_SIGNALS[signal.Signals(number)]}, at once\n".encode())
+        os._exit(128 + number)
+
+    handlers = {number: signal.signal(number, stop) for number in _SIGNALS}
+    try:
+        yield
+    finally:
+        if not came:  # else a second one may come while the program ends
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+
 def exit_code(name: str, work: Callable[[], None]) -> int:
     """Do the work of a program; its exit code, with one line on stderr where that is not 0.
 
     Args:
         name: of the program, before the line.
-        work: ValueError and OSError are told as bad input (2), `Broken` (1) and an interrupt (130)
-            as such. Where nobody reads standard output any more, it ends without a word (141).
+        work: ValueError and OSError are told as bad input (2), `Broken` and a worker process that
+            was killed as such (1), SIGINT (130) and SIGTERM (143) too; a second signal does not
+            wait. Where nobody reads standard output any more, it ends without a word (141).
     """
     try:
-        work()
-        sys.stdout.flush()
+        with _stoppable(name):
+            work()
+            sys.stdout.flush()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
         return 141
@@ -82,8 +124,13 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
         code, text = 2, " ".join(str(error).split())
     except Broken as error:
         code, text = 1, str(error)
+    except BrokenExecutor:
+        code, text = 1, "a worker process was killed, perhaps for want of memory"
+    except Stopped as stopped:
+        number = signal.Signals(stopped.args[0])
+        code, text = 128 + number, _SIGNALS[number]
     except KeyboardInterrupt:
-        code, text = 130, "interrupted"
+        code, text = 130, _SIGNALS[signal.SIGINT]
     else:
         return 0
     print(f"{name}: {text}", file=sys.stderr)

@@ -97,6 +97,7 @@ class Tune(Configured):
     data: Path = Path("data")  # walks and net; made where missing
     runs: Path = Path("runs")  # results go to RUNS/TRAJ/TIME
     run: Path | None = None  # or to this folder, which must not exist (all: to RUN/TRAJ)
+    resume: Path | None = None  # take up the run in this folder where it was cut
     video: bool = True  # film nominal beside tuned
     processes: Count = 2  # one core each
     json: bool = False  # print JSON instead of the table; `run` names the folder

@@ -4,10 +4,9 @@ The name of a file ends in a digest of all that its content follows from: settin
 net, weights, plant, seed, loss, versions of the packages. Other inputs make another file, so that
 nothing is taken for something else and nothing is overwritten. The program's own lines are not in
 the digest: every result tells the commit it was made at, and a report names them. A damaged file
-is made anew.
+is named and made anew; of a tuning, from the iteration before.
 """
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -18,20 +17,24 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax import pipeline
-from hector_jax.console import bar, say
+from hector_jax.console import bar
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights, nominal
+from hector_jax.control.weights import Weights
 from hector_jax.evaluation import metrics
 from hector_jax.evaluation.metrics import Score
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import Params
-from hector_jax.robot import MODEL_PATH, Robot
+from hector_jax.pipeline import as_line
+from hector_jax.robot import Robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import Imperfections
-from hector_jax.storage import fingerprint, load_tree, save_tree, versions
+from hector_jax.storage import Checkpoint, append_file, digest, locked, write_file
 from hector_jax.trajectory import State, Trajectory, Wrench
-from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, Tuning
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.course import KIND, Record, load_tuning
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.loss import LossConfig
+
+_KINDS = {"score": "score", "walk": "trajectory"}  # of files, by the beginning of their names
 
 Key = TypeVar("Key")
 Tree = TypeVar("Tree")
@@ -60,84 +63,33 @@ class Judged(NamedTuple):
     shown: dict[str, Trajectory]  # by set, the walk on the first plant, at the plan interval
 
 
-def digest(*parts: Any) -> str:
-    """Twelve digits for settings (known by their repr), trees of numbers and the plants' XML."""
-    is_tree = lambda x: isinstance(x, tuple) or x is None  # noqa: E731
-    told = [fingerprint(part) if is_tree(part) else repr(part) for part in parts]
-    key = "\n".join([*told, repr(versions())]).encode() + MODEL_PATH.read_bytes()
-    return hashlib.sha256(key).hexdigest()[:12]
+class Journal:
+    """metrics.jsonl, a line for each iteration: as they come, and in order once tunings are over.
 
-
-def _taken(path: Path, like: Any, kind: str, robot: Robot) -> tuple[Any, dict[str, Any]] | None:
-    """What is kept under `path` with its notes; None where there is nothing sound."""
-    if not path.exists():
-        return None
-    try:
-        tree, card = load_tree(path, like, kind=kind, robot=robot)
-    except ValueError as error:
-        say(f"made anew: {error}")
-        return None
-    return tree, card["about"]
-
-
-class _Course(NamedTuple):
-    """The arrays of a tuning, iterations stacked; the words go into the card."""
-
-    weights: Weights
-    evaluation: Evaluation
-    accepted: Any
-    step: Any
-    ten: Weights
-    converged: Weights
-
-
-def _course_like() -> _Course:
-    none = np.zeros(0)
-    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), nominal())
-    seen = Evaluation(none, Losses(none, none, none), rows, none, none)
-    return _Course(rows, seen, none, none, nominal(), nominal())
-
-
-def save_tuning(path: Path, tuning: Tuning, robot: Robot, commit: str = "") -> None:
-    """Keep a tuning with its history.
-
-    Raises:
-        OSError: where the file cannot be written.
+    The truth is in the records of the tunings; the file is made from them.
     """
-    stack = lambda trees: jax.tree.map(lambda *x: np.stack(x), *trees)  # noqa: E731
-    course = _Course(
-        weights=stack([i.weights for i in tuning.history]),
-        evaluation=stack([i.evaluation for i in tuning.history]),
-        accepted=np.array([i.accepted for i in tuning.history]),
-        step=np.array([i.step for i in tuning.history]),
-        ten=tuning.ten,
-        converged=tuning.converged,
-    )
-    reasons = [i.reason for i in tuning.history]
-    about = {"reasons": reasons, "stop": tuning.stop, "commit": commit}
-    save_tree(path, course, kind="tuning", robot=robot, about=about)
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._known: dict[str, Sequence[Iteration]] = {}
 
-def load_tuning(path: Path, robot: Robot) -> Tuned | None:
-    """What `save_tuning` kept, or None where there is nothing sound."""
-    taken = _taken(path, _course_like(), "tuning", robot)
-    if taken is None:
-        return None
-    course, about = taken
-    row = lambda tree, i: jax.tree.map(lambda x: x[i], tree)  # noqa: E731
-    history = [
-        Iteration(
-            i,
-            row(course.weights, i),
-            row(course.evaluation, i),
-            bool(course.accepted[i]),
-            reason,
-            float(course.step[i]),
-        )
-        for i, reason in enumerate(about["reasons"])
-    ]
-    tuning = Tuning(history, course.ten, course.converged, about["stop"])
-    return Tuned(tuning, about["commit"])
+    def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
+        """Write the file anew, with these tunings after or instead of those written before.
+
+        Raises:
+            OSError: where the file cannot be written; the old one stays.
+        """
+        self._known.update(histories)
+        lines = (as_line(name, i) for name, history in self._known.items() for i in history)
+        write_file(self.path, "".join(lines).encode())
+
+    def add(self, name: str, iteration: Iteration) -> None:
+        """Write one line more.
+
+        Raises:
+            OSError: where the file cannot be written.
+        """
+        append_file(self.path, as_line(name, iteration).encode())
 
 
 def tune(
@@ -148,21 +100,36 @@ def tune(
     folder: Path,
     commit: str,
     title: str,
+    journal: Journal | None = None,
+    dumps: Path | None = None,
 ) -> dict[str, Tuned]:
-    """`pipeline.tune_many`, for those problems whose tunings are not in `folder` yet."""
-    paths = {
-        name: folder / f"tuning-{name}-{digest(config, robot, nominal(), *problem)}.npz"
-        for name, problem in problems.items()
-    }
-    found = {name: load_tuning(path, robot) for name, path in paths.items()}
-    missing = {name: problems[name] for name, tuned in found.items() if tuned is None}
-    if missing:
-        dumps = folder / "dumps"
-        tunings = pipeline.tune_many(pool, config, robot, missing, title, dumps=dumps)
-        for name, tuning in tunings.items():
-            save_tuning(paths[name], tuning, robot, commit)
-            found[name] = Tuned(tuning, commit)
-    return {name: tuned for name, tuned in found.items() if tuned is not None}
+    """`pipeline.tune_many`, taking up what is in `folder`.
+
+    Args:
+        pool, config, robot, problems, title: see there.
+        folder: of the tunings, a file for each.
+        commit: to note with what is made now.
+        journal: to write the iterations to.
+        dumps: folder for what was refused; that of the tunings' own by default.
+
+    Raises:
+        OSError: the folder cannot be written, or another process is writing there.
+    """
+    with locked(folder):
+        records = pipeline.records_in(folder, config, robot, problems, {"commit": commit})
+        known = (pool, config, robot, problems, title)
+        kept_in = {"records": records, "dumps": dumps or folder / "dumps"}
+        if journal is None:
+            tunings = pipeline.tune_many(*known, **kept_in)
+        else:
+            journal.write({n: r.past.history if r.past else () for n, r in records.items()})
+            tunings = pipeline.tune_many(*known, journal.add, **kept_in)
+            journal.write({name: tuning.history for name, tuning in tunings.items()})
+    return {name: _tuned(tuning, records[name], commit) for name, tuning in tunings.items()}
+
+
+def _tuned(tuning: Tuning, record: Record, commit: str) -> Tuned:
+    return Tuned(tuning, record.notes["commit"] if record.is_finished else commit)
 
 
 def tune_measured(
@@ -177,15 +144,20 @@ def tune_measured(
     commit: str,
     title: str,
 ) -> Tuned:
-    """`pipeline.tune_measured`, where its tuning is not in `folder` yet."""
+    """`pipeline.tune_measured`, taking up what is in `folder`.
+
+    Raises:
+        ValueError: a walk with the starting weights falls or cannot be believed.
+        OSError: the folder cannot be written, or another process is writing there.
+    """
     key = digest(config, robot, weights, command, params, *plants)
-    path = folder / f"tuning-walks-{key}.npz"
-    found = load_tuning(path, robot)
-    if found is None:
+    with locked(folder):
+        path = folder / f"tuning-walks-{key}.npz"
+        record = load_tuning(Checkpoint(path, KIND, robot, {"commit": commit}))
         known = (config, robot, weights, command, params, plants, title)
-        found = Tuned(pipeline.tune_measured(pool, *known), commit)
-        save_tuning(path, found.tuning, robot, commit)
-    return found
+        if record.past is not None and record.is_finished:
+            return _tuned(record.past, record, commit)
+        return Tuned(pipeline.tune_measured(pool, *known, record), commit)
 
 
 def _walked(config: LossConfig, walk: Trajectory, commit: str) -> Walked:
@@ -230,6 +202,7 @@ def judge(
     folder: Path,
     commit: str,
     title: str,
+    seconds: float = 4.0,
 ) -> Judged:
     """Scores of every weight set on every plant, walking what is not in `folder` yet.
 
@@ -238,31 +211,59 @@ def judge(
         config: controller and loss.
         robot: nominal body.
         sets: weights by name.
-        command: what to walk, four seconds.
+        command: what to walk.
         plants: of the seeds.
         seeds: of the plants and of the estimators.
         folder: of the scores, a file per walk; the walks of the first seed are kept themselves.
         commit: to note with what is made now.
         title: for the person who waits.
+        seconds: of each walk.
+
+    Raises:
+        OSError: the folder cannot be written, or another process is writing there.
     """
-    walk_config = config.rollout.walk
     jobs = {
-        (name, seed): Job(weights, command, plant, seed=seed)
+        (name, seed): Job(weights, command, plant, seconds, seed)
         for plant, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
+    with locked(folder):
+        scored, shown = _scored(pool, config, robot, jobs, seeds[0], folder, commit, title)
+    return Judged(
+        {name: [scored[name, seed] for seed in seeds] for name in sets},
+        {name: shown[name] for name in sets},
+    )
+
+
+def _scored(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    jobs: Mapping[tuple[str, int], Job],
+    first: int,
+    folder: Path,
+    commit: str,
+    title: str,
+) -> tuple[dict[tuple[str, int], Walked], dict[str, Trajectory]]:
+    """What is kept of jobs by set and seed, and of those of the first seed the walks."""
+    walk_config = config.rollout.walk
     endings = {
         (name, seed): f"{name}-{seed}-{digest(walk_config, config.loss, robot, job)}.npz"
         for (name, seed), job in jobs.items()
     }
     scored: dict[tuple[str, int], Walked] = {}
     shown: dict[str, Trajectory] = {}
-    for (name, seed), ending in endings.items():
-        taken = _taken(folder / f"score-{ending}", _walked_like(), "score", robot)
+
+    def kept(what: str, key: tuple[str, int]) -> Checkpoint:
+        about = {"commit": commit}
+        return Checkpoint(folder / f"{what}-{endings[key]}", _KINDS[what], robot, about)
+
+    for name, seed in endings:
+        taken = kept("score", (name, seed)).load(_walked_like())
         if taken is None:
             continue
-        if seed == seeds[0]:
-            walk = _taken(folder / f"walk-{ending}", _trajectory_like(), "trajectory", robot)
+        if seed == first:
+            walk = kept("walk", (name, seed)).load(_trajectory_like())
             if walk is None:
                 continue
             shown[name] = walk[0]
@@ -272,17 +273,13 @@ def judge(
         title = f"{title}, {len(scored)} of {len(jobs)} walks kept" if scored else title
         walks = pipeline.walks_of(pool, config, robot, [jobs[key] for key in missing], title)
         for (name, seed), walk in zip(missing, walks, strict=True):
-            found, ending = _walked(config.loss, walk, commit), endings[name, seed]
-            if seed == seeds[0]:
+            found = _walked(config.loss, walk, commit)
+            if seed == first:
                 shown[name] = at_interval(walk, walk_config.gait.tick)
-                save_tree(folder / f"walk-{ending}", shown[name], kind="trajectory", robot=robot)
-            path = folder / f"score-{ending}"
-            save_tree(path, tuple(found[:3]), kind="score", robot=robot, about={"commit": commit})
+                kept("walk", (name, seed)).save(shown[name])
+            kept("score", (name, seed)).save(tuple(found[:3]))
             scored[name, seed] = found
-    return Judged(
-        {name: [scored[name, seed] for seed in seeds] for name in sets},
-        {name: shown[name] for name in sets},
-    )
+    return scored, shown
 
 
 def trees(
@@ -303,12 +300,13 @@ def trees(
         robot: the body that the trees are of.
         about: to note with what is made now.
     """
-    taken = {key: _taken(path, like, kind, robot) for key, path in paths.items()}
+    kept = {key: Checkpoint(path, kind, robot, about or {}) for key, path in paths.items()}
+    taken = {key: one.load(like) for key, one in kept.items()}
     found = {key: one[0] for key, one in taken.items() if one is not None}
     missing = [key for key in paths if key not in found]
     if missing:
         for key, tree in zip(missing, make(missing), strict=True):
-            save_tree(paths[key], tree, kind=kind, robot=robot, about=dict(about or {}))
+            kept[key].save(tree)
             found[key] = tree
     return {key: found[key] for key in paths}
 

@@ -9,7 +9,6 @@ from concurrent.futures import Executor, Future, wait
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import repeat
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,13 +29,15 @@ from hector_jax.grfm.training import History, TrainConfig
 from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose, from_table, shown
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
+from hector_jax.runtime import letters
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.storage import as_json, fingerprint, make_folder
+from hector_jax.storage import Checkpoint, as_json, digest, fingerprint, locked
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune, measured
 from hector_jax.tuning import search as searching
+from hector_jax.tuning.course import KIND, Record, load_tuning, save_tuning
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
@@ -108,8 +109,9 @@ def _tune_job(
     params: Params | None,
     name: str,
     tell: Any,
+    record: Record | None,
 ) -> Tuning:
-    """One tuning in a worker; the queue `tell` hears of each iteration."""
+    """One tuning in a worker, kept as it goes; the queue `tell` hears of each iteration."""
     return difftune.tune(
         config,
         robot,
@@ -118,7 +120,16 @@ def _tune_job(
         standing_anchor(robot),
         _effect(params),
         lambda iteration: tell.put((name, iteration)),
+        **_kept_in(record),
     )
+
+
+def _kept_in(record: Record | None) -> dict[str, Any]:
+    """Arguments of a tuning that is taken up from its record and kept in it."""
+    if record is None:
+        return {}
+    past = record.past.history if record.past else ()
+    return {"past": past, "keep": partial(save_tuning, record.kept)}
 
 
 def tune_many(
@@ -128,6 +139,7 @@ def tune_many(
     problems: Mapping[str, tuple[Command, Params | None]],
     title: str,
     on_iteration: Callable[[str, Iteration], None] = lambda name, iteration: None,
+    records: Mapping[str, Record] | None = None,
     dumps: Path | None = None,
 ) -> dict[str, Tuning]:
     """Tune several problems side by side from the nominal weights.
@@ -139,19 +151,27 @@ def tune_many(
         problems: by name, the command and the net to tune through (None: the plain rigid body).
         title: for the person who waits.
         on_iteration: called with name and iteration as they happen.
+        records: by name, where the tunings are kept, iteration by iteration; they are taken up
+            from there, and a finished one is not tuned again.
         dumps: folder for what was refused, see `replay.keep`; None: nothing is kept.
 
     Raises:
         ValueError: the starting weights fall or cannot be solved on the model.
     """
-    with get_context("spawn").Manager() as manager, bar(title) as tell:
-        heard = manager.Queue()
+    records = records or {}
+    found = {n: r.past for n, r in records.items() if n in problems and r.is_finished and r.past}
+    if len(found) == len(problems):
+        return {name: found[name] for name in problems}
+    done = sum(len(r.past.history) - 1 for r in records.values() if r.past)
+    with letters() as heard, bar(title) as tell:
         running: dict[str, Future[Tuning]] = {
-            name: pool.submit(_tune_job, config, robot, command, params, name, heard)
+            name: pool.submit(
+                _tune_job, config, robot, command, params, name, heard, records.get(name)
+            )
             for name, (command, params) in problems.items()
+            if name not in found
         }
-        tell(0, config.iterations * len(problems), "compiling")
-        done = 0
+        tell(done, config.iterations * len(problems), "compiling")
         while not all(future.done() for future in running.values()) or not heard.empty():
             if heard.empty():
                 wait(running.values(), timeout=0.1)
@@ -165,7 +185,7 @@ def tune_many(
                 command, params = problems[name]
                 anchor = standing_anchor(robot)
                 replay.keep(dumps, name, config, robot, command, anchor, params, iteration)
-        return {name: future.result() for name, future in running.items()}
+        return {name: found.get(name) or running[name].result() for name in problems}
 
 
 def measured_plants(count: int) -> list[Imperfections]:
@@ -195,6 +215,7 @@ def tune_measured(
     params: Params | None,
     plants: Sequence[Imperfections],
     title: str,
+    record: Record | None = None,
 ) -> Tuning:
     """Tune on along walks on the high-fidelity simulator, one on each plant for every step.
 
@@ -207,6 +228,7 @@ def tune_measured(
         params: the net whose Jacobian is used; None: the plain rigid body.
         plants: see `measured_plants`.
         title: for the person who waits.
+        record: where it is kept, iteration by iteration, and taken up from.
 
     Raises:
         ValueError: a walk with the starting weights falls or cannot be believed.
@@ -222,7 +244,7 @@ def tune_measured(
         def look(trial: Weights) -> list[Evaluation]:
             return list(pool.map(job, repeat(trial), plants))
 
-        return measured.tune_measured(config, weights, look, note)
+        return measured.tune_measured(config, weights, look, note, **_kept_in(record))
 
 
 def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
@@ -247,12 +269,38 @@ def gradient_norms(
         return {name: future.result() for name, future in running.items()}
 
 
-def tuning_paths(pool: Executor, config: TuneConfig, robot: Robot) -> list[Weights]:
-    """Weights that plain tunings of the trajectories pass through, stacked: data covers them."""
+def records_in(
+    folder: Path,
+    config: TuneConfig,
+    robot: Robot,
+    problems: Mapping[str, tuple[Command, Params | None]],
+    about: Mapping[str, Any] | None = None,
+) -> dict[str, Record]:
+    """Records of tunings in a folder, by the names of the problems; see `tune_many`.
+
+    Args:
+        folder: where.
+        config, robot, problems: see `tune_many`; others have other records.
+        about: JSON values to note with what is made now.
+    """
+    endings = {n: digest(config, robot, nominal(), *each) for n, each in problems.items()}
+    return {
+        name: load_tuning(
+            Checkpoint(folder / f"tuning-{name}-{ending}.npz", KIND, robot, about or {})
+        )
+        for name, ending in endings.items()
+    }
+
+
+def tuning_paths(pool: Executor, config: TuneConfig, robot: Robot, folder: Path) -> list[Weights]:
+    """Weights that plain tunings of the trajectories pass through, stacked: data covers them.
+
+    The tunings are kept in `folder`.
+    """
     problems = {name: (named_command(name), None) for name in COMMANDS}
-    tunings = tune_many(
-        pool, config, robot, problems, "tuning paths on the rigid body, for the data"
-    )
+    title = "tuning paths on the rigid body, for the data"
+    records = records_in(folder, config, robot, problems)
+    tunings = tune_many(pool, config, robot, problems, title, records=records)
     stacked = []
     for name in COMMANDS:
         passed = [i.weights for i in tunings[name].history if i.accepted]
@@ -266,14 +314,14 @@ def collect(
     """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there.
 
     Raises:
-        OSError: the folder cannot be written; told before anything is walked.
+        OSError: the folder cannot be written, or another process is writing there; told before
+            anything is walked.
         ValueError: it holds walks of other jobs, another robot, controller or engine.
     """
-    make_folder(folder)
-    jobs = dataset.draw_jobs(
-        config.seed, config.walks, tuning_paths(pool, tune, robot), config.seconds
-    )
-    _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, folder)
+    with locked(folder):
+        paths = tuning_paths(pool, tune, robot, folder / "paths")
+        jobs = dataset.draw_jobs(config.seed, config.walks, paths, config.seconds)
+        _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, folder)
 
 
 def _keep_walks(
@@ -384,10 +432,22 @@ def train(
 ) -> Learned:
     """Train a GRFM-Net on the walks under `folder`, and under `more`, and keep it at `path`.
 
-    Its card tells the walks and the controller that it belongs to.
+    Its card tells the walks and the controller that it belongs to. A training that was cut is taken
+    up from the epoch that it kept beside `path`.
+
+    Raises:
+        OSError: the folder of `path` cannot be written, or another process is writing there.
+        ValueError: no walks, or damaged ones.
     """
-    folders = (folder, *more)
+    with locked(path.parent):
+        return _train(config, robot, (folder, *more), path)
+
+
+def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> Learned:
     parts = samples(robot, *folders)
+    made_of = [dataset.walked_with(each) for each in folders]
+    ending = digest(config, robot, made_of)
+    kept = Checkpoint(path.with_name(f"training-{ending}.npz"), training.KIND, robot)
     with bar(f"training GRFM-Net ({config.variant}) on {len(parts.training.walk)} samples") as tell:
         tell(0, config.epochs, "compiling")
         params, course = training.train(
@@ -395,6 +455,7 @@ def train(
             parts.training,
             parts.validation,
             lambda epoch, _: tell(epoch, config.epochs, ""),
+            kept,
         )
     linear = network.fit_linear(parts.training)
     effects = {
@@ -404,14 +465,15 @@ def train(
     }
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
-        "made_of": dataset.walked_with(folder),
-        **({"and_of": [dataset.walked_with(each) for each in more]} if more else {}),
+        "made_of": made_of[0],
+        **({"and_of": made_of[1:]} if made_of[1:] else {}),
         "settings": asdict(config),
         "samples": {**sizes, "dropped": parts.dropped},
         "errors": training.report(effects, parts.held_out),
         "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
+    kept.remove()
     return Learned(params, linear, about["errors"], course, config, folders)
 
 
@@ -538,10 +600,10 @@ def search(
 
     Raises:
         ValueError: see `choose_engine`, `named_command` and `tuning.search.search`.
-        OSError: the folder cannot be written; told before anything is walked.
+        OSError: the folder cannot be written, or another process is writing there; told before
+            anything is walked.
     """
     engine = choose_engine(engine)
-    make_folder(folder)
     size = config.population * len(starts)
     about = {  # not the engine: both give a loss to seven digits
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
@@ -555,7 +617,8 @@ def search(
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
         return losses_on_hfs(pool, tune, robot, engine, sets, size, own)
 
-    with bar(f"searching on the high-fidelity simulator, engine {engine}") as tell:
+    title = f"searching on the high-fidelity simulator, engine {engine}"
+    with locked(folder), bar(title) as tell:
 
         def on_generation(histories: Mapping[str, list[Generation]]) -> None:
             done = sum(len(history) for history in histories.values()) * config.population
@@ -602,11 +665,11 @@ def refresh(
         on held-out walks, `old` and `new`, as `training.report` gives them.
     """
     walks = folder / "walks"
-    make_folder(walks)
     late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
     path = jax.tree.map(lambda *w: np.stack(w), tuning.ten, *late)
     jobs = dataset.draw_jobs_near(config.seed, config.walks, command, path, config.seconds)
-    _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, walks)
+    with locked(walks):
+        _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, walks)
     oldest, *newer = (*before.folders, walks)
     after = train(before.config, robot, oldest, folder / "refreshed.npz", newer)
     effects = {

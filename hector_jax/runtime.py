@@ -8,10 +8,13 @@ import gc
 import os
 import signal
 import tempfile
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from multiprocessing import get_context
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
@@ -69,18 +72,65 @@ def all_devices() -> None:
         )
 
 
-def start_worker(cores: Any) -> None:
+class _Process(SpawnProcess):
+    """A process that interrupts of the terminal, which reach all of a program, do not reach."""
+
+    def start(self) -> None:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child keeps it
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Spawn(SpawnContext):
+    Process = _Process
+
+
+@contextmanager
+def _lifeline() -> Iterator[tuple[Connection, Connection]]:
+    """A pipe whose first end is for processes that are to live no longer than its second end."""
+    theirs, ours = _Spawn().Pipe(duplex=False)
+    with theirs, ours:
+        yield theirs, ours
+
+
+def _leave_with(lifeline: Connection) -> None:
+    """End this process when the other end of its lifeline is closed, by whatever end of its parent.
+
+    Without it workers outlive a parent that was killed: each holds the queue open that it waits on.
+    """
+
+    def watch() -> None:
+        with suppress(EOFError, OSError):
+            lifeline.recv_bytes()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def letters() -> Iterator[Any]:
+    """A queue that jobs of worker processes can be handed."""
+    manager = SyncManager(ctx=_Spawn())
+    with _lifeline() as (theirs, _):
+        manager.start(_leave_with, (theirs,))
+        with manager:
+            yield manager.Queue()
+
+
+def start_worker(cores: Any, lifeline: Connection) -> None:
     """Set up a worker process as its parent is, with interrupts and accelerators left to it.
 
     Several workers stay on a core each, the next of the queue `cores`: XLA's threads of one would
     otherwise wait for those of the others, which costs several times the work.
     """
+    _leave_with(lifeline)
     core = cores.get()
     if core is not None:
         os.sched_setaffinity(0, {core})
     import jax
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     jax.config.update("jax_platforms", "cpu")
     setup_jax()
 
@@ -96,7 +146,7 @@ def _cores(processes: int) -> list[int | None]:
 
 @contextmanager
 def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes, each set up by `start_worker`; what still waits is dropped on an error.
+    """Worker processes, each set up by `start_worker`; on an error they end in the midst of a job.
 
     The caller's own script has to be importable (`if __name__ == "__main__"`), because the
     processes are spawned.
@@ -106,13 +156,19 @@ def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
     """
     if processes < 1:
         raise ValueError(f"the number of processes must be at least 1, got {processes}")
-    spawn = get_context("spawn")
+    spawn = _Spawn()
     cores = spawn.SimpleQueue()
     for core in _cores(processes):
         cores.put(core)
-    with ProcessPoolExecutor(processes, spawn, initializer=start_worker, initargs=(cores,)) as pool:
+    with (
+        _lifeline() as (theirs, ours),
+        ProcessPoolExecutor(
+            processes, spawn, initializer=start_worker, initargs=(cores, theirs)
+        ) as pool,
+    ):
         try:
             yield pool
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            ours.close()
             raise

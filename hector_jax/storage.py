@@ -6,9 +6,14 @@ versions, and `about`, which belongs to whoever wrote it. The archive's comment 
 bytes before it, so a file that was cut or changed anywhere is refused as a whole. The robot is
 known by the hash of its numbers: what was learned on one body is not loaded for another. Files
 appear by rename, so a reader finds the old one or the new one and never a part.
+
+Whatever is computed for longer than a moment keeps how far it came as a `Checkpoint` of such files,
+in a folder that `locked` gives to one process.
 """
 
 import difflib
+import errno
+import fcntl
 import hashlib
 import io
 import json
@@ -16,7 +21,10 @@ import os
 import platform
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,12 +32,15 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from hector_jax.console import say
 from hector_jax.control.weights import Weights
 from hector_jax.inputs import one_line, problem, read_text, shown
+from hector_jax.robot import MODEL_PATH
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
 _MOST_WEIGHTS = 1_000_000  # bytes
+_PART = ".part"  # ends the name of a file that is being written
 _DIGEST = 64  # hexadecimal digits of a sha256
 _PACKAGES = (
     "hector-jax",
@@ -48,6 +59,11 @@ Tree = TypeVar("Tree")
 
 def versions() -> dict[str, str]:
     """Versions of Python and of those packages that shape our numbers and are installed."""
+    return dict(_versions())
+
+
+@cache  # a checkpoint asks for them at every save
+def _versions() -> dict[str, str]:
     found = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
@@ -67,8 +83,21 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()[:16]
 
 
-def write_file(path: Path, data: bytes) -> None:
+def digest(*parts: Any) -> str:
+    """Twelve digits for settings (known by their repr), trees of numbers and the plants' XML."""
+    is_tree = lambda x: isinstance(x, tuple) or x is None  # noqa: E731
+    told = [fingerprint(part) if is_tree(part) else repr(part) for part in parts]
+    key = "\n".join([*told, repr(versions())]).encode() + MODEL_PATH.read_bytes()
+    return hashlib.sha256(key).hexdigest()[:12]
+
+
+def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
     """Put `data` under `path`, whole or not at all; missing folders are made.
+
+    Args:
+        path: the file, replaced if it is there.
+        data: all of it.
+        before: name that the file which is replaced goes to.
 
     Raises:
         OSError: one line with the path, where the folder or the disk refuses.
@@ -76,7 +105,7 @@ def write_file(path: Path, data: bytes) -> None:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        handle, name = tempfile.mkstemp(_PART, f".{path.name}.", path.parent)
     except OSError as error:
         raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
     try:
@@ -85,12 +114,39 @@ def write_file(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.chmod(name, 0o644)
+        if before is not None and path.exists():
+            os.replace(path, before)
         os.replace(name, path)
+        _sync(path.parent)
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
         raise
+
+
+def append_file(path: Path, data: bytes) -> None:
+    """Add `data` to a file; a stop in the midst may leave part of it.
+
+    Raises:
+        OSError: one line with the path, where the folder or the disk refuses.
+    """
+    try:
+        with Path(path).open("ab") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
+
+
+def _sync(folder: Path) -> None:
+    """Bring the names of a folder's files to the disk; without it a rename may outlive its data."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def make_folder(folder: Path) -> None:
@@ -105,6 +161,28 @@ def make_folder(folder: Path) -> None:
             pass
     except OSError as error:
         raise OSError(error.errno, f"cannot write to {folder}: {error.strerror}") from error
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Be the only process that writes to `folder`, which is made, as long as the block lasts.
+
+    A process that is killed lets go of the lock; what it left half-written is removed here.
+
+    Raises:
+        OSError: one line with the folder, where another process has the lock, or where the folder
+            cannot be made or written.
+    """
+    make_folder(folder)
+    with (Path(folder) / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            told = f"{folder}: another process is writing there; wait for it or name another folder"
+            raise OSError(errno.EAGAIN, told) from error
+        for left in Path(folder).glob(f".*{_PART}"):
+            left.unlink(missing_ok=True)
+        yield
 
 
 def save_tree(
@@ -122,6 +200,10 @@ def save_tree(
     Raises:
         OSError: where the file cannot be written.
     """
+    write_file(path, _packed(tree, kind, robot, about))
+
+
+def _packed(tree: Any, kind: str, robot: Any, about: Mapping[str, Any] | None) -> bytes:
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     card = {
         "format": FORMAT,
@@ -138,7 +220,7 @@ def save_tree(
                 np.lib.format.write_array(entry, array, allow_pickle=False)
         archive.comment = b"0" * _DIGEST  # makes room; a zip file ends with its comment
     content = buffer.getvalue()[:-_DIGEST]
-    write_file(path, content + hashlib.sha256(content).hexdigest().encode())
+    return content + hashlib.sha256(content).hexdigest().encode()
 
 
 def load_tree(
@@ -235,6 +317,71 @@ def _read_bytes(path: Path) -> bytes:
 def _named_leaves(tree: Any) -> dict[str, Any]:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """How far something came, on disk: the newest state and the one before it.
+
+    A file that is cut, changed, of another robot, layout or of other versions, under which the same
+    bytes cannot be promised, is named, not taken up, and put aside as `.refused`. Of what else a
+    state follows from, the file's name is to hold a `digest`.
+    """
+
+    path: Path  # of the newest state
+    kind: str  # see save_tree
+    robot: Any = None
+    about: Mapping[str, Any] = field(default_factory=dict)  # JSON values for every card
+
+    @property
+    def before(self) -> Path:
+        """The file of the state before the newest."""
+        return self._beside("before")
+
+    def _beside(self, word: str) -> Path:
+        return self.path.with_name(f"{self.path.stem}.{word}{self.path.suffix}")
+
+    def save(self, tree: Any, about: Mapping[str, Any] | None = None) -> None:
+        """Keep a state, with more notes for its card.
+
+        Raises:
+            OSError: where the file cannot be written; what was kept stays.
+        """
+        data = _packed(tree, self.kind, self.robot, {**self.about, **(about or {})})
+        write_file(self.path, data, self.before)
+
+    def load(self, like: Tree) -> tuple[Tree, dict[str, Any]] | None:
+        """The newest sound state, with the notes of its card; None where there is none."""
+        for path in (self.path, self.before):
+            if not path.exists():
+                continue
+            try:
+                tree, card = load_tree(path, like, kind=self.kind, robot=self.robot)
+                check_versions(path, card["versions"])
+            except ValueError as error:
+                say(f"not taken up: {error}")
+                continue
+            if path == self.before and self.path.exists():
+                # out of the way: the next save must not put it in the place of the sound one
+                os.replace(self.path, self._beside("refused"))
+            return tree, card["about"]
+        return None
+
+    def remove(self) -> None:
+        """Forget both states."""
+        for path in (self.path, self.before):
+            path.unlink(missing_ok=True)
+
+
+def check_versions(path: Path, made_with: Mapping[str, str]) -> None:
+    """Hold what a file was made with against what is installed.
+
+    Raises:
+        ValueError: one line naming the file and the first package that differs.
+    """
+    for name, here in versions().items():
+        if (made := made_with.get(name)) != here:
+            raise ValueError(f"{path}: made with {name} {made}, here is {name} {here}")
 
 
 def as_json(value: Any, indent: int | None = None) -> str:

@@ -26,7 +26,7 @@ from hector_jax.kept import Judged, Tuned
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
 from hector_jax.sim.world import Imperfections, hfs
-from hector_jax.storage import load_weights, make_folder
+from hector_jax.storage import digest, load_weights, locked, make_folder
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
 from hector_jax.tuning.search import Found, SearchConfig
@@ -136,14 +136,24 @@ def make_table(
 
     Raises:
         ValueError: the flags ask for what cannot be, or a file is damaged.
-        OSError: a folder cannot be written.
+        OSError: a folder cannot be written, or another process is writing there.
     """
     asked = args
     if args.quick:
         args = replace(args, **{n: min(getattr(args, n), most) for n, most in _QUICK.items()})
-    plan, robot = _plan(args), load_robot()
-    out = args.out / "quick" if args.quick else args.out
-    shelf = args.kept or args.out / "kept"
+    plan, out = _plan(args), args.out / "quick" if args.quick else args.out
+    with locked(out):
+        return _make_table(args, asked, plan, out, plants)
+
+
+def _make_table(
+    args: flags.Table,
+    asked: flags.Table,
+    plan: _Plan,
+    out: Path,
+    plants: Callable[[range], list[Imperfections]],
+) -> tuple[Path, dict[str, Verdict]]:
+    robot, shelf = load_robot(), args.kept or args.out / "kept"
     for folder in (out / "pictures", shelf):
         make_folder(folder)
     made_with = environment()
@@ -193,7 +203,7 @@ def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str,
     """The derivative-free baseline of all trajectories, in lock-step."""
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
     engine, model = pipeline.choose_engine("auto"), plan.tune.rollout
-    key = kept.digest(engine, model, plan.tune.loss, settings, robot, hfs(), nominal())
+    key = digest(engine, model, plan.tune.loss, settings, robot, hfs(), nominal())
     starts = dict.fromkeys(plan.commands, nominal())
     folder = shelf / f"search-{key}"
     return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)

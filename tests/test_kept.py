@@ -15,6 +15,8 @@ from hector_jax.evaluation import metrics
 from hector_jax.robot import load_robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs, ideal
+from hector_jax.storage import Checkpoint, digest
+from hector_jax.tuning.course import KIND, load_tuning, save_tuning
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
@@ -31,8 +33,11 @@ def tuned(monkeypatch):
     """Names of the problems that are really tuned."""
     names = []
 
-    def tune_many(pool, config, robot, problems, title, dumps):
-        names.extend(problems)
+    def tune_many(pool, config, robot, problems, title, records, dumps):
+        for name, record in records.items():
+            if not record.is_finished:
+                names.append(name)
+                save_tuning(record.kept, TUNING)
         return dict.fromkeys(problems, TUNING)
 
     monkeypatch.setattr(pipeline, "tune_many", tune_many)
@@ -69,14 +74,16 @@ def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
 
 def test_a_tuning_comes_back_as_it_was(tmp_path):
     path = tmp_path / "tuning.npz"
-    kept.save_tuning(path, TUNING, ROBOT, "abc")
-    back = kept.load_tuning(path, ROBOT)
-    assert back.commit == "abc"
-    assert back.tuning.stop == TUNING.stop
-    assert [i.reason for i in back.tuning.history] == [i.reason for i in TUNING.history]
-    assert [i.accepted for i in back.tuning.history] == [i.accepted for i in TUNING.history]
-    same(back.tuning._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
-    for one, other in zip(back.tuning.history, TUNING.history, strict=True):
+    record = Checkpoint(path, KIND, ROBOT, {"commit": "abc"})
+    save_tuning(record, TUNING)
+    back = load_tuning(record)
+    assert back.is_finished
+    assert back.notes["commit"] == "abc"
+    assert back.past.stop == TUNING.stop
+    assert [i.reason for i in back.past.history] == [i.reason for i in TUNING.history]
+    assert [i.accepted for i in back.past.history] == [i.accepted for i in TUNING.history]
+    same(back.past._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
+    for one, other in zip(back.past.history, TUNING.history, strict=True):
         assert one.iteration == other.iteration
         assert one.step == other.step
         same((one.weights, one.evaluation), (other.weights, other.evaluation))
@@ -93,7 +100,7 @@ def test_a_tuning_is_made_once_and_again_for_other_settings(tmp_path, tuned):
 
 def test_a_damaged_tuning_is_made_anew(tmp_path, tuned, capsys):
     tune(tmp_path)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("*.npz")
     path.write_bytes(path.read_bytes()[:-100])
     tune(tmp_path)
     assert len(tuned) == 2
@@ -144,11 +151,11 @@ def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
 
 def test_the_digest_tells_settings_trees_and_seeds_apart():
     found = {
-        kept.digest(CONFIG, ROBOT, nominal()),
-        kept.digest(CONFIG, ROBOT, expert()),
-        kept.digest(TuneConfig(iterations=20), ROBOT, nominal()),
-        kept.digest(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal()),
-        kept.digest(CONFIG, ROBOT, nominal(), None),
+        digest(CONFIG, ROBOT, nominal()),
+        digest(CONFIG, ROBOT, expert()),
+        digest(TuneConfig(iterations=20), ROBOT, nominal()),
+        digest(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal()),
+        digest(CONFIG, ROBOT, nominal(), None),
     }
     assert len(found) == 5
 

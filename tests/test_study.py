@@ -13,6 +13,7 @@ from hector_jax.evaluation.video import VideoUnavailable
 from hector_jax.flags import Table, as_command
 from hector_jax.sim.world import hfs
 from hector_jax.storage import save_weights
+from hector_jax.tuning.course import Record
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.search import Found, Generation
 
@@ -32,7 +33,7 @@ def asked(monkeypatch):
         one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(starts, one)
 
-    def tune_many(pool, config, robot, problems, title, dumps):
+    def tune_many(pool, config, robot, problems, title, records, dumps):
         told["tunings"].append((config.iterations, *problems))
         return dict.fromkeys(problems, Tuning(pretend_history(12), nominal(), expert(), "done"))
 
@@ -44,7 +45,7 @@ def asked(monkeypatch):
     def write_video(*args):
         raise VideoUnavailable("no film: none here")
 
-    def tune_measured(pool, config, robot, weights, command, params, plants, title):
+    def tune_measured(pool, config, robot, weights, command, params, plants, title, record):
         told["steps"] = config.iterations - 10, len(plants)
         return Tuning(pretend_history(3), nominal(), expert(), "done")
 
@@ -56,7 +57,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(pipeline, "tune_many", tune_many)
     monkeypatch.setattr(pipeline, "tune_measured", tune_measured)
     monkeypatch.setattr(pipeline, "walks_of", walks_of)
-    monkeypatch.setattr(kept, "load_tuning", lambda path, robot: None)
+    monkeypatch.setattr(kept, "load_tuning", Record)
     monkeypatch.setattr(study, "write_video", write_video)
     return told
 
@@ -132,14 +133,14 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
         ({"steps": -1}, "--steps must be a whole number of at least 0, got -1"),
         ({"trajectories": ("turn",)}, "--trajectories must be of straight, c, s, got turn"),
         ({"iterations": 3}, "--iterations must be a whole number of at least 10, got 3"),
-        ({"rollouts": 3}, "budget must be at least one generation"),
+        ({"rollouts": 3}, "budget must be at least the population"),
         ({"trajectories": ("moon",)}, "--trajectories must be of straight, c, s, got moon"),
         ({"trajectories": ("s", "s")}, "--trajectories must name each once, got s s"),
         ({"extra": ("mine",)}, "--extra must be NAME=FOLDER.*got mine"),
         ({"extra": ("my set=x",)}, "--extra must be NAME=FOLDER.*got my set=x"),
         ({"extra": ("with=x",)}, "--extra with=x: there is a set 'with' already"),
         ({"extra": ("a=x", "a=y")}, "--extra a=y: there is a set 'a' already"),
-        ({"extra": ("a=nowhere",)}, "cannot read nowhere/straight.json"),
+        ({"extra": ("a=nowhere",)}, "nowhere/straight.json: cannot read weights"),
         ({"earlier": Path("nowhere.json")}, "cannot read nowhere.json"),
         ({"processes": 0}, "--processes must be a whole number of at least 1, got 0"),
     ],
@@ -158,10 +159,12 @@ def test_the_line_that_asks_again_names_what_is_not_default():
 
 def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(commands, "run", asked.append)
-    commands._tune(flags.Tune(traj="all", run=tmp_path, seeds=2))
-    assert [one.traj for one in asked] == ["straight", "c", "s"]
-    assert [one.run.name for one in asked] == ["straight", "c", "s"]
-    assert {one.seeds for one in asked} == {2}
-    commands._tune(flags.Tune(traj="all"))
-    assert asked[-1].run is None
+    monkeypatch.setattr(commands, "_tune_in", lambda folder, args: asked.append((folder, args)))
+    commands._tune(flags.Tune(traj="all", run=tmp_path / "run", seeds=2))
+    assert [one.traj for _, one in asked] == ["straight", "c", "s"]
+    assert [folder.name for folder, _ in asked] == ["straight", "c", "s"]
+    assert {one.seeds for _, one in asked} == {2}
+    commands._tune(flags.Tune(traj="all", resume=tmp_path / "run"))
+    assert [one.seeds for _, one in asked[3:]] == [2, 2, 2]
+    commands._tune(flags.Tune(traj="all", runs=tmp_path / "runs"))
+    assert [folder.parent.name for folder, _ in asked[6:]] == ["straight", "c", "s"]

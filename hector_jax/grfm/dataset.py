@@ -9,7 +9,6 @@ the start of the tick. Training and validation are split by walk: samples of one
 """
 
 import hashlib
-import itertools
 import json
 import math
 import re
@@ -23,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from hector_jax.console import say
 from hector_jax.control import gait
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
@@ -234,8 +234,8 @@ def collect(
 ) -> None:
     """Walk all jobs and keep them under `folder` in shards, taking up what an earlier call left.
 
-    A sound shard of the same jobs is kept, a missing or damaged one is made and written as soon as
-    its walks are there. `card.json` appears when all are.
+    A sound shard of the same jobs is kept, a missing or damaged one is made: each of its walks is
+    kept in a file of its own until all are there. `card.json` appears when all shards are.
 
     Args:
         folder: where; made if missing.
@@ -259,27 +259,38 @@ def collect(
         "frames": "world; wrench of the ground on the foot at its foot point, left then right",
         "told": told,
     }
+    single = {start: Path(folder) / f"walk-{start:05d}.npz" for start in range(len(jobs))}
     chunks = {
-        Path(folder) / f"shard-{start // shard:03d}.npz": jobs[start : start + shard]
+        Path(folder) / f"shard-{start // shard:03d}.npz": range(len(jobs))[start : start + shard]
         for start in range(0, len(jobs), shard)
     }
-    kept = {path: _kept_shard(path, _stack(chunk), robot, told) for path, chunk in chunks.items()}
-    missing = [job for path, chunk in chunks.items() if kept[path] is None for job in chunk]
-    walks = iter(walk_jobs(missing) if missing else ())
+
+    def take(path: Path, numbers: Sequence[int]) -> Walks | None:
+        return _kept_shard(path, _stack([jobs[i] for i in numbers]), robot, told)
+
+    kept = {path: take(path, numbers) for path, numbers in chunks.items()}
+    open_ = [i for path, numbers in chunks.items() if kept[path] is None for i in numbers]
+    alone = {i: take(single[i], [i]) for i in open_}
+    missing = [i for i, walk in alone.items() if walk is None]
+    walks = iter(walk_jobs([jobs[i] for i in missing]) if missing else ())
     done, falls = len(jobs) - len(missing), 0
     progress(done, len(jobs))
-    for path, chunk in chunks.items():
+    for path, numbers in chunks.items():
         shard_walks = kept[path]
         if shard_walks is None:
-            taken = []
-            for walk in itertools.islice(walks, len(chunk)):
-                taken.append(at_interval(walk, interval))
+            asked = [i for i in numbers if alone[i] is None]
+            for i, walk in zip(asked, walks, strict=False):
+                alone[i] = Walks(_stack([jobs[i]]), _stack([at_interval(walk, interval)]))
+                save_tree(single[i], alone[i], kind="walks", robot=robot, about=facts)
                 done += 1
                 progress(done, len(jobs))
-            if len(taken) != len(chunk):
-                raise ValueError(f"{path}: {len(chunk)} walks asked for, {len(taken)} came")
-            shard_walks = Walks(_stack(chunk), _stack(taken))
+            taken = [walk for i in numbers if (walk := alone[i]) is not None]
+            if len(taken) != len(numbers):
+                raise ValueError(f"{path}: {len(numbers)} walks asked for, {len(taken)} came")
+            shard_walks = jax.tree.map(lambda *walks: np.concatenate(walks), *taken)
             save_tree(path, shard_walks, kind="walks", robot=robot, about=facts)
+        for i in numbers:
+            single[i].unlink(missing_ok=True)
         falls += int(np.any(shard_walks.trajectory.fallen, axis=1).sum())
     card = {"walks": len(jobs), "falls": falls, "shards": [p.name for p in chunks], **facts}
     write_file(Path(folder) / "card.json", (json.dumps(card, indent=2) + "\n").encode())
@@ -347,8 +358,9 @@ def _kept_shard(path: Path, asked: Job, robot: Robot, told: dict[str, Any]) -> W
         return None
     try:
         card = read_card(path)
-    except ValueError:
-        return None  # damaged: to be made again
+    except ValueError as error:
+        say(f"made anew: {error}")
+        return None
     if card["about"].get("told") != told:
         raise ValueError(f"{path}: collected with other settings; choose another folder")
     walks = _load_shard(path, robot)

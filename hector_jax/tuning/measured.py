@@ -86,6 +86,8 @@ def tune_measured(
     weights: Weights,
     look: Callable[[Weights], Sequence[Evaluation]],
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
+    past: Sequence[Iteration] = (),
+    keep: Callable[[Tuning], None] = lambda tuning: None,
 ) -> Tuning:
     """Tune on measured walks, from weights that have been tuned on the model.
 
@@ -97,6 +99,7 @@ def tune_measured(
         weights: where to start.
         look: walks with weights on each plant and differentiates, see `evaluate_walk`.
         on_iteration: called after each iteration.
+        past, keep: see `descend`.
 
     Raises:
         ValueError: a walk with the starting weights falls or cannot be believed.
@@ -107,4 +110,4 @@ def tune_measured(
         both = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
         return both._replace(residual=np.max([one.residual for one in found]))
 
-    return descend(config, weights, mean, on_iteration, first=PAPER_ITERATIONS)
+    return descend(config, weights, mean, on_iteration, PAPER_ITERATIONS, past, keep)

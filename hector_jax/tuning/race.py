@@ -7,7 +7,6 @@ and counts for none.
 """
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.weights import DIRECTION_NAMES, Weights
-from hector_jax.storage import as_json, write_file
+from hector_jax.storage import append_file, as_json, write_file
 from hector_jax.tuning.rivals import Rival, Steps
 from hector_jax.tuning.search import Generation, Walk, placed, read_record
 
@@ -131,10 +130,7 @@ def _note(raced: Raced, line: Mapping[str, Any]) -> None:
 
 
 def _append(path: Path, line: Mapping[str, Any]) -> None:
-    with path.open("a") as file:
-        file.write(as_json(line) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    append_file(path, (as_json(line) + "\n").encode())
 
 
 def _read(path: Path, head: Mapping[str, Any]) -> list[dict[str, Any]] | None:

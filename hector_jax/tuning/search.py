@@ -34,7 +34,7 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.inputs import POSITIVE, SEED, SOME, Interval, check
-from hector_jax.storage import write_file
+from hector_jax.storage import append_file, write_file
 
 FORMAT = 1
 
@@ -209,10 +209,7 @@ class _Search:
             "steps": generation.steps.tolist(),
             "losses": [x if math.isfinite(x) else None for x in generation.losses.tolist()],
         }
-        with self.path.open("a") as file:
-            file.write(json.dumps(line, allow_nan=False) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        append_file(self.path, (json.dumps(line, allow_nan=False) + "\n").encode())
         self.course.tell(generation)
 
     def found(self) -> Found:

@@ -1,0 +1,164 @@
+"""Four jobs, kept as the program keeps them, and a killer: `python killed.py JOB FOLDER KILLS`.
+
+The job is begun again and again and killed after a few saves more, at a moment drawn evenly from
+the time between two saves, so that some kills fall inside a save. The last one is left alone.
+Models are toys: what is tried here is what is kept. FOLDER/done has a line for each piece of work
+that was done, whether it was kept or not.
+"""
+
+import os
+import signal
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from pretend import pretend_walk
+from synthetic import synthetic_walk
+
+from hector_jax import kept, pipeline
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.grfm import dataset
+from hector_jax.grfm.training import TrainConfig
+from hector_jax.kept import Journal
+from hector_jax.robot import load_robot
+from hector_jax.runtime import setup_jax
+from hector_jax.sim.world import hfs
+from hector_jax.storage import locked
+from hector_jax.tuning.course import save_tuning
+from hector_jax.tuning.difftune import Evaluation, TuneConfig, Tuning, descend
+from hector_jax.tuning.loss import Losses
+
+ROBOT, S = load_robot(), named_command("s")
+WALKS = 30
+
+
+def done(folder: Path, what) -> None:
+    with (folder.parent / f"{folder.name}.done").open("a") as file:
+        file.write(f"{what}\n")
+
+
+def look(folder: Path, weights) -> Evaluation:
+    """A quadratic in log-weights."""
+    vector = np.asarray(weights_to_vector(weights), float)
+    logs = np.log(vector) - 1.0
+    gradient = vector_to_weights(jnp.asarray(2.0 * logs / vector))
+    done(folder, f"{logs.sum():.17g}")
+    time.sleep(0.01)
+    loss = np.array(logs @ logs)
+    none = np.array(0.0)
+    return Evaluation(loss, Losses(loss, loss, loss), gradient, none, none)
+
+
+def tuning(folder: Path) -> None:
+    config = TuneConfig(iterations=60)
+    with locked(folder):
+        (record,) = pipeline.records_in(folder, config, ROBOT, {"toy": (S, None)}).values()
+        journal = Journal(folder / "metrics.jsonl")
+        journal.write({"toy": record.past.history if record.past else ()})
+        found = descend(
+            config,
+            nominal(),
+            partial(look, folder),
+            partial(journal.add, "toy"),
+            past=record.past.history if record.past else (),
+            keep=partial(save_tuning, record.kept),
+        )
+        journal.write({"toy": found.history})
+
+
+def walk_jobs(folder: Path, jobs):
+    for job in jobs:
+        done(folder, job.seed)
+        yield synthetic_walk(job.seed, 12)
+
+
+def collection(folder: Path) -> None:
+    with locked(folder):
+        jobs = dataset.draw_jobs(0, WALKS)
+        dataset.collect(folder, jobs, partial(walk_jobs, folder), robot=ROBOT, about={})
+
+
+def training(folder: Path) -> None:
+    walks = folder.parent / "walks"
+    with locked(walks):
+        jobs = dataset.draw_jobs(0, 5)
+        dataset.collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT, about={})
+    config = TrainConfig(os.environ.get("VARIANT", "paper"), epochs=60, batch=16)
+    if not (folder / "net.npz").exists():
+        pipeline.train(config, ROBOT, walks, folder / "net.npz")
+
+
+def table(folder: Path) -> None:
+    def walks_of(pool, config, robot, jobs, title):
+        for job in jobs:
+            done(folder, f"{job.seed} {float(job.weights.Q.euler[0])}")
+            yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
+
+    def tune_many(pool, config, robot, problems, title, records):
+        (record,) = records.values()
+        past = record.past.history if record.past else ()
+        keep = partial(save_tuning, record.kept)
+        found: Tuning = descend(config, nominal(), partial(look, folder), past=past, keep=keep)
+        return dict.fromkeys(problems, found)
+
+    pipeline.walks_of, pipeline.tune_many = walks_of, tune_many
+    config, pool = TuneConfig(iterations=20), ThreadPoolExecutor(1)
+    problems = {"without": (S, None)}
+    with locked(folder):
+        tuned = kept.tune(pool, config, ROBOT, problems, folder / "s", "abc", "")["without"]
+        sets = {"nominal": nominal(), "expert": expert(), "without": tuned.tuning.converged}
+        seeds = range(WALKS // 2)
+        plants = [hfs()] * len(seeds)
+        kept.judge(pool, config, ROBOT, sets, S, plants, seeds, folder / "s", "abc", "")
+
+
+JOBS = {job.__name__: job for job in (tuning, collection, training, table)}
+
+
+def newest(folder: Path) -> tuple[int, ...]:
+    """Times of the last change of all folders below: each save changes one."""
+    return tuple(sorted(f.stat().st_mtime_ns for f in (folder, *folder.glob("*/")) if f.is_dir()))
+
+
+def killed(start, folder: Path, saves: int, wait: float) -> bool:
+    """Start the job, let it save a few times and wait; whether it was still there to be killed."""
+    child = start()
+    try:
+        for _ in range(saves):
+            before = newest(folder)
+            while newest(folder) == before:
+                if os.waitpid(child, os.WNOHANG)[0]:
+                    return False
+                time.sleep(0.0005)
+        time.sleep(wait)
+        os.kill(child, signal.SIGKILL)
+        return os.waitpid(child, 0)[1] == signal.SIGKILL
+    except ChildProcessError:
+        return False
+
+
+def main(name: str, folder: Path, kills: int) -> None:
+    def start() -> int:
+        child = os.fork()  # before JAX has threads; spares importing all again
+        if child == 0:
+            setup_jax()
+            JOBS[name](folder)
+            os._exit(0)
+        return child
+
+    folder.mkdir(parents=True)
+    rng, hits = np.random.default_rng(len(name)), 0
+    for _ in range(kills):
+        hits += killed(start, folder, int(rng.integers(1, 4)), rng.uniform(0.0, 0.03))
+    code = os.waitpid(start(), 0)[1]
+    print(f"{name}: {hits} kills", flush=True)
+    sys.exit(code != 0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]))

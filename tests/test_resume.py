@@ -1,0 +1,337 @@
+"""Cut anywhere, taken up again: the same bytes; and who may write, and how a program is stopped."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from killed import look
+
+from hector_jax import commands, flags, storage
+from hector_jax.console import exit_code
+from hector_jax.control.weights import nominal
+from hector_jax.robot import load_robot
+from hector_jax.runtime import workers
+from hector_jax.storage import Checkpoint, locked, write_file
+from hector_jax.tuning.course import KIND, load_tuning, save_tuning
+from hector_jax.tuning.difftune import TuneConfig, descend
+
+ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
+STATE = {"x": np.arange(3.0)}
+
+
+class Cut(BaseException):
+    """In the place of SIGKILL."""
+
+
+def tune(folder):
+    """A toy tuning that is kept; taken up where it was cut."""
+    with locked(folder):
+        record = load_tuning(Checkpoint(folder / "tuning.npz", KIND, ROBOT))
+        past = record.past.history if record.past else ()
+        keep = lambda tuning: save_tuning(record.kept, tuning)  # noqa: E731
+        return descend(CONFIG, nominal(), lambda w: look(folder, w), past=past, keep=keep)
+
+
+def files(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def looks(folder):
+    return (folder.parent / f"{folder.name}.done").read_text().splitlines()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    tune(folder)
+    return folder
+
+
+def test_a_tuning_cut_at_any_step_of_a_save_ends_in_the_same_bytes(tmp_path, whole, monkeypatch):
+    """Cut before and after the file is brought to the disk and between the two renamings."""
+    folder, rng, cuts = tmp_path / "run", np.random.default_rng(0), 12
+    for number in range(cuts):
+        step = ("fsync", "replace", "chmod")[number % 3]
+        left = iter(range(int(rng.integers(0, 3)), -1, -1))
+
+        def cut(*args, step=step, left=left):
+            if next(left) == 0:
+                raise Cut
+            return getattr(os, step)(*args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(storage, "os", SimpleNamespace(**{**vars(os), step: cut}))
+            patch.setattr(Path, "unlink", lambda *args, **kwargs: None)  # nor does SIGKILL clean up
+            with pytest.raises(Cut):
+                tune(folder)
+    tune(folder)
+    assert files(folder) == files(whole)
+    assert len(looks(folder)) - len(looks(whole)) <= cuts  # each costs one iteration, at most
+
+
+def spoil(path, how):
+    data = bytearray(path.read_bytes())
+    if how == "truncated":
+        data = data[: len(data) // 2]
+    elif how == "bit-flipped":
+        data[len(data) // 3] ^= 4
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("how", ["truncated", "bit-flipped", "version", "shape", "robot"])
+def test_a_spoilt_state_is_named_and_the_one_before_is_taken(tmp_path, capsys, monkeypatch, how):
+    kept = Checkpoint(tmp_path / "state.npz", "thing", ROBOT)
+    kept.save({"x": np.zeros(3)})
+    kept.save(STATE)
+    assert kept.load(STATE)[0]["x"].tolist() == [0.0, 1.0, 2.0]
+    if how == "version":
+        others = {**storage.versions(), "jax": "0.0.1"}
+        with monkeypatch.context() as patch:
+            patch.setattr(storage, "versions", lambda: others)
+            kept.save(STATE)
+    elif how == "shape":
+        kept.save({"x": np.zeros(4)})
+    elif how == "robot":
+        heavier = ROBOT._replace(mass=np.asarray(ROBOT.mass) + 1.0)
+        Checkpoint(kept.path, "thing", heavier).save(STATE)
+    else:
+        kept.save(STATE)
+        spoil(kept.path, how)
+    assert kept.load(STATE)[0]["x"].tolist() == [0.0, 1.0, 2.0]
+    told = "".join(capsys.readouterr().err.split())
+    assert "nottakenup:" in told
+    assert "state.npz:" in told
+    kept.save({"x": np.ones(3)})  # does not put the spoilt one in the place of the sound one
+    spoil(kept.path, "truncated")
+    assert kept.load(STATE)[0]["x"].tolist() == [0.0, 1.0, 2.0]
+    spoil(kept.before, "truncated")
+    assert kept.load(STATE) is None
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
+def test_a_disk_that_refuses_is_one_line_and_loses_nothing(tmp_path, monkeypatch, code):
+    kept = Checkpoint(tmp_path / "state.npz", "thing")
+    kept.save({"x": np.zeros(3)})
+    kept.save(STATE)
+    before = files(tmp_path)
+
+    def full(handle):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=f"cannot write {kept.path}: {os.strerror(code)}"):
+        kept.save(STATE)
+    assert files(tmp_path) == before
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_anything_is_computed():
+    with pytest.raises(OSError, match="cannot write to /proc"), locked(Path("/proc")):
+        pass
+
+
+def test_a_folder_has_one_writer_and_a_half_written_file_is_swept(tmp_path):
+    left = tmp_path / ".state.npz.abc.part"
+    left.write_bytes(b"half")
+    with locked(tmp_path):
+        assert not left.exists()
+        with pytest.raises(OSError, match="another process is writing there"), locked(tmp_path):
+            pass
+    with locked(tmp_path):
+        pass
+
+
+def test_what_stands_is_never_half_of_a_file(tmp_path):
+    path = tmp_path / "file"
+    write_file(path, b"old")
+    write_file(path, b"new", tmp_path / "before")
+    assert files(tmp_path) == {"file": b"new", "before": b"old"}
+
+
+# Signals: a program with a worker that would sleep for an hour.
+
+PROGRAM = """
+import sys, time
+from hector_jax.console import exit_code
+from hector_jax.runtime import workers
+
+def work():
+    with workers(1) as pool:
+        print(*pool.map(sys.getrefcount, [0]), flush=True)  # the worker is there
+        pool.submit(time.sleep, 3600).result()
+
+if __name__ == "__main__":
+    sys.exit(exit_code("toy", work))
+"""
+
+
+def children(process):
+    told = Path(f"/proc/{process}/task/{process}/children")
+    return [int(one) for one in told.read_text().split()]
+
+
+def is_gone(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().split()[2] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="asks /proc for the workers")
+@pytest.mark.parametrize(
+    ("signals", "code", "line"),
+    [
+        ([signal.SIGINT], 130, "toy: interrupted"),
+        ([signal.SIGINT, signal.SIGINT], 130, "toy: interrupted"),
+        ([signal.SIGTERM], 143, "toy: terminated"),
+        ([signal.SIGKILL], -9, ""),
+    ],
+    ids=["SIGINT", "twice", "SIGTERM", "SIGKILL"],
+)
+def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, code, line):
+    (tmp_path / "program.py").write_text(PROGRAM)
+    program = subprocess.Popen(
+        [sys.executable, "program.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(HERE.parent)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert program.stdout is not None
+    program.stdout.readline()
+    helpers = children(program.pid)
+    for number in signals:
+        # an interrupt of the terminal reaches the workers too
+        (os.killpg if number == signal.SIGINT else os.kill)(program.pid, number)
+    _, err = program.communicate(timeout=60)
+    assert program.returncode == code
+    assert "Traceback" not in err
+    assert err.startswith(line)
+    for _ in range(100):
+        if all(map(is_gone, helpers)):
+            break
+        time.sleep(0.1)
+    assert helpers
+    assert all(map(is_gone, helpers))
+
+
+def test_a_worker_that_is_killed_is_told_in_one_line(capsys):
+    def work():
+        with workers(1) as pool:
+            pool.submit(signal.raise_signal, signal.SIGKILL).result()
+
+    assert exit_code("toy", work) == 1
+    line = "toy: a worker process was killed, perhaps for want of memory\n"
+    assert capsys.readouterr().err == line
+
+
+def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
+    wall = tmp_path / "wall"
+    wall.write_text("")
+    told = (
+        "import sys, tempfile\n"
+        f"tempfile.gettempdir = lambda: {str(wall)!r}\n"
+        "sys.argv = ['hector', 'doctor']\n"
+        "from hector_jax.cli import main\n"
+        "sys.exit(main())"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", told],
+        env={**os.environ, "HOME": str(wall), "XDG_CACHE_HOME": "", "PYTHONPATH": str(HERE.parent)},
+        capture_output=True,
+        text=True,
+    )
+    assert ran.returncode == 2
+    assert ran.stderr.startswith("hector: ")
+    assert len(ran.stderr.splitlines()) == 1
+
+
+# hector tune --resume
+
+
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+    """A run that was cut at once."""
+    monkeypatch.setattr(commands, "_tune_in", lambda folder, args: told.append(args))
+    told = []
+    commands._tune(flags.Tune(traj="c", seeds=3, run=tmp_path / "run"))
+    return tmp_path / "run", told
+
+
+def test_a_run_is_taken_up_with_the_flags_it_was_begun_with(begun):
+    folder, told = begun
+    commands._tune(flags.Tune(resume=folder, processes=1))
+    assert (told[-1].traj, told[-1].seeds, told[-1].processes) == ("c", 3, 1)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"iterations": 50}, "run: begun with --iterations 100, got 50"),
+        ({"traj": "s"}, "run: begun with --traj c, got s"),
+        ({"run": Path("other")}, "only one can be given"),
+    ],
+)
+def test_another_configuration_is_not_taken_up(begun, asked, message):
+    folder, told = begun
+    before = files(folder)
+    with pytest.raises(ValueError, match=message):
+        commands._tune(flags.Tune(**{"resume": folder, **asked}))
+    assert len(told) == 1
+    assert files(folder) == before
+
+
+def test_a_run_of_other_versions_another_robot_or_none_is_not_taken_up(begun, monkeypatch):
+    folder, _ = begun
+    again = flags.Tune(resume=folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "versions", lambda: {"jax": "0.0.1"})
+        with pytest.raises(ValueError, match="versions.json: made with jax .*, here is jax 0.0.1"):
+            commands._tune(again)
+    with monkeypatch.context() as patch:
+        patch.setattr(commands, "load_robot", lambda: ROBOT._replace(mass=np.asarray(13.0)))
+        with pytest.raises(ValueError, match="run: begun with robot"):
+            commands._tune(again)
+    with pytest.raises(ValueError, match="none/config.json: no run to take up: No such file"):
+        commands._tune(flags.Tune(resume=folder / "none"))
+    with locked(folder), pytest.raises(OSError, match="another process is writing there"):
+        commands._tune(again)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("job", ["tuning", "collection", "training", "table"])
+def test_killed_25_times_on_all_cores_it_ends_in_the_bytes_of_an_unbroken_run_on_one(tmp_path, job):
+    cores = os.sched_getaffinity(0)
+
+    def run(name, kills, cores):
+        (tmp_path / name).mkdir()
+        ran = subprocess.run(
+            [sys.executable, "killed.py", job, tmp_path / name / job, str(kills)],
+            cwd=HERE,
+            env={**os.environ, "PYTHONPATH": str(HERE.parent)},
+            preexec_fn=lambda: os.sched_setaffinity(0, cores),
+            capture_output=True,
+            text=True,
+        )
+        assert ran.returncode == 0, ran.stderr
+        return int(ran.stdout.split()[1])
+
+    run("whole", 0, {min(cores)})
+    hits = run("cut", 25, cores)
+    assert hits >= 20  # the last ones may find the job done
+    assert files(tmp_path / "cut" / job) == files(tmp_path / "whole" / job)
+    if job != "training":
+        more = len(looks(tmp_path / "cut" / job)) - len(looks(tmp_path / "whole" / job))
+        assert more <= hits  # each kill costs one piece of work, at most
