@@ -82,5 +82,9 @@ def euler_from_rotation(R_wb: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def wrap_angle(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """The same angle [rad] in [-pi, pi)."""
+    """The same angle [rad] in [-pi, pi).
+
+    >>> wrap_angle(jnp.array([0.5, 2 * jnp.pi + 0.5, -4.0])).round(3).tolist()
+    [0.5, 0.5, 2.283]
+    """
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi

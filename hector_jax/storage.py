@@ -385,7 +385,11 @@ def check_versions(path: Path, made_with: Mapping[str, str]) -> None:
 
 
 def as_json(value: Any, indent: int | None = None) -> str:
-    """JSON of nested values; numbers that are not finite, which JSON does not have, are null."""
+    """JSON of nested values; numbers that are not finite, which JSON does not have, are null.
+
+    >>> as_json({"L": [1.0, float("nan")]})
+    '{"L": [1.0, null]}'
+    """
     return json.dumps(_known(value), indent=indent, allow_nan=False)
 
 

@@ -79,7 +79,12 @@ def unpack_state(x: Float[Array, "15"]) -> State:
 
 
 def pack_wrench(wrench: Wrench) -> Float[Array, "12"]:
-    """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3)."""
+    """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3).
+
+    >>> left = Wrench(jnp.array([[1.0, 2, 3], [0, 0, 0]]), jnp.array([[4.0, 5, 6], [0, 0, 0]]))
+    >>> pack_wrench(left).tolist()
+    [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 4.0, 5.0, 6.0, 0.0, 0.0, 0.0]
+    """
     return jnp.concatenate([wrench.force.reshape(6), wrench.moment.reshape(6)])
 
 

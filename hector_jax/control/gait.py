@@ -55,7 +55,11 @@ def _feet_ticks(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*
 
 
 def contact(config: GaitConfig, tick: Int[Array, "*batch"]) -> Bool[Array, "*batch 2"]:
-    """Which feet stand in the interval that starts at `tick`."""
+    """Which feet stand in the interval that starts at `tick`.
+
+    >>> contact(GaitConfig(), jnp.array([0, 19, 20, 40])).tolist()  # left, right
+    [[True, False], [True, False], [False, True], [True, False]]
+    """
     gait = _feet_ticks(config, tick) % config.cycle < config.stance
     return gait | (tick < config.first_tick)[..., None]
 
@@ -67,7 +71,11 @@ def swing_ticks(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*
 
 
 def ticks_to_touchdown(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*batch 2"]:
-    """Ticks until each foot next touches down."""
+    """Ticks until each foot next touches down.
+
+    >>> ticks_to_touchdown(GaitConfig(), jnp.asarray(5)).tolist()
+    [35, 15]
+    """
     wait = jnp.maximum(config.first_tick - tick, 0)[..., None]
     return wait + config.cycle - _feet_ticks(config, tick) % config.cycle
 

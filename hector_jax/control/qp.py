@@ -159,6 +159,14 @@ def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
 
     Raises:
         ValueError: shapes that do not fit together.
+
+    The point of a line, x + y = 1, that is nearest to the origin with x at most 0.2:
+
+    >>> A = jnp.array([[1.0, 1.0], [1.0, 0.0]])
+    >>> low, high = jnp.array([1.0, 0.0]), jnp.array([1.0, 0.2])
+    >>> found = solve_qp(QP(jnp.eye(2), jnp.zeros(2), A, low, high))
+    >>> found.x.round(9).tolist(), Status(int(found.status)).name
+    ([0.2, 0.8], 'SOLVED')
     """
     _check_shapes(qp)
     dtype = jnp.result_type(*qp, jnp.float32)

@@ -72,6 +72,9 @@ def named_command(name: str) -> Command:
     the spot in 4 s; a figure of eight, two circles of 4 s each; a second at 0.5 m/s and one in
     place. All have two pieces, so that they may share a batch.
 
+    >>> named_command("stop-and-go").velocity.tolist()
+    [[0.5, 0.0], [0.0, 0.0]]
+
     Raises:
         ValueError: the name is none of them.
     """

@@ -92,6 +92,12 @@ def directions() -> Float[np.ndarray, "18 24"]:
 
 
 def moved(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
-    """Weights after a step in the 18 directions."""
+    """Weights after a step in the 18 directions.
+
+    >>> steps = np.zeros(18)
+    >>> steps[DIRECTION_NAMES.index("Q_yaw")] = np.log(2.0)
+    >>> moved(nominal(), steps).Q.euler.round(6).tolist()
+    [50.0, 50.0, 100.0]
+    """
     vector = weights_to_vector(weights) * jnp.exp(logs @ directions())
     return jax.tree.map(np.asarray, vector_to_weights(vector))

@@ -130,6 +130,10 @@ def bootstrap(samples: Float[np.ndarray, " seeds"], statistic: Any = np.mean) ->
     Args:
         samples: one value per seed.
         statistic: reduces along `axis`, such as `numpy.mean` or `numpy.median`.
+
+    >>> found = bootstrap(np.array([1.0, 2.0, 3.0, 10.0]), np.median)
+    >>> found.low <= found.value == 2.5 <= found.high
+    True
     """
     return _bootstrap(np.asarray(samples, float).tobytes(), statistic)
 

@@ -350,7 +350,14 @@ def _drift_table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:
-    """A table in Markdown; as many first columns as are words to the left, numbers to the right."""
+    """A table in Markdown; as many first columns as are words to the left, numbers to the right.
+
+    >>> print(markdown_table(("set", "L"), [("nominal", "3.9"), ("expert", "2.8")]))
+    | set | L |
+    | :--- | ---: |
+    | nominal | 3.9 |
+    | expert | 2.8 |
+    """
     line = lambda cells: f"| {' | '.join(cells)} |"  # noqa: E731
     rule = [":---" if i < words else "---:" for i in range(len(head))]
     return "\n".join(map(line, [head, rule, *rows]))

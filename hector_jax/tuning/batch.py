@@ -88,6 +88,9 @@ def tail_weights(losses: Float[Array, " n"], tail: Float[Array, ""]) -> Float[Ar
     """Weights, of sum 1, that make the mean over the worst share of some losses (CVaR).
 
     By them the gradients add up to the gradient of that mean, but where two losses change places.
+
+    >>> tail_weights(jnp.array([3.0, 1.0, 2.0, 9.0]), jnp.asarray(0.5)).tolist()
+    [0.5, 0.0, 0.0, 0.5]
     """
     counted = jnp.maximum(tail * len(losses), 1.0)
     rank = jnp.argsort(jnp.argsort(-losses))

@@ -1,0 +1,168 @@
+"""What the pages say can be done: examples run, commands parse, the site needs no network."""
+
+import ast
+import doctest
+import importlib
+import pkgutil
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import hector_jax
+from hector_jax import cli, flags
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+MADE = {"_build", "reference"}  # by a build of the site
+PAGES = sorted(p for p in DOCS.rglob("*.md") if not MADE & set(p.parts))
+READ = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *PAGES]
+MODULES = sorted(
+    module.name
+    for module in pkgutil.walk_packages(hector_jax.__path__, "hector_jax.")
+    if not module.ispkg
+)
+
+
+def blocks(text, language=""):
+    """Fenced blocks of a page."""
+    fenced = re.findall(r"^```(.*)\n((?:.*\n)*?)```$", text, re.MULTILINE)
+    return [block for kind, block in fenced if kind == language]
+
+
+def docstrings():
+    """Those with examples, by module and name; read from the source, which no wrapper hides."""
+    for name in MODULES:
+        tree = ast.parse((ROOT / f"{name.replace('.', '/')}.py").read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                text = ast.get_docstring(node) or ""
+                if ">>>" in text:
+                    yield pytest.param(name, text, id=getattr(node, "name", name))
+
+
+def run_examples(text, names, title):
+    example = doctest.DocTestParser().get_doctest(text, names, title, None, None)
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    runner.run(example)
+    assert runner.tries
+    assert not runner.failures
+
+
+@pytest.mark.parametrize(("module", "text"), list(docstrings()))
+def test_examples_in_docstrings_say_what_comes_out(module, text):
+    run_examples(text, dict(vars(importlib.import_module(module))), module)
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        # a gradient has to be compiled
+        pytest.param(
+            page,
+            id=page.stem,
+            marks=pytest.mark.slow if page.stem in ("tutorial", "loss") else (),
+        )
+        for page in PAGES
+        if ">>>" in page.read_text()
+    ],
+)
+def test_examples_in_pages_say_what_comes_out(page):
+    run_examples("\n".join(blocks(page.read_text(), "python")), {}, page.stem)
+
+
+def lines_of(path, program):
+    """Calls of a program in a page, of the blocks that are fenced or indented."""
+    text = path.read_text()
+    lines = [line for block in blocks(text) for line in block.splitlines()]
+    lines += re.findall(rf"^    ({program} .*)$", text, re.MULTILINE)
+    lines = [line.strip().removeprefix(".venv/bin/") for line in lines]
+    return [line for line in lines if line.startswith(f"{program} ") and "<" not in line]
+
+
+CALLS = sorted({(path.name, line) for path in READ for line in lines_of(path, "hector")})
+NAMED = sorted({n for path in READ for n in re.findall(r"`hector ([a-z]+)", path.read_text())})
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_commands_that_pages_name_are_there(name):
+    assert name in {flags.command_name(kind) for kind in get_args(flags.Command)}
+
+
+def test_pages_show_commands():
+    assert len(CALLS) > 20
+
+
+@pytest.mark.parametrize(("page", "line"), CALLS)
+def test_commands_in_pages_parse(page, line, capsys):
+    words = shlex.split(line, comments=True)[1:]
+    if "--config" in words:  # a file of the reader's
+        at = words.index("--config")
+        del words[at : at + 2]
+    code = 0
+    try:
+        cli._parsed(words)
+    except SystemExit as left:  # after --help, too
+        code = left.code
+    assert code == 0, capsys.readouterr().err
+
+
+def test_settings_in_pages_are_read(tmp_path):
+    (told,) = blocks((DOCS / "howto" / "outputs.md").read_text(), "toml")
+    (tmp_path / "night.toml").write_text(told)
+    assert flags.from_file(flags.Tune, tmp_path / "night.toml").seeds == 32
+
+
+@pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
+def test_targets_of_make_in_pages_are_there(path):
+    there = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for line in lines_of(path, "make"):
+        words = shlex.split(line, comments=True)[1:]
+        assert {word for word in words if "=" not in word} <= there, line
+
+
+@pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
+def test_files_that_pages_name_are_there(path):
+    named = re.findall(r"\b(?:experiments|examples|assets)/[\w/.-]+\.\w+", path.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_equations_carry_the_papers_numbers():
+    labels = re.findall(r"\$\$ \(eq(\d+)\)", (DOCS / "theory.md").read_text())
+    assert [int(label) for label in labels] == list(range(1, 17))
+
+
+def test_the_citation_is_of_this_version():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_and_asks_nobody_for_anything(tmp_path):
+    build = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", DOCS, tmp_path / "site"]
+    done = subprocess.run(build, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    outside = re.compile(r"<(?:script|link|img|iframe)[^>]+(?:src|href)=\"(?:https?:)?//", re.I)
+    for path in (tmp_path / "site").rglob("*.html"):
+        assert not outside.search(path.read_text()), path
+    for path in (tmp_path / "site").rglob("*.css"):
+        assert not re.search(r"@import|url\([\"']?(?:https?:)?//", path.read_text()), path
+    theory = (tmp_path / "site" / "theory.html").read_text()
+    assert theory.count("<math") > 40
+    numbers = re.findall(r'class="eqno"[^>]*>\((\d+)\)', theory)
+    assert numbers == [str(n) for n in range(1, 17)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tune", "phi"])
+def test_notebooks_run_to_their_end(name, tmp_path):
+    nbclient, nbformat = (pytest.importorskip(module) for module in ("nbclient", "nbformat"))
+    notebook = nbformat.read(DOCS / "notebooks" / f"{name}.ipynb", as_version=4)
+    assert any(cell.get("outputs") for cell in notebook.cells)  # the site shows these
+    where = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=900, resources=where).execute()
