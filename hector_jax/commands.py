@@ -18,7 +18,7 @@ import numpy as np
 from hector_jax import pipeline, study
 from hector_jax.console import say
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
 from hector_jax.evaluation import fidelity, metrics, plots
 from hector_jax.evaluation.metrics import Verdict
@@ -82,10 +82,20 @@ def run(args: Any) -> None:
     raise NotImplementedError(type(args))
 
 
-def _weights(text: str) -> Weights:
+def _weights(text: str, robot: Robot) -> Weights:
     """A weight set by its name, or from a file."""
     named = {"nominal": nominal, "expert": expert}
-    return named[text]() if text in named else load_weights(Path(text))
+    return named[text](robot) if text in named else load_weights(Path(text))
+
+
+def _tuned_as(robot: Robot, **settings: Any) -> TuneConfig:
+    """Settings of a tuning, with the controller that the robot's description asks for."""
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **settings)
+
+
+def _of_robot(folder: Path, args: Any, robot: Robot) -> Path:
+    """Another robot than the packaged one has a folder of its own in there."""
+    return folder if args.robot is None else folder / robot.description.name
 
 
 def _plants(world: str, seeds: range) -> list[Imperfections]:
@@ -100,8 +110,10 @@ def _plants(world: str, seeds: range) -> list[Imperfections]:
 @run.register
 def _collect(args: Collect) -> None:
     config = pipeline.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
+    robot = load_robot(args.robot)
+    tune = _tuned_as(robot)
     with workers(args.processes) as pool:
-        pipeline.collect(pool, config, TuneConfig(), load_robot(), args.out)
+        pipeline.collect(pool, config, tune, robot, args.out)
     say(f"walks are in {args.out}")
 
 
@@ -109,7 +121,7 @@ def _collect(args: Collect) -> None:
 def _train(args: Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     path = args.out or pipeline.net_path(args.data.parent, args.variant)
-    found = pipeline.train(config, load_robot(), args.data, path)
+    found = pipeline.train(config, load_robot(args.robot), args.data, path)
     for name, errors in found.errors.items():
         print(
             f"{name:7s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
@@ -205,9 +217,10 @@ def _taken(folder: Path) -> str:
     return f"run folder {folder} exists; name another by --run, nothing was touched"
 
 
-def _new_folder(args: Tune) -> Path:
+def _new_folder(args: Tune, robot: Robot) -> Path:
     """The run's folder, made here; an existing one is never written into."""
-    folder = args.run or args.runs / args.traj / f"{datetime.now():%Y%m%d-%H%M%S}"
+    runs = _of_robot(args.runs, args, robot)
+    folder = args.run or runs / args.traj / f"{datetime.now():%Y%m%d-%H%M%S}"
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
@@ -225,19 +238,19 @@ def _tune(args: Tune) -> None:
         for one in several:
             run(one)
         return
-    command, robot = named_command(args.traj), load_robot()
+    command, robot = named_command(args.traj), load_robot(args.robot)
     if args.alpha not in ("paper", "auto"):
         raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
     least_of = {"seeds": 1, "processes": 1, "iterations": PAPER_ITERATIONS, "refresh": 0}
     for name, least in least_of.items():
         if getattr(args, name) < least:
             raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
-    config, variant = TuneConfig(iterations=args.iterations), args.variant
+    config, variant = _tuned_as(robot, iterations=args.iterations), args.variant
     TrainConfig(variant)  # refuses an unknown one before a folder is made
-    folder = _new_folder(args)
+    folder, data = _new_folder(args, robot), _of_robot(args.data, args, robot)
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, config, robot, args.data, variant)
+        net = pipeline.ground(pool, config, robot, data, variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
@@ -273,8 +286,8 @@ def _tune(args: Tune) -> None:
                 tunings |= pipeline.tune_many(pool, config, robot, again, title, note)
                 tuning = tunings[name]
         sets = {
-            "nominal": nominal(),
-            "expert": expert(),
+            "nominal": nominal(robot),
+            "expert": expert(robot),
             **{f"{name}_ten": tunings[name].ten for name in problems},
             **{name: tuning.converged for name, tuning in tunings.items()},
         }
@@ -387,14 +400,15 @@ def _search(args: Search) -> None:
         named_command(name)
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = pipeline.choose_engine(args.engine)
-    robot, tune, start = load_robot(), TuneConfig(), _weights(args.start)
+    robot = load_robot(args.robot)
+    tune, start = _tuned_as(robot), _weights(args.start, robot)
     make_folder(args.out)
     with workers(args.processes) as pool:
         found = pipeline.search(
             pool, config, tune, robot, dict.fromkeys(names, start), engine, args.record or args.out
         )
         say("walking start, expert and the best once more")
-        sets = {name: [start, expert(), found[name].weights] for name in names}
+        sets = {name: [start, expert(robot), found[name].weights] for name in names}
         at_once = config.population * len(names)
         compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once)
     print("L in 1e6 on the high-fidelity simulator")
@@ -425,17 +439,18 @@ def _search(args: Search) -> None:
 
 @run.register
 def _evaluate(args: Evaluate) -> None:
-    command, robot = named_command(args.traj), load_robot()
+    command, robot = named_command(args.traj), load_robot(args.robot)
+    config = _tuned_as(robot)
     _check_seconds(args.seconds)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
-    sets = {text: _weights(text) for text in args.weights}
+    sets = {text: _weights(text, robot) for text in args.weights}
     plants = _plants(args.world, seeds)
     with workers(args.processes) as pool:
         title = f"judging on {args.world}, {count} plants"
         walks = pipeline.judge(
-            pool, TuneConfig(), robot, sets, command, plants, seeds, title, args.seconds
+            pool, config, robot, sets, command, plants, seeds, title, args.seconds
         )
     verdict = _verdict(LossConfig(), seeds, walks)
     if args.json:
@@ -451,14 +466,15 @@ def _check_seconds(seconds: float) -> None:
 
 @run.register
 def _walk(args: Walk) -> None:
-    command, weights, robot = named_command(args.traj), _weights(args.weights), load_robot()
+    command, robot = named_command(args.traj), load_robot(args.robot)
+    weights, config = _weights(args.weights, robot), walk_config(robot)
     _check_seconds(args.seconds)
 
     def walked(weights: Weights) -> Trajectory:
         if args.world == "srbm":
             return _rigid_body(robot, weights, command, args.seconds)
         plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
-        return walk(WalkConfig(), robot, weights, command, plant, args.seconds, args.seed)
+        return walk(config, robot, weights, command, plant, args.seconds, args.seed)
 
     say("compiling (only the first time on a machine) and walking")
     trajectory = walked(weights)
@@ -483,11 +499,12 @@ def _walk(args: Walk) -> None:
         print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
-        _film(args.video, robot, {beside: walked(other()), args.weights: trajectory})
+        _film(args.video, robot, {beside: walked(other(robot)), args.weights: trajectory})
 
 
 def _rigid_body(robot: Robot, weights: Weights, command: Any, seconds: float) -> Trajectory:
-    config = RolloutConfig(ticks=round(seconds / RolloutConfig().walk.gait.tick))
+    controller = walk_config(robot)
+    config = RolloutConfig(controller, ticks=round(seconds / controller.gait.tick))
     walked = jax.jit(rollout, static_argnums=0)
     anchor = standing_anchor(robot)
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))

@@ -16,6 +16,7 @@ class Collect:
     seed: int = 0  # of everything drawn: commands, weights, plants, pushes
     engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
     processes: int = 2  # one core each
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Train:
     variant: str = "residual"  # or paper
     epochs: int = 200
     seed: int = 0
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class Tune:
     run: Path | None = None  # or to this folder, which must not exist (all: to RUN/TRAJ)
     video: bool = True  # film nominal beside tuned
     processes: int = 2  # one core each
+    robot: Path | None = None  # TOML of another biped, whose data go to DATA/NAME; or HECTOR
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class Search:
     out: Path = Path("runs/search")  # folder of the weights found, with a card of each
     record: Path | None = None  # folder of what was walked, taken up again; OUT by default
     processes: int = 2  # one core each
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,7 @@ class Evaluate:
     first_seed: int = 0
     processes: int = 2  # one core each
     json: bool = False  # print JSON instead of the table
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,7 @@ class Walk:
     out: Path | None = None  # keep the trajectory (.npz)
     video: Path | None = None  # film it (.mp4), nominal weights beside it
     json: bool = False  # print JSON instead of words
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def _tune_job(
     return difftune.tune(
         config,
         robot,
-        nominal(),
+        nominal(robot),
         command,
         standing_anchor(robot),
         _effect(params),
@@ -218,7 +218,7 @@ def tune_measured(
 
 def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
     anchor = standing_anchor(robot)
-    norms = difftune.gradient_norms(config, robot, nominal(), command, anchor, _effect(params))
+    norms = difftune.gradient_norms(config, robot, nominal(robot), command, anchor, _effect(params))
     return jax.device_get(norms)
 
 
@@ -262,7 +262,7 @@ def collect(
     """
     make_folder(folder)
     jobs = dataset.draw_jobs(
-        config.seed, config.walks, tuning_paths(pool, tune, robot), config.seconds
+        config.seed, config.walks, tuning_paths(pool, tune, robot), config.seconds, robot
     )
     _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, folder)
 

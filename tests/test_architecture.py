@@ -9,6 +9,7 @@ ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
     ["console", "runtime", "geometry"],
     ["trajectory"],
+    ["description"],
     ["robot"],
     ["model"],
     ["control"],

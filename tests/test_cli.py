@@ -206,7 +206,7 @@ def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
 def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     path = tmp_path / "hector.xml"
     path.write_text(change(MODEL_PATH.read_text()))
-    monkeypatch.setattr(commands, "load_robot", lambda: load_robot(path))
+    monkeypatch.setattr(commands, "load_robot", lambda _: load_robot(path))
     line = refused(monkeypatch, capsys, "walk")
     assert "hector.xml" in line
     assert expected in line

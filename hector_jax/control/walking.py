@@ -5,8 +5,9 @@ along; the MuJoCo worlds call `step_plan` and `actuate` with what they measure. 
 the nominal robot only, never the plant's own numbers.
 """
 
-from dataclasses import dataclass
-from typing import NamedTuple
+import math
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from hector_jax.control.legs import LegConfig, joint_torques, swing_joints, trun
 from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
+from hector_jax.description import unknown
 from hector_jax.geometry import rotation_from_euler, wrap_angle
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
@@ -45,6 +47,45 @@ class WalkConfig:
     def mpc_step(self) -> float:
         """MPC step dt [s]."""
         return self.mpc.step_ticks * self.gait.tick
+
+
+def walk_config(robot: Robot) -> WalkConfig:
+    """The controller that a robot's description asks for.
+
+    Raises:
+        ValueError: one line naming the file, the key and what was expected.
+    """
+    path, given = robot.description.path, dict(robot.description.control)
+    kinds = {"gait": GaitConfig, "mpc": MpcConfig, "footstep": FootstepConfig, "legs": LegConfig}
+    try:
+        parts = {name: _part(name, kind, given.get(name, ())) for name, kind in kinds.items()}
+        return WalkConfig(**parts)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _part(name: str, kind: type, given: tuple[tuple[str, Any], ...]) -> Any:
+    """Settings of a part of the controller, from the description's section of that name."""
+    defaults = {
+        field.name: field.default for field in fields(kind) if not is_dataclass(field.default)
+    }
+    for key, value in given:
+        if key not in defaults:
+            raise ValueError(f"unknown key {name + '.' + key!r}; {unknown(key, defaults)}")
+        like = defaults[key]
+        if not _alike(value, like):
+            raise ValueError(f"{name}.{key} is {value!r}, expected a value such as {like!r}")
+    return kind(**dict(given))
+
+
+def _alike(value: Any, like: Any) -> bool:
+    if isinstance(like, tuple):
+        return (
+            isinstance(value, tuple) and len(value) == len(like) and all(map(_alike, value, like))
+        )
+    if isinstance(like, float):  # a whole number is one too, and a bool is none
+        return type(value) in (int, float) and math.isfinite(value)
+    return type(value) is type(like)
 
 
 class Feet(NamedTuple):

@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from hector_jax.geometry import rotation_from_euler
-from hector_jax.robot import MODEL_PATH, Robot
+from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
@@ -87,7 +87,6 @@ def write_video(
     walks: Mapping[str, Trajectory],
     strip: Path | None = None,
     config: VideoConfig | None = None,
-    model: Path = MODEL_PATH,
 ) -> str:
     """Draw two walks side by side as an MP4.
 
@@ -97,7 +96,6 @@ def write_video(
         walks: two, by the words that stand above them, before and after.
         strip: PNG to write with snapshots of both.
         config: size and rate; None takes 640 x 360 at 25 frames per second.
-        model: robot description to draw.
 
     Returns:
         The back end that drew it.
@@ -116,7 +114,7 @@ def write_video(
     asked = os.environ.get("MUJOCO_GL")
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder = Path(name)
-        np.savez(folder / "request.npz", **_request(config, robot, walks, model))
+        np.savez(folder / "request.npz", **_request(config, robot, walks))
         failures = []
         for back_end in (asked,) if asked else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
@@ -160,16 +158,14 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
     return _one_line(said[-1]) if said else f"ended with code {done.returncode}"
 
 
-def _request(
-    config: VideoConfig, robot: Robot, walks: Mapping[str, Trajectory], model: Path
-) -> dict[str, Any]:
+def _request(config: VideoConfig, robot: Robot, walks: Mapping[str, Trajectory]) -> dict[str, Any]:
     """Everything the child needs to know, as arrays."""
     seconds = min(float(w.period) * len(w.fallen) for w in walks.values())
     times = np.arange(0.0, seconds + 1e-9, config.speed / config.rate)
     request: dict[str, Any] = {
         "size": np.array([config.width, config.height, config.rate, config.tiles]),
         "times": times,
-        "model": np.array(str(Path(model).resolve())),
+        "model": np.array(str(robot.description.model.resolve())),
         "labels": np.array(list(walks)),
     }
     for i, walk in enumerate(walks.values()):
