@@ -10,8 +10,8 @@
     [limits]
     min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond, it has fallen
     [gait] [mpc] [footstep] [legs]     # fields of GaitConfig, MpcConfig, FootstepConfig, LegConfig
-    [nominal] [expert]                 # weights: euler, position, ang_velocity, velocity, force,
-                                       # moment, three numbers each
+    [weights]
+    nominal, expert = { euler, position, ang_velocity, velocity, force, moment }   # x, y, z or one
 
 What is left out is as in assets/hector.toml. Masses, lengths, joint and torque limits are the
 MJCF's; a description rides on its `Robot` and is static under jit.
@@ -42,7 +42,7 @@ HECTOR_AXES = "zxyyy"
 CONTROL = ("gait", "mpc", "footstep", "legs")  # sections that the controller reads
 DIAGONALS = ("euler", "position", "ang_velocity", "velocity", "force", "moment")
 
-_TOP = ("name", "model", "standing", "joints", "feet", "limits", *CONTROL, "nominal", "expert")
+_TOP = ("name", "model", "standing", "joints", "feet", "limits", *CONTROL, "weights")
 _MAX_BYTES = 100_000
 
 Triple = tuple[float, float, float]
@@ -110,7 +110,8 @@ def read_description(path: Path) -> Description:
         raise ValueError(
             f"{path}: joints.axes is {axes!r}, expected {HECTOR_AXES!r} in the order of the leg"
         )
-    limits = _table(path, told, "limits")
+    limits, weights = _table(path, told, "limits"), _table(path, told, "weights")
+    _known(path, weights, ("nominal", "expert"), "weights.")
     _known(path, limits, ("min_height", "max_tilt"), "limits.")
     return Description(
         model=model,
@@ -127,8 +128,8 @@ def read_description(path: Path) -> Description:
             for name in CONTROL
             if name in told
         ),
-        nominal=_diagonals(path, told, "nominal"),
-        expert=_diagonals(path, told, "expert"),
+        nominal=_diagonals(path, weights, "nominal"),
+        expert=_diagonals(path, weights, "expert"),
     )
 
 
@@ -226,16 +227,17 @@ def _limit(path: Path, table: Mapping[str, Any], key: str, default: float) -> fl
     return float(value)
 
 
-def _diagonals(path: Path, told: Mapping[str, Any], name: str) -> tuple[Triple, ...] | None:
-    if name not in told:
+def _diagonals(path: Path, weights: Mapping[str, Any], name: str) -> tuple[Triple, ...] | None:
+    if name not in weights:
         return None
-    table = _table(path, told, name)
-    _known(path, table, DIAGONALS, f"{name}.")
+    table = _table(path, weights, name)
+    _known(path, table, DIAGONALS, f"weights.{name}.")
     rows = []
     for key in DIAGONALS:
-        row = table.get(key)
-        if not isinstance(row, list) or len(row) != 3 or not all(_number(x) and x > 0 for x in row):
-            raise _wrong(path, f"{name}.{key}", row, "three positive numbers")
+        given = table.get(key)
+        row = given if isinstance(given, list) else [given] * 3
+        if len(row) != 3 or not all(_number(x) and x > 0 for x in row):
+            raise _wrong(path, f"weights.{name}.{key}", given, "a positive number, or three")
         x, y, z = map(float, row)
         rows.append((x, y, z))
     return tuple(rows)

@@ -69,23 +69,28 @@ def _part(name: str, kind: type, given: tuple[tuple[str, Any], ...]) -> Any:
     defaults = {
         field.name: field.default for field in fields(kind) if not is_dataclass(field.default)
     }
+    settings = {}
     for key, value in given:
         if key not in defaults:
             raise ValueError(f"unknown key {name + '.' + key!r}; {unknown(key, defaults)}")
-        like = defaults[key]
-        if not _alike(value, like):
+        settings[key] = _as(defaults[key], value)
+        if settings[key] is None:
+            like = defaults[key]
             raise ValueError(f"{name}.{key} is {value!r}, expected a value such as {like!r}")
-    return kind(**dict(given))
+    return kind(**settings)
 
 
-def _alike(value: Any, like: Any) -> bool:
+def _as(like: Any, value: Any) -> Any:
+    """The value where it is of the same kind as another, else None."""
     if isinstance(like, tuple):
-        return (
-            isinstance(value, tuple) and len(value) == len(like) and all(map(_alike, value, like))
-        )
-    if isinstance(like, float):  # a whole number is one too, and a bool is none
-        return type(value) in (int, float) and math.isfinite(value)
-    return type(value) is type(like)
+        if not isinstance(value, tuple) or len(value) != len(like):
+            return None
+        each = tuple(map(_as, like, value))
+        return None if None in each else each
+    if isinstance(like, float) and type(value) is int:
+        return float(value)
+    good = type(value) is type(like) and (type(value) is not float or math.isfinite(value))
+    return value if good else None
 
 
 class Feet(NamedTuple):

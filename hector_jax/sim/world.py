@@ -214,7 +214,7 @@ def _model(description: Description, slack: bool) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(description.model))
     for geom in list(spec.geoms):  # what is only looked at costs time and room in every plant
         geom.material = ""
-        if not geom.contype and not geom.conaffinity:
+        if not geom.contype and not geom.conaffinity and geom.parent.explicitinertial:
             spec.delete(geom)
     for looks in (*spec.materials, *spec.textures):
         spec.delete(looks)
