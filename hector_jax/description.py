@@ -100,9 +100,9 @@ def read_description(path: Path) -> Description:
     path = Path(path)
     told = _parse(path)
     _known(path, told, _TOP, "")
-    model = path.with_name(_text(path, told, "model", "", MODEL_PATH.name))
-    if model.parent != path.parent:
-        raise ValueError(f"{path}: model {told['model']!r} must be the name of a file beside it")
+    model = _text(path, told, "model", "", MODEL_PATH.name)
+    if Path(model).name != model:
+        raise _wrong(path, "model", model, "the name of a file beside it")
     joints, feet = _table(path, told, "joints"), _table(path, told, "feet")
     _known(path, joints, (*SIDES, "axes"), "joints.")
     axes = _text(path, joints, "axes", "joints.", HECTOR_AXES)
@@ -114,7 +114,7 @@ def read_description(path: Path) -> Description:
     _known(path, weights, ("nominal", "expert"), "weights.")
     _known(path, limits, ("min_height", "max_tilt"), "limits.")
     return Description(
-        model=model,
+        model=path.parent / model,
         path=path,
         name=_name(path, told),
         standing=_text(path, told, "standing", "", Description.standing),
