@@ -244,4 +244,7 @@ def _diagonals(path: Path, weights: Mapping[str, Any], name: str) -> tuple[Tripl
 
 
 def _frozen(value: Any) -> Any:
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+    """The value as one that can be hashed, which what is static has to be."""
+    if isinstance(value, dict):
+        value = list(value.items())
+    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value

@@ -32,6 +32,7 @@ from hector_jax.trajectory import State, Trajectory
 BACK_ENDS = ("egl", "osmesa", "glfw")
 
 _PATIENCE = 300.0  # [s] for a back end to draw the whole film
+_HEIGHT = 0.423  # [m] of the centre of mass of the robot that the camera is set for
 _TRAILS = ((0.72, 0.13, 0.20, 1.0), (0.0, 0.48, 0.37, 1.0))  # colours of before and after
 _REFERENCE = (0.08, 0.08, 0.10, 1.0)
 _ARROW = (0.93, 0.42, 0.11, 0.9)
@@ -165,6 +166,7 @@ def _request(config: VideoConfig, robot: Robot, walks: Mapping[str, Trajectory])
     request: dict[str, Any] = {
         "size": np.array([config.width, config.height, config.rate, config.tiles]),
         "times": times,
+        "scale": np.asarray(robot.standing_height / _HEIGHT),
         "model": np.array(str(robot.description.model.resolve())),
         "labels": np.array(list(walks)),
     }
@@ -242,9 +244,9 @@ def _view(
     data.qpos[:] = request[f"pose_{walk}"][k]
     mujoco.mj_forward(model, data)
     reference, path = request[f"reference_{walk}"], request[f"path_{walk}"]
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = [*request[f"aim_{walk}"][k, :2], 0.37]
-    camera.distance, camera.azimuth, camera.elevation = 1.75, 125.0, -14.0
+    camera, scale = mujoco.MjvCamera(), float(request["scale"])
+    camera.lookat[:] = [*request[f"aim_{walk}"][k, :2], 0.37 * scale]
+    camera.distance, camera.azimuth, camera.elevation = 1.75 * scale, 125.0, -14.0
     renderer.update_scene(data, camera)
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
     scene = renderer.scene

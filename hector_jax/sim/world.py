@@ -212,7 +212,8 @@ def _check(imperfections: Imperfections) -> None:
 def _model(description: Description, slack: bool) -> mujoco.MjModel:
     compile_model(description)  # for its checks
     spec = mujoco.MjSpec.from_file(str(description.model))
-    for geom in list(spec.geoms):  # what is only looked at costs time and room in every plant
+    # what is only looked at, and gives its body no mass, costs time and room in every plant
+    for geom in list(spec.geoms):
         geom.material = ""
         if not geom.contype and not geom.conaffinity and geom.parent.explicitinertial:
             spec.delete(geom)
