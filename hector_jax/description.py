@@ -216,13 +216,14 @@ def _feet(path: Path, feet: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
     return {field: both(key, field) for key, field in fields.items()}
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _positive(value: Any) -> bool:
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return plain and 0 < value < math.inf
 
 
 def _limit(path: Path, table: Mapping[str, Any], key: str, default: float) -> float:
     value = table.get(key, default)
-    if not _number(value) or value <= 0:
+    if not _positive(value):
         raise _wrong(path, f"limits.{key}", value, "a positive number")
     return float(value)
 
@@ -236,7 +237,7 @@ def _diagonals(path: Path, weights: Mapping[str, Any], name: str) -> tuple[Tripl
     for key in DIAGONALS:
         given = table.get(key)
         row = given if isinstance(given, list) else [given] * 3
-        if len(row) != 3 or not all(_number(x) and x > 0 for x in row):
+        if len(row) != 3 or not all(map(_positive, row)):
             raise _wrong(path, f"weights.{name}.{key}", given, "a positive number, or three")
         x, y, z = map(float, row)
         rows.append((x, y, z))
