@@ -20,6 +20,7 @@ from hector_jax.grfm.dataset import load_walks
 from hector_jax.model.kinematics import foot_jacobians, foot_poses, inverse_legs
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import describe, load_model, load_robot
+from hector_jax.sim.parallel import _places, batched_model
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
 from hector_jax.trajectory import State, has_fallen
@@ -118,6 +119,15 @@ def test_imperfections_reach_the_joints_of_any_robot(strider):
     assert world.model.body_mass.sum() == pytest.approx(float(strider.mass))
     heavy = build_world(ideal()._replace(mass=np.array(1.1)), strider.description)
     assert heavy.model.body_mass.sum() == pytest.approx(1.1 * float(strider.mass))
+
+
+def test_mjx_takes_any_robot_and_knows_what_may_not_touch_the_floor(strider):
+    world = build_world(hfs(), strider.description)
+    model, _ = batched_model([world])
+    assert (model.nq, model.nu) == (27, 10)
+    places = _places(world)
+    parts = [world.model.geom(geom).name for geom in (*places.boxes, *places.capsules)]
+    assert parts == ["trunk", "left_thigh", "left_shin", "right_thigh", "right_shin"]
 
 
 @pytest.mark.parametrize(
