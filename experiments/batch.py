@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -28,7 +29,7 @@ from hector_jax.control.reference import COMMANDS, Command, named_command, stand
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation import metrics, plots
 from hector_jax.evaluation.metrics import Score
-from hector_jax.evaluation.report import environment
+from hector_jax.evaluation.report import environment, markdown_table
 from hector_jax.evaluation.transfer import disturbed
 from hector_jax.grfm.network import as_effect, load_net, member_effects
 from hector_jax.model.effect import last_command
@@ -37,7 +38,14 @@ from hector_jax.runtime import all_devices, setup_jax, workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
 from hector_jax.storage import load_weights, make_folder, save_weights, write_file, write_json
-from hector_jax.tuning.batch import Problem, Scenario, Tunings, stack, tune_batch
+from hector_jax.tuning.batch import (
+    Problem,
+    Scenario,
+    Tunings,
+    stack,
+    tail_weights,
+    tune_batch,
+)
 from hector_jax.tuning.difftune import Reason, Stop, TuneConfig, stopped
 from hector_jax.tuning.loss import Alpha, LossConfig, Losses
 from hector_jax.tuning.rollout import Variation, no_variation
@@ -189,18 +197,6 @@ def judged(
     }
 
 
-def tail_mean(losses: np.ndarray) -> float:
-    """Mean over the worst `TAIL` of some losses, of one at least."""
-    worst = np.sort(losses)[::-1]
-    return float(worst[: max(1, round(TAIL * len(worst)))].mean())
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown, its numbers to the right."""
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def million(x: Any) -> str:
     """A loss in 1e6."""
     return f"{float(x) / 1e6:.3f}"
@@ -280,7 +276,7 @@ def shared(flags: Shared) -> None:
         "Each trajectory's loss is divided by that of its nominal walk before the mean, or the "
         "worst, of all is lowered. Judged by one walk on the high-fidelity simulator (hfs) each; "
         "in brackets the change to nominal. `unseen` was tuned on by none.",
-        table(head, [row(n) for n in sets]),
+        markdown_table(head, [row(n) for n in sets]),
         "\n".join(f"- {line}" for line in ends),
     ]
     written(flags, sets, {"hfs": loss, "falls": fell}, text, ("shared.png", caption))
@@ -360,10 +356,11 @@ def plant_table(scores: Mapping[str, Score], base: str) -> str:
     for name, score in scores.items():
         change = 100 * (metrics.bootstrap(score.L / scores[base].L, np.median).value - 1)
         falls = f"{int(score.fallen.sum())} of {len(score.L)}"
-        rows.append(
-            [name, falls, million(score.L.mean()), million(tail_mean(score.L)), f"{change:+.1f} %"]
-        )
-    return table(["set", "falls", "mean L", f"worst {TAIL:.0%}", f"median, to {base}"], rows)
+        losses = jnp.asarray(score.L)
+        worst = tail_weights(losses, jnp.asarray(TAIL)) @ losses
+        rows.append([name, falls, million(losses.mean()), million(worst), f"{change:+.1f} %"])
+    head = ("set", "falls", "mean L", f"worst {TAIL:.0%}", f"median, to {base}")
+    return markdown_table(head, rows)
 
 
 def as_numbers(scores: Mapping[str, Score]) -> dict[str, Any]:
@@ -421,7 +418,7 @@ def front(flags: Front) -> None:
         f"# Tracking against smoothness: {flags.traj}",
         "Both alphas are multiplied by one price; tracking is alpha_1 L_Eul + alpha_2 L_pos with "
         "the paper's alphas, whatever the price.",
-        table(head, rows),
+        markdown_table(head, rows),
     ]
     told = {"prices": prices.tolist(), "model": model.tolist(), "hfs": there}
     written(flags, sets, told, text, ("front.png", caption))
@@ -455,10 +452,10 @@ def starts(flags: Starts) -> None:
         f"{flags.starts} starts, the first at nominal, the others log-uniform within "
         f"x/{flags.factor:g} of it; {int((~sound).sum())} are refused at their "
         "first walk: a fall, a plan that is not solved, or numbers that are not finite.",
-        table(["L on the model", "least", "25 %", "median", "75 %", "most"], rows),
+        markdown_table(["L on the model", "least", "25 %", "median", "75 %", "most"], rows),
         f"From nominal: {million(last[0] if sound[0] else np.nan)}, "
         f"{int(np.sum(last < last[0]))} of the others end lower.",
-        table(
+        markdown_table(
             ["set", "L on the hfs", "fell"],
             [[n, million(s.L[0]), "yes" if s.fallen.any() else "no"] for n, s in scores.items()],
         ),

@@ -15,11 +15,10 @@ Walks are kept under OUT/walks and taken up again. `--standin` adds plants of th
 for a verdict; nothing here was chosen by them.
 """
 
-import hashlib
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -30,7 +29,7 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import pipeline
+from hector_jax import kept, pipeline
 from hector_jax.console import bar, exit_code, made_at
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import (
@@ -41,7 +40,7 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.evaluation import plots
-from hector_jax.evaluation.report import environment
+from hector_jax.evaluation.report import environment, markdown_table
 from hector_jax.grfm.network import as_effect
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
@@ -50,14 +49,7 @@ from hector_jax.sim.changes import Change
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import (
-    fingerprint,
-    load_tree,
-    load_weights,
-    save_tree,
-    write_file,
-    write_json,
-)
+from hector_jax.storage import load_weights, write_file, write_json
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
@@ -240,18 +232,19 @@ def walk_cases(
 
     def path(case: Case) -> Path:
         how, _, job, effect, moment, arm = cases[case]
-        numbers = fingerprint((robot, job._replace(changes=None), effect))
-        key = f"{how!r} {changes!r} {moment} {arm} {numbers}"
         name = "-".join(case).replace(" ", "")
-        return flags.out / "walks" / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}.npz"
+        ending = kept.digest(how, robot, job, (effect,), moment, arm)
+        return flags.out / "walks" / f"{name}-{ending}.npz"
+
+    def walked(missing: Sequence[Case]) -> Iterator[Walked]:
+        running = {case: pool.submit(_walk_case, *cases[case]) for case in missing}
+        with bar("walks on plants that change") as tell:
+            for done, (case, future) in enumerate(running.items(), 1):
+                yield future.result()
+                tell(done, len(running), " ".join(case))
 
     like = Walked(*(np.zeros((0,) * n) for n in (1, 2, 1, 1, 0, 2, 1, 1)))
-    running = {c: pool.submit(_walk_case, *w) for c, w in cases.items() if not path(c).exists()}
-    with bar("walks on plants that change") as tell:
-        for done, (case, future) in enumerate(running.items(), 1):
-            save_tree(path(case), future.result(), kind="online", robot=robot)
-            tell(done, len(running), " ".join(case))
-    return {case: load_tree(path(case), like, kind="online", robot=robot)[0] for case in cases}
+    return kept.trees({case: path(case) for case in cases}, walked, like, "online", robot)
 
 
 def main() -> None:
@@ -293,11 +286,9 @@ def _median(values: np.ndarray) -> str:
 def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
     """L before and after the change by trajectory, start weights and arm."""
     names = list(plants(flags))
-    lines = [
-        "| trajectory | start | arm | L before, 1e6 | L after, 1e6 | before, % against fixed "
-        "| after, % against fixed | z after, cm | falls | refused |",
-        "| :--- | :--- | :--- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
-    ]
+    head = ("trajectory", "start", "arm", "L before, 1e6", "L after, 1e6")
+    head += ("before, % against fixed", "after, % against fixed", "z after, cm", "falls", "refused")
+    lines = []
     for trajectory in flags.trajectories:
         for which in flags.sets:
             for arm in flags.arms:
@@ -313,12 +304,9 @@ def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
                 height = 100.0 * np.median([row.height[1] for row in rows])
                 falls = sum(bool(row.fallen) for row in rows)
                 refused = sum(int(row.refused.sum()) for row in rows)
-                lines.append(
-                    f"| {trajectory} | {which} | {arm} | {halves[0]:.2f} | {halves[1]:.2f} "
-                    f"| {change[0]} | {change[1]} | {height:+.1f} | {falls} of {len(rows)} "
-                    f"| {refused} |"
-                )
-    return "\n".join(lines)
+                line = [trajectory, which, arm, *(f"{half:.2f}" for half in halves), *change]
+                lines.append([*line, f"{height:+.1f}", f"{falls} of {len(rows)}", str(refused)])
+    return markdown_table(head, lines, words=3)
 
 
 def _spread(values: np.ndarray) -> str:

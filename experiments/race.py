@@ -11,7 +11,6 @@ What is random is repeated with other seeds. All go in lock-step, so that a roun
 MJX, or walks on the processes. Everything is kept under OUT and taken up again.
 """
 
-import hashlib
 import json
 import shutil
 import statistics
@@ -28,12 +27,12 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import pipeline
+from hector_jax import kept, pipeline
 from hector_jax.console import bar, exit_code, made_at, say
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.evaluation import plots
-from hector_jax.evaluation.report import environment
+from hector_jax.evaluation.report import environment, markdown_table
 from hector_jax.grfm.network import Params, as_effect, load_net
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.model.effect import last_command
@@ -133,10 +132,10 @@ def _price_job(config: TuneConfig, robot: Robot, command: Command) -> float:
     """Seconds of a walk, the mean of three, when all is compiled."""
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     job = Job(nominal(), command, hfs(), seconds)
-    walk_job(config.rollout.walk, robot, job, None)
+    walk_job(config.rollout.walk, robot, job)
     begin = time.monotonic()
     for _ in range(3):
-        walk_job(config.rollout.walk, robot, job, None)
+        walk_job(config.rollout.walk, robot, job)
     return (time.monotonic() - begin) / 3
 
 
@@ -174,10 +173,10 @@ def on_model(
     params: Params,
 ) -> tuple[dict[str, Course], float]:
     """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
-    key = f"{config!r} {RATE} {fingerprint(command)} {fingerprint(params)} {fingerprint(robot)}"
-    # seconds are kept too: they are of this code, these packages and so many at once
-    key += f" {versions()} {flags.processes} {environment().get('commit')}"
-    path = flags.out / f"model-{hashlib.sha256(key.encode()).hexdigest()[:12]}.json"
+    # seconds are kept too: they are of this code and so many at once
+    made = flags.processes, environment().get("commit")
+    key = kept.digest(config, RATE, command, params, robot, repr(made))
+    path = flags.out / f"model-{key}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
             tell(0, len(ON_MODEL), "compiling")
@@ -236,7 +235,7 @@ def run(
         "command": fingerprint(command),
         "start": fingerprint(nominal()),
         "versions": versions(),
-        "settings": hashlib.sha256(repr(sorted(rivals.items())).encode()).hexdigest()[:12],
+        "settings": kept.digest(sorted(rivals.items())),
     }
 
     def think(
@@ -371,7 +370,7 @@ def report(
             "last": last,
         }
     head = ["method", "repeats", *(f"after {m}" for m in marks), "its own last", "walks", "s"]
-    table = "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])
+    table = markdown_table(head, rows)
     count = {m: [(np.arange(len(x), dtype=float), x) for x in losses] for m, losses in best.items()}
     spent = {
         m: [(seconds, x) for (_, seconds), x in zip(groups[m], losses, strict=True)]

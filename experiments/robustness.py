@@ -10,12 +10,11 @@ are named. The controller learns of none of it.
 scores of finished walks are kept under OUT/scores and taken up again.
 """
 
-import hashlib
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -23,7 +22,8 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax.console import bar, exit_code
+from hector_jax import kept
+from hector_jax.console import exit_code, made_at
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation import metrics, plots
@@ -41,19 +41,12 @@ from hector_jax.evaluation.robustness import (
     table,
 )
 from hector_jax.grfm.dataset import SOLVED
-from hector_jax.robot import Robot, load_robot
+from hector_jax.robot import load_robot
 from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk_many
+from hector_jax.sim.walk import walk_many
 from hector_jax.sim.world import named_world
-from hector_jax.storage import (
-    fingerprint,
-    load_tree,
-    load_weights,
-    save_tree,
-    write_file,
-    write_json,
-)
+from hector_jax.storage import fingerprint, load_weights, write_file, write_json
 from hector_jax.tuning.loss import LossConfig
 
 BASELINE = "nominal"
@@ -106,36 +99,6 @@ def weight_sets(named: Sequence[str]) -> dict[str, Weights]:
     return sets
 
 
-def walk_groups(
-    pool: Executor, robot: Robot, groups: Mapping[str, Sequence[Job]], folder: Path
-) -> dict[str, Score]:
-    """Scores of groups of walks, stacked; a group that is on disk is taken."""
-    config, loss = WalkConfig(), LossConfig()
-
-    def path(name: str) -> Path:
-        key = f"{config!r} {loss!r} {fingerprint(list(groups[name]))} {fingerprint(robot)}"
-        return folder / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}.npz"
-
-    missing = [name for name in groups if not path(name).exists()]
-    jobs = [job for name in missing for job in groups[name]]
-    if jobs:
-        with bar(f"{len(jobs)} walks") as tell:
-            tell(0, len(jobs), "compiling")
-            walks, done = walk_many(pool, config, robot, jobs), 0
-            for name in missing:
-                told = []
-                for walk in (next(walks) for _ in groups[name]):
-                    told.append(metrics.score(loss, walk))
-                    done += 1
-                    tell(done, len(jobs), name)
-                stacked = Score(*(np.stack(rows) for rows in zip(*told, strict=True)))
-                about = {"controller": repr(config)}
-                save_tree(path(name), stacked, kind="robustness", robot=robot, about=about)
-    one, three = np.zeros(0), np.zeros((0, 3))
-    like = Score(one, one, one, one, one, three, three, one, one, one)
-    return {n: load_tree(path(n), like, kind="robustness", robot=robot)[0] for n in groups}
-
-
 def compare(
     levels: Sequence[Level], sets: Sequence[str], scores: Mapping[tuple[Level, str], Score]
 ) -> Found:
@@ -180,9 +143,20 @@ def main() -> None:
         key: f"{key[0].name}-{key[1]}-{key[2]}".replace(" ", "-").replace("/", "-")
         for key in groups
     }
+    config, loss = WalkConfig(), LossConfig()
+    one, three = np.zeros(0), np.zeros((0, 3))
     with workers(flags.processes) as pool:
-        jobs = {named[key]: group for key, group in groups.items()}
-        walked = walk_groups(pool, robot, jobs, flags.out / "scores")
+        walked = kept.walk_groups(
+            {named[key]: group for key, group in groups.items()},
+            partial(walk_many, pool, config, robot),
+            partial(metrics.score, loss),
+            Score(one, one, one, one, one, three, three, one, one, one),
+            "robustness",
+            robot,
+            flags.out / "scores",
+            (config, loss),
+            "",
+        )
     scores = {
         (level, name): jax.tree.map(
             lambda *rows: np.stack(rows), *(walked[named[level, name, seed]] for seed in seeds)
@@ -213,8 +187,10 @@ def report(flags: Flags, found: Found, folder: Path) -> Path:
     }
     last = flags.first_seed + flags.seeds - 1
     phases = "one phase of the gait" if count == 1 else f"{count} phases of the gait"
+    about = environment()
     text = [
         "# What the weight sets bear",
+        made_at(about),
         f"Trajectory {flags.scenes.traj}, world {world}, plants {flags.first_seed} to {last}. "
         f"Pushes of 0.1 s on the trunk from eight sides, floors that turn slippery for 2 s, both "
         f"begun at {phases}; slopes of 3 degrees that rise towards "
@@ -235,7 +211,7 @@ def report(flags: Flags, found: Found, folder: Path) -> Path:
             if name in ("world", "seeds", "first_seed", "scenes")
         },
         "weights": {name: fingerprint(w) for name, w in weight_sets(flags.set).items()},
-        "environment": environment(),
+        "environment": about,
         "residual": found.residual,
         "levels": {
             level.name: {

@@ -15,9 +15,8 @@ controller and trained. Over data that another one walked, the command alone is 
     python experiments/transfer.py --effort-about weight --data data-weight --out runs/weight
 """
 
-import hashlib
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,7 +27,7 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import pipeline
+from hector_jax import kept, pipeline
 from hector_jax.console import bar, exit_code, made_at, say
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
@@ -45,18 +44,10 @@ from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import hfs
-from hector_jax.storage import (
-    fingerprint,
-    load_tree,
-    load_weights,
-    save_tree,
-    save_weights,
-    write_file,
-    write_json,
-)
+from hector_jax.storage import load_weights, write_file, write_json
 from hector_jax.trajectory import Load, Trajectory
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tune_step
-from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.loss import LossConfig, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 SETS = ("nominal", "expert", "tuned")
@@ -80,6 +71,8 @@ class Flags:
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:
+        if not self.sets:
+            raise ValueError(f"Flags.sets must name one at least of {', '.join(SETS)}, got none")
         for name in self.sets:
             if name not in SETS:
                 raise ValueError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
@@ -147,24 +140,18 @@ def tuned_sets(
     given: Mapping[str, Weights],
 ) -> dict[str, Weights]:
     """Weights after the paper's ten iterations by trajectory: given ones, kept ones or made now."""
-    key = f"{config!r} {fingerprint(params)} {fingerprint(robot)}".encode()
-    digest = hashlib.sha256(key).hexdigest()[:12]
-    kept = {
-        name: flags.out / f"tuned-{name}-{digest}.json"
-        for name in flags.trajectories
-        if name not in given
+    problems = {
+        name: (named_command(name), params) for name in flags.trajectories if name not in given
     }
-    missing = {
-        name: (named_command(name), params) for name, path in kept.items() if not path.exists()
-    }
-    if missing:
-        found = pipeline.tune_many(pool, config, robot, missing, "tuning, ten iterations")
-        for name, tuning in found.items():
-            save_weights(kept[name], tuning.ten)
-    return {**given, **{name: load_weights(path) for name, path in kept.items()}}
+    commit = environment().get("commit", "")
+    title = "tuning, ten iterations"
+    found = kept.tune(pool, config, robot, problems, flags.out, commit, title)
+    return {**given, **{name: tuned.tuning.ten for name, tuned in found.items()}}
 
 
-_loss = jax.jit(lambda walk: total(LossConfig(), losses(walk)))
+def _tell(walk: Trajectory) -> Walked:
+    loss = loss_of(LossConfig(), walk)
+    return Walked(np.asarray(loss), walk.fallen.any(), walk.residual.max())
 
 
 def walk_groups(
@@ -176,37 +163,14 @@ def walk_groups(
 ) -> tuple[dict[str, Walked], str]:
     """Walks of groups of jobs on the hfs, and their engine; a group that is on disk is taken."""
     engine = "c" if jax.default_backend() == "cpu" else "mjx"
-
-    def path(name: str) -> Path:
-        key = f"{config!r} {LossConfig()!r} {engine} {fingerprint(list(groups[name]))}"
-        key += fingerprint(robot)
-        return folder / f"{name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}.npz"
-
-    missing = [name for name in groups if not path(name).exists()]
-    jobs = [job for name in missing for job in groups[name]]
-
-    def walked() -> Iterator[Trajectory]:
-        if engine == "c":
-            return walk_many(pool, config, robot, jobs)
-        return walk_batch(config, robot, jobs, fine=True, single=False)
-
-    if jobs:
-        with bar(f"{len(jobs)} walks on the high-fidelity simulator, engine {engine}") as tell:
-            tell(0, len(jobs), "compiling")
-            walks, done = walked(), 0
-            for name in missing:
-                told = []
-                for walk in (next(walks) for _ in groups[name]):
-                    told.append((float(_loss(walk)), walk.fallen.any(), walk.residual.max()))
-                    done += 1
-                    tell(done, len(jobs), name)
-                found = Walked(*map(np.array, zip(*told, strict=True)))
-                about = {"controller": repr(config), "engine": engine}
-                save_tree(path(name), found, kind="transfer", robot=robot, about=about)
+    walk = {
+        "c": partial(walk_many, pool, config, robot),
+        "mjx": partial(walk_batch, config, robot, fine=True, single=False),
+    }[engine]
     like = Walked(np.zeros(0), np.zeros(0), np.zeros(0))
-    return {
-        name: load_tree(path(name), like, kind="transfer", robot=robot)[0] for name in groups
-    }, engine
+    key, title = (config, LossConfig(), engine), f" on the high-fidelity simulator, engine {engine}"
+    walked = kept.walk_groups(groups, walk, _tell, like, "transfer", robot, folder, key, title)
+    return walked, engine
 
 
 def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
@@ -223,7 +187,7 @@ def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
 @partial(jax.jit, static_argnums=0)
 def _model_loss(config, robot, weights, command, anchor, effect):
     walk = rollout(config.rollout, robot, weights, command, anchor, effect)
-    return total(config.loss, losses(walk))
+    return loss_of(config.loss, walk)
 
 
 def _model_job(

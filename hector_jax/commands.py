@@ -1,9 +1,9 @@
 """What each command of `hector` does with its flags (flags.py)."""
 
 import dataclasses
-import tempfile
+import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from datetime import datetime
@@ -15,12 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax import pipeline, study
-from hector_jax.console import say
-from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig, walk_config
+from hector_jax import doctor, export, pipeline, replay, study
+from hector_jax.console import Broken, say
+from hector_jax.control.reference import COMMANDS, named_command
+from hector_jax.control.trajectories import Course, beyond, course, limits
+from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
-from hector_jax.evaluation import fidelity, metrics, plots
+from hector_jax.evaluation import fidelity, metrics, plots, progress, runs, view
 from hector_jax.evaluation.metrics import Verdict
 from hector_jax.evaluation.report import (
     WORLDS,
@@ -31,28 +32,35 @@ from hector_jax.evaluation.report import (
     write_fidelity,
     write_report,
 )
-from hector_jax.evaluation.video import VideoUnavailable, write_video
+from hector_jax.evaluation.tensorboard import write_events
+from hector_jax.evaluation.video import Arrows, VideoUnavailable, write_video
 from hector_jax.flags import (
     Collect,
+    Compare,
     Doctor,
     Evaluate,
+    Export,
     Grfm,
+    Replay,
     Search,
     Table,
+    Tensorboard,
     Train,
     Tune,
+    View,
     Walk,
     as_command,
     settings,
 )
 from hector_jax.grfm import training
-from hector_jax.grfm.dataset import SOLVED, Walks, at_interval, make_dataset
+from hector_jax.grfm.dataset import PIECES, SOLVED, Walks, at_interval, make_dataset
 from hector_jax.grfm.gated import gated_effect
-from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.grfm.network import as_effect, linear_effect, load_net
 from hector_jax.grfm.training import TrainConfig, predict
+from hector_jax.inputs import did_you_mean, shown
 from hector_jax.model.effect import last_command
-from hector_jax.robot import Robot, load_robot
-from hector_jax.runtime import cache_folder, workers
+from hector_jax.robot import Robot, compile_model, load_robot
+from hector_jax.runtime import workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, hfs, named_world
@@ -66,9 +74,9 @@ from hector_jax.storage import (
     write_json,
 )
 from hector_jax.trajectory import Trajectory, Wrench
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, aligned
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.search import SearchConfig
 
 
@@ -85,6 +93,11 @@ def run(args: Any) -> None:
 def _weights(text: str, robot: Robot) -> Weights:
     """A weight set by its name, or from a file."""
     named = {"nominal": nominal, "expert": expert}
+    if text not in named and not Path(text).suffix and not Path(text).exists():
+        raise ValueError(
+            f"no weights {shown(text)}{did_you_mean(text, named)}; there are: "
+            f"{', '.join(named)}, or a file"
+        )
     return named[text](robot) if text in named else load_weights(Path(text))
 
 
@@ -93,18 +106,43 @@ def _tuned_as(robot: Robot, **settings: Any) -> TuneConfig:
     return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **settings)
 
 
-def _of_robot(folder: Path, args: Any, robot: Robot) -> Path:
+def _of_robot(folder: Path, asked: Any, robot: Robot) -> Path:
     """Another robot than the packaged one has a folder of its own in there."""
-    return folder if args.robot is None else folder / robot.description.name
+    return folder if asked.robot is None else folder / robot.description.name
 
 
 def _plants(world: str, seeds: range) -> list[Imperfections]:
     if world == "standin":
         return [standin(seed) for seed in seeds]
-    try:
-        return [named_world(world, seed) for seed in seeds]
-    except ValueError as error:
-        raise ValueError(f"{error}, standin (for `walk` also srbm)") from None
+    return [named_world(world, seed) for seed in seeds]
+
+
+def _course(text: str, robot: Robot) -> Course:
+    """What to walk; one line says where a file asks for more than the robot may be able to."""
+    found = course(text)
+    if found.seconds and (told := beyond(limits(robot, walk_config(robot).gait), found.command)):
+        say(f"warning: {text}: {told}")
+    return found
+
+
+def _seconds(asked: float, wanted: Course) -> float:
+    """Length of a walk: what the trajectory's file says, else what the flag does."""
+    if wanted.seconds is None:
+        return asked
+    if asked != Walk.seconds:
+        raise ValueError(
+            f"--seconds is for built-in trajectories: {wanted.name} lasts {wanted.seconds:g} s, "
+            f"as its file says, got {asked:g}"
+        )
+    return wanted.seconds
+
+
+def _lasting(config: TuneConfig, wanted: Course) -> TuneConfig:
+    """The tuning with rollouts as long as the trajectory, where its file says how long."""
+    if wanted.seconds is None:
+        return config
+    ticks = round(wanted.seconds / config.rollout.walk.gait.tick)
+    return replace(config, rollout=replace(config.rollout, ticks=ticks))
 
 
 @run.register
@@ -122,19 +160,22 @@ def _train(args: Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     path = args.out or pipeline.net_path(args.data.parent, args.variant)
     found = pipeline.train(config, load_robot(args.robot), args.data, path)
-    for name, errors in found.errors.items():
-        print(
-            f"{name:7s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
-            "   (held-out walks)"
-        )
+    if args.json:
+        print(as_json({"net": str(path), "errors": found.errors}))
+    else:
+        _print_errors(found.errors)
     say(f"the net is in {path}")
+
+
+def _print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
+    print("mean square errors on held-out walks")
+    for name, of in errors.items():
+        print(f"{name:9s} force {of['force']:8.2f} N^2   moment {of['moment']:7.4f} (N m)^2")
 
 
 @run.register
 def _grfm(args: Grfm) -> None:
     robot, config = load_robot(), TuneConfig()
-    if args.seeds < 0:
-        raise ValueError(f"--seeds must be at least 0, got {args.seeds}")
     make_folder(args.out)
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, config, robot, args.data)
@@ -169,10 +210,10 @@ def _grfm(args: Grfm) -> None:
     }
     pictures = [Picture(f"{name}.png", caption) for name, caption in captions.items()]
     told = write_fidelity(args.out, found, pictures)
-    for name, errors in found["hfs"]["errors"].items():
-        print(
-            f"{name:9s} force {errors['force']:8.2f} N^2   moment {errors['moment']:7.4f} (N m)^2"
-        )
+    if args.json:
+        print(as_json({"report": str(told), "worlds": found}))
+    else:
+        _print_errors(found["hfs"]["errors"])
     say(f"the whole story, with pictures: {told}")
 
 
@@ -217,10 +258,10 @@ def _taken(folder: Path) -> str:
     return f"run folder {folder} exists; name another by --run, nothing was touched"
 
 
-def _new_folder(args: Tune, robot: Robot) -> Path:
+def _new_folder(args: Tune, robot: Robot, trajectory: str) -> Path:
     """The run's folder, made here; an existing one is never written into."""
     runs = _of_robot(args.runs, args, robot)
-    folder = args.run or runs / args.traj / f"{datetime.now():%Y%m%d-%H%M%S}"
+    folder = args.run or runs / trajectory / f"{datetime.now():%Y%m%d-%H%M%S}"
     try:
         folder.mkdir(parents=True)
     except FileExistsError:
@@ -238,40 +279,45 @@ def _tune(args: Tune) -> None:
         for one in several:
             run(one)
         return
-    command, robot = named_command(args.traj), load_robot(args.robot)
-    if args.alpha not in ("paper", "auto"):
-        raise ValueError(f"--alpha must be 'paper' or 'auto', got {args.alpha!r}")
-    least_of = {"seeds": 1, "processes": 1, "iterations": PAPER_ITERATIONS, "refresh": 0}
-    for name, least in least_of.items():
-        if getattr(args, name) < least:
-            raise ValueError(f"--{name} must be at least {least}, got {getattr(args, name)}")
-    config, variant = _tuned_as(robot, iterations=args.iterations), args.variant
-    TrainConfig(variant)  # refuses an unknown one before a folder is made
-    folder, data = _new_folder(args, robot), _of_robot(args.data, args, robot)
+    robot = load_robot(args.robot)
+    wanted = _course(args.traj, robot)
+    command, lasts = wanted.command, wanted.seconds or Walk.seconds
+    if args.refresh and len(command.duration) > PIECES:
+        raise ValueError(
+            f"--refresh takes trajectories of at most {PIECES} segments, {wanted.name} has "
+            f"{len(command.duration)}"
+        )
+    shared, variant = _tuned_as(robot, iterations=args.iterations), args.variant
+    config, data = _lasting(shared, wanted), _of_robot(args.data, args, robot)
+    folder, start = _new_folder(args, robot, wanted.name), time.monotonic()
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, config, robot, data, variant)
+        net = pipeline.ground(pool, shared, robot, data, variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        resolved = {"flags": settings(args), "tune": dataclasses.asdict(config)}
+        # without the folder, so that `--config` can ask for the same in another one
+        asked = replace(args, run=None)
+        resolved = {"flags": settings(asked), "tune": dataclasses.asdict(config)}
+        made_with = environment()
         write_json(folder / "config.json", resolved)
-        write_json(folder / "versions.json", environment())
+        write_json(folder / "versions.json", made_with)
         shifts: list[dict[str, Any]] = []
+        dumps = folder / "dumps"
         with (folder / "metrics.jsonl").open("w", buffering=1) as metrics_file:
 
             def note(name: str, iteration: Iteration) -> None:
                 metrics_file.write(pipeline.as_line(name, iteration))
 
-            title = f"tuning {args.traj} without and with GRFM-Net"
-            tunings = pipeline.tune_many(pool, config, robot, problems, title, note)
+            title = f"tuning {wanted.name} without and with GRFM-Net"
+            tunings = pipeline.tune_many(pool, config, robot, problems, title, note, dumps)
             newest, tuning = net, tunings["with"]
             for count in range(1, args.refresh + 1):
                 newest, shift = pipeline.refresh(
                     pool,
-                    replace(pipeline.REFRESH, seed=count),
+                    replace(pipeline.REFRESH, seed=count, seconds=lasts),
                     config,
                     robot,
                     command,
@@ -282,8 +328,8 @@ def _tune(args: Tune) -> None:
                 shifts.append(shift)
                 name = "with_refreshed" + (str(count) if count > 1 else "")
                 again = {name: (command, newest.params)}
-                title = f"tuning {args.traj} with the net refreshed"
-                tunings |= pipeline.tune_many(pool, config, robot, again, title, note)
+                title = f"tuning {wanted.name} with the net refreshed"
+                tunings |= pipeline.tune_many(pool, config, robot, again, title, note, dumps)
                 tuning = tunings[name]
         sets = {
             "nominal": nominal(robot),
@@ -304,10 +350,10 @@ def _tune(args: Tune) -> None:
             _plants("standin", seeds),
             seeds,
             f"judging on {args.seeds} stand-in plants",
+            lasts,
         )
-        on_hfs = pipeline.judge(
-            pool, config, robot, sets, command, [hfs()], [0], "walking on the simulator of the data"
-        )
+        title = "walking on the simulator of the data"
+        on_hfs = pipeline.judge(pool, config, robot, sets, command, [hfs()], [0], title, lasts)
     verdict = _verdict(config.loss, seeds, walks)
     result = metrics.as_result(verdict)
     for name, found in metrics.as_result(_verdict(config.loss, [0], on_hfs), "hfs")["sets"].items():
@@ -315,6 +361,7 @@ def _tune(args: Tune) -> None:
     if shifts:
         result["refresh"] = shifts
     write_json(folder / "result.json", result)
+    write_json(folder / "versions.json", made_with | {"seconds": f"{time.monotonic() - start:.0f}"})
     pictures = _draw(folder, config, robot, net, sets, tunings, walks, on_hfs["nominal"][0])
     film: Picture | str = "left out (--no-video)"
     if args.video:
@@ -327,7 +374,7 @@ def _tune(args: Tune) -> None:
     told = write_report(
         folder,
         Report(
-            trajectory=args.traj,
+            trajectory=wanted.name,
             verdict=verdict,
             tunings=tunings,
             norms=norms,
@@ -336,11 +383,14 @@ def _tune(args: Tune) -> None:
             pictures=pictures,
             film=film,
             config=resolved,
-            environment=environment(),
-            command=as_command("tune", replace(args, run=None)),
+            environment=made_with,
+            command=as_command("tune", asked),
         ),
     )
-    print_table(verdict, f"{args.traj}, {args.seeds} stand-in plants")
+    if args.json:
+        print(as_json({"run": str(folder), "traj": wanted.name, **result}))
+    else:
+        print_table(verdict, f"{wanted.name}, {args.seeds} stand-in plants")
     say(f"the whole story, with pictures: {told}")
 
 
@@ -388,36 +438,45 @@ def _draw(
 @run.register
 def _table(args: Table) -> None:
     told, verdicts = study.make_table(args, partial(_plants, "standin"))
-    for name, verdict in verdicts.items():
-        print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
+    if args.json:
+        results = {name: metrics.as_result(verdict) for name, verdict in verdicts.items()}
+        print(as_json({"report": str(told), "trajectories": results}))
+    else:
+        for name, verdict in verdicts.items():
+            print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
     say(f"the whole story, with pictures: {told}")
 
 
 @run.register
 def _search(args: Search) -> None:
-    names = COMMANDS if args.traj == "all" else (args.traj,)
-    for name in names:
-        named_command(name)
+    robot = load_robot(args.robot)
+    wanted = [_course(text, robot) for text in (COMMANDS if args.traj == "all" else (args.traj,))]
+    own = {one.name: one.command for one in wanted}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = pipeline.choose_engine(args.engine)
-    robot = load_robot(args.robot)
-    tune, start = _tuned_as(robot), _weights(args.start, robot)
+    tune, start = _lasting(_tuned_as(robot), wanted[0]), _weights(args.start, robot)
     make_folder(args.out)
     with workers(args.processes) as pool:
         found = pipeline.search(
-            pool, config, tune, robot, dict.fromkeys(names, start), engine, args.record or args.out
+            pool,
+            config,
+            tune,
+            robot,
+            dict.fromkeys(own, start),
+            engine,
+            args.record or args.out,
+            own,
         )
         say("walking start, expert and the best once more")
-        sets = {name: [start, expert(robot), found[name].weights] for name in names}
-        at_once = config.population * len(names)
-        compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once)
-    print("L in 1e6 on the high-fidelity simulator")
-    print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+        sets = {name: [start, expert(robot), found[name].weights] for name in own}
+        at_once = config.population * len(own)
+        compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once, own)
+    cards = {}
     for name, one in found.items():
         at_start, at_expert, again = compared[name].tolist()
         walks = len(one.history) * config.population
         losses = {"start": at_start, "best": one.loss, "best_again": again, "expert": at_expert}
-        card = {
+        cards[name] = {
             "trajectory": name,
             "L": losses,
             "walks": walks,
@@ -431,17 +490,23 @@ def _search(args: Search) -> None:
             "versions": versions(),
         }
         save_weights(args.out / f"{name}.json", one.weights)
-        write_json(args.out / f"{name}-card.json", card)
-        shown = "".join(f"{x / 1e6:9.3f}" for x in (at_start, one.loss, at_expert))
-        print(f"{name:10s}{shown}{walks:8d}{one.walk:9d}")
+        write_json(args.out / f"{name}-card.json", cards[name])
+    if args.json:
+        print(as_json({"weights": str(args.out), "cards": cards}))
+    else:
+        print("L in 1e6 on the high-fidelity simulator")
+        print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+        for name, card in cards.items():
+            shown = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
+            print(f"{name:10s}{shown}{card['walks']:8d}{card['best_at']:9d}")
     say(f"weights are in {args.out}")
 
 
 @run.register
 def _evaluate(args: Evaluate) -> None:
-    command, robot = named_command(args.traj), load_robot(args.robot)
-    config = _tuned_as(robot)
-    _check_seconds(args.seconds)
+    robot = load_robot(args.robot)
+    wanted = _course(args.traj, robot)
+    seconds = _seconds(args.seconds, wanted)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
@@ -450,34 +515,21 @@ def _evaluate(args: Evaluate) -> None:
     with workers(args.processes) as pool:
         title = f"judging on {args.world}, {count} plants"
         walks = pipeline.judge(
-            pool, config, robot, sets, command, plants, seeds, title, args.seconds
+            pool, _tuned_as(robot), robot, sets, wanted.command, plants, seeds, title, seconds
         )
     verdict = _verdict(LossConfig(), seeds, walks)
     if args.json:
         print(as_json(metrics.as_result(verdict, args.world)))
     else:
-        print_table(verdict, f"{args.traj}, {count} plants", args.world)
-
-
-def _check_seconds(seconds: float) -> None:
-    if not 0.0 < seconds <= 600.0:
-        raise ValueError(f"--seconds must be above 0 and at most 600, got {seconds}")
+        print_table(verdict, f"{wanted.name}, {count} plants", args.world)
 
 
 @run.register
 def _walk(args: Walk) -> None:
-    command, robot = named_command(args.traj), load_robot(args.robot)
-    weights, config = _weights(args.weights, robot), walk_config(robot)
-    _check_seconds(args.seconds)
-
-    def walked(weights: Weights) -> Trajectory:
-        if args.world == "srbm":
-            return _rigid_body(robot, weights, command, args.seconds)
-        plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
-        return walk(config, robot, weights, command, plant, args.seconds, args.seed)
-
+    robot = load_robot(args.robot)
+    weights, wanted = _weights(args.weights, robot), _course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = walked(weights)
+    trajectory = _walked(args, robot, wanted, weights)
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     if args.out is not None:
@@ -489,7 +541,7 @@ def _walk(args: Walk) -> None:
         print(as_json(told))  # a walk that falls at once has no errors
     else:
         print(
-            f"{args.traj} in {args.world}, {args.weights} weights: "
+            f"{wanted.name} in {args.world}, {args.weights} weights: "
             + (f"fell after {upright:.2f} s" if found.fallen else f"walked {upright:.2f} s")
             + f"; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
             f"L_pos {found.L_pos:.2f} m^2, L_ctrl {found.L_ctrl / 1e6:.3f}e6)"
@@ -499,15 +551,20 @@ def _walk(args: Walk) -> None:
         print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
-        _film(args.video, robot, {beside: walked(other(robot)), args.weights: trajectory})
+        _film(
+            args.video,
+            robot,
+            {beside: _walked(args, robot, wanted, other(robot)), args.weights: trajectory},
+        )
 
 
-def _rigid_body(robot: Robot, weights: Weights, command: Any, seconds: float) -> Trajectory:
-    controller = walk_config(robot)
-    config = RolloutConfig(controller, ticks=round(seconds / controller.gait.tick))
-    walked = jax.jit(rollout, static_argnums=0)
-    anchor = standing_anchor(robot)
-    return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
+def _walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) -> Trajectory:
+    """One walk in the world of the flags."""
+    seconds = _seconds(args.seconds, wanted)
+    if args.world == "srbm":
+        return pipeline.walk_rigid_body(robot, weights, wanted.command, seconds)
+    plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
+    return walk(walk_config(robot), robot, weights, wanted.command, plant, seconds, args.seed)
 
 
 def _film(
@@ -524,25 +581,149 @@ def _film(
 
 @run.register
 def _doctor(args: Doctor) -> None:
-    rows = {
-        **versions(),
-        "device": ", ".join(str(device) for device in jax.devices()),
-        "precision": f"{64 if jax.config.read('jax_enable_x64') else 32} bits",
-        "cache": str(cache_folder()),
-    }
-    for name, text in rows.items():
-        print(f"{name:12s} {text}")
-    start = time.monotonic()
-    robot, command = load_robot(), named_command("straight")
-    walks = {
-        "srbm": _rigid_body(robot, expert(), command, 1.0),
-        "ideal": walk(WalkConfig(), robot, expert(), command, _plants("ideal", range(1))[0], 0.2),
-    }
-    for world, found in walks.items():
-        if found.fallen.any() or not found.residual.max() <= SOLVED:
-            raise ValueError(f"self-test failed: the robot does not walk in {world}")
-    print(f"{'self-test':12s} walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s")
-    with tempfile.TemporaryDirectory() as folder:
-        short = {name: walks["ideal"] for name in ("one", "other")}
-        missing = _film(Path(folder) / "film.mp4", robot, short)
-    print(f"{'video':12s} {missing or 'works'}")
+    told, faults = doctor.examine()
+    if args.json:
+        print(as_json({**told, "faults": faults}))
+    else:
+        for name, text in told.items():
+            print(f"{name:12s} {text}")
+    if faults:
+        raise Broken("; ".join(faults))
+
+
+@run.register
+def _compare(args: Compare) -> None:
+    told = runs.compare_runs([runs.load_run(folder) for folder in args.runs])
+    if args.json:
+        print(as_json(told))
+    else:
+        runs.print_comparison(told)
+
+
+@run.register
+def _tensorboard(args: Tensorboard) -> None:
+    out = args.out or args.run / "tensorboard"
+    write_events(args.run, out)
+    print(f"tensorboard --logdir {shlex.quote(str(out))}")
+
+
+@run.register
+def _export(args: Export) -> None:
+    # before the first array: see hector_jax.export
+    jax.config.update("jax_platforms", "cpu")
+    command = named_command(args.traj)
+    path, config, robot = export.find_weights(args.run, args.set)
+    weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
+    folder = args.out or (args.run if args.run.is_dir() else args.run.parent) / "export"
+    say("exporting, walking once and asking both controllers")
+    known = (config, load_robot(robot), weights, command, folder)
+    card = export.export(*known, name=name, seconds=args.seconds)
+    if args.json:
+        print(as_json(card))
+        return
+    found = card["check"]
+    differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
+    print(f"largest difference from the live controller: {differences.format(**found)}")
+    for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
+        times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+        print(f"a call {text} [ms]: {times.format(**found[what])}")
+    say(f"all of it is in {folder}")
+
+
+@run.register
+def _view(args: View) -> None:
+    beside = args.run.with_name(f"{args.run.name}-view")
+    folder = args.out or (beside if args.headless else None)
+    if folder is None:
+        view.check_viser()
+    if args.seconds < 0.1:
+        raise ValueError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
+    if args.sets[0] == args.sets[1]:
+        raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
+    asked = progress.read_asked(args.run)
+    robot = load_robot(asked.robot)
+    wanted = _course(asked.trajectory, robot)
+    if folder is not None:
+        if folder.resolve() == args.run.resolve():
+            raise ValueError(f"--out must not be the folder of the run, got {folder}")
+        make_folder(folder)
+    sets = {name: progress.weights_of(args.run, name, robot) for name in args.sets}
+    data = _of_robot(args.data or asked.data, asked, robot)
+    effect = _phi_of(data, asked.variant, robot)
+    story = [f"**{asked.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
+    shown: dict[str, view.Shown] = {}
+    say(f"walking anew in {args.world}, seed {args.seed}")
+    for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
+        walked = _walked(args, robot, wanted, weights)
+        loss = metrics.score(asked.loss, walked).L / 1e6
+        story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
+        say(f"  {story[-1]}")
+        walked = at_interval(walked, walk_config(robot).gait.tick)
+        stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
+        effects = {} if effect is None else {"residual": effect}
+        curves = _curves(robot, stacked, effects)
+        shown[name] = view.Shown(walked, curves)
+    model = compile_model(robot.description)
+    motions = [view.motion(robot, model, one) for one in shown.values()]
+    if folder is not None:
+        histories = progress.read_metrics(args.run)
+        _draw_view(folder, robot, histories, asked.loss, shown, view.film_arrows(motions))
+        say(f"film and pictures are in {folder}")
+        return
+    view.serve(
+        dict(zip(_titles(shown), motions, strict=True)),
+        model,
+        args.run,
+        "\n\n".join(story),
+        lambda address: say(f"open {address} in a browser; Ctrl-C ends it"),
+        args.host,
+        args.port,
+    )
+
+
+def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
+    """Phi of the net that is kept under `data`; where there is none, a line says so."""
+    path = pipeline.net_path(data, variant)
+    if not path.exists():
+        say(f"no net at {path}, so none of its predictions; --data names another folder")
+        return None
+    return as_effect(load_net(path, robot, variant)[0])
+
+
+def _titles(names: Iterable[str]) -> list[str]:
+    return [f"{when}: {name}" for when, name in zip(("before", "after"), names, strict=True)]
+
+
+def _draw_view(
+    folder: Path,
+    robot: Robot,
+    histories: progress.Histories,
+    loss: LossConfig,
+    shown: Mapping[str, view.Shown],
+    arrows: Sequence[Arrows],
+) -> None:
+    """What the page shows, as a film and pictures."""
+    walks = {name: one.walk for name, one in shown.items()}
+    plots.tracking(folder / "tracking.png", walks)
+    plots.path_from_above(folder / "path.png", walks)
+    after = list(shown.values())[-1]
+    period, ticks = float(after.walk.period), len(after.walk.fallen)
+    first = min(0.4, period * ticks)  # [s], two steps
+    plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
+    tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
+    if tuned:
+        plots.losses(folder / "losses.png", loss, tuned)
+    say("drawing the film")
+    try:
+        titled = dict(zip(_titles(walks), walks.values(), strict=True))
+        write_video(folder / "film.mp4", robot, titled, folder / "film.png", arrows=arrows)
+    except VideoUnavailable as error:
+        raise ValueError(str(error)) from None
+
+
+@run.register
+def _replay(args: Replay) -> None:
+    found = replay.again(args.dump)
+    print(as_json(found._asdict(), indent=2) if args.json else replay.in_words(found))
+    if not found.same:
+        raise Broken(f"{args.dump}: {replay.verdict(found)}")

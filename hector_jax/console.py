@@ -1,5 +1,6 @@
 """What a person sees while waiting: one line or one bar on stderr; stdout carries results only."""
 
+import os
 import shlex
 import sys
 import time
@@ -59,17 +60,28 @@ def bar(title: str) -> Iterator[Tell]:
     say(f"{title}: done in {time.monotonic() - start:.0f} s")
 
 
+class Broken(RuntimeError):  # noqa: N818, it is no fault of the program
+    """What was to be found out is bad news, such as a machine that fails the doctor's tests."""
+
+
 def exit_code(name: str, work: Callable[[], None]) -> int:
     """Do the work of a program; its exit code, with one line on stderr where that is not 0.
 
     Args:
         name: of the program, before the line.
-        work: ValueError and OSError are told as bad input (2), an interrupt as such (130).
+        work: ValueError and OSError are told as bad input (2), `Broken` (1) and an interrupt (130)
+            as such. Where nobody reads standard output any more, it ends without a word (141).
     """
     try:
         work()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
+        return 141
     except (ValueError, OSError) as error:
         code, text = 2, " ".join(str(error).split())
+    except Broken as error:
+        code, text = 1, str(error)
     except KeyboardInterrupt:
         code, text = 130, "interrupted"
     else:

@@ -17,17 +17,15 @@ What is left out is as in assets/hector.toml. Masses, lengths, joint and torque 
 MJCF's; a description rides on its `Robot` and is static under jit.
 """
 
-import difflib
-import json
-import math
 import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from hector_jax.inputs import POSITIVE, did_you_mean, one_line, problem, read_text, shown
 from hector_jax.trajectory import MAX_TILT, MIN_HEIGHT
 
 _PACKAGE = Path(__file__).parent
@@ -83,6 +81,11 @@ class Description:
         return self.axes.index("z")
 
     @property
+    def roll_joint(self) -> int:
+        """Which joint of a leg turns it about the way ahead."""
+        return self.axes.index("x")
+
+    @property
     def pitch_joints(self) -> tuple[int, int, int]:
         """Which joints of a leg are hip pitch, knee and ankle."""
         hip, knee, ankle = (i for i, axis in enumerate(self.axes) if axis == "y")
@@ -108,7 +111,8 @@ def read_description(path: Path) -> Description:
     axes = _text(path, joints, "axes", "joints.", HECTOR_AXES)
     if sorted(axes) != sorted(HECTOR_AXES):
         raise ValueError(
-            f"{path}: joints.axes is {axes!r}, expected {HECTOR_AXES!r} in the order of the leg"
+            f"{path}: joints.axes is {shown(axes)}, expected {HECTOR_AXES!r} in the "
+            "order of the leg"
         )
     limits, weights = _table(path, told, "limits"), _table(path, told, "weights")
     _known(path, weights, ("nominal", "expert"), "weights.")
@@ -133,35 +137,43 @@ def read_description(path: Path) -> Description:
     )
 
 
-def unknown(name: str, names: Iterable[str]) -> str:
-    """Which known name is meant by one that is not, or which there are."""
-    known = list(names)
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else f"expected {', '.join(known)}"
+def as_table(description: Description) -> dict[str, Any]:
+    """A description as JSON values; `from_card` reads them."""
+    plain = lambda x: str(x) if isinstance(x, Path) else x  # noqa: E731
+    return {name: plain(value) for name, value in asdict(description).items()}
+
+
+def from_card(table: Mapping[str, Any]) -> Description:
+    """The description that `as_table` told; what is not told is HECTOR's.
+
+    Raises:
+        TypeError: the table holds something else.
+    """
+    paths = {field.name for field in fields(Description) if field.type is Path}
+    return Description(
+        **{name: Path(x) if name in paths else _frozen(x) for name, x in table.items()}
+    )
 
 
 def _parse(path: Path) -> dict[str, Any]:
+    text = read_text(path, "the robot description", _MAX_BYTES)
     try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise ValueError(
-                f"{path}: {size / 1e3:.0f} kB, expected at most {_MAX_BYTES / 1e3:.0f} kB"
-            )
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot read the robot description: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path}: no valid TOML: {error}") from None
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: no valid TOML: {one_line(error)}") from None
 
 
 def _known(path: Path, table: Mapping[str, Any], names: tuple[str, ...], prefix: str) -> None:
     for key in table:
         if key not in names:
-            raise ValueError(f"{path}: unknown key {(prefix + key)[:60]!r}; {unknown(key, names)}")
+            raise ValueError(
+                f"{path}: unknown key {shown(prefix + key)}{did_you_mean(key, names)}; "
+                f"there are: {', '.join(names)}"
+            )
 
 
 def _wrong(path: Path, name: str, got: Any, expected: str) -> ValueError:
-    return ValueError(f"{path}: {name} is {json.dumps(got, default=str)[:60]}, expected {expected}")
+    return ValueError(f"{path}: {name} is {shown(got)}, expected {expected}")
 
 
 def _table(path: Path, told: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -217,8 +229,7 @@ def _feet(path: Path, feet: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
 
 
 def _positive(value: Any) -> bool:
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    return plain and 0 < value < math.inf
+    return problem(value, float, POSITIVE) is None
 
 
 def _limit(path: Path, table: Mapping[str, Any], key: str, default: float) -> float:

@@ -8,17 +8,17 @@ is made anew.
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax import pipeline
-from hector_jax.console import say
+from hector_jax.console import bar, say
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.evaluation import metrics
@@ -32,6 +32,9 @@ from hector_jax.storage import fingerprint, load_tree, save_tree, versions
 from hector_jax.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import LossConfig, Losses
+
+Key = TypeVar("Key")
+Tree = TypeVar("Tree")
 
 
 class Tuned(NamedTuple):
@@ -154,7 +157,9 @@ def tune(
     found = {name: load_tuning(path, robot) for name, path in paths.items()}
     missing = {name: problems[name] for name, tuned in found.items() if tuned is None}
     if missing:
-        for name, tuning in pipeline.tune_many(pool, config, robot, missing, title).items():
+        dumps = folder / "dumps"
+        tunings = pipeline.tune_many(pool, config, robot, missing, title, dumps=dumps)
+        for name, tuning in tunings.items():
             save_tuning(paths[name], tuning, robot, commit)
             found[name] = Tuned(tuning, commit)
     return {name: tuned for name, tuned in found.items() if tuned is not None}
@@ -278,3 +283,77 @@ def judge(
         {name: [scored[name, seed] for seed in seeds] for name in sets},
         {name: shown[name] for name in sets},
     )
+
+
+def trees(
+    paths: Mapping[Key, Path],
+    make: Callable[[Sequence[Key]], Iterable[Tree]],
+    like: Tree,
+    kind: str,
+    robot: Robot,
+    about: Mapping[str, Any] | None = None,
+) -> dict[Key, Tree]:
+    """Trees of arrays by key: those on disk are taken, the others made and saved as they come.
+
+    Args:
+        paths: a file for each, its name with a `digest` of all that the tree follows from.
+        make: yields the trees of the keys that it is given, in their order.
+        like: a tree of the same form.
+        kind: of the files.
+        robot: the body that the trees are of.
+        about: to note with what is made now.
+    """
+    taken = {key: _taken(path, like, kind, robot) for key, path in paths.items()}
+    found = {key: one[0] for key, one in taken.items() if one is not None}
+    missing = [key for key in paths if key not in found]
+    if missing:
+        for key, tree in zip(missing, make(missing), strict=True):
+            save_tree(paths[key], tree, kind=kind, robot=robot, about=dict(about or {}))
+            found[key] = tree
+    return {key: found[key] for key in paths}
+
+
+def walk_groups(
+    groups: Mapping[str, Sequence[Job]],
+    walk: Callable[[Sequence[Job]], Iterator[Trajectory]],
+    tell: Callable[[Trajectory], Tree],
+    like: Tree,
+    kind: str,
+    robot: Robot,
+    folder: Path,
+    key: tuple[Any, ...],
+    title: str,
+) -> dict[str, Tree]:
+    """What there is to say of each walk of groups of jobs, stacked; whole groups are kept.
+
+    Args:
+        groups: of jobs, by a name that may stand in a file's.
+        walk: walks jobs, in their order.
+        tell: what is kept of a walk, a NamedTuple of arrays.
+        like: such a tuple.
+        kind: of the files.
+        robot: the body.
+        folder: of the files.
+        key: what the walks follow from beside the jobs, as `digest` takes it; noted in the files.
+        title: for the person who waits, after the number of walks.
+    """
+    paths = {
+        name: folder / f"{name}-{digest(*key, robot, tuple(jobs))}.npz"
+        for name, jobs in groups.items()
+    }
+
+    def make(missing: Sequence[str]) -> Iterator[Tree]:
+        jobs = [job for name in missing for job in groups[name]]
+        with bar(f"{len(jobs)} walks{title}") as on:
+            on(0, len(jobs), "compiling")
+            walks, done = walk(jobs), 0
+            for name in missing:
+                rows = []
+                for _ in groups[name]:
+                    rows.append(tell(next(walks)))
+                    done += 1
+                    on(done, len(jobs), name)
+                yield jax.tree.map(lambda *x: np.stack(x), *rows)
+
+    about = {"settings": [repr(part) for part in key]}
+    return trees(paths, make, like, kind, robot, about)

@@ -17,15 +17,17 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax import replay
 from hector_jax.console import bar
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
+from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose, from_table, shown
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.sim.parallel import walk_batch
@@ -36,9 +38,12 @@ from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune, measured
 from hector_jax.tuning import search as searching
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
-from hector_jax.tuning.loss import Losses, losses, total
+from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
+
+ENGINES = ("auto", "c", "mjx")
 
 
 def choose_engine(asked: str) -> str:
@@ -47,15 +52,9 @@ def choose_engine(asked: str) -> str:
     Raises:
         ValueError: none of the three.
     """
-    _check_engine(asked)
-    if asked == "auto":
+    if choose("engine", asked, ENGINES) == "auto":
         return "c" if jax.default_backend() == "cpu" else "mjx"
     return asked
-
-
-def _check_engine(asked: str) -> None:
-    if asked not in ("auto", "c", "mjx"):
-        raise ValueError(f"engine must be 'auto', 'c' or 'mjx', got {asked!r}")
 
 
 @dataclass(frozen=True)
@@ -68,17 +67,18 @@ class CollectConfig:
     engine: str = "auto"  # c: MuJoCo on the processes; mjx: all at once; auto: mjx on a GPU
 
     def __post_init__(self) -> None:
-        _check_engine(self.engine)  # devices stay unasked: their number may not be set up yet
+        # devices stay unasked: their number may not be set up yet
+        check(self, walks=SOME, seconds=POSITIVE, seed=SEED, engine=ENGINES)
         if self.walks < 3:
             raise ValueError(
                 "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
                 f"by), got {self.walks}"
             )
         least = HISTORY * GaitConfig.tick
-        if not least <= self.seconds < np.inf:
+        if self.seconds < least:
             raise ValueError(
                 f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
-                f"sample, got {self.seconds:g}"
+                f"sample, got {shown(self.seconds)}"
             )
 
 
@@ -128,6 +128,7 @@ def tune_many(
     problems: Mapping[str, tuple[Command, Params | None]],
     title: str,
     on_iteration: Callable[[str, Iteration], None] = lambda name, iteration: None,
+    dumps: Path | None = None,
 ) -> dict[str, Tuning]:
     """Tune several problems side by side from the nominal weights.
 
@@ -138,6 +139,10 @@ def tune_many(
         problems: by name, the command and the net to tune through (None: the plain rigid body).
         title: for the person who waits.
         on_iteration: called with name and iteration as they happen.
+        dumps: folder for what was refused, see `replay.keep`; None: nothing is kept.
+
+    Raises:
+        ValueError: the starting weights fall or cannot be solved on the model.
     """
     with get_context("spawn").Manager() as manager, bar(title) as tell:
         heard = manager.Queue()
@@ -156,12 +161,16 @@ def tune_many(
             loss = float(iteration.evaluation.loss) / 1e6
             tell(done, config.iterations * len(problems), f"{name}: L {loss:.3f}e6")
             on_iteration(name, iteration)
+            if dumps is not None:
+                command, params = problems[name]
+                anchor = standing_anchor(robot)
+                replay.keep(dumps, name, config, robot, command, anchor, params, iteration)
         return {name: future.result() for name, future in running.items()}
 
 
 def measured_plants(count: int) -> list[Imperfections]:
-    """The hfs and plants drawn around it as for collection, which tunings on walks go by."""
-    return [hfs(), *(hfs_drawn(seed) for seed in range(1, count))]
+    """The hfs and plants drawn around it, which tunings on walks go by; others judge variants."""
+    return [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + count))]
 
 
 def _measured_job(
@@ -270,7 +279,7 @@ def collect(
 def _keep_walks(
     pool: Executor,
     engine: str,
-    walk_config: WalkConfig,
+    walking: WalkConfig,
     robot: Robot,
     jobs: Sequence[Job],
     folder: Path,
@@ -281,8 +290,8 @@ def _keep_walks(
 
     def walk_jobs(jobs: list[Job]) -> Iterator[Trajectory]:
         if engine == "c":
-            return walk_many(pool, walk_config, robot, jobs)
-        return walk_batch(walk_config, robot, jobs, single=single)
+            return walk_many(pool, walking, robot, jobs)
+        return walk_batch(walking, robot, jobs, single=single)
 
     title = f"collecting {len(jobs)} walks on the high-fidelity simulator, engine {engine}"
     with bar(title) as tell:
@@ -292,12 +301,21 @@ def _keep_walks(
             walk_jobs,
             robot=robot,
             about={
-                "controller": repr(walk_config),
+                "controller": repr(walking),
                 "engine": engine,
                 "physics_bits": 32 if single else 64,
             },
             progress=lambda done, of: tell(done, of, "" if done else "compiling"),
         )
+
+
+def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
+    """A walk on the plain single rigid body, `seconds` long, from standing."""
+    controller = walk_config(robot)
+    config = RolloutConfig(controller, ticks=round(seconds / controller.gait.tick))
+    walked = jax.jit(rollout, static_argnums=0)
+    anchor = standing_anchor(robot)
+    return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
 class Samples(NamedTuple):
@@ -420,10 +438,14 @@ def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Lear
         return train(config, robot, folder, path)
     params, _, card = network.load_net(path, robot, config.variant)
     about = card["about"]
-    course = History(**{name: np.array(about["course"][name]) for name in History._fields})
+    config = from_table(f"{path}: about.settings", TrainConfig, about.get("settings"))
+    try:
+        course = History(**{n: np.array(about["course"][n], float) for n in History._fields})
+        errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: its card does not tell its training: {error!r}") from None
     linear = network.fit_linear(samples(robot, folder).training)
-    config = TrainConfig(**about["settings"])
-    return Learned(params, linear, about["errors"], course, config, (folder,))
+    return Learned(params, linear, errors, course, config, (folder,))
 
 
 def ground(
@@ -451,7 +473,8 @@ def ground(
     return learned(train_config, robot, walks, net_path(data, train_config.variant))
 
 
-_loss = jax.jit(lambda config, walk: total(config, losses(walk)), static_argnums=0)
+def _command(name: str, own: Mapping[str, Command] | None) -> Command:
+    return own[name] if own and name in own else named_command(name)
 
 
 def losses_on_hfs(
@@ -461,6 +484,7 @@ def losses_on_hfs(
     engine: str,
     sets: Mapping[str, Sequence[Weights]],
     at_once: int,
+    own: Mapping[str, Command] | None = None,
 ) -> dict[str, Float[np.ndarray, " sets"]]:
     """L of weight sets on the high-fidelity simulator, one walk each, as long as the rollouts.
 
@@ -471,11 +495,12 @@ def losses_on_hfs(
         engine: c or mjx, in 64 bits.
         sets: by the trajectory that they walk.
         at_once: walks that MJX is compiled for; fewer are filled up to it.
+        own: commands of trajectories that are not built in, by their name.
     """
     walk = config.rollout.walk
     seconds = config.rollout.ticks * walk.gait.tick
     jobs = [
-        Job(weights, named_command(name), hfs(), seconds)
+        Job(weights, _command(name, own), hfs(), seconds)
         for name, each in sets.items()
         for weights in each
     ]
@@ -484,7 +509,9 @@ def losses_on_hfs(
     else:
         filled = jobs + jobs[-1:] * (at_once - len(jobs))
         walks = walk_batch(walk, robot, filled, fine=True)
-    told = iter([float(_loss(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)])
+    told = iter(
+        [float(loss_of(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)]
+    )
     return {name: np.array([next(told) for _ in each]) for name, each in sets.items()}
 
 
@@ -496,6 +523,7 @@ def search(
     starts: Mapping[str, Weights],
     engine: str,
     folder: Path,
+    own: Mapping[str, Command] | None = None,
 ) -> dict[str, Found]:
     """CMA-ES on the high-fidelity simulator, taking up the records under `folder`.
 
@@ -507,6 +535,7 @@ def search(
         starts: where to start, by the name of the trajectory; all go in lock-step.
         engine: auto, c or mjx.
         folder: of the records.
+        own: commands of trajectories that are not built in, by their name.
 
     Raises:
         ValueError: see `choose_engine`, `named_command` and `tuning.search.search`.
@@ -515,18 +544,17 @@ def search(
     engine = choose_engine(engine)
     make_folder(folder)
     size = config.population * len(starts)
-    about = {
-        "engine": engine,
+    about = {  # not the engine: both give a loss to seven digits
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
         "controller": repr(tune.rollout.walk),
         "loss": repr(tune.loss),
         "robot": fingerprint(robot),
         "plant": fingerprint(hfs()),
-        "commands": {name: fingerprint(named_command(name)) for name in (*COMMANDS, *starts)},
+        "commands": {name: fingerprint(_command(name, own)) for name in (*COMMANDS, *starts)},
     }
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        return losses_on_hfs(pool, tune, robot, engine, sets, size)
+        return losses_on_hfs(pool, tune, robot, engine, sets, size, own)
 
     with bar(f"searching on the high-fidelity simulator, engine {engine}") as tell:
 

@@ -10,8 +10,6 @@ joint that moves it, parallel to the trunk's when all joints are zero.
 """
 
 import difflib
-import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,14 +25,18 @@ from hector_jax.description import (
     Description,
     read_description,
 )
+from hector_jax.mjcf import read_mjcf, refusal
 
 # HECTOR's
 MODEL_PATH, STANDING = Description.model, Description.standing
 JOINT_NAMES, FOOT_POINTS = Description.joints, Description.foot_points
 
 _AXES = dict(zip("xyz", np.eye(3), strict=True))
-_MAX_BYTES = 1_000_000
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
+
+# MuJoCo writes its warnings into a file of the working directory; the counters in MjData, which
+# every walk reads, tell the same.
+mujoco.set_mju_user_warning(lambda message: None)
 
 
 class Robot(NamedTuple):
@@ -133,53 +135,20 @@ def compile_model(description: Description) -> mujoco.MjModel:
 
     Raises:
         ValueError: one line saying what came, what was expected and what there is. The MJCF must be
-            one self-contained XML of at most 1 MB, without DOCTYPE, that compiles to the biped of
-            this module's docstring.
+            one that `mjcf.read_mjcf` lets pass and that compiles to the biped of this module's
+            docstring.
     """
     path = description.model
-    text = _read(path)
+    root = read_mjcf(path)
     try:
-        model = mujoco.MjModel.from_xml_string(text)
+        model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"{path}: MuJoCo refuses it: {_one_line(error)}") from None
+        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
     _check_base(path, model)
     _check_joints(description, model)
     _check_motors(description, model)
     _check_feet(description, model)
     return model
-
-
-def _read(path: Path) -> str:
-    """Text of a description that is small, self-contained and well-formed."""
-    try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise ValueError(
-                f"{path}: {size / 1e6:.1f} MB, expected at most {_MAX_BYTES / 1e6:.0f} MB"
-            )
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot read the robot description: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ValueError(
-            f"{path}: not a text file, expected an MJCF description in UTF-8"
-        ) from None
-    found = re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE)
-    if found:
-        raise ValueError(f"{path}: {found[1].upper()} is not accepted, expected plain MJCF")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path}: malformed XML: {_one_line(error)}") from None
-    if root.tag != "mujoco":
-        raise ValueError(f"{path}: root element is <{root.tag}>, expected <mujoco>")
-    for element in root.iter():
-        if element.tag == "include" or "file" in element.attrib:
-            raise ValueError(
-                f"{path}: <{element.tag}> refers to {element.get('file')!r}, "
-                "expected one self-contained file"
-            )
-    return text
 
 
 def _check_base(path: Path, model: mujoco.MjModel) -> None:
@@ -320,7 +289,3 @@ def _missing(kind: str, name: str, names: Sequence[str]) -> str:
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(name for name in names if name) or "none"
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

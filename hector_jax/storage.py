@@ -25,9 +25,11 @@ import jax
 import numpy as np
 
 from hector_jax.control.weights import Weights
+from hector_jax.inputs import one_line, problem, read_text, shown
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
+_MOST_WEIGHTS = 1_000_000  # bytes
 _DIGEST = 64  # hexadecimal digits of a sha256
 _PACKAGES = (
     "hector-jax",
@@ -160,7 +162,7 @@ def load_tree(
     """
     arrays, card = _read(path)
     if card["kind"] != kind:
-        raise ValueError(f"{path}: holds {card['kind']}, expected {kind}")
+        raise ValueError(f"{path}: holds {shown(card['kind'])[1:-1]}, expected {kind}")
     if robot is not None and card["robot"] != (expected := fingerprint(robot)):
         raise ValueError(
             f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
@@ -168,8 +170,11 @@ def load_tree(
     wanted = _named_leaves(like)
     if arrays.keys() != wanted.keys():
         odd = sorted(arrays.keys() ^ wanted.keys())
-        raise ValueError(f"{path}: another layout of {kind}; fields that differ: {', '.join(odd)}")
+        told = one_line(", ".join(odd))
+        raise ValueError(f"{path}: another layout of {kind}; fields that differ: {told}")
     for name, leaf in wanted.items():
+        if (dtype := arrays[name].dtype).kind not in "biuf":
+            raise ValueError(f"{path}: {name} has type {dtype}, expected numbers")
         shape, got = np.shape(leaf), arrays[name].shape
         if len(shape) != len(got) or any(s not in (0, g) for s, g in zip(shape, got, strict=True)):
             text = ", ".join("any" if s == 0 else str(s) for s in shape)
@@ -193,18 +198,35 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise ValueError(f"{path}: cut or changed since it was written, or not a hector_jax file")
     try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("an entry is compressed")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         card = json.loads(str(arrays.pop("card")))
-    except (KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: no card or no plain arrays inside: {error}") from error
-    if card["format"] != FORMAT:
-        raise ValueError(f"{path}: file format {card['format']}, this version reads {FORMAT}")
+    except Exception as error:  # whoever made the archive chose what goes wrong
+        raise ValueError(f"{path}: no card or no plain arrays inside: {one_line(error)}") from error
+    _check_card(path, card)
     return arrays, card
+
+
+def _check_card(path: Path, card: Any) -> None:
+    if not isinstance(card, dict):
+        raise ValueError(f"{path}: card must be an object, got {shown(card)}")
+    if card.get("format") != FORMAT:
+        raise ValueError(
+            f"{path}: file format {shown(card.get('format'))}, this version reads {FORMAT}"
+        )
+    kinds = {"kind": str, "robot": str | None, "about": dict}
+    for name, kind in kinds.items():
+        if told := problem(card.get(name), kind):
+            raise ValueError(f"{path}: card.{name} {told}")
 
 
 def _read_bytes(path: Path) -> bytes:
     try:
+        if path.exists() and not path.is_file():  # a pipe or a device might never end
+            raise ValueError(f"cannot read {path}: not a plain file")
         return path.read_bytes()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
@@ -237,17 +259,22 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def save_weights(path: Path, weights: Weights) -> None:
-    """Write weights as JSON, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`.
+def weights_tree(weights: Weights) -> dict[str, Any]:
+    """Weights as JSON values, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`."""
+    return {
+        part: {name: np.asarray(value).tolist() for name, value in tree._asdict().items()}
+        for part, tree in weights._asdict().items()
+    }
+
+
+def save_weights(path: Path, weights: Weights, schema: str | None = None) -> None:
+    """Write weights as JSON, as `weights_tree`; with the place of a schema it names that first.
 
     Raises:
         OSError: where the file cannot be written.
     """
-    tree = {
-        "Q": {name: np.asarray(value).tolist() for name, value in weights.Q._asdict().items()},
-        "R": {name: np.asarray(value).tolist() for name, value in weights.R._asdict().items()},
-    }
-    write_file(path, (json.dumps(tree, indent=2) + "\n").encode())
+    tree = {} if schema is None else {"$schema": schema}
+    write_file(path, (json.dumps(tree | weights_tree(weights), indent=2) + "\n").encode())
 
 
 def load_weights(path: Path) -> Weights:
@@ -258,14 +285,15 @@ def load_weights(path: Path) -> Weights:
             shape, or not a positive number.
     """
     path = Path(path)
+    text = read_text(path, "weights", _MOST_WEIGHTS)
     try:
-        tree = json.loads(_read_bytes(path).decode(), object_pairs_hook=_no_twins)
-    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors too
-        if str(error).startswith("cannot read"):
-            raise
+        tree = json.loads(text, object_pairs_hook=_no_twins)
+    except ValueError as error:  # JSONDecodeError is one too
         raise ValueError(f"{path}: no valid JSON: {error}") from error
     except RecursionError as error:
         raise ValueError(f"{path}: no valid JSON: nested too deeply") from error
+    if isinstance(tree, dict):
+        tree.pop("$schema", None)  # for editors; what is in a file is checked here
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
         "Q": dict.fromkeys(State._fields, (3,)),
         "R": dict.fromkeys(Wrench._fields, (2, 3)),

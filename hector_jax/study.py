@@ -67,26 +67,17 @@ class _Plan:
 
 def _plan(args: flags.Table) -> _Plan:
     """Raises ValueError, before anything is computed, where the flags ask for what cannot be."""
-    least_of = {
-        "seeds": 1,
-        "first_seed": 0,
-        "iterations": PAPER_ITERATIONS,
-        "steps": 0,
-        "step_plants": 1,
-    }
-    for name, least in least_of.items():
-        if getattr(args, name) < least:
-            flag = name.replace("_", "-")
-            raise ValueError(f"--{flag} must be at least {least}, got {getattr(args, name)}")
+    flags.check(args)
     for name in args.trajectories:
         if name not in COMMANDS:
             raise ValueError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
     commands = {name: named_command(name) for name in args.trajectories}
     if len(commands) < len(args.trajectories) or not commands:
         raise ValueError(f"--trajectories must name each once, got {' '.join(args.trajectories)}")
+    seeds = range(args.first_seed, args.first_seed + args.seeds)
     return _Plan(
         commands,
-        range(args.first_seed, args.first_seed + args.seeds),
+        seeds,
         TuneConfig(iterations=args.iterations),
         TuneConfig(iterations=PAPER_ITERATIONS + args.steps) if args.steps else None,
         args.step_plants,
@@ -97,7 +88,7 @@ def _plan(args: flags.Table) -> _Plan:
             for name in args.trajectories
             if (args.ceiling / f"{name}.json").exists()
         },
-        None if args.earlier is None else table.load_earlier(args.earlier),
+        None if args.earlier is None else table.load_earlier(args.earlier, seeds),
     )
 
 
@@ -159,12 +150,19 @@ def make_table(
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, plan.tune, robot, args.data)
         searches = _search(pool, plan, robot, shelf)
-        tunings, judged = {}, {}
-        for name, command in plan.commands.items():
-            problems = {"without": (command, None), "with": (command, net.params)}
-            tunings[name], judged[name] = _walk_sets(
-                pool, plan, robot, name, problems, searches[name], plants, shelf, made_with
+        commit = made_with.get("commit", "")
+        tunings = {
+            name: _tune(pool, plan, robot, name, net.params, shelf / name, commit)
+            for name in plan.commands
+        }
+        # nothing that tunes or searches runs once the plants of the verdict are known
+        judges = plants(plan.seeds)
+        judged = {
+            name: _walk_sets(
+                pool, plan, robot, name, tuned, searches[name], judges, shelf / name, commit
             )
+            for name, tuned in tunings.items()
+        }
     verdicts = {name: _verdict(plan, found) for name, found in judged.items()}
     commits = {tuned.commit for each in tunings.values() for tuned in each.values()}
     commits |= {w.commit for found in judged.values() for ws in found.walks.values() for w in ws}
@@ -201,28 +199,20 @@ def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str,
     return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)
 
 
-def _walk_sets(
+def _tune(
     pool: Executor,
     plan: _Plan,
     robot: Robot,
     name: str,
-    problems: Mapping[str, tuple[Command, Params | None]],
-    searched: Found,
-    plants: Callable[[range], list[Imperfections]],
-    shelf: Path,
-    made_with: Mapping[str, str],
-) -> tuple[dict[str, Tuned], Judged]:
-    """The tunings of one trajectory, and the walks of all its sets."""
-    commit = made_with.get("commit", "")
-    tuned = kept.tune(
-        pool,
-        plan.tune,
-        robot,
-        problems,
-        shelf / name,
-        commit,
-        f"tuning {name} without and with GRFM-Net",
-    )
+    params: Params | None,
+    folder: Path,
+    commit: str,
+) -> dict[str, Tuned]:
+    """The tunings of one trajectory."""
+    command = plan.commands[name]
+    problems = {"without": (command, None), "with": (command, params)}
+    title = f"tuning {name} without and with GRFM-Net"
+    tuned = kept.tune(pool, plan.tune, robot, problems, folder, commit, title)
     if plan.walks is not None:
         try:
             tuned[WALKS] = kept.tune_measured(
@@ -230,36 +220,42 @@ def _walk_sets(
                 plan.walks,
                 robot,
                 tuned["with"].tuning.converged,
-                *problems["with"],
+                command,
+                params,
                 pipeline.measured_plants(plan.plants),
-                shelf / name,
+                folder,
                 commit,
                 f"tuning {name} further, along walks on the simulator",
             )
         except ValueError as error:  # a walk with the tuned weights falls
             say(f"{name}: no row {WALKS}: {error}")
+    return tuned
+
+
+def _walk_sets(
+    pool: Executor,
+    plan: _Plan,
+    robot: Robot,
+    name: str,
+    tuned: Mapping[str, Tuned],
+    searched: Found,
+    plants: list[Imperfections],
+    folder: Path,
+    commit: str,
+) -> Judged:
+    """The walks of all sets of one trajectory."""
     sets = {
         "nominal": nominal(),
         "expert": expert(),
         "searched": searched.weights,
-        **{f"{which}_ten": tuned[which].tuning.ten for which in problems},
+        **{f"{which}_ten": tuned[which].tuning.ten for which in ("without", "with")},
         **{which: one.tuning.converged for which, one in tuned.items()},
         **plan.extra[name],
     }
     title = f"judging {name} on {len(plan.seeds)} stand-in plants"
-    judged = kept.judge(
-        pool,
-        plan.tune,
-        robot,
-        sets,
-        plan.commands[name],
-        plants(plan.seeds),
-        plan.seeds,
-        shelf / name,
-        commit,
-        title,
-    )
-    return tuned, judged
+    command, seeds = plan.commands[name], plan.seeds
+    known = (sets, command, plants, seeds, folder, commit, title)
+    return kept.judge(pool, plan.tune, robot, *known)
 
 
 def _verdict(plan: _Plan, judged: Judged) -> Verdict:

@@ -7,8 +7,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
-    ["console", "runtime", "geometry"],
-    ["trajectory"],
+    ["console", "runtime", "geometry", "inputs"],
+    ["trajectory", "mjcf"],
     ["description"],
     ["robot"],
     ["model"],
@@ -17,21 +17,25 @@ FLOORS = [
     ["tuning", "sim"],
     ["grfm"],
     ["evaluation"],
-    ["flags", "pipeline"],
-    ["kept"],
+    ["replay"],
+    ["flags", "pipeline", "export"],
+    ["kept", "doctor"],
     ["study"],
     ["commands"],
     ["cli"],
 ]
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
-    "mujoco": ("robot", "sim", "evaluation.video"),
+    "mujoco": ("robot", "sim", "evaluation.video", "evaluation.view"),
+    "viser": ("evaluation.view",),
+    "trimesh": ("evaluation.view",),
     "flax": ("grfm.network",),
     "optax": ("grfm.training", "tuning.difftune", "tuning.rivals"),
     "jaxopt": ("control.qp",),
     "cmaes": ("tuning.search",),
     "sklearn": ("tuning.rivals",),
     "matplotlib": ("evaluation.plots",),
+    "tensorboardX": ("evaluation.tensorboard",),
     "tyro": ("cli",),
 }
 

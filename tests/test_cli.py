@@ -1,19 +1,25 @@
 """The console script as a person meets it: plain words, exit codes, one line for bad input."""
 
 import json
+import os
 import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import get_args
 
 import jax
 import numpy as np
 import pytest
+from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
-from hector_jax import commands
+from hector_jax import commands, doctor
 from hector_jax.cli import main
 from hector_jax.control.weights import expert
+from hector_jax.flags import Command, Tune, command_name, from_file
 from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
 from hector_jax.model.effect import last_command
 from hector_jax.pipeline import CollectConfig
@@ -38,13 +44,22 @@ def refused(monkeypatch, capsys, *arguments):
     return lines[0]
 
 
+def refused_flag(monkeypatch, capsys, *arguments):
+    """Runs a command with a flag that does not parse; what is said, without its box."""
+    with pytest.raises(SystemExit) as left:
+        call(monkeypatch, *arguments)
+    assert left.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    return " ".join(re.sub("[╭╮╰╯│─]", " ", err).split())
+
+
 def test_help_names_the_commands():
     shown = subprocess.run(
         [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
     )
     assert shown.returncode == 0
-    names = ("collect", "train", "grfm", "tune", "search", "table", "evaluate", "walk", "doctor")
-    for name in names:
+    for name in map(command_name, get_args(Command)):
         assert name in shown.stdout
     assert shown.stderr == ""
 
@@ -79,13 +94,13 @@ def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
 @pytest.mark.parametrize("command", ["walk", "evaluate"])
 def test_a_walk_of_no_length_is_refused(monkeypatch, capsys, command):
     line = refused(monkeypatch, capsys, command, "--traj", "eight", "--seconds", "0")
-    assert "--seconds must be above 0 and at most 600, got 0.0" in line
+    assert "--seconds must be a number above 0 and at most 600, got 0.0" in line
 
 
 def test_unknown_world(monkeypatch, capsys):
-    line = refused(monkeypatch, capsys, "walk", "--world", "moon")
-    assert "moon" in line
-    assert "standin" in line
+    said = refused_flag(monkeypatch, capsys, "walk", "--world", "moon")
+    assert "moon" in said
+    assert "standin" in said
 
 
 @pytest.mark.parametrize(
@@ -113,6 +128,11 @@ def test_missing_weights_file(monkeypatch, capsys, tmp_path):
     assert "none.json" in line
 
 
+def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, capsys):
+    line = refused(monkeypatch, capsys, "walk", "--weights", "exprt")
+    assert "no weights 'exprt'; did you mean 'expert'?; there are: nominal, expert, or" in line
+
+
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("mine")
@@ -124,9 +144,8 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "expected"),
     [
-        (("--engine", "warp"), "engine"),
         (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        (("--seconds", "nan"), "at least 0.03 s"),
+        (("--seconds", "nan"), "--seconds must be a number that is finite, got nan"),
         (("--walks", "2"), "at least 3"),
     ],
 )
@@ -217,7 +236,7 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     [
         (("--budget", "9"), "budget"),
         (("--population", "2"), "population"),
-        (("--engine", "warp"), "engine"),
+        (("--seed", "-1"), "--seed must be a whole number of at least 0 and"),
         (("--start", "none.json"), "none.json"),
     ],
 )
@@ -249,8 +268,37 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
     assert call(monkeypatch, *flags, *folders) == 0
     assert capsys.readouterr().out == shown
     assert kept == {path: path.read_bytes() for path in tmp_path.rglob("*.json*")}
+    assert call(monkeypatch, *flags, *folders, "--json") == 0
+    cards = json.loads(capsys.readouterr().out)["cards"]
+    assert cards == {n: json.loads(kept[tmp_path / "found" / f"{n}-card.json"]) for n in cards}
     line = refused(monkeypatch, capsys, *flags, *folders, "--seed", "1")
     assert "another search" in line
+
+
+@pytest.mark.parametrize("asked", ["json", "words"])
+def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_path, asked):
+    errors = {"raw": {"force": 2.0, "moment": 1.0}, "net": {"force": 0.5, "moment": 0.25}}
+    monkeypatch.setattr(
+        commands.pipeline, "train", lambda *args: SimpleNamespace(errors=errors, args=args)
+    )
+    more = ("--json",) if asked == "json" else ()
+    assert call(monkeypatch, "train", "--out", tmp_path / "net.npz", *more) == 0
+    out = capsys.readouterr().out
+    if asked == "json":
+        assert json.loads(out) == {"net": str(tmp_path / "net.npz"), "errors": errors}
+    else:
+        assert [line.split()[0] for line in out.splitlines()[1:]] == ["raw", "net"]
+
+
+def test_a_table_prints_json_and_nothing_else(monkeypatch, capsys, tmp_path):
+    verdict = pretend_verdict()
+    made = (tmp_path / "report.md", {"c": verdict, "s": verdict})
+    monkeypatch.setattr(commands.study, "make_table", lambda *args: made)
+    assert call(monkeypatch, "table", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["report"] == str(made[0])
+    assert told["trajectories"].keys() == {"c", "s"}
+    assert told["trajectories"]["c"]["sets"].keys() == set(verdict.scores)
 
 
 @pytest.mark.slow
@@ -261,9 +309,18 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
     monkeypatch.setattr(commands.pipeline, "REFRESH", replace(small, walks=4))
     flags = ("--seeds", "2", "--iterations", "11", "--refresh", "1")
-    assert call(monkeypatch, "tune", *flags, "--run", "run") == 0
+    assert call(monkeypatch, "tune", *flags, "--run", "run", "--json") == 0
     out = capsys.readouterr().out
     run = tmp_path / "run"
+    assert json.loads(out) == {
+        "run": "run",
+        "traj": "straight",
+        **json.loads((run / "result.json").read_text()),
+    }
+    assert from_file(Tune, run / "config.json") == Tune(
+        seeds=2, iterations=11, refresh=1, json=True
+    )
+    assert float(json.loads((run / "versions.json").read_text())["seconds"]) > 0.0
     names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "with_refreshed"]
     for name in names:
         assert name in out
@@ -307,6 +364,10 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     out = capsys.readouterr().out
     for name in commands.study.SETS:
         assert name in out
+    assert call(monkeypatch, "table", *flags, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert set(commands.study.SETS) <= told["trajectories"]["c"]["sets"].keys()
+    assert Path(told["report"]).exists()
     assert (tmp_path / "runs/table/pictures/c.png").stat().st_size > 50_000
 
 
@@ -322,8 +383,6 @@ def test_the_table_refuses_wrong_flags_in_one_line(monkeypatch, capsys, tmp_path
         ("--processes", "0"),
         ("--iterations", "3"),
         ("--seeds", "0"),
-        ("--alpha", "both"),
-        ("--variant", "papier"),
         ("--refresh", "-1"),
     ],
 )
@@ -331,3 +390,120 @@ def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong)
     line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)
     assert wrong[0].lstrip("-") in line
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "flag", "wrong", "known"),
+    [
+        ("tune", "--alpha", "both", "auto"),
+        ("tune", "--variant", "papier", "residual"),
+        ("search", "--engine", "warp", "mjx"),
+        ("collect", "--engine", "warp", "mjx"),
+        ("evaluate", "--world", "srbm", "hfs-varied"),
+        ("walk", "--seconds", "long", "float"),
+        ("tune", "--sedes", "3", "--seeds"),
+        ("completion", "cmd.exe", "", "fish"),
+    ],
+)
+def test_flags_that_do_not_parse_name_what_is_known(
+    monkeypatch, capsys, tmp_path, command, flag, wrong, known
+):
+    monkeypatch.chdir(tmp_path)
+    said = refused_flag(monkeypatch, capsys, *filter(None, (command, flag, wrong)))
+    assert flag in said
+    assert wrong in said
+    assert known in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", [command_name(kind) for kind in get_args(Command)])
+def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, name):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as left:
+        call(monkeypatch, name, "--help")
+    assert left.value.code == 0
+    shown = capsys.readouterr().out
+    assert f"Example: hector {name}" in shown
+    untold = [
+        line for line in shown.splitlines() if re.search(r"--[\w-]+( \S+)?  +\(default", line)
+    ]
+    assert untold == []
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_prints_a_script_that_knows_the_commands(monkeypatch, capsys, tmp_path, shell):
+    with pytest.raises(SystemExit) as left:
+        call(monkeypatch, "completion", shell)
+    assert left.value.code in (0, None)
+    script = capsys.readouterr().out
+    for word in ("evaluate", "--first-seed", "hfs-varied", "--config"):
+        assert word.removeprefix("--") in script
+    if shell == "bash":
+        path = tmp_path / "hector"
+        path.write_text(script)
+        checked = subprocess.run(["bash", "-n", path], capture_output=True, text=True)
+        assert (checked.returncode, checked.stderr) == (0, "")
+        ask = (
+            f"source {path}; COMP_WORDS=(hector ev); COMP_CWORD=1; COMP_LINE='hector ev'; "
+            "COMP_POINT=9; $(complete -p hector | sed 's/.*-F \\([^ ]*\\).*/\\1/') hector ev; "
+            'echo "${COMPREPLY[@]}"'
+        )
+        asked = subprocess.run(["bash", "-c", ask], capture_output=True, text=True)
+        assert asked.stdout.split() == ["evaluate"]
+
+
+def test_a_doctor_that_finds_a_fault_leaves_with_one(monkeypatch, capsys):
+    walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
+    monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
+    monkeypatch.setattr(doctor, "_video", lambda *args: "not looked at")
+    monkeypatch.setattr(doctor, "SOLVED", -1.0)
+    assert call(monkeypatch, "doctor", "--json") == 1
+    out, err = capsys.readouterr()
+    faults = [f"self-test: the robot does not walk in {world}" for world in walks]
+    assert json.loads(out)["faults"] == faults
+    assert err == f"hector: {'; '.join(faults)}\n"
+
+
+def test_a_doctor_without_a_device_says_so():
+    shown = subprocess.run(
+        [sys.executable, "-m", "hector_jax.cli", "doctor"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "JAX_PLATFORMS": "abacus"},
+    )
+    assert shown.returncode == 1
+    assert "hector: JAX finds no device: " in shown.stderr
+    assert "abacus" in shown.stderr
+    assert "Traceback" not in shown.stderr
+
+
+def test_a_sound_machine_passes_the_doctor(monkeypatch, capsys):
+    walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
+    monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
+    monkeypatch.setattr(doctor, "_video", lambda *args: "not looked at")
+    assert call(monkeypatch, "doctor", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["faults"] == []
+    assert told["precision"] == "float64"
+    assert told["robot"].startswith(str(MODEL_PATH))
+    assert {"python", "jax", "mujoco", "devices", "cache", "extras", "video"} <= told.keys()
+    told = doctor.examine()[0]  # without --json the same lines
+    assert call(monkeypatch, "doctor") == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(told)
+
+
+def test_a_reader_that_has_enough_is_no_error():
+    shown = subprocess.run(
+        [
+            "bash",
+            "-c",
+            f"{sys.executable} -m hector_jax.cli completion bash | head -n 1; "
+            f"{sys.executable} -c 'from hector_jax.console import exit_code; "
+            'exit(exit_code("x", lambda: print("y\\n" * 99999)))\' | head -n 1; '
+            "exit ${PIPESTATUS[0]}",
+        ],
+        capture_output=True,
+        text=True,
+    )
+    assert shown.returncode == 141
+    assert shown.stderr == ""

@@ -45,6 +45,11 @@ def test_start_weights_of_no_known_name_are_refused(name):
         script(name).Flags(sets=("foo",))
 
 
+def test_transfer_without_weight_sets_is_refused():
+    with pytest.raises(ValueError, match="Flags.sets must name one at least of nominal"):
+        script("transfer").Flags(sets=())
+
+
 def test_online_asks_for_no_file_by_itself_and_for_whole_windows():
     online = script("online")
     flags = online.Flags()

@@ -1,6 +1,7 @@
 """What is kept is taken up, and only where the same is asked."""
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import jax
 import numpy as np
@@ -10,7 +11,9 @@ from pretend import pretend_history, pretend_walk
 from hector_jax import kept, pipeline
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import bounds, expert, nominal
+from hector_jax.evaluation import metrics
 from hector_jax.robot import load_robot
+from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
@@ -28,7 +31,7 @@ def tuned(monkeypatch):
     """Names of the problems that are really tuned."""
     names = []
 
-    def tune_many(pool, config, robot, problems, title):
+    def tune_many(pool, config, robot, problems, title, dumps):
         names.extend(problems)
         return dict.fromkeys(problems, TUNING)
 
@@ -148,3 +151,34 @@ def test_the_digest_tells_settings_trees_and_seeds_apart():
         kept.digest(CONFIG, ROBOT, nominal(), None),
     }
     assert len(found) == 5
+
+
+def test_groups_of_walks_are_kept_one_by_one(tmp_path):
+    jobs = [Job(nominal(), S, hfs(), seed=seed) for seed in range(4)]
+    groups = {"a": jobs[:1], "b": jobs[1:]}
+    walked = []
+
+    def walk(asked):
+        for job in asked:
+            if job.seed in walk.bad:
+                raise KeyboardInterrupt
+            walked.append(job.seed)
+            yield pretend_walk(job.seed, 0.02, 1.0)
+
+    def scores(config=CONFIG):
+        tell = partial(metrics.score, config.loss)
+        like = jax.tree.map(lambda x: x[None][:0], kept._walked_like()[0])
+        known = (walk, tell, like, "test", ROBOT, tmp_path, (config,), "")
+        return kept.walk_groups(groups, *known)
+
+    walk.bad = {2}
+    with pytest.raises(KeyboardInterrupt):
+        scores()
+    walk.bad = set()
+    found = scores()
+    assert walked == [0, 1, 1, 2, 3]  # the whole group is there, of the cut one nothing
+    assert found["b"].L.shape == (3,)
+    same(found, scores())
+    assert len(walked) == 5
+    scores(TuneConfig(iterations=20))
+    assert len(walked) == 9

@@ -146,5 +146,5 @@ def test_the_total_is_weighted_by_the_alphas():
 
 @pytest.mark.parametrize("wrong", [{"euler": -1.0}, {"position": float("nan")}])
 def test_negative_weights_are_refused(wrong):
-    with pytest.raises(ValueError, match="must be >= 0"):
+    with pytest.raises(ValueError, match="must be a number of at least 0"):
         LossConfig(**wrong)

@@ -77,9 +77,9 @@ def test_a_scene_becomes_the_walk_of_a_set_on_a_plant():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"phases": 0}, "phases must be at least 1, got 0"),
-        ({"forces": (50.0, -1.0)}, "forces must be positive and differ"),
-        ({"frictions": ()}, "frictions must be positive and differ, at least one, got"),
+        ({"phases": 0}, "phases must be a whole number of at least 1, got 0"),
+        ({"forces": (50.0, -1.0)}, "forces must be a number above 0, got -1.0 in"),
+        ({"frictions": ()}, "frictions must differ, at least one, got"),
     ],
 )
 def test_scenes_that_make_no_sense_are_refused(wrong, message):

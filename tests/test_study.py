@@ -32,7 +32,7 @@ def asked(monkeypatch):
         one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(starts, one)
 
-    def tune_many(pool, config, robot, problems, title):
+    def tune_many(pool, config, robot, problems, title, dumps):
         told["tunings"].append((config.iterations, *problems))
         return dict.fromkeys(problems, Tuning(pretend_history(12), nominal(), expert(), "done"))
 
@@ -59,6 +59,20 @@ def asked(monkeypatch):
     monkeypatch.setattr(kept, "load_tuning", lambda path, robot: None)
     monkeypatch.setattr(study, "write_video", write_video)
     return told
+
+
+def test_the_plants_of_the_verdict_are_asked_for_once_and_after_all_that_tunes(tmp_path, asked):
+    seen = []
+
+    def late(seeds):
+        seen.append([names for _, *names in asked["tunings"]])
+        assert "search" in asked
+        assert asked["walks"] == 0
+        return plants(seeds)
+
+    names = ("straight", "c", "s")
+    study.make_table(table(tmp_path, quick=True, trajectories=names), late)
+    assert seen == [[["without", "with"]] * 3]
 
 
 def table(tmp_path, **changes):
@@ -113,11 +127,11 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"seeds": 0}, "--seeds must be at least 1, got 0"),
-        ({"first_seed": -1}, "--first-seed must be at least 0, got -1"),
-        ({"steps": -1}, "--steps must be at least 0, got -1"),
+        ({"seeds": 0}, "--seeds must be a whole number of at least 1, got 0"),
+        ({"first_seed": -1}, "--first-seed must be a whole number of at least 0 and .*got -1"),
+        ({"steps": -1}, "--steps must be a whole number of at least 0, got -1"),
         ({"trajectories": ("turn",)}, "--trajectories must be of straight, c, s, got turn"),
-        ({"iterations": 3}, "--iterations must be at least 10, got 3"),
+        ({"iterations": 3}, "--iterations must be a whole number of at least 10, got 3"),
         ({"rollouts": 3}, "budget must be at least one generation"),
         ({"trajectories": ("moon",)}, "--trajectories must be of straight, c, s, got moon"),
         ({"trajectories": ("s", "s")}, "--trajectories must name each once, got s s"),
@@ -127,7 +141,7 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
         ({"extra": ("a=x", "a=y")}, "--extra a=y: there is a set 'a' already"),
         ({"extra": ("a=nowhere",)}, "cannot read nowhere/straight.json"),
         ({"earlier": Path("nowhere.json")}, "cannot read nowhere.json"),
-        ({"processes": 0}, "processes must be at least 1, got 0"),
+        ({"processes": 0}, "--processes must be a whole number of at least 1, got 0"),
     ],
 )
 def test_wrong_flags_are_told_before_anything_is_computed(tmp_path, changes, words):

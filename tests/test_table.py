@@ -105,8 +105,10 @@ def test_the_ranking_is_by_the_median_of_the_paired_ratio():
 
 def test_the_order_is_held_against_that_of_an_earlier_table(tmp_path):
     write_table(tmp_path, whole(s=judged(**GOOD, mine=1e6)))
-    earlier = table.load_earlier(tmp_path / "table.json")
+    earlier = table.load_earlier(tmp_path / "table.json", range(4, 8))
     assert earlier.seeds == "0-3"
+    with pytest.raises(ValueError, match=r"table.json: a table of seeds 0-3 too"):
+        table.load_earlier(tmp_path / "table.json", range(4))
     (same,) = table.same_order({"s": judged(**GOOD)}, earlier)
     assert (same.holds, same.measured) == (True, "all 5")
     (other,) = table.same_order({"s": judged(**GOOD | {"with": 2.5e6})}, earlier)
@@ -123,7 +125,7 @@ def test_a_file_that_is_no_table_is_refused(tmp_path, content):
     if content is not None:
         path.write_text(content)
     with pytest.raises(ValueError, match="table.json"):
-        table.load_earlier(path)
+        table.load_earlier(path, range(4))
 
 
 def test_the_four_files_tell_the_same_numbers(tmp_path):

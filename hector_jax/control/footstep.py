@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hector_jax.geometry import rot_z
+from hector_jax.inputs import NOT_NEGATIVE, check
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State
 
@@ -25,8 +26,7 @@ class FootstepConfig:
     turn: float = 0.5  # share of the lean (z/g) v x omega
 
     def __post_init__(self) -> None:
-        if self.rule not in ("raibert", "paper"):
-            raise ValueError(f"FootstepConfig.rule must be 'raibert' or 'paper', got {self.rule!r}")
+        check(self, rule=("raibert", "paper"), width=NOT_NEGATIVE)
 
 
 def touchdown_points(

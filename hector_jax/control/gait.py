@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, check
+
 
 @dataclass(frozen=True)
 class GaitConfig:
@@ -22,11 +24,11 @@ class GaitConfig:
     cycles: int = 2  # gait cycles in place before t = 0 (MuJoCo worlds)
 
     def __post_init__(self) -> None:
-        if self.tick <= 0.0:
-            raise ValueError(f"GaitConfig.tick must be positive [s], got {self.tick}")
-        if self.swing < 1 or self.stance < self.swing or (self.stance + self.swing) % 2:
+        rules = {"tick": POSITIVE, "stance": SOME, "swing": SOME}
+        check(self, **rules, stand=NOT_NEGATIVE, cycles=NOT_NEGATIVE)
+        if self.stance < self.swing or (self.stance + self.swing) % 2:
             raise ValueError(
-                "GaitConfig needs swing >= 1, stance >= swing and an even cycle, "
+                "GaitConfig.stance must be at least swing and make an even cycle with it, "
                 f"got stance {self.stance}, swing {self.swing}"
             )
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.geometry import rot_z, rotation_from_euler, wrap_angle
+from hector_jax.inputs import NOT_NEGATIVE, check, shown
 from hector_jax.model.kinematics import foot_jacobians, inverse_legs, leg_gravity
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
@@ -36,10 +37,10 @@ class LegConfig:
     stance_weight: bool = False  # add the leg's own weight to the stance torque
 
     def __post_init__(self) -> None:
+        check(self, height=NOT_NEGATIVE, kp=NOT_NEGATIVE, kd=NOT_NEGATIVE)
         for name in ("kp", "kd"):
-            gains = getattr(self, name)
-            if len(gains) != 5 or min(gains) < 0.0:
-                raise ValueError(f"LegConfig.{name} needs five gains >= 0, got {gains}")
+            if len(gains := getattr(self, name)) != 5:
+                raise ValueError(f"LegConfig.{name} must be five gains, got {shown(gains)}")
 
 
 def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:

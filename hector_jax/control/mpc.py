@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float
 from hector_jax.control.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.control.weights import Weights
 from hector_jax.geometry import rot_z
+from hector_jax.inputs import POSITIVE, SOME, check
 from hector_jax.model import srbm
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench, pack_wrench, unpack_wrench
@@ -49,15 +50,14 @@ class MpcConfig:
     qp: QpConfig = QpConfig()
 
     def __post_init__(self) -> None:
-        if self.horizon < 1 or self.step_ticks < 1:
-            raise ValueError(
-                "MpcConfig needs horizon >= 1 and step_ticks >= 1, "
-                f"got {self.horizon}, {self.step_ticks}"
-            )
-        if self.effort_about not in ("zero", "weight"):
-            raise ValueError(
-                f"MpcConfig.effort_about must be 'zero' or 'weight', got {self.effort_about!r}"
-            )
+        check(
+            self,
+            horizon=SOME,
+            step_ticks=SOME,
+            friction=POSITIVE,
+            max_force=POSITIVE,
+            effort_about=("zero", "weight"),
+        )
 
 
 class Horizon(NamedTuple):

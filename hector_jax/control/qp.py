@@ -43,6 +43,7 @@ from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, Int
 
 from hector_jax.control import pivot
+from hector_jax.inputs import POSITIVE, SOME, check
 
 SAVED = "qp"
 """Name of what `jax.checkpoint` is to keep of a solve, so that none is solved again backwards."""
@@ -115,14 +116,14 @@ class QpConfig:
     ratio_cap: float | None = None
 
     def __post_init__(self) -> None:
-        if self.solver not in ("interior_point", "jaxopt"):
-            raise ValueError(
-                f'QpConfig.solver is "{self.solver}"; there are "interior_point" and "jaxopt"'
-            )
-        for name in ("tolerance", "active_set_tries", "max_iterations", "ratio_cap"):
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"QpConfig.{name} is {value}; expected a positive number")
+        check(
+            self,
+            solver=("interior_point", "jaxopt"),
+            tolerance=POSITIVE,
+            active_set_tries=SOME,
+            max_iterations=SOME,
+            ratio_cap=POSITIVE,
+        )
 
 
 class _Floors(NamedTuple):

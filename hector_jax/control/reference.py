@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
+from hector_jax.inputs import did_you_mean, shown
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State
 
@@ -75,7 +76,10 @@ def named_command(name: str) -> Command:
         ValueError: the name is none of them.
     """
     if name not in _PIECES:
-        raise ValueError(f"unknown trajectory {name!r}; there are: {', '.join(_PIECES)}")
+        raise ValueError(
+            f"unknown trajectory {shown(name)}{did_you_mean(name, _PIECES)}; "
+            f"there are: {', '.join(_PIECES)}"
+        )
     seconds, velocity, rates = _PIECES[name]
     return Command(np.full(2, seconds), np.array(velocity), np.array(rates))
 

@@ -5,9 +5,8 @@ along; the MuJoCo worlds call `step_plan` and `actuate` with what they measure. 
 the nominal robot only, never the plant's own numbers.
 """
 
-import math
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +19,8 @@ from hector_jax.control.legs import LegConfig, joint_torques, swing_joints, trun
 from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
-from hector_jax.description import unknown
 from hector_jax.geometry import rotation_from_euler, wrap_angle
+from hector_jax.inputs import check, from_table
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
@@ -37,9 +36,10 @@ class WalkConfig:
     legs: LegConfig = LegConfig()
 
     def __post_init__(self) -> None:
+        check(self)
         if 2 * self.gait.tick > self.mpc_step + 1e-12:
             raise ValueError(
-                "the plan interval must be at most half the MPC step, "
+                "WalkConfig.gait.tick must be at most half the MPC step, "
                 f"got tick {self.gait.tick} s and step {self.mpc_step} s"
             )
 
@@ -57,40 +57,11 @@ def walk_config(robot: Robot) -> WalkConfig:
     """
     path, given = robot.description.path, dict(robot.description.control)
     kinds = {"gait": GaitConfig, "mpc": MpcConfig, "footstep": FootstepConfig, "legs": LegConfig}
-    try:
-        parts = {name: _part(name, kind, given.get(name, ())) for name, kind in kinds.items()}
-        return WalkConfig(**parts)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
-def _part(name: str, kind: type, given: tuple[tuple[str, Any], ...]) -> Any:
-    """Settings of a part of the controller, from the description's section of that name."""
-    defaults = {
-        field.name: field.default for field in fields(kind) if not is_dataclass(field.default)
+    parts = {
+        name: from_table(f"{path}: {name}", kind, dict(given.get(name, ())))
+        for name, kind in kinds.items()
     }
-    settings = {}
-    for key, value in given:
-        if key not in defaults:
-            raise ValueError(f"unknown key {name + '.' + key!r}; {unknown(key, defaults)}")
-        settings[key] = _as(defaults[key], value)
-        if settings[key] is None:
-            like = defaults[key]
-            raise ValueError(f"{name}.{key} is {value!r}, expected a value such as {like!r}")
-    return kind(**settings)
-
-
-def _as(like: Any, value: Any) -> Any:
-    """The value where it is of the same kind as another, else None."""
-    if isinstance(like, tuple):
-        if not isinstance(value, tuple) or len(value) != len(like):
-            return None
-        each = tuple(map(_as, like, value))
-        return None if None in each else each
-    if isinstance(like, float) and type(value) is int:
-        return float(value)
-    good = type(value) is type(like) and (type(value) is not float or math.isfinite(value))
-    return value if good else None
+    return from_table(str(path), WalkConfig, parts)
 
 
 class Feet(NamedTuple):

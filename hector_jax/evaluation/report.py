@@ -150,9 +150,8 @@ def _compared(verdict: Verdict, name: str, baseline: str) -> Comparison | None:
     return compare(verdict, name, baseline) if known else None
 
 
-def seeds_text(verdict: Verdict) -> str:
-    """The seeds, as a range where they are one."""
-    seeds = verdict.seeds
+def seeds_text(seeds: Sequence[int] | np.ndarray) -> str:
+    """Seeds as a range where they are one."""
     if len(seeds) > 1 and np.array_equal(seeds, np.arange(seeds[0], seeds[0] + len(seeds))):
         return f"{seeds[0]}-{seeds[-1]}"
     return ", ".join(map(str, seeds))
@@ -168,9 +167,9 @@ def _power(x: float) -> str:
 
 def legend(verdict: Verdict) -> list[str]:
     """What the columns of a verdict mean."""
-    count = len(verdict.seeds)
+    plants = f"{len(verdict.seeds)} plants (seeds {seeds_text(verdict.seeds)})"
     lines = [
-        f"{_formula(verdict.alpha)}; means over {count} plants (seeds {seeds_text(verdict)}).",
+        f"{_formula(verdict.alpha)}; means over {plants}.",
         "Change of L in %, median over plants of the paired ratio [95 % bootstrap interval]; "
         "below zero is better.",
     ]
@@ -350,11 +349,11 @@ def _drift_table(found: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
     return markdown_table(("", *found), rows)
 
 
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; the first column to the left, the others to the right."""
-    line = lambda cells: "| " + " | ".join(cells) + " |"  # noqa: E731
-    rule = "|" + "|".join([" :--- "] + [" ---: "] * (len(head) - 1)) + "|"
-    return "\n".join([line(head), rule, *map(line, rows)])
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:
+    """A table in Markdown; as many first columns as are words to the left, numbers to the right."""
+    line = lambda cells: f"| {' | '.join(cells)} |"  # noqa: E731
+    rule = [":---" if i < words else "---:" for i in range(len(head))]
+    return "\n".join(map(line, [head, rule, *rows]))
 
 
 def _summary(verdict: Verdict) -> str:
@@ -485,7 +484,7 @@ def _reasons(refused: Sequence[Iteration]) -> str:
     """Why steps were refused, and which."""
     steps: dict[str, list[str]] = {}
     for i in refused:
-        steps.setdefault(re.sub(r" \d.*", "", i.reason), []).append(str(i.iteration))
+        steps.setdefault(re.sub(r" (\d|inf|nan).*", "", i.reason), []).append(str(i.iteration))
     told = [f"{reason} (iteration {', '.join(which)})" for reason, which in steps.items()]
     return ": " + "; ".join(told) if told else ""
 

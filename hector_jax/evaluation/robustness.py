@@ -15,9 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import UNSEEN, Command, named_command
+from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
 from hector_jax.control.weights import Weights
 from hector_jax.evaluation.metrics import FALL_MARGIN, Interval, Score, bootstrap
+from hector_jax.evaluation.report import markdown_table
+from hector_jax.inputs import POSITIVE, SOME, check, shown
 from hector_jax.sim.changes import Change
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push
@@ -73,13 +75,13 @@ class SceneConfig:
     phases: int = 3  # of the gait, at which a push or a slippery floor begins
 
     def __post_init__(self) -> None:
-        if self.phases < 1:
-            raise ValueError(f"SceneConfig.phases must be at least 1, got {self.phases}")
+        trajectories = (*COMMANDS, *UNSEEN)
+        check(self, traj=trajectories, forces=POSITIVE, frictions=POSITIVE, phases=SOME)
         for name in ("forces", "frictions"):
             values = getattr(self, name)
-            if not values or not min(values) > 0.0 or len(set(values)) < len(values):
+            if not values or len(set(values)) < len(values):
                 raise ValueError(
-                    f"SceneConfig.{name} must be positive and differ, at least one, got {values}"
+                    f"SceneConfig.{name} must differ, at least one, got {shown(values)}"
                 )
 
 
@@ -190,13 +192,13 @@ def table(cells: Mapping[Level, Mapping[str, Cell]], losses: Mapping[Level, floa
     baseline, *others = next(iter(cells.values()))
     head = ["", f"{baseline}: falls", "L [1e6]"]
     head += [text for name in others for text in (f"{name}: falls", f"L / {baseline}")]
-    rows = [head, ["---"] + ["---:"] * (len(head) - 1)]
+    rows = []
     for level, found in cells.items():
         row = [level.name, _falls(found[baseline]), f"{losses[level] / 1e6:.2f}"]
         for name in others:
             row += [_falls(found[name]), _ratio(found[name])]
         rows.append(row)
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return markdown_table(head, rows)
 
 
 def _falls(cell: Cell) -> str:

@@ -221,12 +221,23 @@ def ranking(verdict: Verdict) -> list[str]:
     return sorted(verdict.scores, key=lambda name: float(np.median(verdict.scores[name].L / base)))
 
 
-def load_earlier(path: Path) -> Earlier:
-    """The order of the sets in a table.json.
+def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
+    """The order of the sets in a table.json of other plants than those of `seeds`.
 
     Raises:
-        ValueError: one line naming the file, where it cannot be read or is no such file.
+        ValueError: one line naming the file, where it cannot be read, is no such file, or is of the
+            same plants, on which the order would be the same by itself.
     """
+    earlier = _load_earlier(path)
+    if earlier.seeds == seeds_text(seeds):
+        raise ValueError(
+            f"{path}: a table of seeds {earlier.seeds} too; the order is to be held against that "
+            "on other plants"
+        )
+    return earlier
+
+
+def _load_earlier(path: Path) -> Earlier:
     try:
         told = json.loads(path.read_text())
         rankings = {name: list(one["ranking"]) for name, one in told["trajectories"].items()}
@@ -512,7 +523,7 @@ def _result(table: Table, found: Mapping[tuple[str, str], Line]) -> dict[str, An
         "command": table.command,
         "environment": dict(table.environment),
         "commits": list(table.commits),
-        "seeds": seeds_text(next(iter(table.verdicts.values()))),
+        "seeds": seeds_text(next(iter(table.verdicts.values())).seeds),
         "config": dict(table.config),
         "bars": [bar._asdict() for bar in _all_bars(table, found)],
         "aims": [bar._asdict() for bar in aims(found)],
@@ -555,7 +566,7 @@ def _tex(verdicts: Mapping[str, Verdict], found: Mapping[tuple[str, str], Line])
     """A tabular that asks for no package; the smallest mean of a trajectory is bold."""
     scales = {"L_Eul": 1.0, "L_pos": 1.0, "L_ctrl": 1e-3, "L": 1e-6}
     first = next(iter(verdicts.values()))
-    seeds = seeds_text(first)
+    seeds = seeds_text(first.seeds)
     head = [
         "",
         r"$L_\mathrm{Eul}$ [rad$^2$]",

@@ -7,7 +7,7 @@ handful of phases such an interval is narrow rather than wide, and it tells noth
 commands.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.stats import spearmanr
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
 from hector_jax.control.weights import Weights, directions, moved, weights_to_vector
 from hector_jax.evaluation.metrics import COVERAGE, RESAMPLES, Interval
+from hector_jax.evaluation.report import markdown_table
 
 SAG = ("Q_z", "Q_vz", "R_Fz")
 """What a rigid body that sinks, or a robot that floats, pulls at."""
@@ -140,13 +141,6 @@ def rank_correlation(
     return float(spearmanr(model[kept], simulator[kept]).statistic)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown; the first two columns to the left, the others to the right."""
-    line = lambda cells: "| " + " | ".join(cells) + " |"  # noqa: E731
-    sides = [":---" if i < 2 else "---:" for i in range(len(head))]
-    return "\n".join([line(head), line(sides), *map(line, rows)])
-
-
 def _told(value: Interval | None) -> str:
     if value is None:
         return ""
@@ -166,7 +160,7 @@ def gradient_table(rows: Mapping[tuple[str, str], Row | None]) -> str:
             continue
         cells = (row.cosine, row.beyond_sag, row.gain, row.gain_beyond_sag)
         lines.append((trajectory, kind, *map(_told, cells), f"{row.wrong}, {row.share:.0%}"))
-    return table(head, lines)
+    return markdown_table(head, lines, words=2)
 
 
 def wrong_sentence(trajectory: str, kind: str, row: Row) -> str:
@@ -187,7 +181,8 @@ def rank_table(ranks: Mapping[tuple[str, str], Mapping[str, float]]) -> str:
     """Rank correlations by trajectory and phi, and by how far the weights were disturbed."""
     factors = next(iter(ranks.values()), {})
     rows = [(*key, *(f"{value:.3f}" for value in row.values())) for key, row in ranks.items()]
-    return table(("trajectory", "phi", *(f"within x/{factor}" for factor in factors)), rows)
+    head = ("trajectory", "phi", *(f"within x/{factor}" for factor in factors))
+    return markdown_table(head, rows, words=2)
 
 
 def verdict(rows: Mapping[tuple[str, str], Row | None], kind: str) -> str:

@@ -12,10 +12,10 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import imageio_ffmpeg
 import jax
@@ -26,21 +26,31 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from hector_jax.geometry import rotation_from_euler
+from hector_jax.inputs import POSITIVE, SOME, Interval, check
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
+METRES_PER_NEWTON = 0.35 / 120.0  # the robot's weight is an arrow of 35 cm
+LEAST_ARROW = 0.03  # [m]; shorter ones are not drawn
 
 _PATIENCE = 300.0  # [s] for a back end to draw the whole film
 _HEIGHT = 0.423  # [m] of the centre of mass of the robot that the camera is set for
 _TRAILS = ((0.72, 0.13, 0.20, 1.0), (0.0, 0.48, 0.37, 1.0))  # colours of before and after
 _REFERENCE = (0.08, 0.08, 0.10, 1.0)
-_ARROW = (0.93, 0.42, 0.11, 0.9)
-_METRES_PER_NEWTON = 0.35 / 120.0  # the robot's weight is an arrow of 35 cm
+_ARROW = (237, 107, 28)
 
 
 class VideoUnavailable(RuntimeError):  # noqa: N818, it is no fault of the program
     """No film can be made here; the message says why in one line."""
+
+
+class Arrows(NamedTuple):
+    """Arrows of one meaning in both walks of a film."""
+
+    words: str
+    colour: tuple[int, int, int]
+    ends: tuple[Float[np.ndarray, "T 2 2 3"], ...]  # of each walk: sample, foot, start and tip [m]
 
 
 @dataclass(frozen=True)
@@ -54,16 +64,13 @@ class VideoConfig:
     tiles: int = 6  # pictures in a row of the strip
 
     def __post_init__(self) -> None:
-        if self.width % 4 or self.height % 2 or min(self.width, self.height) < 64:
-            raise ValueError(
-                f"VideoConfig needs a width in fours and a height in twos of 64 pixels or more, "
-                f"got {self.width} x {self.height}"
-            )
-        if self.rate < 1 or self.tiles < 1 or not self.speed > 0.0:
-            raise ValueError(
-                f"VideoConfig needs rate, tiles and speed above zero, "
-                f"got {self.rate}, {self.tiles}, {self.speed}"
-            )
+        size = Interval(64, 8192)
+        check(self, width=size, height=size, rate=SOME, speed=POSITIVE, tiles=SOME)
+        for name, of in (("width", 4), ("height", 2)):
+            if getattr(self, name) % of:
+                raise ValueError(
+                    f"VideoConfig.{name} must be a multiple of {of}, got {getattr(self, name)}"
+                )
 
 
 def poses(
@@ -88,6 +95,7 @@ def write_video(
     walks: Mapping[str, Trajectory],
     strip: Path | None = None,
     config: VideoConfig | None = None,
+    arrows: Sequence[Arrows] | None = None,
 ) -> str:
     """Draw two walks side by side as an MP4.
 
@@ -97,6 +105,7 @@ def write_video(
         walks: two, by the words that stand above them, before and after.
         strip: PNG to write with snapshots of both.
         config: size and rate; None takes 640 x 360 at 25 frames per second.
+        arrows: to draw at the feet; None takes the forces of the ground.
 
     Returns:
         The back end that drew it.
@@ -115,7 +124,7 @@ def write_video(
     asked = os.environ.get("MUJOCO_GL")
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder = Path(name)
-        np.savez(folder / "request.npz", **_request(config, robot, walks))
+        np.savez(folder / "request.npz", **_request(config, robot, walks, arrows))
         failures = []
         for back_end in (asked,) if asked else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
@@ -159,8 +168,14 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
     return _one_line(said[-1]) if said else f"ended with code {done.returncode}"
 
 
-def _request(config: VideoConfig, robot: Robot, walks: Mapping[str, Trajectory]) -> dict[str, Any]:
+def _request(
+    config: VideoConfig,
+    robot: Robot,
+    walks: Mapping[str, Trajectory],
+    arrows: Sequence[Arrows] | None = None,
+) -> dict[str, Any]:
     """Everything the child needs to know, as arrays."""
+    arrows = [_ground(walks)] if arrows is None else arrows
     seconds = min(float(w.period) * len(w.fallen) for w in walks.values())
     times = np.arange(0.0, seconds + 1e-9, config.speed / config.rate)
     request: dict[str, Any] = {
@@ -169,6 +184,8 @@ def _request(config: VideoConfig, robot: Robot, walks: Mapping[str, Trajectory])
         "scale": np.asarray(robot.standing_height / _HEIGHT),
         "model": np.array(str(robot.description.model.resolve())),
         "labels": np.array(list(walks)),
+        "arrow_words": np.array([one.words for one in arrows]),
+        "arrow_colours": np.array([one.colour for one in arrows]) / 255.0,
     }
     for i, walk in enumerate(walks.values()):
         period, fallen = float(walk.period), np.asarray(walk.fallen)
@@ -180,11 +197,20 @@ def _request(config: VideoConfig, robot: Robot, walks: Mapping[str, Trajectory])
             f"path_{i}": np.asarray(walk.state.position)[at],
             f"aim_{i}": np.asarray(walk.reference.position)[at],
             f"reference_{i}": np.asarray(walk.reference.position)[:: max(1, round(0.02 / period))],
-            f"feet_{i}": np.asarray(walk.feet)[at],
-            f"force_{i}": _smooth(np.asarray(walk.effect.force), period)[at],
+            f"arrows_{i}": np.stack([one.ends[i][at] for one in arrows], axis=1),
             f"fall_{i}": np.array(period * up if fallen.any() else np.inf),
         }
     return request
+
+
+def _ground(walks: Mapping[str, Trajectory]) -> Arrows:
+    """The forces of the ground on both feet."""
+    ends = []
+    for walk in walks.values():
+        feet = np.asarray(walk.feet)
+        force = _smooth(np.asarray(walk.effect.force), float(walk.period))
+        ends.append(np.stack([feet, feet + METRES_PER_NEWTON * force], axis=2))
+    return Arrows("ground force", _ARROW, tuple(ends))
 
 
 def _smooth(force: Float[np.ndarray, "T 2 3"], period: float) -> Float[np.ndarray, "T 2 3"]:
@@ -201,6 +227,8 @@ def _draw(request: Mapping[str, Any]) -> None:
     """Write film.mp4 and strip.png into the working directory."""
     width, height, rate, tiles = (int(x) for x in request["size"])
     times, labels = request["times"], [str(x) for x in request["labels"]]
+    words = [str(x) for x in request["arrow_words"]]
+    meanings = dict(zip(words, request["arrow_colours"], strict=True))
     model = mujoco.MjModel.from_xml_path(str(request["model"]))
     data = mujoco.MjData(model)
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width // 2)
@@ -226,7 +254,7 @@ def _draw(request: Mapping[str, Any]) -> None:
             for row, half in zip(snapshots, halves, strict=True):
                 row.append(half)
         falls = [float(request[f"fall_{i}"]) for i in range(2)]
-        writer.send(np.ascontiguousarray(_frame(halves, labels, falls, float(time))))
+        writer.send(np.ascontiguousarray(_frame(halves, labels, falls, float(time), meanings)))
     writer.close()
     renderer.close()
     Image.fromarray(_strip(snapshots, labels, times[chosen])).save("strip.png")
@@ -254,10 +282,10 @@ def _view(
         _line(scene, start, end, 0.005, _REFERENCE)
     for start, end in zip(path[:k], path[1 : k + 1], strict=True):
         _line(scene, start, end, 0.006, _TRAILS[walk])
-    for foot, force in zip(request[f"feet_{walk}"][k], request[f"force_{walk}"][k], strict=True):
-        if np.linalg.norm(force) > 10.0:
-            tip = foot + _METRES_PER_NEWTON * force
-            _between(scene, mujoco.mjtGeom.mjGEOM_ARROW, foot, tip, 0.012, _ARROW)
+    for both, colour in zip(request[f"arrows_{walk}"][k], request["arrow_colours"], strict=True):
+        for foot, tip in both:
+            if np.linalg.norm(tip - foot) > LEAST_ARROW:
+                _between(scene, mujoco.mjtGeom.mjGEOM_ARROW, foot, tip, 0.012, (*colour, 0.9))
     return renderer.render()
 
 
@@ -284,12 +312,18 @@ def _between(
         geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(rgba, "f")
     )
     mujoco.mjv_connector(geom, kind, radius, start, end)
+    if kind == mujoco.mjtGeom.mjGEOM_ARROW:
+        geom.size[2] *= 2.0  # MuJoCo draws an arrow half as long as it was asked for
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     scene.ngeom += 1
 
 
 def _frame(
-    halves: list[np.ndarray], labels: list[str], falls: list[float], time: float
+    halves: list[np.ndarray],
+    labels: list[str],
+    falls: list[float],
+    time: float,
+    meanings: Mapping[str, Any],
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Both halves with their words."""
     picture = Image.fromarray(np.concatenate(halves, axis=1))
@@ -301,19 +335,21 @@ def _frame(
             _words(draw, (i * half + 10, 36), f"fell at {fall:.2f} s", (0.7, 0.1, 0.1, 1.0))
     draw.rectangle((half - 1, 0, half, height), fill="white")
     _words(draw, (picture.width - 10, height - 10), f"{time:.1f} s", None, anchor="rb")
-    _words(draw, (10, height - 10), "dashed: reference   arrows: ground force", None, 11, "lb")
+    place = 10.0
+    for words, colour in {"dashed: reference": None, **meanings}.items():
+        place = 14.0 + _words(draw, (place, height - 10), words, colour, 11, "lb")
     return np.asarray(picture)
 
 
 def _words(
     draw: ImageDraw.ImageDraw,
-    place: tuple[int, int],
+    place: tuple[float, float],
     text: str,
-    colour: tuple[float, ...] | None,
+    colour: Sequence[float] | None,
     size: int = 14,
     anchor: str = "lt",
-) -> None:
-    """Words on a light plate, with a mark in the colour of what they name."""
+) -> float:
+    """Words on a light plate, with a mark in the colour of what they name; its right edge."""
     font = ImageFont.load_default(size=size)
     left, top, right, bottom = draw.textbbox(place, text, font, anchor)
     mark = 0 if colour is None else size
@@ -324,6 +360,7 @@ def _words(
         fill = tuple(int(255 * c) for c in colour)
         draw.rounded_rectangle((left, top, left + size - 5, bottom), 2, fill=fill)
     draw.text((place[0] + mark, place[1]), text, "#16181c", font, anchor)
+    return right + 5 + mark
 
 
 def _strip(

@@ -12,6 +12,7 @@ import hashlib
 import itertools
 import json
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.inputs import shown
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
@@ -330,17 +332,31 @@ def _read_collection(folder: Path) -> dict[str, Any]:
     path = Path(folder) / "card.json"
     try:
         card = json.loads(path.read_text())
-        return {"shards": list(card["shards"]), "told": dict(card["told"])}
+        shards, told = card["shards"], dict(card["told"])
+        if not shards or not all(re.fullmatch(r"shard-\d+\.npz", name) for name in shards):
+            raise ValueError(f"shards are {shown(shards)}")
     except FileNotFoundError:
         raise ValueError(
             f"{folder}: no finished collection (no card.json); collect first"
         ) from None
-    except (ValueError, KeyError, TypeError, OSError) as error:
+    except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         raise ValueError(f"{path}: no card of a collection; collect again") from error
+    for name in shards:
+        if not (Path(folder) / name).is_file():
+            raise ValueError(f"{path}: no file {name} beside it; collect again")
+    return {"shards": shards, "told": told}
 
 
 def _load_shard(path: Path, robot: Robot) -> Walks:
-    return load_tree(path, _like(), kind="walks", robot=robot)[0]
+    walks = load_tree(path, _like(), kind="walks", robot=robot)[0]
+    count, ticks = walks.trajectory.fallen.shape
+    for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
+        if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
+            raise ValueError(f"{path}: {name} is not of {count} walks, as trajectory.fallen is")
+    run = walks.trajectory._replace(initial=walks.trajectory.fallen, period=walks.trajectory.fallen)
+    if not count or any(leaf.shape[1] != ticks for leaf in jax.tree.leaves(run)):
+        raise ValueError(f"{path}: its walks are not of one length, that of trajectory.fallen")
+    return walks
 
 
 def _kept_shard(path: Path, asked: Job, robot: Robot, told: dict[str, Any]) -> Walks | None:

@@ -43,6 +43,7 @@ from hector_jax.grfm.gated import (
     seen_labels,
     views,
 )
+from hector_jax.inputs import Interval, problem, shown
 from hector_jax.model.effect import HISTORY, Effect, Window, sure
 from hector_jax.robot import Robot
 from hector_jax.storage import load_tree, read_card, save_tree
@@ -51,6 +52,7 @@ from hector_jax.trajectory import Wrench
 HIDDEN = {"paper": (64, 64, 64), "residual": (32, 32)}  # widths of the layers, by variant
 MEMBERS = {"paper": 1, "residual": 4}  # nets of each kind that are trained side by side
 VARIANTS = tuple(HIDDEN)
+_DEEPEST, _WIDEST = 8, 4096  # hidden layers and their units in a file
 BOUND = 0.5  # most that a residual net adds, in units of what the linear part leaves
 FAMILIAR = 0.99  # share of the training samples that are nearer than where trust is halved
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
@@ -348,7 +350,15 @@ def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str
     card = read_card(path)
     kinds = {f"grfm-{name}": name for name in ([variant] if variant else VARIANTS)}
     if card["kind"] not in kinds:
-        raise ValueError(f"{path}: holds {card['kind']}, expected {' or '.join(kinds)}")
+        held = shown(card["kind"])[1:-1]
+        raise ValueError(f"{path}: holds {held}, expected {' or '.join(kinds)}")
+    hidden = card["about"].get("hidden")
+    sizes = hidden if isinstance(hidden, list) and 1 <= len(hidden) <= _DEEPEST else [None]
+    if any(problem(size, int, Interval(1, _WIDEST)) for size in sizes):
+        raise ValueError(
+            f"{path}: about.hidden must be 1 to {_DEEPEST} whole numbers from 1 to {_WIDEST}, "
+            f"got {shown(hidden)}"
+        )
     return kinds[card["kind"]], card
 
 
@@ -367,15 +377,15 @@ def load_net(
             with a number that is not finite.
     """
     found, card = read_net_card(path, variant)
-    like = _like(found, tuple(card["about"]["hidden"]))
+    like = layout(found, tuple(card["about"]["hidden"]))
     params, card = load_tree(path, like, kind=card["kind"], robot=robot)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise ValueError(f"{path}: a parameter of the net is not finite")
     return params, found, card
 
 
-def _like(variant: str, hidden: tuple[int, ...]) -> Params:
-    """Layout of the parameters; nothing is computed. Axes of length 0 are ticks."""
+def layout(variant: str, hidden: tuple[int, ...]) -> Params:
+    """Zeros of the shapes of the parameters, as `load_tree` wants them; an axis 0 is of ticks."""
     inputs, outputs = _sizes(variant)
     shapes = jax.eval_shape(Net(hidden, outputs).init, jax.random.key(0), jnp.zeros(inputs))
     stack = (MEMBERS[variant],) if variant == "residual" else ()

@@ -35,6 +35,7 @@ from hector_jax.grfm.network import (
     residual_inputs,
     standardised,
 )
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SEED, SOME, check
 from hector_jax.model.effect import Window
 from hector_jax.trajectory import Wrench
 
@@ -52,20 +53,15 @@ class TrainConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.variant not in VARIANTS:
-            raise ValueError(
-                f"TrainConfig.variant must be one of {', '.join(VARIANTS)}, got {self.variant!r}"
-            )
-        if self.epochs < 1 or self.batch < 1:
-            raise ValueError(
-                f"TrainConfig needs at least 1 epoch and 1 sample per step, "
-                f"got epochs {self.epochs}, batch {self.batch}"
-            )
-        if not (self.learning_rate > 0.0 and self.l2 >= 0.0):
-            raise ValueError(
-                f"TrainConfig needs learning_rate > 0 and l2 >= 0, "
-                f"got {self.learning_rate}, {self.l2}"
-            )
+        check(
+            self,
+            variant=VARIANTS,
+            epochs=SOME,
+            batch=SOME,
+            learning_rate=POSITIVE,
+            l2=NOT_NEGATIVE,
+            seed=SEED,
+        )
 
 
 class History(NamedTuple):

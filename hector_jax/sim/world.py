@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hector_jax.description import Description
+from hector_jax.inputs import did_you_mean, shown
 from hector_jax.robot import compile_model
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples
@@ -27,10 +28,6 @@ MAX_DELAY = 0.008  # [s] that the motors' memory can hold
 SLACK = "_backlash"  # ending of the names of backlash joints
 SLACK_DAMPING = 0.01  # [N m s/rad] of a backlash joint
 STOP_TIME = 0.004  # [s] solref of the backlash's end stops: gear teeth are hard
-
-# MuJoCo writes its warnings into a file of the working directory; the counters in MjData, which
-# every walk reads, tell the same.
-mujoco.set_mju_user_warning(lambda message: None)
 
 
 class Estimator(NamedTuple):
@@ -176,7 +173,10 @@ def named_world(name: str, seed: int = 0) -> Imperfections:
         ValueError: the name is none of WORLDS.
     """
     if name not in WORLDS:
-        raise ValueError(f"unknown world {name!r}; there are: {', '.join(WORLDS)}")
+        raise ValueError(
+            f"unknown world {shown(name)}{did_you_mean(name, WORLDS)}; "
+            f"there are: {', '.join(WORLDS)}"
+        )
     return {"ideal": ideal, "hfs": hfs, "hfs-varied": lambda: hfs_varied(seed)}[name]()
 
 

@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, check
 from hector_jax.robot import Robot
 from hector_jax.tuning.loss import Alpha, LossConfig, Losses, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -51,15 +52,17 @@ class TuneConfig:
     residual: float = 1e-8  # worst relative KKT residual that is believed: that of a solved QP
 
     def __post_init__(self) -> None:
-        if self.update not in ("relative", "literal"):
-            raise ValueError(
-                f"TuneConfig.update must be 'relative' or 'literal', got {self.update!r}"
-            )
-        for name in ("beta_q", "beta_r", "residual", "smallest_step"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"TuneConfig.{name} must be positive, got {getattr(self, name)}")
-        if self.iterations < 1 or self.patience < 1:
-            raise ValueError("TuneConfig.iterations and patience must be at least 1")
+        check(
+            self,
+            beta_q=POSITIVE,
+            beta_r=POSITIVE,
+            update=("relative", "literal"),
+            iterations=SOME,
+            patience=SOME,
+            gain=NOT_NEGATIVE,
+            smallest_step=POSITIVE,
+            residual=POSITIVE,
+        )
 
 
 class Evaluation(NamedTuple):
@@ -209,8 +212,9 @@ def step_weights(
 
 def believed(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
     """Whether an evaluation is to be believed: the `Reason` why not."""
-    numbers = [evaluation.loss, *jax.tree.leaves(evaluation.gradient)]
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
+    # squares, because a gradient near the largest number overflows where a step is made of it
+    squares = [jnp.square(x) for x in (evaluation.loss, *jax.tree.leaves(evaluation.gradient))]
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in squares]))
     solved = jnp.asarray(evaluation.residual) <= config.residual
     reason = jnp.where(solved, Reason.ACCEPTED, Reason.UNSOLVED)
     reason = jnp.where(jnp.asarray(evaluation.fallen) > 0, Reason.FELL, reason)
@@ -225,9 +229,9 @@ def init(config: TuneConfig, weights: Weights, count: int = 0) -> Progress:
         share=jnp.asarray(1.0),
         count=jnp.asarray(count, jnp.int32),
         best=weights,
-        loss=jnp.asarray(jnp.inf),
+        loss=jnp.asarray(jnp.inf, float),  # typed as later ones, or `update` is compiled again
         gradient=jax.tree.map(jnp.zeros_like, weights),
-        recent=jnp.full(config.patience + 1, jnp.nan),
+        recent=jnp.full(config.patience + 1, jnp.nan, float),
         ten=weights,
         stop=jnp.asarray(Stop.GOING, jnp.int32),
     )
@@ -354,22 +358,27 @@ def descend(
         first: number of the first one; from the paper's ten on every step has to lower the loss.
 
     Raises:
-        ValueError: the evaluation of the starting weights is not to be believed.
+        ValueError: the evaluation of the starting weights is not to be believed; `on_iteration` has
+            been told of it.
     """
     history: list[Iteration] = []
     progress = init(config, weights, first)
     while progress.stop == Stop.GOING:
-        trial = jax.tree.map(np.asarray, progress.trial)
-        found = jax.tree.map(np.asarray, look(trial))
+        # copies, because a view would keep the device's array for as long as the history
+        trial = jax.tree.map(np.array, progress.trial)
+        found = jax.tree.map(np.array, look(trial))
         step = float(progress.share) if history else 0.0
         progress, code = update(config, progress, found)
         reason = _in_words(config, Reason(int(code)), found)
-        if progress.stop == Stop.BAD_START:
-            raise ValueError(f"the starting weights cannot be tuned from: {reason}")
         history.append(Iteration(first + len(history), trial, found, not reason, reason, step))
         on_iteration(history[-1])
+        if progress.stop == Stop.BAD_START:
+            raise ValueError(f"the starting weights cannot be tuned from: {reason}")
     ten, converged = jax.tree.map(np.asarray, (progress.ten, progress.best))
-    return Tuning(history, ten, converged, stopped(config, Stop(int(progress.stop))))
+    stop = stopped(config, Stop(int(progress.stop)))
+    if progress.stop == Stop.SMALL_STEP and refusal(config, history[-1].evaluation):
+        stop = f"{stop}, the last refused: {history[-1].reason}"
+    return Tuning(history, ten, converged, stop)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -9,12 +9,14 @@ the larger of the last error and a fixed one, and smoothness stops.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from hector_jax.inputs import NOT_NEGATIVE, check
 from hector_jax.trajectory import Trajectory, Wrench
 
 SAMPLE = 1e-3  # [s] the rate at which the paper sums
@@ -30,8 +32,7 @@ class LossConfig:
     position: float = 2e5  # alpha_2 [1/m^2]
 
     def __post_init__(self) -> None:
-        if not (self.euler >= 0.0 and self.position >= 0.0):
-            raise ValueError(f"LossConfig weights must be >= 0, got {self.euler}, {self.position}")
+        check(self, euler=NOT_NEGATIVE, position=NOT_NEGATIVE)
 
 
 class Alpha(NamedTuple):
@@ -88,3 +89,9 @@ def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
 def total(config: LossConfig | Alpha, parts: Losses) -> Float[Array, "*batch"]:
     """L of its parts. Source: Eq. 11."""
     return config.euler * parts.euler + config.position * parts.position + parts.control
+
+
+@partial(jax.jit, static_argnums=0)
+def loss_of(config: LossConfig, trajectory: Trajectory) -> Float[Array, ""]:
+    """L of one walk. Source: Eq. 11."""
+    return total(config, losses(trajectory))

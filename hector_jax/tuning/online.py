@@ -25,6 +25,7 @@ from jaxtyping import Array, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.walking import Feet, Measurement, measured_feet
 from hector_jax.control.weights import Weights
+from hector_jax.inputs import NOT_NEGATIVE, SHARE, Interval, check
 from hector_jax.model.effect import HISTORY
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
@@ -53,19 +54,9 @@ class OnlineConfig:
     estimator: str = "carried"  # along measured states; "cut": begun anew in each window; "model"
 
     def __post_init__(self) -> None:
-        if self.window < 2:
-            raise ValueError(f"OnlineConfig.window must be at least 2 ticks, got {self.window}")
-        if not 0 <= self.late < self.window:
-            raise ValueError(
-                f"OnlineConfig.late must be at least 0 and below window, got {self.late}"
-            )
-        if not 0.0 <= self.step <= 1.0:
-            raise ValueError(f"OnlineConfig.step must be between 0 and 1, got {self.step}")
-        if self.estimator not in ESTIMATORS:
-            raise ValueError(
-                f"OnlineConfig.estimator must be one of {', '.join(ESTIMATORS)}, "
-                f"got {self.estimator!r}"
-            )
+        check(self, window=Interval(2), late=NOT_NEGATIVE, step=SHARE, estimator=ESTIMATORS)
+        if self.late >= self.window:
+            raise ValueError(f"OnlineConfig.late must be below window, got {self.late}")
 
 
 class Told(NamedTuple):

@@ -22,6 +22,7 @@ from hector_jax.control.reference import Anchor, Command, anchor_at, reference_a
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
 from hector_jax.geometry import rotation_from_euler
+from hector_jax.inputs import NOT_NEGATIVE, SOME, Interval, check
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.model.kinematics import foot_poses
@@ -39,12 +40,7 @@ class RolloutConfig:
     block: int = 500  # ticks whose solves are kept for the gradient; longer walks are walked twice
 
     def __post_init__(self) -> None:
-        if self.ticks < 2:
-            raise ValueError(f"RolloutConfig.ticks must be at least 2, got {self.ticks}")
-        if self.block < 1:
-            raise ValueError(f"RolloutConfig.block must be at least 1 tick, got {self.block}")
-        if self.lead < 0:
-            raise ValueError(f"RolloutConfig.lead must be at least 0 ticks, got {self.lead}")
+        check(self, ticks=Interval(2), lead=NOT_NEGATIVE, block=SOME)
         if self.lead > -self.walk.gait.first_tick:
             raise ValueError(
                 "RolloutConfig.lead must not reach back before the gait starts "

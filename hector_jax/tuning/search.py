@@ -33,6 +33,7 @@ from hector_jax.control.weights import (
     moved,
     weights_to_vector,
 )
+from hector_jax.inputs import POSITIVE, SEED, SOME, Interval, check
 from hector_jax.storage import write_file
 
 FORMAT = 1
@@ -48,17 +49,12 @@ class SearchConfig:
     spread: float = 1.0  # first standard deviation of each log-weight
 
     def __post_init__(self) -> None:
-        if self.population < 4:
-            raise ValueError(f"the population must be at least 4, got {self.population}")
+        check(self, budget=SOME, population=Interval(4), seed=SEED, spread=POSITIVE)
         if self.budget < self.population:
             raise ValueError(
-                f"the budget must be at least one generation of {self.population} walks, "
+                f"SearchConfig.budget must be at least the population, {self.population} walks, "
                 f"got {self.budget}"
             )
-        if not 0 <= self.seed < 2**32:
-            raise ValueError(f"the seed must be 0 to 2^32 - 1, got {self.seed}")
-        if not (self.spread > 0.0 and math.isfinite(self.spread)):
-            raise ValueError(f"the spread must be positive, got {self.spread}")
 
     @property
     def generations(self) -> int:

@@ -1,0 +1,192 @@
+"""Trajectories of one's own: a command from a small TOML file, and whether the robot can walk it.
+
+    name = "slalom"        # letters, digits, - and _; names the folder of the results
+
+    [[segment]]            # one after the other, from the start again after the last
+    seconds = 1.0          # a multiple of 0.05 s
+    v_x = 0.4              # [m/s] ahead
+    v_y = 0.0              # [m/s] to the left
+    yaw_rate = 0.8         # [rad/s] to the left
+
+What is left out of a segment is zero. Walks, tunings and verdicts of such a command last as long as
+its segments together. What is beyond any biped of this size is refused; what is beyond this robot
+is told and walked all the same.
+"""
+
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
+from hector_jax.inputs import Interval, check, from_table, one_line, read_text, shown
+from hector_jax.robot import Robot
+
+_MOST_SECONDS = 600.0
+_GRID = 0.05  # [s]
+_MOST_SEGMENTS = 100
+_MOST_BYTES = 100_000
+_FASTEST = 10.0  # [m/s], [rad/s]; more is another unit
+
+
+class Course(NamedTuple):
+    """What to walk."""
+
+    name: str
+    command: Command
+    seconds: float | None = None  # its length, where a file says so
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of constant velocity in the robot's own directions."""
+
+    seconds: float
+    v_x: float = 0.0  # [m/s] ahead
+    v_y: float = 0.0  # [m/s] to the left
+    yaw_rate: float = 0.0  # [rad/s]
+
+    RULES: ClassVar = {
+        "seconds": Interval(_GRID, _MOST_SECONDS),
+        **dict.fromkeys(("v_x", "v_y", "yaw_rate"), Interval(-_FASTEST, _FASTEST)),
+    }
+
+    def __post_init__(self) -> None:
+        check(self, **self.RULES)
+        if abs(self.seconds / _GRID - round(self.seconds / _GRID)) > 1e-6:
+            raise ValueError(
+                f"Segment.seconds must be a multiple of {_GRID} s, got {shown(self.seconds)}"
+            )
+
+
+@dataclass(frozen=True)
+class _File:
+    name: str
+    segment: list
+
+    def __post_init__(self) -> None:
+        check(self)
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}", self.name):
+            raise ValueError(
+                "name must be 1 to 40 letters, digits, - or _, the first neither - nor _, "
+                f"got {shown(self.name)}"
+            )
+        if self.name in (*COMMANDS, *UNSEEN, "all"):
+            raise ValueError(f"name must not be that of a built-in trajectory, got {self.name!r}")
+        if not 1 <= len(self.segment) <= _MOST_SEGMENTS:
+            raise ValueError(
+                f"[[segment]] must be there 1 to {_MOST_SEGMENTS} times, got {len(self.segment)}"
+            )
+
+
+def load_course(path: Path) -> Course:
+    """The course of a TOML file, see the module.
+
+    Raises:
+        ValueError: one line naming the file and the field that is unknown, missing or out of range.
+    """
+    path = Path(path)
+    text = read_text(path, "a trajectory", _MOST_BYTES)
+    try:
+        table = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: no valid TOML: {one_line(error)}") from None
+    told = from_table(str(path), _File, table)
+    segments = [
+        from_table(f"{path}: segment {number}", Segment, one)
+        for number, one in enumerate(told.segment, 1)
+    ]
+    seconds = sum(one.seconds for one in segments)
+    if seconds > _MOST_SECONDS:
+        raise ValueError(
+            f"{path}: the segments must last at most {_MOST_SECONDS:g} s together, got {seconds:g}"
+        )
+    command = Command(
+        duration=np.array([one.seconds for one in segments]),
+        velocity=np.array([(one.v_x, one.v_y) for one in segments]),
+        yaw_rate=np.array([one.yaw_rate for one in segments]),
+    )
+    return Course(told.name, command, round(seconds / _GRID) * _GRID)
+
+
+def course(text: str) -> Course:
+    """A trajectory by its name, or from the TOML file of that path.
+
+    Raises:
+        ValueError: `named_command` knows no such name, or see `load_course`.
+    """
+    if text.endswith(".toml"):
+        return load_course(Path(text))
+    try:
+        return Course(text, named_command(text))
+    except ValueError as error:
+        raise ValueError(f"{error}, or a file NAME.toml") from None
+
+
+class Limits(NamedTuple):
+    """Speeds up to which a robot can be expected to walk."""
+
+    ahead: float  # [m/s]
+    back: float  # [m/s]
+    aside: float  # [m/s]
+    turn: float  # [rad/s]
+
+
+def limits(robot: Robot, gait: GaitConfig) -> Limits:
+    """What a robot can be expected to walk, from its legs and the time that a foot stands.
+
+    A rule of thumb: over a stance the body moves on by half of what the leg could reach at standing
+    height; the other half is left for balance. Sideways the hip's roll bounds the reach, backwards
+    the foot's shorter lever behind the ankle, in a turn the hip's yaw. Of HECTOR in MuJoCo (`hfs`,
+    expert weights, 6 s from standing) it says 1.55, 1.04, 1.20 m/s and 3.5 rad/s; it walked 1.6,
+    1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
+    """
+    names = robot.description
+    hip, knee, ankle = names.pitch_joints
+    down = robot.joint_origin[0, :, 2]
+    thigh, shin = abs(down[hip + 1 : knee + 1].sum()), abs(down[knee + 1 : ankle + 1].sum())
+
+    def length(bend: float) -> float:
+        return np.sqrt(thigh**2 + shin**2 + 2 * thigh * shin * np.cos(bend))
+
+    def least(joint: int) -> float:
+        return np.min(np.abs([robot.joint_lower[joint], robot.joint_upper[joint]]))
+
+    stands = length(robot.standing_joints[knee])
+    reach = np.sqrt(max(length(least(knee)) ** 2 - stands**2, 0.0))
+    yaw, roll = least(names.yaw_joint), least(names.roll_joint)
+    height = stands + abs(robot.foot_point[0, 2])
+    stance = gait.stance * gait.tick
+    return Limits(
+        ahead=float(reach / stance),
+        back=float(reach / stance * min(robot.heel / robot.toe, 1.0)),
+        aside=float(min(reach, height * np.tan(roll)) / stance),
+        turn=float(yaw / stance),
+    )
+
+
+def beyond(limits: Limits, command: Command) -> str | None:
+    """Where a command asks for more than a robot can be expected to walk, in one line.
+
+    A change from one segment to the next counts like a start from standing.
+    """
+    ahead, aside = np.asarray(command.velocity).T
+    asked = {
+        "v_x": (ahead, -limits.back, limits.ahead, "m/s"),
+        "v_y": (aside, -limits.aside, limits.aside, "m/s"),
+        "yaw_rate": (np.asarray(command.yaw_rate), -limits.turn, limits.turn, "rad/s"),
+    }
+    for name, (values, low, high, unit) in asked.items():
+        changes = np.diff(values, prepend=0.0)
+        for number, (value, change) in enumerate(zip(values, changes, strict=True), 1):
+            for what, size in ((name, value), (f"the change of {name}", change)):
+                if not low <= size <= high:
+                    return (
+                        f"segment {number}: {what} is {size:g} {unit}; this robot and gait can be "
+                        f"expected to walk {low:.2g} to {high:.2g} {unit}"
+                    )
+    return None

@@ -1,0 +1,206 @@
+"""What a person hands in: one line says what came, what was expected and the nearest known name.
+
+Settings are frozen dataclasses that call `check` when they are made; tables of a TOML file become
+such dataclasses by `from_table`. A rule narrows what the type of a field allows: an `Interval` of
+numbers, or the words to choose from.
+"""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Finite numbers from `low` to `high`, both allowed."""
+
+    low: int | float = -math.inf
+    high: int | float = math.inf
+    above: bool = False  # low itself is not allowed
+
+    def __contains__(self, number: Any) -> bool:
+        over = number > self.low if self.above else number >= self.low
+        return bool(over and number <= self.high and math.isfinite(number))
+
+    def __str__(self) -> str:
+        low = f"{'above' if self.above else 'of at least'} {self.low:g}"
+        parts = [low] * math.isfinite(self.low)
+        parts += [f"{'' if parts else 'of '}at most {self.high:g}"] * math.isfinite(self.high)
+        return " and ".join(parts) or "that is finite"
+
+
+POSITIVE = Interval(0.0, above=True)
+NOT_NEGATIVE = Interval(0.0)
+SHARE = Interval(0.0, 1.0)
+SOME = Interval(1)  # a number of things, at least one
+SEED = Interval(0, 2**32 - 1)
+
+
+Rule = Interval | tuple[str, ...]
+"""What is allowed beyond a type: numbers, or words."""
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """`; did you mean 'NAME'?` with the nearest of some names; nothing where none is near."""
+    near = difflib.get_close_matches(str(name)[:100], [n for n in names if n], n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def shown(value: Any) -> str:
+    """A value as it came, on one line and not longer than a line."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python prints no integer of many thousand digits
+        text = "a number of too many digits"
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def one_line(error: BaseException | str) -> str:
+    """What an error or a text says, on one line of at most 300 characters."""
+    return " ".join(str(error).split())[:300]
+
+
+def _words(choices: Iterable[str]) -> str:
+    *others, last = map(repr, choices)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def problem(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
+    """What is wrong with a value, `must be ..., got ...`; None where nothing is.
+
+    Args:
+        value: what came.
+        kind: the annotation: bool, int, float, str, a class, a tuple or a union of these; what is
+            none of them allows everything.
+        rule: what is allowed of numbers or words; without one, numbers have to be finite.
+    """
+    if isinstance(kind, types.UnionType):
+        kinds = typing.get_args(kind)
+        found = [problem(value, one, rule) for one in kinds if one is not types.NoneType]
+        missing = value is None and types.NoneType in kinds
+        return None if missing or None in found else found[0]
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, tuple):
+            return f"must be a tuple, got {shown(value)}"
+        of = typing.get_args(kind)[0]
+        found = [told for one in value if (told := problem(one, of, rule))]
+        return f"{found[0]} in {shown(value)}" if found else None
+    return _simple_problem(value, kind, rule)
+
+
+def _simple_problem(value: Any, kind: Any, rule: Rule | None) -> str | None:
+    if kind is bool:
+        return None if isinstance(value, bool) else f"must be true or false, got {shown(value)}"
+    if kind in (int, float):
+        number, name = (Integral, "a whole number") if kind is int else (Real, "a number")
+        allowed = rule if isinstance(rule, Interval) else Interval()
+        try:
+            fine = isinstance(value, number) and not isinstance(value, bool) and value in allowed
+        except OverflowError:  # an integer that no float holds
+            fine = False
+        return None if fine else f"must be {name} {allowed}, got {shown(value)}"
+    if kind is str and isinstance(rule, tuple):
+        hint = did_you_mean(value, rule) if isinstance(value, str) else ""
+        return None if value in rule else f"must be {_words(rule)}, got {shown(value)}{hint}"
+    if isinstance(kind, type) and not isinstance(value, kind):
+        return f"must be {'words' if kind is str else f'a {kind.__name__}'}, got {shown(value)}"
+    return None
+
+
+def check(settings: Any, /, **rules: Rule) -> None:
+    """Check the fields of a dataclass against their types and rules; for `__post_init__`.
+
+    Raises:
+        ValueError: `CLASS.FIELD must be ..., got ...`.
+    """
+    for field in dataclasses.fields(settings):
+        told = problem(getattr(settings, field.name), field.type, rules.get(field.name))
+        if told:
+            raise ValueError(f"{type(settings).__name__}.{field.name} {told}")
+
+
+def choose(name: str, word: str, choices: Iterable[str]) -> str:
+    """The word, one of those there are.
+
+    Raises:
+        ValueError: `NAME must be ..., got ...`.
+    """
+    if told := problem(word, str, tuple(choices)):
+        raise ValueError(f"{name} {told}")
+    return word
+
+
+def read_text(path: Path, what: str, most: int) -> str:
+    """Text of a file in UTF-8.
+
+    Args:
+        path: the file.
+        what: it should be, in words.
+        most: bytes it may have.
+
+    Raises:
+        ValueError: one line naming the file: missing, too large, no text.
+    """
+    try:
+        size = path.stat().st_size
+        if not path.is_file():  # a pipe or a device might never end
+            raise ValueError(f"{path}: cannot read {what}: not a plain file")
+        if size > most:
+            raise ValueError(f"{path}: {size / 1e6:.1f} MB, expected at most {most / 1e6:g} MB")
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot read {what}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: not a text file, expected {what} in UTF-8") from None
+
+
+def from_table(where: str, kind: type[T], table: Any) -> T:
+    """A dataclass from a table of a file.
+
+    Args:
+        where: the file and the place in it, for the message.
+        kind: the dataclass, which checks itself; fields without a default have to be there. Its
+            `RULES`, where it has any, are told with values of a wrong type.
+        table: what was read.
+
+    Raises:
+        ValueError: one line naming `where` and the field that is unknown, missing or wrong.
+    """
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    if not isinstance(table, Mapping):
+        raise ValueError(f"{where} must be a table of {', '.join(fields)}, got {shown(table)}")
+    for name in table:
+        if name not in fields:
+            raise ValueError(
+                f"{where}: unknown field {shown(name)}{did_you_mean(name, fields)}; "
+                f"there are: {', '.join(fields)}"
+            )
+    for name, field in fields.items():
+        if name not in table and field.default is dataclasses.MISSING:
+            raise ValueError(f"{where}: missing field {name!r}; there are: {', '.join(fields)}")
+    values = {name: _as_float(fields[name].type, value) for name, value in table.items()}
+    rules = getattr(kind, "RULES", {})
+    for name, value in values.items():
+        if told := problem(value, fields[name].type, rules.get(name)):
+            raise ValueError(f"{where}: {name} {told}")
+    try:
+        return kind(**values)
+    except ValueError as error:
+        told = str(error).removeprefix(f"{kind.__name__}.")
+        raise ValueError(f"{where}: {told}") from None
+
+
+def _as_float(kind: Any, value: Any) -> Any:
+    """What a person writes as 1 where 1.0 is meant, and a list where a tuple is."""
+    if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
+        return tuple(_as_float(typing.get_args(kind)[0], one) for one in value)
+    return float(value) if kind is float and type(value) is int and abs(value) < 2**53 else value

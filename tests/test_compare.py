@@ -1,0 +1,172 @@
+"""Finished runs side by side, and their tunings for TensorBoard."""
+
+import io
+import json
+import struct
+import sys
+
+import pytest
+from rich.console import Console
+
+from hector_jax import cli
+from hector_jax.evaluation.runs import compare_runs, load_run, print_comparison, read_metrics
+from hector_jax.evaluation.tensorboard import write_events
+from hector_jax.flags import Tune, from_file, settings
+
+
+def change(median, counts=True):
+    found = {"median": median, "low": median - 3.0, "high": median + 3.0}
+    return found | {"wins": 1.0, "counts": counts, "parts": {}}
+
+
+def verdict(L, falls=0, **changes):
+    part = {"mean": L, "low": 0.9 * L, "high": 1.1 * L}
+    return {"L": part, "L_ctrl": part, "falls": falls, "seeds": [0, 1], "change": changes}
+
+
+def line(name, iteration, accepted=True, L=1e6):
+    row = {"set": name, "iteration": iteration, "accepted": accepted, "L": L, "step": 0.5}
+    return row | {"weights": {"Q_x": 50.0 + iteration}, "gradient_log": {"Q_x": -1.0}}
+
+
+def run_folder(folder, flags=None, versions=None):
+    folder.mkdir(parents=True)
+    result = {
+        "alpha": {},
+        "sets": {
+            "nominal": {"standin": verdict(2e6)},
+            "expert": {"standin": verdict(1.5e6, nominal=change(-25.0))},
+            "with": {
+                "standin": verdict(
+                    1e6, 1, nominal=change(-50.0), expert=change(-33.3, counts=False)
+                )
+            },
+        },
+    }
+    config = {"flags": settings(flags or Tune()), "tune": {"loss": {"euler": 1e5}}}
+    (folder / "result.json").write_text(json.dumps(result))
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "versions.json").write_text(json.dumps({"jax": "1"} | (versions or {})))
+    lines = [line("with", 0), line("with", 1, accepted=False, L=None), line("with", 2, L=8e5)]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    return [
+        run_folder(tmp_path / "c" / "one", versions={"seconds": "150", "commit": "aaa"}),
+        run_folder(tmp_path / "c" / "two", Tune(traj="c", seeds=32)),
+    ]
+
+
+def test_a_comparison_tells_losses_falls_iterations_and_what_differs(runs):
+    told = compare_runs([load_run(folder) for folder in runs])
+    one, two = told["runs"]
+    assert (one["run"], one["seconds"], two["seconds"]) == (str(runs[0]), 150.0, None)
+    assert one["sets"]["with"]["change"]["expert"]["median"] == -33.3
+    assert (one["sets"]["with"]["falls"], one["sets"]["with"]["seeds"]) == (1, 2)
+    assert one["tuning"] == {"with": {"iterations": 2, "refused": 1}}
+    assert told["differ"] == {
+        "settings": {"flags.traj": ["straight", "c"], "flags.seeds": [8, 32]},
+        "versions": {"commit": ["aaa", None]},
+    }
+    same = compare_runs([load_run(runs[0])] * 2)
+    assert same["differ"] == {"settings": {}, "versions": {}}
+
+
+def test_the_table_has_a_column_for_each_run(runs):
+    shown = io.StringIO()
+    told = compare_runs([load_run(folder) for folder in runs])
+    print_comparison(told, Console(file=shown))
+    text = shown.getvalue()
+    rows = {row[:32].strip(): row[32:].split() for row in text.splitlines()}
+    assert "c/one" in text
+    assert "c/two" in text
+    assert rows["with: L [1e6]"] == ["1.000", "1.000"]
+    assert "-33 [-36, -30]*" in text  # void
+    assert rows["settings: flags.seeds"] == ["8", "32"]
+    assert rows["time [s]"] == ["150", "-"]
+    assert rows["with: iterations (refused)"] == ["2", "(1)", "2", "(1)"]
+
+
+def test_the_command_prints_json_and_nothing_else(monkeypatch, capsys, runs):
+    monkeypatch.setattr(sys, "argv", ["hector", "compare", *map(str, runs), "--json"])
+    assert cli.main() == 0
+    out, err = capsys.readouterr()
+    assert [one["run"] for one in json.loads(out)["runs"]] == [str(run) for run in runs]
+    assert err == ""
+
+
+def test_what_a_run_wrote_can_be_asked_for_again(runs):
+    assert from_file(Tune, runs[1] / "config.json") == Tune(traj="c", seeds=32)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fault"),
+    [
+        ("result.json", None, "cannot read .*result.json: No such file.*expected a run folder"),
+        ("result.json", "{", "result.json: no valid JSON"),
+        ("result.json", "[]", "result.json: expected an object"),
+        ("result.json", "{}", "result.json: no `sets`"),
+        ("result.json", '{"sets": {"with": {"hfs": {}}}}', "set with has no verdict"),
+        ("config.json", None, "cannot read .*config.json"),
+        ("versions.json", "3", "versions.json: expected an object"),
+        ("metrics.jsonl", "{}\n", "metrics.jsonl: line 1 is no iteration"),
+        ("metrics.jsonl", '"a"\n', "metrics.jsonl: line 1 is no iteration"),
+    ],
+)
+def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
+    if text is None:
+        (runs[0] / name).unlink()
+    else:
+        (runs[0] / name).write_text(text)
+    with pytest.raises(ValueError, match=fault) as told:
+        compare_runs([load_run(folder) for folder in runs])
+    assert "\n" not in str(told.value)
+
+
+def test_no_run_at_all_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["hector", "compare"])
+    assert cli.main() == 2
+    assert "at least one run folder" in capsys.readouterr().err
+
+
+def test_a_line_that_is_being_written_is_not_read_yet(runs):
+    with (runs[0] / "metrics.jsonl").open("a") as file:
+        file.write('{"set": "wi')
+    assert len(read_metrics(runs[0])) == 3
+
+
+def scalars(folder):
+    """Tags and steps with their values, from the event file in a folder."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    (path,) = folder.iterdir()
+    data, found = path.read_bytes(), {}
+    while data:
+        (length,) = struct.unpack("<Q", data[:8])
+        event = Event.FromString(data[12 : 12 + length])
+        found |= {(value.tag, event.step): value.simple_value for value in event.summary.value}
+        data = data[16 + length :]
+    return found
+
+
+def test_tensorboard_gets_the_numbers_of_the_metrics(runs, tmp_path):
+    pytest.importorskip("tensorboardX")
+    for _ in range(2):  # again while a run goes on: replaced, not doubled
+        (folder,) = write_events(runs[0], tmp_path / "events")
+    assert folder == tmp_path / "events" / "with"
+    found = scalars(folder)
+    assert found["loss/L", 0] == 1e6
+    assert found["loss/L", 2] == 8e5
+    assert ("loss/L", 1) not in found  # it was not finite
+    assert [found["step/accepted", step] for step in range(3)] == [1.0, 0.0, 1.0]
+    assert [found["weights/Q_x", step] for step in range(3)] == [50.0, 51.0, 52.0]
+    assert found["gradient_log/Q_x", 1] == -1.0
+
+
+def test_without_its_package_tensorboard_says_which(monkeypatch, runs, tmp_path):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(ValueError, match="pip install 'hector-jax\\[tensorboard\\]'"):
+        write_events(runs[0], tmp_path)

@@ -1,0 +1,232 @@
+"""Flags from files: the line beats the file, the file beats the default, and faults have a name."""
+
+import json
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from hypothesis import given
+from hypothesis import settings as settings_of
+from hypothesis import strategies as st
+
+from hector_jax import cli, flags
+from hector_jax.evaluation.report import PAPER_ITERATIONS
+from hector_jax.flags import Command, Configured, Evaluate, Table, Tune, from_file, settings
+from hector_jax.inputs import Interval
+
+FILES = [kind for kind in get_args(Command) if issubclass(kind, Configured)]
+
+
+def written(folder, text, name="run.toml"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def parsed(*words):
+    return cli._parsed([str(word) for word in words])
+
+
+def test_the_line_beats_the_file_and_the_file_beats_the_default(tmp_path):
+    path = written(tmp_path, 'traj = "c"\nseeds = 3\nvideo = false\ndata = "mine"\n')
+    found = parsed("tune", "--config", path, "--seeds", "5", "--video")
+    assert found == Tune(config=path, traj="c", seeds=5, video=True, data=Path("mine"))
+    assert parsed("tune", "--seeds", "5", f"--config={path}").traj == "c"
+    assert parsed("tune").seeds == Tune().seeds
+
+
+def test_the_help_shows_what_the_file_says(tmp_path, capsys):
+    path = written(tmp_path, "seeds = 31\n")
+    with pytest.raises(SystemExit):
+        parsed("tune", "--config", path, "--help")
+    assert "(default: 31)" in capsys.readouterr().out
+
+
+def test_keys_are_spelt_as_flags_or_as_fields(tmp_path):
+    for key in ("first-seed", "first_seed"):
+        assert from_file(Evaluate, written(tmp_path, f"{key} = 7\n")).first_seed == 7
+    text = "first-seed = 7\nfirst_seed = 8\n"
+    with pytest.raises(ValueError, match="first_seed is given twice"):
+        from_file(Evaluate, written(tmp_path, text))
+
+
+def test_lists_paths_and_whole_numbers_are_taken_as_their_flags_want_them(tmp_path):
+    text = 'weights = ["nominal", "mine.json"]\nseconds = 2\njson = true\n'
+    found = from_file(Evaluate, written(tmp_path, text))
+    assert found == Evaluate(weights=("nominal", "mine.json"), seconds=2.0, json=True)
+    text = 'kept = "shelf"\nextra = ["a=x"]\n'
+    assert from_file(Table, written(tmp_path, text)) == Table(kept=Path("shelf"), extra=("a=x",))
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_what_is_written_is_read_as_it_was(tmp_path, kind):
+    """Every field is moved from its default, written as a run does, and read again."""
+    moved = {}
+    for field in fields(kind):
+        old = getattr(kind(), field.name)
+        if isinstance(old, bool):
+            moved[field.name] = not old
+        elif isinstance(old, int | float):
+            moved[field.name] = old + 1
+        elif isinstance(old, tuple):
+            moved[field.name] = (*old, "more")
+        elif field.name not in ("config", "variant", "engine", "alpha", "world"):
+            moved[field.name] = Path("else") if old is None else type(old)("else")
+    asked = kind(**moved)
+    told = json.dumps({"flags": settings(asked), "tune": {"other": "things"}})
+    assert from_file(kind, written(tmp_path, told, "config.json")) == asked
+    told = json.dumps({"flags": settings(kind())})  # null where nothing is named
+    assert from_file(kind, written(tmp_path, told, "config.json")) == kind()
+    assert "config" not in settings(asked)
+
+
+def test_the_line_that_asks_again_needs_no_file(tmp_path):
+    found = parsed("tune", "--config", written(tmp_path, 'traj = "s"\n'), "--seeds", "4")
+    assert flags.as_command("tune", found) == "hector tune --traj s --seeds 4"
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("sedes = 3", "unknown key 'sedes'; did you mean 'seeds'?"),
+        ("first-sede = 3", "unknown key 'first-sede'; did you mean 'first-seed'?"),
+        ("moon = 3", "unknown key 'moon'; known: ceiling, data, "),
+        ('config = "other.toml"', "unknown key 'config'"),
+        ("[tune]\nseeds = 3", "unknown key 'tune'"),
+        ('seeds = "3"', "seeds must be a whole number of at least 1, got '3'"),
+        ("seeds = 3.0", "seeds must be a whole number of at least 1, got 3.0"),
+        ("seeds = true", "seeds must be a whole number of at least 1, got True"),
+        ("seeds = 0", "seeds must be a whole number of at least 1, got 0"),
+        (
+            "first-seed = -1",
+            "first-seed must be a whole number of at least 0 and at most 4",
+        ),
+        ("quick = 1", "quick must be true or false, got 1"),
+        ("data = 1", "data must be a Path, got 1"),
+        ("kept = []", "kept must be a Path, got []"),
+        ('trajectories = "c"', "trajectories must be a list, got 'c'"),
+        ("trajectories = [1]", "trajectories must be words, got 1 in (1,)"),
+        ("iterations = 9", "iterations must be a whole number of at least 10, got 9"),
+        ("seeds = 1979-05-27", "seeds must be a whole number of at least 1, got datetime.date"),
+        ("seeds = ", "no valid TOML: "),
+        ("seeds = 1\nseeds = 2", "no valid TOML: "),
+    ],
+)
+def test_a_wrong_file_is_one_line_with_file_and_key(tmp_path, text, fault):
+    path = written(tmp_path, text)
+    with pytest.raises(ValueError, match=r"run\.toml: ") as told:
+        from_file(Table, path)
+    assert str(told.value).startswith(f"{path}: {fault}")
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "fault"),
+    [
+        ('world = "standing"', "must be 'ideal', 'hfs', .*did you mean 'standin'"),
+        ("world = 3", "world must be 'ideal', .*got 3"),
+        ("seconds = 0", "seconds must be a number above 0 and at most 600, got 0"),
+        ("seconds = 601.0", "seconds must be a number above 0 and at most 600, got 601"),
+        ("seconds = nan", "seconds must be a number above 0 and at most 600, got nan"),
+        (f"seconds = 1{400 * '0'}", "seconds must be a number above 0 and at most 600, got 1000"),
+        (
+            "first-seed = 4294967296",
+            "first-seed must be a whole number of at least 0 and .*got 4294967296",
+        ),
+        ("seconds = inf", "seconds must be a number above 0 and at most 600, got inf"),
+        ('seconds = "long"', "seconds must be a number above 0 and at most 600, got 'long'"),
+    ],
+)
+def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
+    with pytest.raises(ValueError, match=fault):
+        from_file(Evaluate, written(tmp_path, key))
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "fault"),
+    [
+        ("run.toml", b"\xff\xfe", "not a text file"),
+        ("run.toml", b"seeds = 1" + b"0" * 5000, "no valid TOML"),
+        ("run.json", b"{", "no valid JSON"),
+        ("run.json", b"[]", "no `flags` inside"),
+        ("run.json", b'{"tune": {}}', "no `flags` inside"),
+        (
+            "run.json",
+            b'{"flags": {"seeds": null}}',
+            "seeds must be a whole number.*got None",
+        ),
+        ("run.json", b"[" * 100_000, "no valid"),
+        ("run.toml", b"a = " + b"[" * 100_000, "no valid"),
+        ("none.toml", None, "No such file"),
+    ],
+)
+def test_a_file_that_is_none_is_named(tmp_path, name, data, fault):
+    if data is not None:
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(ValueError, match=fault) as told:
+        from_file(Tune, tmp_path / name)
+    assert str(tmp_path / name) in str(told.value)
+
+
+def test_the_program_tells_a_wrong_file_in_one_line(monkeypatch, capsys, tmp_path):
+    path = written(tmp_path, "seeds = 0\n")
+    monkeypatch.setattr(sys, "argv", ["hector", "tune", "--config", str(path)])
+    assert cli.main() == 2
+    out, err = capsys.readouterr()
+    assert (out, err) == (
+        "",
+        f"hector: {path}: seeds must be a whole number of at least 1, got 0\n",
+    )
+
+
+@pytest.mark.parametrize(
+    ("wrong", "fault"),
+    [
+        (Tune(seeds=0), "--seeds must be a whole number of at least 1, got 0"),
+        (
+            Evaluate(first_seed=-2),
+            "--first-seed must be a whole number of at least 0 and .*got -2",
+        ),
+    ],
+)
+def test_flags_are_held_to_their_ranges(wrong, fault):
+    with pytest.raises(ValueError, match=fault):
+        flags.check(wrong)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_the_defaults_are_in_range(kind):
+    flags.check(kind())
+
+
+def test_the_least_number_of_iterations_is_the_papers():
+    assert flags.Iterations.__metadata__ == (Interval(PAPER_ITERATIONS),)
+
+
+_VALUES = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=20)
+    | st.sampled_from(["s", "hfs", "auto", "paper", 1, 10, 2**32, 10**400, ["a"], [1], {"a": 1}])
+)
+_KEYS = st.text(max_size=20) | st.sampled_from(
+    sorted({field.name for kind in FILES for field in fields(kind)})
+)
+
+
+@settings_of(max_examples=300, derandomize=True, deadline=None, database=None)
+@given(st.sampled_from(FILES), st.dictionaries(_KEYS, _VALUES, max_size=4))
+def test_any_table_makes_flags_in_range_or_one_line_with_the_file(tmp_path_factory, kind, table):
+    path = tmp_path_factory.mktemp("any") / "config.json"
+    path.write_text(json.dumps({"flags": table}))
+    told = f"{path}: "
+    try:
+        flags.check(from_file(kind, path))
+    except ValueError as error:
+        told = str(error)
+    assert told.startswith(f"{path}: ")
+    assert len(told.splitlines()) == 1

@@ -1,0 +1,425 @@
+"""What goes to the robot: weights, the C++ controller's own QP, the exported controller."""
+
+import ast
+import importlib.util
+import json
+import re
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+from oracles import exact_solution
+from scipy.spatial.transform import Rotation
+
+from hector_jax import commands
+from hector_jax.cli import main
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
+from hector_jax.control.qp import QP, Status
+from hector_jax.control.reference import named_command
+from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.export import (
+    PLATFORMS,
+    SCHEMA,
+    TOLERANCE,
+    Check,
+    check,
+    controller,
+    export_controller,
+    find_weights,
+    load_controller,
+    record,
+    weights_cpp,
+    weights_schema,
+)
+from hector_jax.robot import load_robot
+from hector_jax.storage import load_weights, save_weights, weights_tree
+from hector_jax.trajectory import State, pack_wrench
+
+ROBOT, CONFIG = load_robot(), WalkConfig()
+EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"
+
+
+def random_weights(seed):
+    """Twenty-four different numbers, left and right too."""
+    draws = np.random.default_rng(seed).uniform(-1, 1, 24)
+    return vector_to_weights(weights_to_vector(expert()) * 3.0**draws)
+
+
+# Weights and their schema
+
+
+def test_weights_meet_their_schema_and_are_read_back(tmp_path):
+    jsonschema.Draft202012Validator.check_schema(weights_schema())
+    weights = random_weights(0)
+    save_weights(tmp_path / "weights.json", weights, SCHEMA)
+    tree = json.loads((tmp_path / "weights.json").read_text())
+    assert tree["$schema"] == SCHEMA
+    jsonschema.validate(tree, weights_schema())
+    jax.tree.map(np.testing.assert_array_equal, load_weights(tmp_path / "weights.json"), weights)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda tree: tree.pop("R"),
+        lambda tree: tree["Q"].pop("euler"),
+        lambda tree: tree["Q"].update(speed=[1.0, 1.0, 1.0]),
+        lambda tree: tree["Q"]["euler"].append(1.0),
+        lambda tree: tree["R"].update(force=[1.0, 1.0, 1.0]),
+        lambda tree: tree["Q"].update(euler=[1.0, 0.0, 1.0]),
+        lambda tree: tree["Q"].update(euler=[1.0, "1", 1.0]),
+    ],
+)
+def test_what_the_loader_refuses_the_schema_refuses_too(tmp_path, wrong):
+    tree = weights_tree(nominal())
+    wrong(tree)
+    path = tmp_path / "weights.json"
+    path.write_text(json.dumps(tree))
+    with pytest.raises(ValueError, match=r"weights\.json"):
+        load_weights(path)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(tree, weights_schema())
+
+
+# The open C++ controller
+
+
+def pasted(text, name):
+    """The twelve numbers of `double name[12] = {...};`."""
+    inside = re.search(rf"double {name}\[12\] = \{{(.*?)\}};", text, re.DOTALL).group(1)
+    return np.array([float(x) for x in re.sub(r"//.*", "", inside).split(",") if x.strip()])
+
+
+def their_qp(Q, Alpha, state, lever, foot_yaw, reference, contact, dt, mass, inertia):
+    """Its QP, written down from what its SolverMPC.cpp does, with the robot and dt given.
+
+    States rpy, p, omega, v, 9.81; inputs F_0, F_1, M_0, M_1; A and B frozen, powers of A, H and g
+    with their 2; rows friction (mu 2.0), M_x, two of the line foot, 2 F_z <= 1000; a foot in the
+    air has no variables. Two slips of it are mended, and header and test say so: M_x may be up to
+    0.01 N m there, and foot 1 has one line row twice.
+    """
+    N = len(contact)
+    roll, pitch, yaw = state.euler
+    R_wb = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    A, B = np.zeros((13, 13)), np.zeros((13, 12))
+    rates = [[np.cos(yaw) * np.cos(pitch), -np.sin(yaw), 0], [0, np.cos(yaw), 0], [0, 0, 1]]
+    rates[1][0], rates[2][0] = np.sin(yaw) * np.cos(pitch), -np.sin(pitch)
+    A[0:3, 6:9] = np.linalg.inv(rates)
+    A[3:6, 9:12] = np.eye(3)
+    A[11, 12] = -1.0
+    turn = np.linalg.inv(R_wb @ inertia @ R_wb.T)
+    for foot in (0, 1):
+        B[6:9, 3 * foot : 3 * foot + 3] = turn @ np.cross(lever[foot], np.eye(3)).T
+        B[6:9, 6 + 3 * foot : 9 + 3 * foot] = turn
+        B[9:12, 3 * foot : 3 * foot + 3] = np.eye(3) / mass
+    A, B = np.eye(13) + dt * A, dt * B
+    powers = [np.linalg.matrix_power(A, i) for i in range(N + 1)]
+    A_qp = np.vstack(powers[1:])
+    B_qp = np.block([[powers[i - j] @ B if i >= j else 0 * B for j in range(N)] for i in range(N)])
+    S = np.diag(np.tile(np.append(Q, 0.0), N))
+    x_0 = np.concatenate([*state, [9.81]])
+    X_d = np.concatenate([np.append(row, 0.0) for row in np.concatenate(reference, axis=1)])
+    H = 2.0 * (B_qp.T @ S @ B_qp + np.diag(np.tile(Alpha, N)))
+    g = 2.0 * B_qp.T @ S @ (A_qp @ x_0 - X_d)
+
+    mu, lt, lh, big = 2.0, 0.09, 0.06, 5e10
+    F, below, above = np.zeros((16, 12)), np.zeros(16), np.zeros(16)
+    for foot in (0, 1):
+        f, m, row = 3 * foot, 6 + 3 * foot, 8 * foot
+        yaw = foot_yaw[foot]
+        ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        left = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        F[row : row + 4, f + 2] = 1.0
+        F[row : row + 4, f : f + 2] = [[-mu, 0], [mu, 0], [0, -mu], [0, mu]]
+        F[row + 4, m : m + 3] = ahead
+        F[row + 5, f + 2], F[row + 5, m : m + 3] = -lt, left
+        F[row + 6, f + 2], F[row + 6, m : m + 3] = -lh, -left
+        F[row + 7, f + 2] = 2.0
+        below[row : row + 8] = [0, 0, 0, 0, 0, -big, -big, 0]
+        above[row : row + 8] = [big, big, big, big, 0, 0, 0, 1000.0]
+    stands = np.concatenate([np.tile(np.repeat(feet, 3), 2) for feet in contact])
+    rows = np.concatenate([np.repeat(feet, 8) for feet in contact])
+    full = QP(H, g, np.kron(np.eye(N), F), np.tile(below, N), np.tile(above, N))
+    return (
+        QP(
+            full.P[np.ix_(stands, stands)],
+            full.q[stands],
+            full.A[np.ix_(rows, stands)],
+            full.l[rows],
+            full.u[rows],
+        ),
+        stands,
+    )
+
+
+def same_problem(seed):
+    """A state, and a horizon about it as the C++ controller has it: nothing moves along."""
+    rng = np.random.default_rng(seed)
+    N, dt = CONFIG.mpc.horizon, CONFIG.mpc_step
+    euler = np.array([0.05, -0.08, 0.6]) + 0.03 * rng.normal(size=3)
+    state = State(euler, np.array([0.3, 0.1, 0.41]), *(0.2 * rng.normal(size=(2, 3))))
+    lever = np.array([[0.02, 0.08, -0.41], [-0.03, -0.08, -0.41]]) + 0.02 * rng.normal(size=(2, 3))
+    foot_yaw = 0.6 + 0.1 * rng.normal(size=2)
+    steps = dt * np.arange(1, N + 1)[:, None]
+    reference = State(
+        np.tile([0.0, 0.0, 0.6], (N, 1)),
+        state.position + steps * np.array([0.4, 0.2, 0.0]),
+        np.zeros((N, 3)),
+        np.tile([0.4, 0.2, 0.0], (N, 1)),
+    )
+    left = (np.arange(N) + 5 * seed) // 5 % 2 == 0
+    contact = np.stack([left, ~left], axis=1)
+    return state, lever, foot_yaw, reference, contact
+
+
+# toe and heel have changed places in their rows, and theirs hold by no friction each
+THEIRS = replace(CONFIG.mpc, line_friction=False)
+SWAPPED = ROBOT._replace(toe=np.array(0.06), heel=np.array(0.09), gravity=np.array([0, 0, 9.81]))
+solve = jax.jit(solve_mpc, static_argnums=(0, 5, 6))
+
+
+def both_minimisers(seed, factor=1.0, states=slice(None), inputs=slice(None)):
+    """Our first wrench (12,), theirs with the weights as pasted or spoilt, and if a limit binds."""
+    weights, (state, lever, foot_yaw, reference, contact) = random_weights(seed), same_problem(seed)
+    N, dt = CONFIG.mpc.horizon, CONFIG.mpc_step
+    text = weights_cpp(weights, CONFIG, ROBOT, "random")
+    Q, Alpha = pasted(text, "Q")[states], factor * pasted(text, "Alpha")[inputs]
+    known = (state, lever, foot_yaw, reference, contact, dt, ROBOT.mass, ROBOT.inertia)
+    qp, stands = their_qp(Q, Alpha, *known)
+    theirs = np.zeros(12 * N)
+    theirs[stands] = exact_solution(qp)[0]
+    each = jax.tree.map(
+        jnp.asarray,
+        Horizon(
+            reference,
+            np.tile(state.euler, (N, 1)),
+            np.tile(lever, (N, 1, 1)),
+            np.tile(foot_yaw, (N, 1)),
+            contact,
+        ),
+    )
+    wrench, solution = solve(
+        THEIRS, SWAPPED, weights, jax.tree.map(jnp.asarray, state), each, dt, 1
+    )
+    assert solution.status == Status.SOLVED
+    active = np.abs(np.asarray(solution.y)) > 1e-9
+    return np.asarray(pack_wrench(wrench)), theirs[:12], active.any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_cpp_controller_finds_our_wrench_with_the_pasted_weights(seed):
+    ours, theirs, _ = both_minimisers(seed)
+    assert np.abs(ours).max() > 10.0
+    np.testing.assert_allclose(ours, theirs, atol=1e-7)
+
+
+def test_limits_press_in_some_of_these_problems():
+    assert any(both_minimisers(seed)[2] for seed in range(6))
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"factor": 2.0},  # the 2 of the quadratic form
+        {"factor": 0.5},
+        {"states": np.r_[3:6, 0:3, 6:12]},  # position first
+        {"states": np.r_[0:6, 9:12, 6:9]},  # velocity before the rates
+        {"inputs": np.r_[3:6, 0:3, 6:12]},  # right foot first
+        {"inputs": np.r_[0:3, 6:9, 3:6, 9:12]},  # foot by foot
+    ],
+)
+def test_another_factor_or_order_would_be_noticed(spoilt):
+    ours, theirs, _ = both_minimisers(0, **spoilt)
+    assert np.abs(ours - theirs).max() > 0.1
+
+
+def test_the_header_says_what_the_cpp_controller_lacks():
+    text = weights_cpp(nominal(), CONFIG, ROBOT, "nominal")
+    for fact in ("0.04 s", "9.0 kg", "footholds", "toe and heel swapped", "0.01 N m", "M_z"):
+        assert fact in text
+    assert "ATTENTION" not in text
+    about_weight = WalkConfig(mpc=MpcConfig(effort_about="weight"))
+    assert "ATTENTION" in weights_cpp(nominal(), about_weight, ROBOT, "nominal")
+    code = [line for line in text.splitlines() if not line.startswith("//")]
+    assert code[0] == "double Q[12] = {"
+    assert max(map(len, text.splitlines())) <= 100
+
+
+# The exported controller
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    """Exported and loaded, and an example of its arguments."""
+    example = controller(CONFIG, ROBOT, expert())[1]
+    return load_controller(export_controller(CONFIG, ROBOT, expert())), example
+
+
+def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
+    walked = record(CONFIG, ROBOT, expert(), named_command("s"), 0.4)
+    found = check(CONFIG, *loaded, walked)
+    assert max(found.force, found.moment, found.torque) <= TOLERANCE
+    assert found.unsolved == 0
+    assert np.abs(walked.wrench.force).max() > 100.0
+    assert walked.measurement.state.velocity[-1, 0] > 0.1
+
+
+def test_the_check_notices_other_weights(loaded):
+    found = check(CONFIG, *loaded, record(CONFIG, ROBOT, nominal(), named_command("s"), 0.1))
+    assert found.force > 1.0
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_only_custom_calls_with_a_guarantee_are_in_it(platform):
+    exported = jax.export.deserialize(
+        bytearray(export_controller(CONFIG, ROBOT, expert(), platform))
+    )
+    assert exported.platforms == (platform,)
+    assert not exported.disabled_safety_checks
+    calls = set(re.findall(r"custom_call @(\w+)", exported.mlir_module()))
+    assert calls
+    assert all(name.startswith(("lapack_", "cusolver_", "cu_lu_")) for name in calls), calls
+
+
+def test_weights_that_fall_are_not_exported():
+    limp = nominal()._replace(Q=jax.tree.map(lambda w: 1e-6 * w, nominal().Q))
+    with pytest.raises(ValueError, match="fall"):
+        record(CONFIG, ROBOT, limp, named_command("straight"), 0.2)
+
+
+def test_another_device_is_refused(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.raises(ValueError, match="JAX_PLATFORMS=cpu"):
+        export_controller(CONFIG, ROBOT, expert())
+
+
+def test_without_flatbuffers_it_is_said_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(ValueError, match=r"hector-jax\[export\]"):
+        export_controller(CONFIG, ROBOT, expert())
+
+
+# The command
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A finished run, as far as export reads it."""
+    walk = asdict(CONFIG)
+    save_weights(tmp_path / "weights" / "with.json", expert())
+    (tmp_path / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": walk}}}))
+    return tmp_path
+
+
+def call(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["hector", "export", *map(str, arguments)])
+    return main()
+
+
+def test_the_command_writes_files_that_run_without_us(monkeypatch, capsys, run):
+    assert call(monkeypatch, run, "--seconds", "0.1", "--json") == 0
+    card = json.loads(capsys.readouterr().out)
+    folder = run / "export"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "check.npz",
+        "controller-cpu.jaxexport",
+        "controller-cuda.jaxexport",
+        "controller.json",
+        "weights.cpp",
+        "weights.json",
+        "weights.schema.json",
+    ]
+    assert json.loads((folder / "controller.json").read_text()) == card
+    assert card["check"]["force"] <= TOLERANCE
+    assert card["check"]["plan_ms"]["p50"] > 0.0
+    schema = json.loads((folder / SCHEMA).read_text())
+    jsonschema.validate(json.loads((folder / "weights.json").read_text()), schema)
+    jax.tree.map(np.testing.assert_array_equal, load_weights(folder / "weights.json"), expert())
+
+    spec = importlib.util.spec_from_file_location("run_exported", EXAMPLE)
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    example.main(folder)
+    assert "1200 calls" in capsys.readouterr().out
+    (folder / "controller-cpu.jaxexport").write_bytes(b"another")
+    with pytest.raises(SystemExit, match="not the file"):
+        example.main(folder)
+
+
+def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsys, run):
+    for part in ("export_controller", "record", "load_controller"):
+        monkeypatch.setattr(commands.export, part, lambda *known: None)
+    found = Check(2e-6, 0.0, 0.0, 0, {}, {})
+    monkeypatch.setattr(commands.export, "check", lambda *known: found)
+    assert call(monkeypatch, run) == 2
+    assert "2.0e-06 N" in capsys.readouterr().err
+    assert list((run / "export").iterdir()) == []
+
+
+def test_the_example_knows_nothing_of_us():
+    tree = ast.parse(EXAMPLE.read_text())
+    names = {
+        name.split(".")[0]
+        for node in ast.walk(tree)
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    assert names == {"hashlib", "json", "sys", "time", "pathlib", "jax", "numpy"}
+
+
+def test_a_run_is_exported_with_its_own_controller(run):
+    own = replace(CONFIG, gait=GaitConfig(stance=24, swing=16), mpc=MpcConfig(friction=0.4))
+    kept = asdict(own)
+    del kept["mpc"]["effort_about"]  # of a run from before there was such a setting
+    (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
+    assert find_weights(run, "with") == (run / "weights" / "with.json", own, None)
+    hash(find_weights(run, "with")[1])
+    path = run / "weights" / "with.json"
+    assert find_weights(path, "with") == (path, CONFIG, None)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["--set", "wiht"], "did you mean 'with'"),
+        (["--set", "zzz"], "there are: with"),
+        (["--traj", "circle"], "circle"),
+        (["--seconds", "0"], "--seconds"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(monkeypatch, capsys, run, arguments, part):
+    assert call(monkeypatch, run, *arguments) == 2
+    out, err = capsys.readouterr()
+    lines = [line for line in err.splitlines() if line.startswith("hector:")]
+    assert len(lines) == 1
+    assert part in lines[0]
+    assert "Traceback" not in out + err
+    assert not (run / "export").exists()
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"tune": 3}', '{"tune": {"rollout": {"walk": 1}}}'])
+def test_a_run_without_settings_is_refused_by_name(run, text):
+    (run / "config.json").write_text(text)
+    with pytest.raises(ValueError, match=r"config\.json"):
+        find_weights(run, "with")
+
+
+def test_a_weights_file_is_exported_by_its_name(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(commands.export, "export", lambda *known, **kw: asked.append(kw) or {})
+    path = tmp_path / "mine.json"
+    save_weights(path, expert())
+    assert call(monkeypatch, path, "--json") == 0
+    assert asked == [{"name": "mine.json/mine", "seconds": 1.0}]

@@ -1,0 +1,395 @@
+"""Whatever a person hands in is taken as it should be or refused in one line: drawn by the hundred.
+
+Nothing is compiled: loaders and checks alone.
+"""
+
+import dataclasses
+import hashlib
+import io
+import json
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import get_args, get_origin
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, configuration, given, settings
+from hypothesis import strategies as st
+
+from hector_jax.control.footstep import FootstepConfig
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.legs import LegConfig
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.qp import QpConfig
+from hector_jax.control.trajectories import load_course
+from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import expert
+from hector_jax.evaluation.robustness import SceneConfig
+from hector_jax.evaluation.video import VideoConfig
+from hector_jax.grfm import dataset, network
+from hector_jax.grfm.training import TrainConfig
+from hector_jax.inputs import Interval, did_you_mean, problem, shown
+from hector_jax.pipeline import CollectConfig
+from hector_jax.robot import load_robot
+from hector_jax.storage import load_weights, save_tree, save_weights
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.online import OnlineConfig
+from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.search import SearchConfig
+
+configuration.set_hypothesis_home_dir(Path(tempfile.gettempdir()) / "hypothesis")  # not in here
+ROBOT = load_robot()
+
+hundreds = settings(
+    max_examples=300,
+    derandomize=True,
+    database=None,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+)
+
+NUMBERS = st.one_of(
+    st.sampled_from([0, -1, 1, 0.0, -1.0, 0.5, 1e308, -1e-308, 2**63, -(10**400), 10**400]),
+    st.sampled_from([float("nan"), float("inf"), float("-inf")]),
+    st.integers(-1000, 1000),
+    st.floats(-1e6, 1e6),
+)
+WORDS = st.one_of(
+    st.sampled_from(["", "weigth", "nan", "1", "../x", "papier"]), st.text(max_size=9)
+)
+JUNK = st.recursive(
+    st.one_of(st.none(), st.booleans(), NUMBERS, WORDS),
+    lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(WORDS, inner, max_size=3)),
+    max_leaves=6,
+)
+
+
+def one_line(error):
+    message = str(error)
+    assert "\n" not in message
+    assert len(message) < 1000, message
+    return message
+
+
+# Settings
+
+CONFIGS = (
+    GaitConfig,
+    FootstepConfig,
+    LegConfig,
+    QpConfig,
+    MpcConfig,
+    WalkConfig,
+    RolloutConfig,
+    LossConfig,
+    TuneConfig,
+    SearchConfig,
+    OnlineConfig,
+    TrainConfig,
+    CollectConfig,
+    SceneConfig,
+    VideoConfig,
+)
+FIELDS = [(kind, field) for kind in CONFIGS for field in dataclasses.fields(kind)]
+SIGNED = {"LegConfig.landing", "FootstepConfig.feedback", "FootstepConfig.turn"}
+
+
+def made(kind, **values):
+    """What kind(**values) makes in a program; the types that the tests check are left aside."""
+    config = object.__new__(kind)
+    for field in dataclasses.fields(kind):
+        default = field.default
+        if default is dataclasses.MISSING:
+            default = field.default_factory()
+        object.__setattr__(config, field.name, values.get(field.name, default))
+    config.__post_init__()
+    return config
+
+
+@hundreds
+@given(st.sampled_from(FIELDS), st.one_of(JUNK, st.lists(JUNK, max_size=5).map(tuple)))
+def test_settings_are_taken_or_refused_by_field_and_value(place, value):
+    kind, field = place
+    try:
+        made(kind, **{field.name: value})
+    except ValueError as error:
+        message = one_line(error)
+        assert message.startswith(f"{kind.__name__}.")
+        assert field.name in message
+        assert "must " in message
+        assert shown(value) in message or repr(value)[:20] in message
+    else:
+        assert problem(value, field.type) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "field"), FIELDS, ids=[f"{k.__name__}.{f.name}" for k, f in FIELDS]
+)
+def test_no_setting_takes_a_nan_a_word_or_a_number_below_its_range(kind, field):
+    name = f"{kind.__name__}.{field.name}"
+    numeric = {int, float} & {field.type, *get_args(field.type)}
+    wrong = [float("nan"), float("inf"), -1e9, 10**400] if numeric else [float("nan"), 3]
+    for value in [*wrong, "weigth", [], {}]:
+        if name in SIGNED and value == -1e9:
+            continue
+        value = (value,) * 5 if get_origin(field.type) is tuple else value
+        if problem(value, field.type) is None and field.type is bool:
+            continue
+        with pytest.raises(ValueError, match=name):
+            made(kind, **{field.name: value})
+
+
+def test_defaults_and_numpy_numbers_are_taken():
+    for kind in CONFIGS:
+        assert made(kind) == kind()
+    assert made(MpcConfig, horizon=np.int64(5), friction=np.float64(0.5)).horizon == 5
+
+
+def test_ranges_and_hints_are_told_in_words():
+    assert problem(3, int, Interval(5, 9)) == (
+        "must be a whole number of at least 5 and at most 9, got 3"
+    )
+    assert problem(True, float) == "must be a number that is finite, got True"
+    assert problem(0.0, float | None, Interval(0.0, above=True)).startswith(
+        "must be a number above"
+    )
+    assert problem(None, float | None) is None
+    assert problem("wieght", str, ("zero", "weight")) == (
+        "must be 'zero' or 'weight', got 'wieght'; did you mean 'weight'?"
+    )
+    assert did_you_mean("xyz", ["zero", "weight"]) == ""
+    assert len(shown("x" * 1000)) == 60
+
+
+# Files
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("inputs")
+
+
+def places(tree, at=()):
+    """Where something can be changed in nested dictionaries and lists."""
+    yield at
+    inner = tree.items() if isinstance(tree, dict) else enumerate(tree)
+    for key, value in inner:
+        if isinstance(value, dict | list):
+            yield from places(value, (*at, key))
+        else:
+            yield (*at, key)
+
+
+def changed(data, tree):
+    """The tree with one thing replaced, renamed, taken away or put in."""
+    tree = json.loads(json.dumps(tree))
+    at = data.draw(st.sampled_from([place for place in places(tree) if place]))
+    holder = tree
+    for key in at[:-1]:
+        holder = holder[key]
+    how = data.draw(st.sampled_from(["replace", "replace", "rename", "remove", "add"]))
+    if how == "replace" or isinstance(holder, list):
+        holder[at[-1]] = data.draw(JUNK)
+    elif how == "add":
+        holder[data.draw(WORDS)] = data.draw(JUNK)
+    else:
+        value = holder.pop(at[-1])
+        if how == "rename":
+            holder[at[-1][:-1] + data.draw(WORDS)] = value
+    return tree
+
+
+PRINTABLE = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=8).map(str.encode)
+
+
+def torn(data, content):
+    """The bytes cut, or a stretch of them replaced."""
+    begin = data.draw(st.integers(0, len(content)))
+    length = data.draw(st.integers(0, 20))
+    put = data.draw(st.one_of(PRINTABLE, PRINTABLE, st.binary(max_size=8)))
+    return content[:begin] + put + content[begin + length :]
+
+
+def refused_or(load, path):
+    """What comes of a file; None where it is refused, in one line that begins with its name."""
+    try:
+        return load(path)
+    except ValueError as error:
+        message = one_line(error)
+    assert message.startswith((str(path.parent), "cannot read"))
+    return None
+
+
+@hundreds
+@given(st.data())
+def test_weights_files_are_taken_or_refused_in_one_line(folder, data):
+    path = folder / "weights.json"
+    save_weights(path, expert())
+    if data.draw(st.booleans()):
+        path.write_text(json.dumps(changed(data, json.loads(path.read_text()))))
+    else:
+        path.write_bytes(torn(data, path.read_bytes()))
+    found = refused_or(load_weights, path)
+    if found is not None:
+        for leaf, like in zip(jax.tree.leaves(found), jax.tree.leaves(expert()), strict=True):
+            assert leaf.shape == like.shape
+            assert np.all(np.isfinite(leaf) & (leaf > 0))
+
+
+def as_toml(value):
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(k)} = {as_toml(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(as_toml, value)) + "]"
+    return json.dumps(value) if isinstance(value, str | bool) else str(value)  # None is no TOML
+
+
+COURSE = {
+    "name": "mine",
+    "segment": [
+        {"seconds": 1.0, "v_x": 0.3, "v_y": 0.1, "yaw_rate": -0.5},
+        {"seconds": 2, "v_x": 0.0},
+    ],
+}
+
+
+@hundreds
+@given(st.data())
+def test_trajectories_are_taken_or_refused_in_one_line(folder, data):
+    path = folder / "course.toml"
+    if data.draw(st.booleans()):
+        tree = changed(data, COURSE)
+        text = "\n".join(f"{json.dumps(key)} = {as_toml(value)}" for key, value in tree.items())
+        path.write_bytes(text.encode(errors="surrogatepass"))
+    else:
+        path.write_bytes(
+            torn(data, "\n".join(f"{k} = {as_toml(v)}" for k, v in COURSE.items()).encode())
+        )
+    found = refused_or(load_course, path)
+    if found is not None:
+        rows = len(found.command.duration)
+        assert found.command.velocity.shape == (rows, 2)
+        assert np.all(np.abs(found.command.velocity) <= 10.0)
+        assert np.all(np.abs(found.command.yaw_rate) <= 10.0)
+        assert found.seconds == pytest.approx(float(np.sum(found.command.duration)))
+        assert 0.05 <= found.seconds <= 600.0
+
+
+def forge(path, change_card=lambda card: card, arrays=None):
+    """The archive with another card and other arrays, its hash made to fit."""
+    with np.load(path, allow_pickle=False) as archive:
+        held = {name: archive[name] for name in archive.files}
+    card = change_card(json.loads(str(held["card"])))
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, array in {**held, **(arrays or {}), "card": np.array(json.dumps(card))}.items():
+            with archive.open(f"{name}.npy", "w") as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+        archive.comment = b"0" * 64
+    content = buffer.getvalue()[:-64]
+    path.write_bytes(content + hashlib.sha256(content).hexdigest().encode())
+
+
+ARRAYS = st.sampled_from(
+    [
+        np.zeros(0),
+        np.zeros(()),
+        np.full((2, 3), np.nan),
+        np.array("text"),
+        np.zeros(3, complex),
+        np.zeros((1, 1, 1, 1, 1)),
+        np.array(["2020-01-01"], "datetime64[D]"),
+    ]
+)
+
+
+def spoilt(data, path):
+    """A sound file of ours made unsound: its bytes, its card, its arrays, or an array's shape."""
+    with np.load(path, allow_pickle=False) as archive:
+        names = sorted(set(archive.files) - {"card"})
+        shapes = {name: archive[name].shape for name in names}
+    how = data.draw(st.sampled_from(["bytes", "card", "card", "array", "longer"]))
+    if how == "bytes":
+        content = path.read_bytes()
+        other = torn(data, content)
+        assume(other != content)
+        path.write_bytes(other)
+    elif how == "card":
+        forge(path, lambda card: changed(data, card))
+    else:
+        name = data.draw(st.sampled_from(names))
+        longer = np.ones([size + 1 for size in shapes[name]])
+        forge(path, arrays={name: longer if how == "longer" else data.draw(ARRAYS)})
+
+
+@pytest.fixture(scope="module")
+def net(folder):
+    """A small net of zeros."""
+    path = folder / "sound-net.npz"
+    like = network.layout("paper", (3,))
+    network.save_net(path, like, robot=ROBOT, about={})
+    return path
+
+
+@hundreds
+@given(st.data())
+def test_nets_are_taken_or_refused_in_one_line(folder, net, data):
+    path = folder / "net.npz"
+    path.write_bytes(net.read_bytes())
+    spoilt(data, path)
+    found = refused_or(lambda path: network.load_net(path, ROBOT), path)
+    if found is not None:
+        params, variant, _ = found
+        assert variant == "paper"
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+@pytest.fixture(scope="module")
+def walks(folder):
+    """A collection of two walks in which nothing moves."""
+    home = folder / "walks"
+    shape = lambda x: [2, 5][: x.ndim] + list(x.shape[2:])  # noqa: E731
+    like = dataset._like()
+    still = jax.tree.map(
+        lambda x: np.zeros([s or n for s, n in zip(x.shape, shape(x), strict=True)]), like
+    )
+    save_tree(home / "shard-000.npz", still, kind="walks", robot=ROBOT, about={})
+    card = {"walks": 2, "shards": ["shard-000.npz"], "told": {"controller": "mine"}}
+    (home / "card.json").write_text(json.dumps(card))
+    return {path.name: path.read_bytes() for path in home.iterdir()}
+
+
+@hundreds
+@given(st.data())
+def test_collected_walks_are_taken_or_refused_in_one_line(folder, walks, data):
+    home = folder / "spoilt"
+    home.mkdir(exist_ok=True)
+    for name, content in walks.items():
+        (home / name).write_bytes(content)
+    if data.draw(st.booleans()):
+        spoilt(data, home / "shard-000.npz")
+    elif data.draw(st.booleans()):
+        card = home / "card.json"
+        card.write_text(json.dumps(changed(data, json.loads(card.read_text()))))
+    else:
+        (home / "card.json").write_bytes(torn(data, walks["card.json"]))
+    found = refused_or(lambda path: dataset.load_walks(path.parent, ROBOT), home / "card.json")
+    if found is not None:
+        run = found.trajectory
+        assert run.state.euler.shape[:2] == run.fallen.shape == run.residual.shape
+        assert len(jax.tree.leaves(found.job)[0]) == len(run.fallen)
+
+
+def test_an_archive_that_would_swell_is_refused_unread(folder, net):
+    path = folder / "bomb.npz"
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("card.npy", bytes(10_000_000))
+        archive.comment = b"0" * 64
+    content = buffer.getvalue()[:-64]
+    path.write_bytes(content + hashlib.sha256(content).hexdigest().encode())
+    with pytest.raises(ValueError, match="bomb.npz: no card .*: an entry is compressed"):
+        network.load_net(path, ROBOT)

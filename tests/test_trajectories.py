@@ -1,0 +1,209 @@
+"""Trajectories of one's own: what a file may say, and what is told of one that asks too much."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hector_jax import commands
+from hector_jax.cli import main
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.reference import (
+    COMMANDS,
+    UNSEEN,
+    Command,
+    named_command,
+    reference_at,
+    standing_anchor,
+)
+from hector_jax.control.trajectories import beyond, course, limits, load_course
+from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import expert, nominal
+from hector_jax.robot import load_robot
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import hfs
+from hector_jax.tuning.difftune import TuneConfig
+
+SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
+ROBOT = load_robot()
+LIMITS = limits(ROBOT, GaitConfig())
+
+
+def written(tmp_path, text):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_example_is_a_command_of_six_seconds():
+    found = course(str(SLALOM))
+    assert (found.name, found.seconds) == ("slalom", 6.0)
+    np.testing.assert_array_equal(found.command.duration, [1.0, 1.0, 2.0, 1.0, 1.0])
+    np.testing.assert_array_equal(found.command.yaw_rate, [0.0, 0.8, -0.8, 0.8, 0.0])
+    np.testing.assert_array_equal(found.command.velocity[-1], [0.2, 0.1])
+    end = reference_at(0.01, found.command, standing_anchor(ROBOT), 600.0)
+    assert end.euler[2] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_a_segment_leaves_out_is_zero_and_whole_numbers_will_do(tmp_path):
+    path = written(tmp_path, 'name = "back"\n[[segment]]\nseconds = 2\nv_x = -1\n')
+    found = load_course(path)
+    np.testing.assert_array_equal(found.command.velocity, [[-1.0, 0.0]])
+    assert found.command.velocity.dtype == float
+    assert found.seconds == 2.0
+
+
+def test_a_built_in_trajectory_is_taken_by_its_name():
+    found = course("s")
+    assert (found.name, found.seconds) == ("s", None)
+    for got, expected in zip(found.command, named_command("s"), strict=True):
+        np.testing.assert_array_equal(got, expected)
+
+
+HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["missing field 'name'", "there are: name, segment"]),
+        ('name = "mine"', ["missing field 'segment'"]),
+        ('name = "mine"\nsegment = []', ["[[segment]] must be there 1 to 100 times, got 0"]),
+        ('name = "mine"\nsegment = 3', ["segment must be a list, got 3"]),
+        ('name = "mine"\nsegment = [3]', ["segment 1 must be a table of seconds, v_x"]),
+        ("name = 3\nsegment = [{seconds = 1}]", ["name must be words, got 3"]),
+        ('name = "../up"\nsegment = [{seconds = 1}]', ["name must be 1 to 40", "'../up'"]),
+        ('name = "s"\nsegment = [{seconds = 1}]', ["built-in trajectory", "'s'"]),
+        (HEAD + "vx = 0.3", ["segment 1: unknown field 'vx'; did you mean 'v_x'", "yaw_rate"]),
+        (HEAD + "v_x = nan", ["segment 1: v_x must be a number", "at most 10, got nan"]),
+        (HEAD + "v_y = inf", ["segment 1: v_y must be a number", "got inf"]),
+        (HEAD + "v_x = 500", ["at least -10 and at most 10, got 500"]),
+        (HEAD + 'yaw_rate = "fast"', ["yaw_rate must be a number", "at most 10, got 'fast'"]),
+        (HEAD + "yaw_rate = true", ["yaw_rate must be a number", "got True"]),
+        (HEAD + f"v_x = {10**400}", ["v_x must be a number"]),
+        (HEAD + f"v_x = 0x{'f' * 9000}", ["v_x must be a number", "too many digits"]),
+        (HEAD + "[[segment]]\nv_x = 1.0", ["segment 2: missing field 'seconds'"]),
+        (HEAD + "[[segment]]\nseconds = -1", ["segment 2: seconds must be", "0.05", "got -1"]),
+        (HEAD + "[[segment]]\nseconds = 0.07", ["multiple of 0.05 s, got 0.07"]),
+        (HEAD + "v_x == 3", ["no valid TOML", "line 4"]),
+        (HEAD + "[[segment]]\nseconds = 600", ["at most 600 s together, got 601"]),
+        (HEAD + "x = " + "[" * 9000, ["no valid TOML"]),
+        ("#" * 100_001, ["0.1 MB, expected at most 0.1 MB"]),
+    ],
+)
+def test_wrong_files_are_refused_by_file_field_value_and_range(tmp_path, text, words):
+    with pytest.raises(ValueError, match="mine.toml: ") as caught:
+        load_course(written(tmp_path, text))
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_missing_files_and_unknown_names_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="none.toml: cannot read a trajectory: No such file"):
+        course(str(tmp_path / "none.toml"))
+    with pytest.raises(ValueError, match="'strait'; did you mean 'straight'"):
+        course("strait")
+
+
+def test_the_limits_are_those_that_the_robot_was_seen_to_have():
+    np.testing.assert_allclose(LIMITS, [1.55, 1.04, 1.20, 3.5], atol=0.01)
+    slower = limits(ROBOT, GaitConfig(stance=40, swing=40))
+    np.testing.assert_allclose(slower, np.array(LIMITS) / 2)
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, *UNSEEN])
+def test_built_in_trajectories_are_within_the_limits(name):
+    assert beyond(LIMITS, named_command(name)) is None
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ([(2.0, 0.0, 0.0)], "segment 1: v_x is 2 m/s; .* walk -1 to 1.6 m/s"),
+        ([(0.5, 0.0, 0.0), (0.0, -1.5, 0.0)], "segment 2: v_y is -1.5 m/s"),
+        ([(0.0, 0.0, 5.0)], "segment 1: yaw_rate is 5 rad/s"),
+        ([(1.2, 0.0, 0.0), (-0.8, 0.0, 0.0)], "segment 2: the change of v_x is -2 m/s"),
+    ],
+)
+def test_what_is_beyond_the_limits_is_told_by_segment_value_and_range(rows, told):
+    rows = np.array(rows)
+    command = Command(np.ones(len(rows)), rows[:, :2], rows[:, 2])
+    said = beyond(LIMITS, command)
+    assert said is not None
+    with pytest.raises(ValueError, match=told):
+        raise ValueError(said)
+
+
+# On the command line
+
+
+def call(monkeypatch, *words):
+    monkeypatch.setattr("sys.argv", ["hector", *map(str, words)])
+    return main()
+
+
+@pytest.fixture
+def walked(monkeypatch):
+    """What would have been walked, and for how long."""
+    asked = []
+
+    def pretend(config, robot, weights, command, plant, seconds, seed):
+        asked.append((command, seconds))
+        raise ValueError("walked")
+
+    monkeypatch.setattr(commands, "walk", pretend)
+    return asked
+
+
+def test_a_walk_lasts_as_long_as_its_file_says(monkeypatch, capsys, walked):
+    call(monkeypatch, "walk", "--traj", SLALOM)
+    call(monkeypatch, "walk", "--traj", "eight")
+    assert [seconds for _, seconds in walked] == [6.0, 4.0]
+    assert "warning" not in capsys.readouterr().err
+    assert call(monkeypatch, "walk", "--traj", SLALOM, "--seconds", "2") == 2
+    assert "slalom lasts 6 s, as its file says, got 2" in capsys.readouterr().err
+
+
+def test_what_is_beyond_the_robot_is_walked_with_a_warning(monkeypatch, capsys, walked, tmp_path):
+    path = written(tmp_path, HEAD + "v_x = 2.0")
+    call(monkeypatch, "walk", "--traj", path)
+    assert len(walked) == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert f"warning: {path}: segment 1: v_x is 2 m/s" in err
+
+
+def test_rollouts_are_as_long_as_the_file_says():
+    config = TuneConfig()
+    assert commands._lasting(config, course(str(SLALOM))).rollout.ticks == 600
+    assert commands._lasting(config, course("c")) == config
+
+
+def test_a_refresh_of_too_many_segments_is_refused_before_anything(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert call(monkeypatch, "tune", "--traj", SLALOM, "--refresh", "1") == 2
+    assert "at most 4 segments, slalom has 5" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["walk", "evaluate", "tune", "search"])
+def test_a_wrong_file_is_one_line_of_each_command(monkeypatch, capsys, tmp_path, command):
+    monkeypatch.chdir(tmp_path)
+    path = written(tmp_path, HEAD + "vx = 1")
+    assert call(monkeypatch, command, "--traj", path) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "mine.toml: segment 1: unknown field 'vx'" in err
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.toml"]
+
+
+@pytest.mark.slow
+def test_the_example_is_walked_on_the_simulator_within_centimetres():
+    found = course(str(SLALOM))
+    for weights in (nominal(), expert()):
+        walked = walk(WalkConfig(), ROBOT, weights, found.command, hfs(), found.seconds)
+        assert not walked.fallen.any()
+        error = walked.state.position - walked.reference.position
+        assert np.abs(error).max() < 0.10

@@ -1,0 +1,331 @@
+"""A run on a page: what is drawn is what was walked, and a growing run is seen to grow."""
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, opened
+from pretend import pretend_history, pretend_walk
+
+from hector_jax import commands, pipeline
+from hector_jax.cli import main
+from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.evaluation import progress, view
+from hector_jax.evaluation.view import Shown, motion
+from hector_jax.robot import load_model, load_robot
+from hector_jax.storage import save_weights, write_json
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot()
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_model()
+
+
+def shown(seed=0, **kwargs):
+    """A pretended walk; without turning, its yaw frame is the world frame."""
+    walk = pretend_walk(seed, **kwargs)
+    return Shown(walk, {"commanded": walk.command, "measured": walk.effect})
+
+
+def pretend_run(folder, iterations=12, weights=()):
+    """The folder of a run, as far as a page reads it."""
+    loss = {"euler": 1e5, "position": 2e5}
+    flags = {"traj": "straight", "data": str(folder / "data"), "variant": "residual"}
+    write_json(folder / "config.json", {"flags": flags, "tune": {"loss": loss}})
+    write_metrics(folder, iterations)
+    for name in weights:
+        save_weights(folder / "weights" / f"{name}.json", expert())
+    return folder
+
+
+def write_metrics(folder, iterations, refused=()):
+    lines = [
+        pipeline.as_line(name, iteration)
+        for name, pace in (("without", 5.0), ("with", 3.0))
+        for iteration in pretend_history(iterations, pace, refused)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(lines))
+
+
+def test_the_trunk_is_drawn_where_it_was(robot, model):
+    one = shown(seconds=0.5)
+    found = motion(robot, model, one)
+    trunk = model.body("trunk").id
+    apart = np.linalg.norm(found.position[:, trunk] - one.walk.state.position, axis=1)
+    np.testing.assert_allclose(apart, np.linalg.norm(robot.com_offset), atol=1e-9)
+    assert found.position.shape == (50, model.nbody, 3)
+
+
+def test_an_arrow_has_the_length_and_the_direction_of_its_force(robot, model):
+    one = shown(seconds=0.5)
+    arrows = motion(robot, model, one).arrows["force", "measured"]
+    expected = one.walk.effect.force * 0.35 / 120.0
+    found = arrows[:, :, 1] - arrows[:, :, 0]
+    np.testing.assert_allclose(found[..., 2], expected[..., 2])
+    np.testing.assert_allclose(found, expected, atol=0.01)  # the pretended yaw sways a little
+    # beside the foot, outwards
+    aside = arrows[:, :, 0, 1] - one.walk.feet[..., 1]
+    assert (aside[:, 0] > 0.05).all()
+    assert (aside[:, 1] < -0.05).all()
+
+
+def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot, model):
+    walk = pretend_walk(seconds=2.0, turn=np.pi / 4)
+    force = np.zeros((200, 2, 3))
+    force[..., 0] = 120.0  # ahead
+    ahead = Shown(walk, {"predicted": walk.effect._replace(force=force)})
+    arrows = motion(robot, model, ahead).arrows["force", "predicted"]
+    last = (arrows[-1, 0, 1] - arrows[-1, 0, 0]) / 0.35
+    yaw = walk.state.euler[-2, 2]
+    np.testing.assert_allclose(last, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-9)
+
+
+def test_the_film_has_the_force_arrows_of_the_page(robot, model):
+    motions = [motion(robot, model, shown(seed, seconds=0.5)) for seed in (0, 1)]
+    found = view.film_arrows(motions)
+    assert [one.words for one in found] == ["commanded", "measured"]
+    np.testing.assert_array_equal(found[1].ends[1], motions[1].arrows["force", "measured"])
+
+
+def test_each_touchdown_leaves_one_sole_of_the_feet_length(robot, model):
+    found = motion(robot, model, shown(seconds=4.0))
+    assert len(found.soles) == 20
+    length = np.linalg.norm(found.soles[:, 1] - found.soles[:, 0], axis=1)
+    np.testing.assert_allclose(length, robot.toe + robot.heel)
+
+
+def test_a_robot_that_fell_stays_where_it_was_last_seen(robot, model):
+    found = motion(robot, model, shown(seconds=1.0, fall_at=0.5))
+    assert found.fall == pytest.approx(0.5)
+    assert np.isfinite(found.position).all()
+    np.testing.assert_array_equal(found.position[50], found.position[-1])
+
+
+def test_metrics_are_read_back_as_they_were_written(tmp_path):
+    write_metrics(tmp_path, 6, refused=(3,))
+    found = progress.read_metrics(tmp_path)
+    assert list(found) == ["without", "with"]
+    assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
+    written = (tmp_path / "metrics.jsonl").read_text()
+    again = [pipeline.as_line(name, i) for name, history in found.items() for i in history]
+    assert "".join(again) == written
+    curve = progress.curves(found)["with"]
+    assert np.isnan(curve[3])
+    assert curve[6] < curve[0]
+
+
+def test_a_line_that_is_being_written_is_left_for_later(tmp_path):
+    write_metrics(tmp_path, 4)
+    whole = progress.read_metrics(tmp_path)
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"set": "with", "itera')
+    assert len(progress.read_metrics(tmp_path)["with"]) == len(whole["with"])
+
+
+def test_a_damaged_line_is_named(tmp_path):
+    write_metrics(tmp_path, 4)
+    text = (tmp_path / "metrics.jsonl").read_text().replace('"iteration": 2', '"number": 2', 1)
+    (tmp_path / "metrics.jsonl").write_text(text)
+    with pytest.raises(ValueError, match=r"metrics.jsonl, line 3: an iteration .*'iteration'"):
+        progress.read_metrics(tmp_path)
+
+
+def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
+    run = pretend_run(tmp_path)
+    weights, told = progress.weights_of(run, "with")
+    np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(nominal()))
+    assert told == "with at iteration 12, so far"
+    save_weights(run / "weights" / "with.json", expert())
+    weights, told = progress.weights_of(run, "with")
+    np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expert()))
+    assert told == "with"
+
+
+def test_an_unknown_set_is_told_those_that_there_are(tmp_path):
+    run = pretend_run(tmp_path, weights=["with_ten"])
+    expected = "no weight set 'witth'; it has expert, nominal, with, with_ten, without"
+    with pytest.raises(ValueError, match=expected):
+        progress.weights_of(run, "witth")
+
+
+def refused(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["hector", "view", *map(str, arguments)])
+    assert main() == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    return err.splitlines()[-1]
+
+
+def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
+    line = refused(monkeypatch, capsys, tmp_path, "--headless")
+    assert line.startswith(f"hector: {tmp_path} is no run of `hector tune`")
+    (tmp_path / "config.json").write_text("[]")
+    assert "config.json was expected" in refused(monkeypatch, capsys, tmp_path, "--headless")
+
+
+def test_a_run_is_not_filmed_into_its_own_folder(monkeypatch, capsys, tmp_path):
+    line = refused(monkeypatch, capsys, pretend_run(tmp_path), "--out", tmp_path)
+    assert "--out must not be the folder of the run" in line
+
+
+def test_two_different_sets_are_asked_for(monkeypatch, capsys, tmp_path):
+    run = pretend_run(tmp_path)
+    line = refused(monkeypatch, capsys, run, "--headless", "--sets", "with", "with")
+    assert "two different weight sets" in line
+
+
+def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(view, "find_spec", lambda name: None)
+    line = refused(monkeypatch, capsys, pretend_run(tmp_path))
+    assert "pip install 'hector-jax[view]'" in line
+
+
+def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
+    filmed = []
+    monkeypatch.setattr(
+        commands, "write_video", lambda *film, arrows: filmed.append((film, arrows))
+    )
+    monkeypatch.setattr(commands, "_walked", lambda *_: pretend_walk(seconds=0.3))
+    monkeypatch.setattr(view, "find_spec", lambda name: None)  # needs no viser
+    run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
+    flags = ["--world", "srbm", "--sets", "nominal", "expert"]
+    monkeypatch.setattr(sys, "argv", ["hector", "view", *map(str, [run, "--out", out, *flags])])
+    assert main() == 0
+    assert "no net at" in capsys.readouterr().err
+    (path, _, walks, strip), arrows = filmed[0]
+    assert (path.name, strip.name) == ("film.mp4", "film.png")
+    assert list(walks) == ["before: nominal", "after: expert"]
+    assert [one.words for one in arrows] == ["commanded", "measured"]
+    pictures = {"losses.png", "path.png", "tracking.png", "wrenches.png"}
+    assert {file.name for file in out.iterdir()} == pictures
+
+
+@pytest.fixture
+def page(robot, model, tmp_path):
+    viser = pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
+    run = pretend_run(tmp_path)
+    walks = {"before": shown(0, seconds=1.0), "after": shown(1, seconds=1.0, fall_at=0.6)}
+    motions = {name: motion(robot, model, one) for name, one in walks.items()}
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    yield view.Page(server, motions, model, run, "a story"), run, motions
+    server.stop()
+
+
+def test_a_page_plays_from_start_to_end_and_again(page):
+    page, _, motions = page
+    page._speed.value = 1.0
+    page.advance(0.5)
+    assert page._time.value == pytest.approx(0.5)
+    trunk = page._handles[0]["bodies"][1]
+    np.testing.assert_allclose(trunk.position, motions["before"].position[49, 1])
+    assert "fell" not in page._handles[1]["name"].text
+    page.advance(0.3)
+    assert page._handles[1]["name"].text == "after, fell at 0.60 s"
+    page.advance(0.9)
+    assert page._time.value == pytest.approx(1.0)
+    page.advance(0.1)
+    assert page._time.value == 0.0
+
+
+def test_a_page_that_is_paused_stands_still(page):
+    page, _, _ = page
+    page.advance(0.3)
+    page._play(False)
+    before = page._time.value
+    page.advance(0.3)
+    assert page._time.value == before
+    assert page._button.label == "Play"
+
+
+def test_what_is_unchecked_is_not_drawn(page):
+    page, _, _ = page
+    arrows = page._handles[0]["arrows"]
+    assert arrows["force", "measured"].visible
+    assert not arrows["moment", "measured"].visible
+    page._shown["measured"].value = False
+    page._shown["moment"].value = True
+    page._tick = -1
+    page.advance(0.0)
+    assert not arrows["force", "measured"].visible
+    assert arrows["force", "commanded"].visible
+
+
+def test_the_curves_grow_with_the_run(page):
+    page, run, _ = page
+    assert len(page._losses.data[0]) == 13
+    assert "the run goes on" in page._told.content
+    write_metrics(run, 20)
+    page.advance(0.5)
+    assert len(page._losses.data[0]) == 13  # not looked at yet
+    page.advance(0.6)
+    assert len(page._losses.data[0]) == 21
+    assert [line["label"] for line in page._losses.series] == ["iteration", "without", "with"]
+    assert "with: iteration 20" in page._told.content
+    assert "the run goes on" in page._told.content
+    write_json(run / "result.json", {})
+    page.advance(1.1)
+    assert "the run is done" in page._told.content
+
+
+def test_a_taken_port_is_passed_by():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert view._free_port("127.0.0.1", port) not in (0, port)
+
+
+@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 70000), ("203.0.113.7", 8080)])
+def test_an_address_that_cannot_be_listened_on_is_refused(host, port):
+    with pytest.raises((ValueError, OSError), match=r"--port must be|cannot listen on 203"):
+        view._free_port(host, port)
+
+
+def _until(seconds, look):
+    """What `look` finds, asked again until it finds something."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = look()
+        if found is not None:
+            return found
+        time.sleep(1.0)
+    raise AssertionError(f"not seen within {seconds} s")
+
+
+def _drawn(picture):
+    """The scene where both robots are in it: their colours, on what is not one plain plane."""
+    scene = picture[:, :800].astype(int)
+    red = (scene[..., 0] > 130) & (scene[..., 1] < 80) & (scene[..., 2] < 100)
+    green = (scene[..., 0] < 70) & (scene[..., 1] > 90) & (scene[..., 2] < 130)
+    seen = red.sum() > 50 and green.sum() > 50 and scene.std() > 15.0
+    return scene if seen else None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_a_browser_shows_the_run_until_it_is_interrupted(tmp_path):
+    pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
+    run = pretend_run(tmp_path / "run", weights=["with"])
+    words = [sys.executable, "-m", "hector_jax.cli", "view", run, "--seconds", "0.5", "--port", "0"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as page:
+        try:
+            told = next(line for line in page.stderr if line.startswith("open http"))
+            with opened(told.split()[1], tmp_path / "profile") as tab:
+                _until(300, lambda: _drawn(tab.picture()))
+                words = tab.text()
+                for expected in ("before: nominal", "after: with", "Pause", "L on the model"):
+                    assert expected in words
+                write_metrics(run, 20)  # the run goes on
+                _until(60, lambda: True if "with: iteration 20" in tab.text() else None)
+        finally:
+            page.send_signal(signal.SIGINT)
+        out, err = page.communicate(timeout=60)
+    assert page.returncode == 130
+    assert (out, err.splitlines()) == ("", ["hector: interrupted"])
