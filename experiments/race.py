@@ -132,10 +132,10 @@ def _price_job(config: TuneConfig, robot: Robot, command: Command) -> float:
     """Seconds of a walk, the mean of three, when all is compiled."""
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     job = Job(nominal(), command, hfs(), seconds)
-    walk_job(config.rollout.walk, robot, job, None)
+    walk_job(config.rollout.walk, robot, job)
     begin = time.monotonic()
     for _ in range(3):
-        walk_job(config.rollout.walk, robot, job, None)
+        walk_job(config.rollout.walk, robot, job)
     return (time.monotonic() - begin) / 3
 
 

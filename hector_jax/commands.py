@@ -21,7 +21,7 @@ from hector_jax import doctor, export, kept, pipeline, replay, study
 from hector_jax.console import Broken, say
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.trajectories import Course, beyond, course, limits
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
 from hector_jax.evaluation import fidelity, metrics, plots, progress, runs, view
 from hector_jax.evaluation.metrics import Score, Verdict
@@ -63,7 +63,7 @@ from hector_jax.grfm.training import TrainConfig, predict
 from hector_jax.inputs import did_you_mean, shown
 from hector_jax.kept import Journal, Judged
 from hector_jax.model.effect import last_command
-from hector_jax.robot import Robot, load_model, load_robot
+from hector_jax.robot import Robot, compile_model, load_robot
 from hector_jax.runtime import workers
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
@@ -83,6 +83,7 @@ from hector_jax.storage import (
 from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import TuneConfig, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.search import SearchConfig
 
 
@@ -96,7 +97,7 @@ def run(args: Any) -> None:
     raise NotImplementedError(type(args))
 
 
-def _weights(text: str) -> Weights:
+def _weights(text: str, robot: Robot) -> Weights:
     """A weight set by its name, or from a file."""
     named = {"nominal": nominal, "expert": expert}
     if text not in named and not Path(text).suffix and not Path(text).exists():
@@ -104,7 +105,17 @@ def _weights(text: str) -> Weights:
             f"no weights {shown(text)}{did_you_mean(text, named)}; there are: "
             f"{', '.join(named)}, or a file"
         )
-    return named[text]() if text in named else load_weights(Path(text))
+    return named[text](robot) if text in named else load_weights(Path(text))
+
+
+def _tuned_as(robot: Robot, **settings: Any) -> TuneConfig:
+    """Settings of a tuning, with the controller that the robot's description asks for."""
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **settings)
+
+
+def _of_robot(folder: Path, asked: Any, robot: Robot) -> Path:
+    """Another robot than the packaged one has a folder of its own in there."""
+    return folder if asked.robot is None else folder / robot.description.name
 
 
 def _plants(world: str, seeds: range) -> list[Imperfections]:
@@ -116,7 +127,7 @@ def _plants(world: str, seeds: range) -> list[Imperfections]:
 def _course(text: str, robot: Robot) -> Course:
     """What to walk; one line says where a file asks for more than the robot may be able to."""
     found = course(text)
-    if found.seconds and (told := beyond(limits(robot, WalkConfig().gait), found.command)):
+    if found.seconds and (told := beyond(limits(robot, walk_config(robot).gait), found.command)):
         say(f"warning: {text}: {told}")
     return found
 
@@ -144,8 +155,10 @@ def _lasting(config: TuneConfig, wanted: Course) -> TuneConfig:
 @run.register
 def _collect(args: Collect) -> None:
     config = pipeline.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
+    robot = load_robot(args.robot)
+    tune = _tuned_as(robot)
     with workers(args.processes) as pool:
-        pipeline.collect(pool, config, TuneConfig(), load_robot(), args.out)
+        pipeline.collect(pool, config, tune, robot, args.out)
     say(f"walks are in {args.out}")
 
 
@@ -153,7 +166,7 @@ def _collect(args: Collect) -> None:
 def _train(args: Train) -> None:
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     path = args.out or pipeline.net_path(args.data.parent, args.variant)
-    found = pipeline.train(config, load_robot(), args.data, path)
+    found = pipeline.train(config, load_robot(args.robot), args.data, path)
     if args.json:
         print(as_json({"net": str(path), "errors": found.errors}))
     else:
@@ -263,15 +276,12 @@ def _begin(folder: Path, args: Tune) -> None:
         write_json(new / "versions.json", environment())
         # without the folder, so that `--config` can ask for the same in another one
         asked = settings(replace(args, run=None, resume=None))
-        write_json(new / "config.json", {"flags": asked, "robot": _body()})
+        body = fingerprint(load_robot(args.robot))
+        write_json(new / "config.json", {"flags": asked, "robot": body})
         try:
             new.rename(folder)
         except OSError:
             raise ValueError(_taken(folder)) from None
-
-
-def _body() -> str:
-    return fingerprint(load_robot())
 
 
 def _as_begun(folder: Path, args: Tune) -> Tune:
@@ -282,8 +292,8 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
     """
     as_asked = _read_json(folder / "config.json")
     check_versions(folder / "versions.json", _read_json(folder / "versions.json"))
-    _agree(folder, as_asked, {"robot": _body()})
     begun, taken = from_file(Tune, folder / "config.json"), {}
+    _agree(folder, as_asked, {"robot": fingerprint(load_robot(begun.robot))})
     for field in dataclasses.fields(Tune):
         name = field.name
         if name in _FREE:
@@ -321,23 +331,24 @@ def _tune(args: Tune) -> None:
     if args.run and args.resume:
         raise ValueError(f"--run {args.run} and --resume {args.resume}: only one can be given")
     asked = COMMANDS if args.traj == "all" else (args.traj,)
-    wanted = {text: _asked_for(replace(args, traj=text), load_robot()) for text in asked}
     base = args.resume or args.run
     if base is None:
-        now = f"{datetime.now():%Y%m%d-%H%M%S}"
-        folders = {text: args.runs / course.name / now for text, course in wanted.items()}
+        robot, now = load_robot(args.robot), f"{datetime.now():%Y%m%d-%H%M%S}"
+        runs = _of_robot(args.runs, args, robot)
+        folders = {text: runs / _course(text, robot).name / now for text in asked}
     else:
         folders = {text: base / text if args.traj == "all" else base for text in asked}
-    runs = {folder: replace(args, traj=text) for text, folder in folders.items()}
+    several = {folder: replace(args, traj=text) for text, folder in folders.items()}
     if args.resume:
-        runs = {folder: _as_begun(folder, one) for folder, one in runs.items()}
+        several = {folder: _as_begun(folder, one) for folder, one in several.items()}
     else:
-        for folder in runs:
+        for folder, one in several.items():
+            _asked_for(one, load_robot(args.robot))
             if folder.exists():
                 raise ValueError(_taken(folder))
-        for folder, one in runs.items():
+        for folder, one in several.items():
             _begin(folder, one)
-    for folder, one in runs.items():
+    for folder, one in several.items():
         with locked(folder):
             _tune_in(folder, one)
 
@@ -359,16 +370,16 @@ def _asked_for(args: Tune, robot: Robot) -> Course:
 
 def _tune_in(folder: Path, args: Tune) -> None:
     """All of a run, taking up what is in its folder."""
-    robot, start = load_robot(), time.monotonic()
+    robot, start = load_robot(args.robot), time.monotonic()
     wanted = _asked_for(args, robot)
     command, lasts = wanted.command, wanted.seconds or Walk.seconds
-    shared, shelf = TuneConfig(iterations=args.iterations), folder / "kept"
-    config = _lasting(shared, wanted)
+    shared, shelf = _tuned_as(robot, iterations=args.iterations), folder / "kept"
+    config, data = _lasting(shared, wanted), _of_robot(args.data, args, robot)
     made_with = environment()
     commit = made_with.get("commit", "")
     say(f"results go to {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, shared, robot, args.data, args.variant)
+        net = pipeline.ground(pool, shared, robot, data, args.variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
@@ -404,8 +415,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
             tuning = tunings[name].tuning
 
         sets = {
-            "nominal": nominal(),
-            "expert": expert(),
+            "nominal": nominal(robot),
+            "expert": expert(robot),
             **{f"{name}_ten": tunings[name].tuning.ten for name in problems},
             **{name: tuned.tuning.converged for name, tuned in tunings.items()},
         }
@@ -526,12 +537,12 @@ def _table(args: Table) -> None:
 
 @run.register
 def _search(args: Search) -> None:
-    robot = load_robot()
+    robot = load_robot(args.robot)
     wanted = [_course(text, robot) for text in (COMMANDS if args.traj == "all" else (args.traj,))]
     own = {one.name: one.command for one in wanted}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = pipeline.choose_engine(args.engine)
-    tune, start = _lasting(TuneConfig(), wanted[0]), _weights(args.start)
+    tune, start = _lasting(_tuned_as(robot), wanted[0]), _weights(args.start, robot)
     make_folder(args.out)
     with workers(args.processes) as pool:
         found = pipeline.search(
@@ -545,7 +556,7 @@ def _search(args: Search) -> None:
             own,
         )
         say("walking start, expert and the best once more")
-        sets = {name: [start, expert(), found[name].weights] for name in own}
+        sets = {name: [start, expert(robot), found[name].weights] for name in own}
         at_once = config.population * len(own)
         compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once, own)
     cards = {}
@@ -581,18 +592,18 @@ def _search(args: Search) -> None:
 
 @run.register
 def _evaluate(args: Evaluate) -> None:
-    robot = load_robot()
+    robot = load_robot(args.robot)
     wanted = _course(args.traj, robot)
     seconds = _seconds(args.seconds, wanted)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
-    sets = {text: _weights(text) for text in args.weights}
+    sets = {text: _weights(text, robot) for text in args.weights}
     plants = _plants(args.world, seeds)
     with workers(args.processes) as pool:
         title = f"judging on {args.world}, {count} plants"
         walks = pipeline.judge(
-            pool, TuneConfig(), robot, sets, wanted.command, plants, seeds, title, seconds
+            pool, _tuned_as(robot), robot, sets, wanted.command, plants, seeds, title, seconds
         )
     scores = {n: [metrics.score(LossConfig(), walk) for walk in each] for n, each in walks.items()}
     verdict = _verdict(LossConfig(), seeds, scores)
@@ -604,8 +615,8 @@ def _evaluate(args: Evaluate) -> None:
 
 @run.register
 def _walk(args: Walk) -> None:
-    weights, robot = _weights(args.weights), load_robot()
-    wanted = _course(args.traj, robot)
+    robot = load_robot(args.robot)
+    weights, wanted = _weights(args.weights, robot), _course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
     trajectory = _walked(args, robot, wanted, weights)
     found = metrics.score(LossConfig(), trajectory)
@@ -632,7 +643,7 @@ def _walk(args: Walk) -> None:
         _film(
             args.video,
             robot,
-            {beside: _walked(args, robot, wanted, other()), args.weights: trajectory},
+            {beside: _walked(args, robot, wanted, other(robot)), args.weights: trajectory},
         )
 
 
@@ -642,7 +653,7 @@ def _walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) -
     if args.world == "srbm":
         return pipeline.walk_rigid_body(robot, weights, wanted.command, seconds)
     plant = _plants(args.world, range(args.seed, args.seed + 1))[0]
-    return walk(WalkConfig(), robot, weights, wanted.command, plant, seconds, args.seed)
+    return walk(walk_config(robot), robot, weights, wanted.command, plant, seconds, args.seed)
 
 
 def _film(
@@ -690,11 +701,11 @@ def _export(args: Export) -> None:
     # before the first array: see hector_jax.export
     jax.config.update("jax_platforms", "cpu")
     command = named_command(args.traj)
-    path, config = export.find_weights(args.run, args.set)
+    path, config, robot = export.find_weights(args.run, args.set)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
     folder = args.out or (args.run if args.run.is_dir() else args.run.parent) / "export"
     say("exporting, walking once and asking both controllers")
-    known = (config, load_robot(), weights, command, folder)
+    known = (config, load_robot(robot), weights, command, folder)
     card = export.export(*known, name=name, seconds=args.seconds)
     if args.json:
         print(as_json(card))
@@ -718,14 +729,16 @@ def _view(args: View) -> None:
         raise ValueError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
     if args.sets[0] == args.sets[1]:
         raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
-    asked, robot = progress.read_asked(args.run), load_robot()
+    asked = progress.read_asked(args.run)
+    robot = load_robot(asked.robot)
     wanted = _course(asked.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
             raise ValueError(f"--out must not be the folder of the run, got {folder}")
         make_folder(folder)
-    sets = {name: progress.weights_of(args.run, name) for name in args.sets}
-    effect = _phi_of(args.data or asked.data, asked.variant, robot)
+    sets = {name: progress.weights_of(args.run, name, robot) for name in args.sets}
+    data = _of_robot(args.data or asked.data, asked, robot)
+    effect = _phi_of(data, asked.variant, robot)
     story = [f"**{asked.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
     shown: dict[str, view.Shown] = {}
     say(f"walking anew in {args.world}, seed {args.seed}")
@@ -734,12 +747,12 @@ def _view(args: View) -> None:
         loss = metrics.score(asked.loss, walked).L / 1e6
         story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
         say(f"  {story[-1]}")
-        walked = at_interval(walked, WalkConfig().gait.tick)
+        walked = at_interval(walked, walk_config(robot).gait.tick)
         stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
         effects = {} if effect is None else {"residual": effect}
         curves = _curves(robot, stacked, effects)
         shown[name] = view.Shown(walked, curves)
-    model = load_model()
+    model = compile_model(robot.description)
     motions = [view.motion(robot, model, one) for one in shown.values()]
     if folder is not None:
         histories = progress.read_metrics(args.run)

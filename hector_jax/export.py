@@ -47,7 +47,7 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
-from hector_jax.robot import JOINT_NAMES, Robot
+from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.walk import first_tick, substeps, walk
 from hector_jax.sim.world import build_world, ideal, standing_qpos
@@ -70,18 +70,22 @@ TOLERANCE = 1e-6
 Config = TypeVar("Config")
 
 
-def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig]:
-    """A weight set's file and the controller that it was tuned for.
+def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig, Path | None]:
+    """A weight set's file, and the controller and the robot that it was tuned for.
 
     Args:
-        run: folder of a run, or a weights file, which is taken to be of the default controller.
+        run: folder of a run, or a weights file, which is taken to be of HECTOR and the default
+            controller.
         name: of the set in the folder.
+
+    Returns:
+        The file, the controller, and the robot's TOML (None: HECTOR).
 
     Raises:
         ValueError: one line with what is missing or odd, and what there is.
     """
     if not run.is_dir():
-        return run, WalkConfig()
+        return run, WalkConfig(), None
     sets = sorted(path.stem for path in (run / "weights").glob("*.json"))
     if name not in sets:
         near = get_close_matches(name, sets, n=1)
@@ -89,13 +93,15 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig]:
         raise ValueError(f"{run}: no weight set {name!r}; {hint}")
     path = run / "config.json"
     try:
-        kept = json.loads(path.read_text())["tune"]["rollout"]["walk"]
-        config = _restored(WalkConfig(), kept)
+        kept = json.loads(path.read_text())
+        config = _restored(WalkConfig(), kept["tune"]["rollout"]["walk"])
+        robot = kept.get("flags", {}).get("robot")
+        robot = Path(robot) if robot else None
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: no settings of a walking controller: {error}") from error
-    return run / "weights" / f"{name}.json", config
+    return run / "weights" / f"{name}.json", config, robot
 
 
 def _restored(default: Config, kept: dict[str, Any]) -> Config:
@@ -388,7 +394,7 @@ def record(
         ValueError: the robot falls.
     """
     plant = ideal()
-    world = build_world(plant)
+    world = build_world(plant, robot.description)
     standing = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
     rows = [np.concatenate([standing, np.zeros(world.model.nv + 1)])[sensing.coordinates(world)]]
     torques = []
@@ -565,7 +571,7 @@ def export(
         "constants": {
             "milliseconds_per_plan": substeps(config),
             "millisecond_of_tick_0": walked.lead,
-            "joint_names": list(JOINT_NAMES),
+            "joint_names": list(robot.description.joints),
             "standing_joints": robot.standing_joints.tolist(),
             "standing_height": float(robot.standing_height),
             "com_offset": robot.com_offset.tolist(),

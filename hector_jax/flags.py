@@ -50,6 +50,7 @@ class Collect(Configured):
     seed: Seed = 0  # of everything drawn: commands, weights, plants, pushes
     engine: Engine = "auto"  # MuJoCo on the processes, MJX all at once; auto: mjx on a GPU
     processes: Count = 2  # one core each
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class Train(Configured):
     epochs: Count = 200  # over all samples
     seed: Seed = 0  # of the net's first weights and of the order of the samples
     json: bool = False  # print JSON instead of lines
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,7 @@ class Tune(Configured):
     video: bool = True  # film nominal beside tuned
     processes: Count = 2  # one core each
     json: bool = False  # print JSON instead of the table; `run` names the folder
+    robot: Path | None = None  # TOML of another biped, whose data go to DATA/NAME; or HECTOR
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,7 @@ class Search(Configured):
     record: Path | None = None  # folder of what was walked, taken up again; OUT by default
     processes: Count = 2  # one core each
     json: bool = False  # print JSON instead of lines
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -163,6 +167,7 @@ class Evaluate(Configured):
     first_seed: Seed = 0  # of the plants
     processes: Count = 2  # one core each
     json: bool = False  # print JSON instead of the table
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -180,6 +185,7 @@ class Walk(Configured):
     out: Path | None = None  # keep the trajectory (.npz)
     video: Path | None = None  # film it (.mp4), nominal weights beside it
     json: bool = False  # print JSON instead of words
+    robot: Path | None = None  # TOML of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)

@@ -200,5 +200,7 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
 
 
 def _as_float(kind: Any, value: Any) -> Any:
-    """What a person writes as 1 where 1.0 is meant."""
+    """What a person writes as 1 where 1.0 is meant, and a list where a tuple is."""
+    if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
+        return tuple(_as_float(typing.get_args(kind)[0], one) for one in value)
     return float(value) if kind is float and type(value) is int and abs(value) < 2**53 else value

@@ -20,7 +20,7 @@ from hector_jax import replay
 from hector_jax.console import bar
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
@@ -115,7 +115,7 @@ def _tune_job(
     return difftune.tune(
         config,
         robot,
-        nominal(),
+        nominal(robot),
         command,
         standing_anchor(robot),
         _effect(params),
@@ -249,7 +249,7 @@ def tune_measured(
 
 def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
     anchor = standing_anchor(robot)
-    norms = difftune.gradient_norms(config, robot, nominal(), command, anchor, _effect(params))
+    norms = difftune.gradient_norms(config, robot, nominal(robot), command, anchor, _effect(params))
     return jax.device_get(norms)
 
 
@@ -283,7 +283,7 @@ def records_in(
         config, robot, problems: see `tune_many`; others have other records.
         about: JSON values to note with what is made now.
     """
-    endings = {n: digest(config, robot, nominal(), *each) for n, each in problems.items()}
+    endings = {n: digest(config, robot, nominal(robot), *each) for n, each in problems.items()}
     return {
         name: load_tuning(
             Checkpoint(folder / f"tuning-{name}-{ending}.npz", KIND, robot, about or {})
@@ -320,14 +320,14 @@ def collect(
     """
     with locked(folder):
         paths = tuning_paths(pool, tune, robot, folder / "paths")
-        jobs = dataset.draw_jobs(config.seed, config.walks, paths, config.seconds)
+        jobs = dataset.draw_jobs(config.seed, config.walks, paths, config.seconds, robot)
         _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, folder)
 
 
 def _keep_walks(
     pool: Executor,
     engine: str,
-    walk_config: WalkConfig,
+    walking: WalkConfig,
     robot: Robot,
     jobs: Sequence[Job],
     folder: Path,
@@ -338,8 +338,8 @@ def _keep_walks(
 
     def walk_jobs(jobs: list[Job]) -> Iterator[Trajectory]:
         if engine == "c":
-            return walk_many(pool, walk_config, robot, jobs)
-        return walk_batch(walk_config, robot, jobs, single=single)
+            return walk_many(pool, walking, robot, jobs)
+        return walk_batch(walking, robot, jobs, single=single)
 
     title = f"collecting {len(jobs)} walks on the high-fidelity simulator, engine {engine}"
     with bar(title) as tell:
@@ -349,7 +349,7 @@ def _keep_walks(
             walk_jobs,
             robot=robot,
             about={
-                "controller": repr(walk_config),
+                "controller": repr(walking),
                 "engine": engine,
                 "physics_bits": 32 if single else 64,
             },
@@ -359,7 +359,8 @@ def _keep_walks(
 
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
     """A walk on the plain single rigid body, `seconds` long, from standing."""
-    config = RolloutConfig(ticks=round(seconds / RolloutConfig().walk.gait.tick))
+    controller = walk_config(robot)
+    config = RolloutConfig(controller, ticks=round(seconds / controller.gait.tick))
     walked = jax.jit(rollout, static_argnums=0)
     anchor = standing_anchor(robot)
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))

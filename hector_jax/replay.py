@@ -17,6 +17,7 @@ import numpy as np
 from hector_jax.console import say
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
+from hector_jax.description import as_table, from_card
 from hector_jax.evaluation.report import environment
 from hector_jax.grfm.network import NetParams, Params, as_effect, layout, widths
 from hector_jax.model.effect import last_command
@@ -105,6 +106,7 @@ def keep(
             "hidden": widths(params.force),
         },
         "config": asdict(config),
+        "description": as_table(robot.description),
         "environment": environment(),
     }
     try:
@@ -127,10 +129,11 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
     try:
         params = None if net is None else layout(net["variant"], tuple(net["hidden"]))
         config = _made(TuneConfig, about.get("config", {}))
-    except (KeyError, TypeError, ValueError) as error:
+        description = from_card(about.get("description", {}))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: settings that this version does not know: {error}") from error
     like = Dump(
-        load_robot(),
+        load_robot()._replace(description=description),
         nominal(),
         Command(np.zeros(0), np.zeros((0, 2)), np.zeros(0)),
         Anchor(np.zeros(3), none, none),

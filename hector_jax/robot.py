@@ -1,9 +1,9 @@
-"""The robot as numbers: mass, lengths and limits, read from hector.xml and stated nowhere else.
+"""The robot as numbers: mass, lengths and limits, read from its MJCF and stated nowhere else.
 
-`load_model` compiles a robot description and checks that it is a biped this package can walk: a
-free trunk, two mirrored legs with hip yaw, hip roll, hip pitch, knee and ankle, one motor per
-joint, and line feet that touch at a toe and a heel. `load_robot` reads a `Robot` off the compiled
-model.
+`compile_model` compiles the MJCF of a description and checks that it is a biped this package can
+walk: a free trunk, two mirrored legs with hip yaw, hip roll, hip pitch, knee and ankle, one motor
+per joint, and line feet that touch at a toe and a heel. `load_robot` reads a `Robot` off the
+compiled model; which names the parts have, the description says.
 
 Frames: the trunk's is at the trunk body's origin, x ahead, y left, z up; a link's frame sits in the
 joint that moves it, parallel to the trunk's when all joints are zero.
@@ -11,6 +11,7 @@ joint that moves it, parallel to the trunk's when all joints are zero.
 
 import difflib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,21 +19,19 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.description import (
+    DESCRIPTION_PATH,
+    HECTOR_AXES,
+    Description,
+    read_description,
+)
 from hector_jax.mjcf import read_mjcf, refusal
 
-_PACKAGE = Path(__file__).parent
-_INSTALLED = _PACKAGE / "assets" / "hector.xml"  # where a wheel puts it
-MODEL_PATH = _INSTALLED if _INSTALLED.exists() else _PACKAGE.parent / "assets" / "hector.xml"
+# HECTOR's
+MODEL_PATH, STANDING = Description.model, Description.standing
+JOINT_NAMES, FOOT_POINTS = Description.joints, Description.foot_points
 
-SIDES = ("left", "right")
-LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
-JOINT_NAMES = tuple(f"{side}_{joint}" for side in SIDES for joint in LEG_JOINTS)
-FOOT_POINTS = tuple(f"{side}_foot_point" for side in SIDES)
-TOES = tuple(f"{side}_toe" for side in SIDES)
-HEELS = tuple(f"{side}_heel" for side in SIDES)
-STANDING = "standing"  # the keyframe of the standing pose
-
-_LEG_AXES = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0]], dtype=float)
+_AXES = dict(zip("xyz", np.eye(3), strict=True))
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
 
 # MuJoCo writes its warnings into a file of the working directory; the counters in MjData, which
@@ -64,20 +63,35 @@ class Robot(NamedTuple):
     standing_joints: Float[np.ndarray, "10"]  # [rad]
     standing_height: Float[np.ndarray, ""]  # CoM above the floor when standing [m]
     trunk_height: Float[np.ndarray, ""]  # trunk origin above the floor when standing [m]
+    description: Description  # its names and what else its TOML says; static, no array
+
+
+def describe(path: Path | None = None) -> Description:
+    """The description of a robot.
+
+    Args:
+        path: TOML file; an MJCF file with HECTOR's names, which is then described as HECTOR is;
+            None takes the packaged hector.toml.
+
+    Raises:
+        ValueError: as `read_description`.
+    """
+    path = DESCRIPTION_PATH if path is None else Path(path)
+    if path.suffix == ".toml":
+        return read_description(path)
+    return replace(read_description(DESCRIPTION_PATH), model=path)
 
 
 def load_robot(path: Path | None = None) -> Robot:
-    """The robot of a description file.
-
-    Args:
-        path: MJCF file; None takes the packaged hector.xml.
+    """The robot of a file, see `describe`.
 
     Raises:
-        ValueError: as `load_model`.
+        ValueError: as `describe` and `compile_model`.
     """
-    model = load_model(path)
+    description = describe(path)
+    model = compile_model(description)
     data = mujoco.MjData(model)
-    key = model.key(STANDING)
+    key = model.key(description.standing)
     mujoco.mj_resetDataKeyframe(model, data, key.id)
     mujoco.mj_forward(model, data)
 
@@ -85,9 +99,9 @@ def load_robot(path: Path | None = None) -> Robot:
     R_wb = data.xmat[trunk].reshape(3, 3)
     com = data.subtree_com[trunk]
     # The legs' joints, links and actuators in the package's order, whatever the file's.
-    joint = np.array([model.joint(name).id for name in JOINT_NAMES])
+    joint = np.array([model.joint(name).id for name in description.joints])
     link = model.jnt_bodyid[joint]
-    site = [model.site(name).id for name in FOOT_POINTS]
+    site = [model.site(name).id for name in description.foot_points]
     foot_point = model.site_pos[site]
     return Robot(
         mass=model.body_subtreemass[trunk].copy(),
@@ -99,38 +113,41 @@ def load_robot(path: Path | None = None) -> Robot:
         foot_point=foot_point,
         link_mass=model.body_mass[link].reshape(2, 5),
         link_com=model.body_ipos[link].reshape(2, 5, 3),
-        toe=model.geom(TOES[0]).pos[0] - foot_point[0, 0],
-        heel=foot_point[0, 0] - model.geom(HEELS[0]).pos[0],
+        toe=model.geom(description.toes[0]).pos[0] - foot_point[0, 0],
+        heel=foot_point[0, 0] - model.geom(description.heels[0]).pos[0],
         joint_lower=model.jnt_range[joint, 0],
         joint_upper=model.jnt_range[joint, 1],
         torque_limit=model.actuator_ctrlrange[:, 1].copy(),
         standing_joints=key.qpos[model.jnt_qposadr[joint]],
         standing_height=com[2].copy(),
         trunk_height=data.xpos[trunk][2].copy(),
+        description=description,
     )
 
 
 def load_model(path: Path | None = None) -> mujoco.MjModel:
-    """The compiled and checked model of a description file.
+    """The compiled and checked model of a file, see `describe` and `compile_model`."""
+    return compile_model(describe(path))
 
-    Args:
-        path: MJCF file; None takes the packaged hector.xml.
+
+def compile_model(description: Description) -> mujoco.MjModel:
+    """The compiled and checked model of a description.
 
     Raises:
-        ValueError: one line saying what came, what was expected and what there is. The file must be
+        ValueError: one line saying what came, what was expected and what there is. The MJCF must be
             one that `mjcf.read_mjcf` lets pass and that compiles to the biped of this module's
             docstring.
     """
-    path = MODEL_PATH if path is None else Path(path)
+    path = description.model
     root = read_mjcf(path)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as error:
         raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
     _check_base(path, model)
-    _check_joints(path, model)
-    _check_motors(path, model)
-    _check_feet(path, model)
+    _check_joints(description, model)
+    _check_motors(description, model)
+    _check_feet(description, model)
     return model
 
 
@@ -143,30 +160,29 @@ def _check_base(path: Path, model: mujoco.MjModel) -> None:
         )
 
 
-def _check_joints(path: Path, model: mujoco.MjModel) -> None:
+def _check_joints(description: Description, model: mujoco.MjModel) -> None:
+    path, joints = description.model, description.joints
     names = _joints(model)
-    for name in JOINT_NAMES:
+    for name in joints:
         _require(path, "joint", name, names)
-    got = [name for name in names if name in JOINT_NAMES]
-    if got != list(JOINT_NAMES) or len(names) != 1 + len(JOINT_NAMES):
+    got = [name for name in names if name in joints]
+    if got != list(joints) or len(names) != 1 + len(joints):
         raise ValueError(
-            f"{path}: joints are {_listed(names)}; "
-            f"expected a free joint, then {_listed(JOINT_NAMES)}"
+            f"{path}: joints are {_listed(names)}; expected a free joint, then {_listed(joints)}"
         )
-    for index, name in enumerate(JOINT_NAMES):
+    for index, name in enumerate(joints):
         joint = model.joint(name)
         which = index % 5
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
             raise ValueError(f"{path}: joint {name!r} is no hinge, expected a hinge")
-        if not np.allclose(joint.axis, _LEG_AXES[which], atol=_SAME):
-            raise ValueError(
-                f"{path}: axis of joint {name!r} is {joint.axis}, expected {_LEG_AXES[which]}"
-            )
+        axis = _AXES[description.axes[which]]
+        if not np.allclose(joint.axis, axis, atol=_SAME):
+            raise ValueError(f"{path}: axis of joint {name!r} is {joint.axis}, expected {axis}")
         if not joint.limited[0]:
             raise ValueError(f"{path}: joint {name!r} has no range, expected limits in radians")
         body = joint.bodyid[0]
         parent = model.body_parentid[body]
-        expected = _trunk(model) if which == 0 else model.joint(JOINT_NAMES[index - 1]).bodyid[0]
+        expected = _trunk(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
         if parent != expected:
             raise ValueError(
                 f"{path}: joint {name!r} hangs on body {model.body(parent).name!r}, "
@@ -178,20 +194,22 @@ def _check_joints(path: Path, model: mujoco.MjModel) -> None:
                 "expected neither pos on the joint nor an orientation on the body"
             )
         # Two parallel links in one plane: what the closed-form inverse kinematics solves.
-        if which >= 3 and (model.body_pos[body][0] != 0.0 or model.body_pos[body][2] >= 0.0):
+        closed = description.axes == HECTOR_AXES and which >= 3
+        if closed and (model.body_pos[body][0] != 0.0 or model.body_pos[body][2] >= 0.0):
             raise ValueError(
                 f"{path}: body of joint {name!r} is at {model.body_pos[body]}, "
                 "expected x = 0 and z < 0"
             )
 
 
-def _check_motors(path: Path, model: mujoco.MjModel) -> None:
-    if model.nu != len(JOINT_NAMES):
+def _check_motors(description: Description, model: mujoco.MjModel) -> None:
+    path, joints = description.model, description.joints
+    if model.nu != len(joints):
         raise ValueError(
-            f"{path}: {model.nu} actuators, expected {len(JOINT_NAMES)}, "
-            f"one per joint: {_listed(JOINT_NAMES)}"
+            f"{path}: {model.nu} actuators, expected {len(joints)}, "
+            f"one per joint: {_listed(joints)}"
         )
-    for index, name in enumerate(JOINT_NAMES):
+    for index, name in enumerate(joints):
         motor = model.actuator(index)
         driven = model.joint(motor.trnid[0]).name
         if driven != name:
@@ -203,20 +221,21 @@ def _check_motors(path: Path, model: mujoco.MjModel) -> None:
             )
 
 
-def _check_feet(path: Path, model: mujoco.MjModel) -> None:
-    if STANDING not in (keys := [model.key(i).name for i in range(model.nkey)]):
-        raise ValueError(f"{path}: {_missing('keyframe', STANDING, keys)}")
+def _check_feet(description: Description, model: mujoco.MjModel) -> None:
+    path, toes, heels = description.model, description.toes, description.heels
+    if description.standing not in (keys := [model.key(i).name for i in range(model.nkey)]):
+        raise ValueError(f"{path}: {_missing('keyframe', description.standing, keys)}")
     sites = [model.site(i).name for i in range(model.nsite)]
     geoms = [model.geom(i).name for i in range(model.ngeom)]
-    for side, foot in enumerate(FOOT_POINTS):
+    for side, foot in enumerate(description.foot_points):
         _require(path, "site", foot, sites)
-        body = model.joint(JOINT_NAMES[5 * side + 4]).bodyid[0]
+        body = model.joint(description.joints[5 * side + 4]).bodyid[0]
         point = model.site(foot).pos
         if model.site(foot).bodyid[0] != body:
             raise ValueError(
                 f"{path}: site {foot!r} is not on the foot, body {model.body(body).name!r}"
             )
-        for name, ahead in ((TOES[side], 1), (HEELS[side], -1)):
+        for name, ahead in ((toes[side], 1), (heels[side], -1)):
             _require(path, "geom", name, geoms)
             geom = model.geom(name)
             if geom.bodyid[0] != body or geom.type[0] != mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -229,7 +248,7 @@ def _check_feet(path: Path, model: mujoco.MjModel) -> None:
                     f"{path}: lowest point of geom {name!r} is {reach} from site {foot!r}, "
                     f"expected it {'ahead' if ahead > 0 else 'behind'} on the same sole"
                 )
-    for names in (TOES, HEELS):
+    for names in (toes, heels):
         left, right = (model.geom(name).pos[0] for name in names)
         if abs(left - right) > _SAME:
             raise ValueError(

@@ -23,7 +23,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -35,7 +35,7 @@ import numpy as np
 from hector_jax.console import say
 from hector_jax.control.weights import Weights
 from hector_jax.inputs import one_line, problem, read_text, shown
-from hector_jax.robot import MODEL_PATH
+from hector_jax.robot import MODEL_PATH, Robot
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
@@ -84,10 +84,16 @@ def fingerprint(tree: Any) -> str:
 
 
 def digest(*parts: Any) -> str:
-    """Twelve digits for settings (known by their repr), trees of numbers and the plants' XML."""
+    """Twelve digits for settings (by their repr), trees of numbers and robots with their XML."""
     is_tree = lambda x: isinstance(x, tuple) or x is None  # noqa: E731
     told = [fingerprint(part) if is_tree(part) else repr(part) for part in parts]
-    key = "\n".join([*told, repr(versions())]).encode() + MODEL_PATH.read_bytes()
+    bodies = [part.description for part in parts if isinstance(part, Robot)]
+    told += [
+        repr(replace(body, model=Path(body.model.name))) for body in bodies
+    ]  # anywhere on disk
+    key = "\n".join([*told, repr(versions())]).encode()
+    for model in [body.model for body in bodies] or [MODEL_PATH]:
+        key += model.read_bytes()
     return hashlib.sha256(key).hexdigest()[:12]
 
 

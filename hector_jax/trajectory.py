@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 LEFT, RIGHT = 0, 1
-MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it the robot has fallen
+MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen
 MAX_TILT = 0.8  # [rad] of roll or pitch; beyond it too
 
 
@@ -60,10 +60,12 @@ class Trajectory(NamedTuple):
     residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
 
 
-def has_fallen(state: State) -> Bool[Array, "*batch"]:
+def has_fallen(
+    state: State, min_height: float = MIN_HEIGHT, max_tilt: float = MAX_TILT
+) -> Bool[Array, "*batch"]:
     """Whether a base state is that of a fallen robot: too low, too tilted, or not finite."""
-    low = state.position[..., 2] < MIN_HEIGHT
-    tilted = jnp.any(jnp.abs(state.euler[..., :2]) > MAX_TILT, axis=-1)
+    low = state.position[..., 2] < min_height
+    tilted = jnp.any(jnp.abs(state.euler[..., :2]) > max_tilt, axis=-1)
     finite = jnp.all(jnp.stack([jnp.isfinite(x).all(axis=-1) for x in state]), axis=0)
     return low | tilted | ~finite
 

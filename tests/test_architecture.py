@@ -9,6 +9,7 @@ ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
     ["console", "runtime", "geometry", "inputs"],
     ["trajectory", "mjcf"],
+    ["description"],
     ["robot"],
     ["model"],
     ["control"],

@@ -225,7 +225,7 @@ def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
 def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     path = tmp_path / "hector.xml"
     path.write_text(change(MODEL_PATH.read_text()))
-    monkeypatch.setattr(commands, "load_robot", lambda: load_robot(path))
+    monkeypatch.setattr(commands, "load_robot", lambda _: load_robot(path))
     line = refused(monkeypatch, capsys, "walk")
     assert "hector.xml" in line
     assert expected in line
@@ -251,7 +251,7 @@ def test_a_search_refuses_wrong_input_before_it_makes_a_folder(
 def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch, capsys, tmp_path):
     """Two generations of short walks on all trajectories; the second call finds all done."""
     short = TuneConfig(rollout=RolloutConfig(ticks=20))
-    monkeypatch.setattr(commands, "TuneConfig", lambda: short)
+    monkeypatch.setattr(commands, "TuneConfig", lambda rollout: short)
     flags = ("search", "--traj", "all", "--budget", "9", "--population", "4", "--engine", "c")
     folders = ("--out", tmp_path / "found", "--record", tmp_path / "record", "--processes", "1")
     assert call(monkeypatch, *flags, *folders) == 0

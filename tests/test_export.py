@@ -384,10 +384,10 @@ def test_a_run_is_exported_with_its_own_controller(run):
     kept = asdict(own)
     del kept["mpc"]["effort_about"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
-    assert find_weights(run, "with") == (run / "weights" / "with.json", own)
+    assert find_weights(run, "with") == (run / "weights" / "with.json", own, None)
     hash(find_weights(run, "with")[1])
     path = run / "weights" / "with.json"
-    assert find_weights(path, "with") == (path, CONFIG)
+    assert find_weights(path, "with") == (path, CONFIG, None)
 
 
 @pytest.mark.parametrize(

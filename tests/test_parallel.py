@@ -140,7 +140,7 @@ def test_a_part_whose_height_over_the_floor_is_unknown_here_is_refused_by_name(t
     round_trunk = MODEL_PATH.read_text().replace('"trunk" type="box"', '"trunk" type="cylinder"')
     path.write_text(round_trunk)
     with pytest.raises(ValueError, match="geom trunk .* is a CYLINDER; .* BOX or CAPSULE"):
-        walk_batch(CONFIG, ROBOT, [job(expert())], path=path)
+        walk_batch(CONFIG, load_robot(path), [job(expert())])
 
 
 def test_a_robot_of_feet_alone_has_nothing_that_may_not_touch_the_floor():

@@ -33,7 +33,7 @@ def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude(robot):
 
 def test_a_film_shows_the_state_of_its_time_whatever_the_walks_rate(robot):
     slow, fast = (pretend_walk(seconds=1.0, period=p) for p in (0.01, 0.001))
-    found = video._request(VideoConfig(), robot, {"a": slow, "b": fast}, MODEL_PATH)
+    found = video._request(VideoConfig(), robot, {"a": slow, "b": fast})
     assert len(found["times"]) == 26
     np.testing.assert_allclose(found["aim_0"], found["aim_1"], atol=0.006)
     np.testing.assert_allclose(found["aim_0"][10], slow.reference.position[39])
@@ -41,7 +41,7 @@ def test_a_film_shows_the_state_of_its_time_whatever_the_walks_rate(robot):
 
 def test_a_robot_that_fell_stays_where_it_was_last_seen(robot):
     walks = {"a": pretend_walk(seconds=1.0, fall_at=0.5), "b": pretend_walk(seconds=1.0)}
-    found = video._request(VideoConfig(), robot, walks, MODEL_PATH)
+    found = video._request(VideoConfig(), robot, walks)
     assert found["fall_0"] == pytest.approx(0.5)
     assert np.isinf(found["fall_1"])
     assert np.isfinite(found["pose_0"]).all()

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from hector_jax.description import Description
 from hector_jax.robot import load_robot
 from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.standin import standin
@@ -254,7 +255,7 @@ def test_a_broken_file_is_refused_in_one_line(tmp_path):
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody>")
     with pytest.raises(ValueError, match="broken.xml") as caught:
-        build_world(ideal(), broken)
+        build_world(ideal(), Description(broken))
     assert "\n" not in str(caught.value)
 
 

@@ -96,7 +96,8 @@ def swing_joints(
         local = (target - trunk) @ R_wb
         turn = wrap_angle(end_yaw - start_yaw)
         yaw = wrap_angle(start_yaw + s * s * (3.0 - 2.0 * s) * turn - state.euler[2])
-        yaw = jnp.clip(yaw, robot.joint_lower[::5], robot.joint_upper[::5])
+        turns = robot.description.yaw_joint
+        yaw = jnp.clip(yaw, robot.joint_lower[turns::5], robot.joint_upper[turns::5])
         up = R_wb[2]  # world z in the trunk
         in_leg = jnp.stack([up @ rot_z(yaw[0]), up @ rot_z(yaw[1])])
         return inverse_legs(robot, local, yaw, jnp.arctan2(in_leg[:, 0], in_leg[:, 2]))

@@ -145,15 +145,20 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
     expert weights, 6 s from standing) it says 1.55, 1.04, 1.20 m/s and 3.5 rad/s; it walked 1.6,
     1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
     """
-    thigh, shin = (abs(robot.joint_origin[0, joint, 2]) for joint in (3, 4))
+    names = robot.description
+    hip, knee, ankle = names.pitch_joints
+    down = robot.joint_origin[0, :, 2]
+    thigh, shin = abs(down[hip + 1 : knee + 1].sum()), abs(down[knee + 1 : ankle + 1].sum())
 
-    def length(knee: float) -> float:
-        return np.sqrt(thigh**2 + shin**2 + 2 * thigh * shin * np.cos(knee))
+    def length(bend: float) -> float:
+        return np.sqrt(thigh**2 + shin**2 + 2 * thigh * shin * np.cos(bend))
 
-    stands = length(robot.standing_joints[3])
-    straightest = np.min(np.abs([robot.joint_lower[3], robot.joint_upper[3]]))
-    reach = np.sqrt(max(length(straightest) ** 2 - stands**2, 0.0))
-    yaw, roll = (np.min(np.abs([robot.joint_lower[i], robot.joint_upper[i]])) for i in (0, 1))
+    def least(joint: int) -> float:
+        return np.min(np.abs([robot.joint_lower[joint], robot.joint_upper[joint]]))
+
+    stands = length(robot.standing_joints[knee])
+    reach = np.sqrt(max(length(least(knee)) ** 2 - stands**2, 0.0))
+    yaw, roll = least(names.yaw_joint), least(names.roll_joint)
     height = stands + abs(robot.foot_point[0, 2])
     stance = gait.stance * gait.tick
     return Limits(

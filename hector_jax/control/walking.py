@@ -20,7 +20,7 @@ from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.geometry import rotation_from_euler, wrap_angle
-from hector_jax.inputs import check
+from hector_jax.inputs import check, from_table
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
@@ -47,6 +47,21 @@ class WalkConfig:
     def mpc_step(self) -> float:
         """MPC step dt [s]."""
         return self.mpc.step_ticks * self.gait.tick
+
+
+def walk_config(robot: Robot) -> WalkConfig:
+    """The controller that a robot's description asks for.
+
+    Raises:
+        ValueError: one line naming the file, the key and what was expected.
+    """
+    path, given = robot.description.path, dict(robot.description.control)
+    kinds = {"gait": GaitConfig, "mpc": MpcConfig, "footstep": FootstepConfig, "legs": LegConfig}
+    parts = {
+        name: from_table(f"{path}: {name}", kind, dict(given.get(name, ())))
+        for name, kind in kinds.items()
+    }
+    return from_table(str(path), WalkConfig, parts)
 
 
 class Feet(NamedTuple):

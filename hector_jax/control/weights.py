@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
 
 
@@ -45,14 +46,24 @@ def _weights(
     return Weights(State(*rows), Wrench(*both))
 
 
-def nominal() -> Weights:
-    """Flat, untuned weights that still walk: what an engineer writes down before tuning."""
+def nominal(robot: Robot | None = None) -> Weights:
+    """Flat, untuned weights that still walk: what an engineer writes down before tuning.
+
+    Those of a robot are in its description; without one, HECTOR's.
+    """
+    if robot is not None and robot.description.nominal is not None:
+        return _weights(*robot.description.nominal)
     ones = (1.0, 1.0, 1.0)
     return _weights((50.0,) * 3, (50.0,) * 3, ones, ones, (1e-4,) * 3, (1e-3,) * 3)
 
 
-def expert() -> Weights:
-    """The weights that the robot's own laboratory published for its walking controller."""
+def expert(robot: Robot | None = None) -> Weights:
+    """The weights that the robot's own laboratory published for its walking controller.
+
+    Those of a robot are in its description; without one, HECTOR's.
+    """
+    if robot is not None and robot.description.expert is not None:
+        return _weights(*robot.description.expert)
     ones = (1.0, 1.0, 1.0)
     return _weights(
         (100.0, 100.0, 250.0), (200.0, 200.0, 300.0), ones, ones, (1e-4, 1e-4, 5e-4), (1e-2,) * 3

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control import gait
 from hector_jax.control.gait import GaitConfig
+from hector_jax.control.walking import walk_config
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.training import predict
 from hector_jax.model import srbm
@@ -125,7 +126,7 @@ def drift(
     Raises:
         ValueError: no walk is long enough to predict in.
     """
-    config = config or GaitConfig()
+    config = config or walk_config(robot).gait
     ticks = round(HORIZONS[-1] / config.tick)
     fallen = np.asarray(walks.fallen)
     starts = np.arange(FIRST, fallen.shape[1] - ticks + 1, APART)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, vector_to_weights
+from hector_jax.robot import Robot
 from hector_jax.storage import load_weights
 from hector_jax.tuning.difftune import Evaluation, Iteration
 from hector_jax.tuning.loss import LossConfig, Losses
@@ -27,6 +28,7 @@ class Asked(NamedTuple):
     loss: LossConfig
     data: Path  # folder of its net
     variant: str  # of the net
+    robot: Path | None  # TOML of the biped; None: HECTOR
 
 
 def read_asked(folder: Path) -> Asked:
@@ -44,6 +46,7 @@ def read_asked(folder: Path) -> Asked:
             loss=LossConfig(**loss),
             data=Path(flags["data"]),
             variant=str(flags.get("variant", "residual")),
+            robot=Path(flags["robot"]) if flags.get("robot") else None,
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         told = getattr(error, "strerror", None) or repr(error)
@@ -93,13 +96,14 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
     )
 
 
-def weights_of(folder: Path, name: str) -> tuple[Weights, str]:
+def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Weights, str]:
     """A weight set of a run, and what it is in words.
 
     Args:
         folder: of the run.
         name: of a file of its `weights/`; of a tuning that is still going on, whose newest accepted
             weights are taken; nominal and expert are always there.
+        robot: whose nominal and expert weights they are; HECTOR by default.
 
     Raises:
         ValueError: there is no such set; names those that there are.
@@ -109,7 +113,7 @@ def weights_of(folder: Path, name: str) -> tuple[Weights, str]:
         return load_weights(path), name
     published = {"nominal": nominal, "expert": expert}
     if name in published:
-        return published[name](), name
+        return published[name](robot), name
     newest = _newest(read_metrics(folder))
     if name in newest:
         return newest[name].weights, f"{name} at iteration {newest[name].iteration}, so far"

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.geometry import rotation_from_euler
 from hector_jax.inputs import POSITIVE, SOME, Interval, check
-from hector_jax.robot import MODEL_PATH, Robot
+from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
@@ -35,6 +35,7 @@ METRES_PER_NEWTON = 0.35 / 120.0  # the robot's weight is an arrow of 35 cm
 LEAST_ARROW = 0.03  # [m]; shorter ones are not drawn
 
 _PATIENCE = 300.0  # [s] for a back end to draw the whole film
+_HEIGHT = 0.423  # [m] of the centre of mass of the robot that the camera is set for
 _TRAILS = ((0.72, 0.13, 0.20, 1.0), (0.0, 0.48, 0.37, 1.0))  # colours of before and after
 _REFERENCE = (0.08, 0.08, 0.10, 1.0)
 _ARROW = (237, 107, 28)
@@ -94,7 +95,6 @@ def write_video(
     walks: Mapping[str, Trajectory],
     strip: Path | None = None,
     config: VideoConfig | None = None,
-    model: Path = MODEL_PATH,
     arrows: Sequence[Arrows] | None = None,
 ) -> str:
     """Draw two walks side by side as an MP4.
@@ -105,7 +105,6 @@ def write_video(
         walks: two, by the words that stand above them, before and after.
         strip: PNG to write with snapshots of both.
         config: size and rate; None takes 640 x 360 at 25 frames per second.
-        model: robot description to draw.
         arrows: to draw at the feet; None takes the forces of the ground.
 
     Returns:
@@ -125,7 +124,7 @@ def write_video(
     asked = os.environ.get("MUJOCO_GL")
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder = Path(name)
-        np.savez(folder / "request.npz", **_request(config, robot, walks, model, arrows))
+        np.savez(folder / "request.npz", **_request(config, robot, walks, arrows))
         failures = []
         for back_end in (asked,) if asked else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
@@ -173,7 +172,6 @@ def _request(
     config: VideoConfig,
     robot: Robot,
     walks: Mapping[str, Trajectory],
-    model: Path,
     arrows: Sequence[Arrows] | None = None,
 ) -> dict[str, Any]:
     """Everything the child needs to know, as arrays."""
@@ -183,7 +181,8 @@ def _request(
     request: dict[str, Any] = {
         "size": np.array([config.width, config.height, config.rate, config.tiles]),
         "times": times,
-        "model": np.array(str(Path(model).resolve())),
+        "scale": np.asarray(robot.standing_height / _HEIGHT),
+        "model": np.array(str(robot.description.model.resolve())),
         "labels": np.array(list(walks)),
         "arrow_words": np.array([one.words for one in arrows]),
         "arrow_colours": np.array([one.colour for one in arrows]) / 255.0,
@@ -273,9 +272,9 @@ def _view(
     data.qpos[:] = request[f"pose_{walk}"][k]
     mujoco.mj_forward(model, data)
     reference, path = request[f"reference_{walk}"], request[f"path_{walk}"]
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = [*request[f"aim_{walk}"][k, :2], 0.37]
-    camera.distance, camera.azimuth, camera.elevation = 1.75, 125.0, -14.0
+    camera, scale = mujoco.MjvCamera(), float(request["scale"])
+    camera.lookat[:] = [*request[f"aim_{walk}"][k, :2], 0.37 * scale]
+    camera.distance, camera.azimuth, camera.elevation = 1.75 * scale, 125.0, -14.0
     renderer.update_scene(data, camera)
     renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
     scene = renderer.scene

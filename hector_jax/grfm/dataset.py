@@ -26,6 +26,7 @@ from hector_jax.console import say
 from hector_jax.control import gait
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
+from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.inputs import shown
 from hector_jax.model import srbm
@@ -82,7 +83,11 @@ class Dataset(NamedTuple):
 
 
 def draw_jobs(
-    seed: int, count: int, paths: Sequence[Weights] = (), seconds: float = 4.0
+    seed: int,
+    count: int,
+    paths: Sequence[Weights] = (),
+    seconds: float = 4.0,
+    robot: Robot | None = None,
 ) -> list[Job]:
     """What to walk so that phi knows the ground that tuning will tread.
 
@@ -97,16 +102,27 @@ def draw_jobs(
         count: number of walks.
         paths: weights that tunings went through, stacked along a first axis each.
         seconds: length of each walk.
+        robot: whose nominal and expert weights they are; HECTOR by default.
 
     Raises:
         ValueError: fewer than one walk.
     """
     if count < 1:
         raise ValueError(f"the number of walks must be at least 1, got {count}")
-    return [_draw_job(np.random.default_rng([seed, i]), i, paths, seconds) for i in range(count)]
+    centres = nominal(robot), expert(robot)
+    return [
+        _draw_job(np.random.default_rng([seed, i]), i, centres, paths, seconds)
+        for i in range(count)
+    ]
 
 
-def _draw_job(rng: np.random.Generator, i: int, paths: Sequence[Weights], seconds: float) -> Job:
+def _draw_job(
+    rng: np.random.Generator,
+    i: int,
+    centres: tuple[Weights, Weights],
+    paths: Sequence[Weights],
+    seconds: float,
+) -> Job:
     kind = KINDS[i % len(KINDS)]
     command = _random_command(rng) if kind == "random" else _split_last(named_command(kind))
     centre = (i // len(KINDS)) % (3 if paths else 2)
@@ -115,7 +131,7 @@ def _draw_job(rng: np.random.Generator, i: int, paths: Sequence[Weights], second
         point = rng.integers(len(path.Q.euler))
         weights = jax.tree.map(lambda w: np.asarray(w)[point], path)
     else:
-        weights = _draw_weights(rng, (nominal(), expert())[centre], SPREAD)
+        weights = _draw_weights(rng, centres[centre], SPREAD)
     plant = hfs_drawn(int(rng.integers(2**31)))
     return Job(weights, command, plant, seconds, seed=i, push=_draw_push(rng, seconds))
 
@@ -227,7 +243,7 @@ def collect(
     walk_jobs: Callable[[list[Job]], Iterable[Trajectory]],
     *,
     robot: Robot,
-    interval: float = GaitConfig.tick,
+    interval: float | None = None,
     shard: int = 16,
     about: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -243,7 +259,7 @@ def collect(
         walk_jobs: called once, with the jobs whose walks are missing; gives the walks in their
             order, from any world. An iterator that walks while it is asked loses least to a stop.
         robot: the body; shards of another one are refused.
-        interval: the plan interval [s].
+        interval: the plan interval [s], that of the robot's gait by default.
         shard: walks in a file.
         about: JSON values that tell how it was walked; shards that tell otherwise are refused.
         progress: called with walks done and walks in all.
@@ -253,6 +269,7 @@ def collect(
             walks are missing or too short.
         OSError: the folder cannot be written.
     """
+    interval = walk_config(robot).gait.tick if interval is None else interval
     told = json.loads(json.dumps({"interval": interval, **(about or {})}))  # as it is read back
     facts = {
         "units": _UNITS,
@@ -422,14 +439,14 @@ def make_dataset(
         walks: W walks of T ticks, stacked, from t = 0.
         start_tick: gait tick of t = 0, of all walks or of each (W,).
         push: pushes from outside, of all walks or of each (W, ...).
-        config: the gait that was walked.
+        config: the gait that was walked, that of the robot's description by default.
 
     Returns:
         The dataset, with numpy arrays, and how many samples were dropped because of a fall, an
         unsolved QP, or a push, which would pass for one by the legs. The first HISTORY - 1 ticks of
         a walk have no full history and are no samples.
     """
-    config = config or GaitConfig()
+    config = config or walk_config(robot).gait
     count = len(walks.fallen)
     starts = jnp.broadcast_to(jnp.asarray(start_tick, jnp.int32), (count,))
     pushes = jax.tree.map(

@@ -8,17 +8,29 @@ theta = q_2 + q_3 + q_4
     p = o_pitch + Ry(a) o_knee + Ry(b) o_ankle + Ry(theta) sole
 
 and the way back is closed: yaw is given, roll turns the plane onto the target, the rest is a
-triangle of thigh and shin. The knee bends backwards (negative). `load_model` has checked the axes
-and that thigh and shin point down at zero.
+triangle of thigh and shin. The knee bends backwards (negative). `compile_model` has checked the
+axes and that thigh and shin point down at zero.
+
+A leg whose joints come in another order (`Description.axes`) is a product of rotations, and the way
+back is a damped Newton iteration of `NEWTON_STEPS` steps from the standing pose. There the yaw is
+the heading that the foot's y axis is square to, and the pitch is about that axis from it: in the
+order above they are psi and theta.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hector_jax.description import HECTOR_AXES
+from hector_jax.geometry import rot_x, rot_y, rot_z
 from hector_jax.robot import Robot
+
+NEWTON_STEPS = 16
+_LARGEST_STEP = 0.4  # [rad] of a joint in a Newton step
+_DAMPING = 0.1  # times the squared error
 
 
 class Feet(NamedTuple):
@@ -64,15 +76,19 @@ def inverse_legs(
         yaw: hip yaw angles [rad].
         pitch: sum of the three pitch joints [rad], the foot's pitch against the leg's rolled frame.
     """
-    return jax.vmap(_inverse_leg)(
+    knee = robot.description.pitch_joints[1]
+    leg = (
         jnp.asarray(robot.joint_origin),
         jnp.asarray(robot.foot_point),
-        jnp.asarray(robot.joint_lower).reshape(2, 5)[:, 3],
-        jnp.asarray(robot.joint_upper).reshape(2, 5)[:, 3],
-        position,
-        yaw,
-        pitch,
-    ).reshape(10)
+        jnp.asarray(robot.joint_lower).reshape(2, 5)[:, knee],
+        jnp.asarray(robot.joint_upper).reshape(2, 5)[:, knee],
+    )
+    axes = robot.description.axes
+    if axes == HECTOR_AXES:
+        return jax.vmap(_inverse_leg)(*leg, position, yaw, pitch).reshape(10)
+    standing = jnp.asarray(robot.standing_joints).reshape(2, 5)
+    search = jax.vmap(partial(_searched_leg, axes, knee))
+    return search(*leg, standing, position, yaw, pitch).reshape(10)
 
 
 def leg_gravity(
@@ -105,7 +121,9 @@ class _Chain(NamedTuple):
 
 
 def _chain(robot: Robot, joints: Float[Array, "10"]) -> _Chain:
-    return jax.vmap(_leg_chain)(
+    axes = robot.description.axes
+    leg = _leg_chain if axes == HECTOR_AXES else partial(_any_chain, axes)
+    return jax.vmap(leg)(
         jnp.asarray(robot.joint_origin), jnp.asarray(robot.foot_point), joints.reshape(2, 5)
     )
 
@@ -175,3 +193,60 @@ def _inverse_leg(
     knee = -jnp.arccos(jnp.clip(cos_knee, jnp.cos(knee_lower), jnp.cos(knee_upper)))
     hip = jnp.arctan2(-x, -z) - jnp.arctan2(shin * jnp.sin(knee), thigh + shin * jnp.cos(knee))
     return jnp.stack([yaw, roll, hip, knee, pitch - hip - knee])
+
+
+def _any_chain(
+    axes: str,
+    origin: Float[Array, "5 3"],
+    foot_point: Float[Array, "3"],
+    joints: Float[Array, "5"],
+) -> _Chain:
+    turns = {"x": rot_x, "y": rot_y, "z": rot_z}
+    R, point = jnp.eye(3, dtype=joints.dtype), jnp.zeros(3, joints.dtype)
+    points, axis, frames = [], [], []
+    for i, letter in enumerate(axes):
+        point = point + R @ origin[i]
+        points.append(point)
+        axis.append(R[:, "xyz".index(letter)])
+        R = R @ turns[letter](joints[i])
+        frames.append(R)
+    foot = point + R @ foot_point
+    return _Chain(foot, R, *(jnp.stack(rows) for rows in (points, axis, frames)))
+
+
+def _searched_leg(
+    axes: str,
+    knee: int,
+    origin: Float[Array, "5 3"],
+    foot_point: Float[Array, "3"],
+    knee_lower: Float[Array, ""],
+    knee_upper: Float[Array, ""],
+    start: Float[Array, "5"],
+    position: Float[Array, "3"],
+    yaw: Float[Array, ""],
+    pitch: Float[Array, ""],
+) -> Float[Array, "5"]:
+    def error(joints: Array, position: Array, yaw: Array, pitch: Array) -> Array:
+        """Of the foot point [m] and of the foot's two directions; zero where all is met."""
+        chain = _any_chain(axes, origin, foot_point, joints)
+        along = jnp.cos(yaw) * chain.rotation[0] + jnp.sin(yaw) * chain.rotation[1]
+        across = jnp.cos(pitch) * along[2] - jnp.sin(pitch) * along[0]
+        ahead = jnp.cos(pitch) * along[0] + jnp.sin(pitch) * along[2]
+        ahead = jnp.where(across**2 + ahead**2 < 1e-12, 1.0, ahead)
+        return jnp.append(chain.foot - position, jnp.stack([along[1], jnp.arctan2(across, ahead)]))
+
+    def step(joints: Array, target: tuple[Array, Array, Array]) -> Array:
+        still = jax.lax.stop_gradient(joints)
+        now, J = error(still, *target), jax.jacfwd(error)(still, *jax.lax.stop_gradient(target))
+        damping = _DAMPING * jax.lax.stop_gradient(now @ now) + 1e-12
+        return -jnp.linalg.solve(J.T @ J + damping * jnp.eye(5, dtype=J.dtype), J.T @ now)
+
+    def improved(joints: Array, _: None) -> tuple[Array, None]:
+        moved = joints + jnp.clip(step(joints, fixed), -_LARGEST_STEP, _LARGEST_STEP)
+        return moved.at[knee].set(jnp.clip(moved[knee], knee_lower, knee_upper)), None
+
+    target = (position, yaw, pitch)
+    fixed = jax.lax.stop_gradient(target)
+    joints, _ = jax.lax.scan(improved, jax.lax.stop_gradient(start), length=NEWTON_STEPS)
+    # one step more, the only one that is differentiated: its derivative is that of the solution
+    return joints + step(joints, target)

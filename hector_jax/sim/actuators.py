@@ -15,7 +15,6 @@ from hector_jax.robot import Robot
 from hector_jax.sim.world import MAX_DELAY, TIME_STEP, Imperfections
 
 MEMORY = round(MAX_DELAY / TIME_STEP) + 1  # commands remembered, the present one included
-KNEES, ANKLES = (3, 8), (4, 9)
 
 
 class Motors(NamedTuple):
@@ -45,5 +44,6 @@ def step_actuators(
     arrived = jnp.maximum(1.0 - jnp.abs(age), 0.0) @ commands
     lag = jnp.maximum(imperfections.lag, 1e-9)
     torque = arrived + jnp.exp(-TIME_STEP / lag) * (motors.torque - arrived)
-    leak = imperfections.linkage * torque[jnp.array(ANKLES)]
-    return Motors(commands, torque), torque.at[jnp.array(KNEES)].add(leak)
+    _, knee, ankle = robot.description.pitch_joints
+    leak = imperfections.linkage * torque[jnp.array([ankle, 5 + ankle])]
+    return Motors(commands, torque), torque.at[jnp.array([knee, 5 + knee])].add(leak)

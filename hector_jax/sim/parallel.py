@@ -18,7 +18,6 @@ from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -284,7 +283,8 @@ def _walk_one(
         contacts = jax.tree.map(wide, mjx_contacts(data))
         effect, touches = feel(robot, before, contacts, floor, foot_of_geom)
         state = sensing.base_state(robot, read(physics), yaw)
-        fallen = carry.fallen | has_fallen(state) | touches.floor | _in_floor(places, model, data)
+        down = has_fallen(state, *robot.description.limits)
+        fallen = carry.fallen | down | touches.floor | _in_floor(places, model, data)
         held = _where(fallen, (carry.physics, carry.motors, carry.yaw), (physics, motors, yaw))
         return carry._replace(
             physics=held[0],
@@ -377,19 +377,17 @@ def walk_batch(
     chunk: int | None = None,
     fine: bool = False,
     single: bool = False,
-    path: Path | None = None,
 ) -> Iterator[Trajectory]:
     """Walk jobs in MJX, a chunk of them at once.
 
     Args:
         config: the controller.
-        robot: its nominal body.
+        robot: its nominal body; the plants are its MJCF.
         jobs: what to walk, all of one length; plants that do not change, without errors of the
             estimator.
         chunk: walks at once, at most; by default 32 on a CPU and 4096 elsewhere.
         fine: samples of 1 ms; by default one per tick, its effect the mean over the tick.
         single: physics in 32 bits; the controller keeps the precision of JAX.
-        path: the plants' XML, hector.xml by default.
 
     Returns:
         The walks (numpy) in the order of their jobs, as their chunks are done.
@@ -418,7 +416,7 @@ def walk_batch(
     if changing:
         raise ValueError(f"MJX walks plants that do not change: jobs {changing} have changes")
     ticks = [walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
-    worlds = build_worlds([job.imperfections for job in jobs], path)
+    worlds = build_worlds([job.imperfections for job in jobs], robot.description)
     places = _places(worlds[0])
     model, varied = batched_model(worlds, single)
     qpos = jnp.asarray(standing_qpos(worlds[0], robot.standing_joints, float(robot.trunk_height)))

@@ -13,7 +13,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import repeat
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -178,7 +177,7 @@ def observe(
         effect=effect,
         feet=sensing.foot_points(robot, after),
         joints=after.joints + after.slack,
-        fallen=has_fallen(state) | touches.floor,
+        fallen=has_fallen(state, *robot.description.limits) | touches.floor,
         legs_touch=touches.legs,
     )
 
@@ -299,7 +298,6 @@ def walk(
     start_tick: int = 0,
     push: Push = NO_PUSH,
     changes: Sequence[Change] = (),
-    path: Path | None = None,
     on_sample: Callable[[World, mujoco.MjData], None] | None = None,
     retune: Retune | None = None,
 ) -> Trajectory:
@@ -307,7 +305,7 @@ def walk(
 
     Args:
         config: the controller.
-        robot: its nominal body.
+        robot: its nominal body; the plant is its MJCF.
         weights: of the MPC.
         command: what to walk.
         imperfections: the plant.
@@ -316,7 +314,6 @@ def walk(
         start_tick: gait tick of t = 0, for other start phases.
         push: on the trunk.
         changes: of the plant, while it is walked on.
-        path: the plant's XML, hector.xml by default.
         on_sample: called after each millisecond, start-up included, with the world of that moment.
         retune: asked at each tick from t = 0 on for the weights to plan with.
 
@@ -329,7 +326,7 @@ def walk(
     """
     count, begin = substeps(config), first_tick(config)
     ticks = walk_ticks(config, seconds, start_tick)
-    world = build_world(imperfections, path)
+    world = build_world(imperfections, robot.description)
     data = mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
 
@@ -429,9 +426,9 @@ def _trajectory(
     return as_trajectory(np.array(TIME_STEP), initial, planned, sample)
 
 
-def walk_job(config: WalkConfig, robot: Robot, job: Job, path: Path | None = None) -> Trajectory:
+def walk_job(config: WalkConfig, robot: Robot, job: Job) -> Trajectory:
     """`walk` for a job."""
-    return walk(config, robot, *job, path=path)
+    return walk(config, robot, *job)
 
 
 def walk_many(
@@ -439,9 +436,8 @@ def walk_many(
     config: WalkConfig,
     robot: Robot,
     jobs: Sequence[Job],
-    path: Path | None = None,
 ) -> Iterator[Trajectory]:
     """Walk all jobs in a pool (`runtime.workers`); gives the walks in order, as they come."""
     host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
     sent = [Job(host(w), host(c), host(plant), *rest) for w, c, plant, *rest in jobs]
-    yield from pool.map(walk_job, repeat(config), repeat(host(robot)), sent, repeat(path))
+    yield from pool.map(walk_job, repeat(config), repeat(host(robot)), sent)

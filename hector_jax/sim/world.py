@@ -1,4 +1,4 @@
-"""The MuJoCo worlds: hector.xml and what is wrong with a plant's joints, ground and masses.
+"""The MuJoCo worlds: a robot's MJCF and what is wrong with a plant's joints, ground and masses.
 
 Imperfections are numbers, so that a world is data: `ideal`, `hfs` (the high-fidelity simulator) and
 plants drawn around the hfs. What a number means is stated here; the motors' part of it (delay, lag,
@@ -11,7 +11,6 @@ nothing depends on how many joints there are.
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -19,8 +18,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hector_jax.description import Description
 from hector_jax.inputs import did_you_mean, shown
-from hector_jax.robot import JOINT_NAMES, MODEL_PATH, load_model
+from hector_jax.robot import compile_model
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
@@ -58,7 +58,7 @@ class Imperfections(NamedTuple):
 
     joint_friction: Float[Array, "*batch"]  # [N m] dry, each joint
     joint_damping: Float[Array, "*batch"]  # [N m s/rad]
-    armature: Float[Array, "*batch"]  # times that of hector.xml
+    armature: Float[Array, "*batch"]  # times that of the MJCF
     backlash: Float[Array, "*batch"]  # [rad] half width b
     delay: Float[Array, "*batch"]  # [s] of the torque command
     lag: Float[Array, "*batch"]  # [s] first order, of the torque
@@ -66,7 +66,7 @@ class Imperfections(NamedTuple):
     linkage: Float[Array, "*batch"]  # share of the ankle torque that is added at the knee
     contact_time: Float[Array, "*batch"]  # [s] solref of the floor
     floor_friction: Float[Array, "*batch"]
-    mass: Float[Array, "*batch"]  # times that of hector.xml, all links
+    mass: Float[Array, "*batch"]  # times that of the MJCF, all links
     trunk_com: Float[Array, "*batch 3"]  # [m] shift of the trunk's centre of mass
     estimator: Estimator
 
@@ -209,18 +209,19 @@ def _check(imperfections: Imperfections) -> None:
         raise ValueError(f"Imperfections.delay is at most {MAX_DELAY} s, got {imperfections.delay}")
 
 
-def _model(path: Path, slack: bool) -> mujoco.MjModel:
-    load_model(path)  # for its checks
-    spec = mujoco.MjSpec.from_file(str(path))
-    for geom in list(spec.geoms):  # what is only looked at costs time and room in every plant
+def _model(description: Description, slack: bool) -> mujoco.MjModel:
+    compile_model(description)  # for its checks
+    spec = mujoco.MjSpec.from_file(str(description.model))
+    # what is only looked at, and gives its body no mass, costs time and room in every plant
+    for geom in list(spec.geoms):
         geom.material = ""
-        if not geom.contype and not geom.conaffinity:
+        if not geom.contype and not geom.conaffinity and geom.parent.explicitinertial:
             spec.delete(geom)
     for looks in (*spec.materials, *spec.textures):
         spec.delete(looks)
     if not slack:
         return spec.compile()
-    for name in JOINT_NAMES:
+    for name in description.joints:
         motor = spec.joint(name)
         motor.parent.add_joint(
             name=name + SLACK,
@@ -240,13 +241,15 @@ def _model(path: Path, slack: bool) -> mujoco.MjModel:
     return spec.compile()
 
 
-def _compile(path: Path, slack: bool) -> World:
-    model = _model(path, slack)
+def _compile(description: Description, slack: bool) -> World:
+    model, names = _model(description, slack), description.joints
     floors = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
     if len(floors) != 1:
-        raise ValueError(f"{path}: expected one floor that collides, got {len(floors)}")
-    joints = [model.joint(name) for name in JOINT_NAMES]
-    slacks = [model.joint(name + SLACK) for name in JOINT_NAMES] if slack else []
+        raise ValueError(
+            f"{description.model}: expected one floor that collides, got {len(floors)}"
+        )
+    joints = [model.joint(name) for name in names]
+    slacks = [model.joint(name + SLACK) for name in names] if slack else []
     of_joint = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
     feet = [joint.bodyid[0] for joint in joints[4::5]]
     return World(
@@ -272,7 +275,7 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
     model.dof_damping[dof] = imperfections.joint_damping
     model.dof_armature[dof] *= imperfections.armature
     model.jnt_range[world.slack] = imperfections.backlash * np.array([-1.0, 1.0])
-    # The floor alone decides these: in hector.xml the robot's geoms have less friction and no
+    # The floor alone decides these: in the MJCF the robot's geoms have less friction and no
     # share in the mix.
     model.geom_friction[world.floor, 0] = imperfections.floor_friction
     model.geom_solref[world.floor] = imperfections.contact_time, 1.0
@@ -283,12 +286,14 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
     return replace(world, model=model)
 
 
-def build_worlds(imperfections: Sequence[Imperfections], path: Path | None = None) -> list[World]:
+def build_worlds(
+    imperfections: Sequence[Imperfections], description: Description | None = None
+) -> list[World]:
     """The MuJoCo models of several plants.
 
     Args:
         imperfections: what is wrong with each; `backlash` above zero adds ten joints.
-        path: the robot, hector.xml by default.
+        description: of the robot, HECTOR by default.
 
     Raises:
         ValueError: the file is not the robot, or a number is out of its range.
@@ -296,13 +301,13 @@ def build_worlds(imperfections: Sequence[Imperfections], path: Path | None = Non
     for plant in imperfections:
         _check(plant)
     slack = [bool(plant.backlash > 0.0) for plant in imperfections]
-    blank = {kind: _compile(path or MODEL_PATH, kind) for kind in set(slack)}
+    blank = {kind: _compile(description or Description(), kind) for kind in set(slack)}
     return [_with_numbers(blank[s], p) for s, p in zip(slack, imperfections, strict=True)]
 
 
-def build_world(imperfections: Imperfections, path: Path | None = None) -> World:
+def build_world(imperfections: Imperfections, description: Description | None = None) -> World:
     """The MuJoCo model of one plant; see `build_worlds`."""
-    return build_worlds([imperfections], path)[0]
+    return build_worlds([imperfections], description)[0]
 
 
 def standing_qpos(

@@ -131,7 +131,8 @@ def window_gradient(
             config.rollout, robot, weights, command, effect, carry, tangents, tick
         )
         if measured:
-            sample = sample._replace(state=after.state, fallen=has_fallen(after.state))
+            fallen = has_fallen(after.state, *robot.description.limits)
+            sample = sample._replace(state=after.state, fallen=fallen)
         return (then, tangents), (sample, columns)
 
     now, after = jax.tree.map(lambda x: x[:-1], told), jax.tree.map(lambda x: x[1:], told)

@@ -208,7 +208,7 @@ def step_carry(
             carry.feet.position,
             ticks.tick,
         )
-    fallen = carry.fallen | has_fallen(moved)
+    fallen = carry.fallen | has_fallen(moved, *robot.description.limits)
     sample = Trajectory(
         period=jnp.asarray(ticks.tick),
         initial=state,

@@ -1,0 +1,338 @@
+"""Another biped: an MJCF and a short TOML, and no Python."""
+
+import json
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from pretend import pretend_history
+
+from hector_jax import cli, commands, replay
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.trajectories import limits
+from hector_jax.control.walking import WalkConfig, walk_config
+from hector_jax.control.weights import expert, nominal
+from hector_jax.description import Description, read_description
+from hector_jax.evaluation import progress
+from hector_jax.export import find_weights
+from hector_jax.grfm.dataset import load_walks
+from hector_jax.model.kinematics import foot_jacobians, foot_poses, inverse_legs
+from hector_jax.pipeline import CollectConfig
+from hector_jax.robot import describe, load_model, load_robot
+from hector_jax.sim.parallel import _places, batched_model
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import build_world, hfs, ideal
+from hector_jax.storage import save_weights, write_json
+from hector_jax.trajectory import State, has_fallen
+from hector_jax.tuning.difftune import TuneConfig
+
+STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+
+foot_poses_jit = jax.jit(foot_poses)
+foot_jacobians_jit = jax.jit(foot_jacobians)
+inverse_legs_jit = jax.jit(inverse_legs)
+inverse_forward = jax.jit(jax.jacfwd(inverse_legs, argnums=1))
+inverse_reverse = jax.jit(jax.jacrev(inverse_legs, argnums=1))
+
+
+def copied(folder, model=lambda text: text, toml=lambda text: text):
+    """Strider with other text, in a folder of its own."""
+    xml = STRIDER.with_name("strider.xml")
+    (folder / xml.name).write_text(model(xml.read_text()))
+    path = folder / STRIDER.name
+    path.write_text(toml(STRIDER.read_text()))
+    return path
+
+
+def reordered(axes, folder):
+    """Strider with the first three joints of its legs about other axes."""
+    kinds = {"x": "roll", "y": "pitch", "z": "yaw"}
+    bend = np.deg2rad(36.0)
+    by_axis = [bend if axis == "y" else 0.0 for axis in axes[:3]] + [-2 * bend, bend]
+
+    def model(text):
+        for side in ("left", "right"):
+            for joint, axis in zip(("yaw", "roll", "pitch"), axes, strict=False):
+                was = f'name="{side}_{joint}" class="{joint}"'
+                assert was in text
+                text = text.replace(was, f'name="{side}_{joint}" class="{kinds[axis]}"')
+        start, end = text.index(" 1 0 0 0 ") + 9, text.index('"/>\n  </keyframe>')
+        return text[:start] + " ".join(map(str, by_axis * 2)) + text[end:]
+
+    return copied(
+        folder, model, lambda text: text.replace("[joints]", f'[joints]\naxes = "{axes}"')
+    )
+
+
+@pytest.fixture(scope="module")
+def strider():
+    return load_robot(STRIDER)
+
+
+# What the description says
+
+
+def test_the_description_of_hector_says_what_the_code_takes_by_default():
+    robot = load_robot()
+    assert replace(robot.description, control=(), nominal=None, expert=None) == Description()
+    assert walk_config(robot) == WalkConfig()
+    assert repr(walk_config(robot)) == repr(WalkConfig())  # by which walks are known
+    for of_robot, default in ((nominal(robot), nominal()), (expert(robot), expert())):
+        jax.tree.map(np.testing.assert_array_equal, of_robot, default)
+
+
+def test_a_description_adds_no_number_to_the_robot_and_what_is_compiled_knows_it(strider):
+    robot = load_robot()
+    assert len(jax.tree.leaves(robot)) == len(robot) - 1
+    name = jax.jit(lambda r: jnp.asarray(len(r.description.name)))
+    assert (int(name(robot)), int(name(strider))) == (6, 7)
+
+
+def test_strider_needs_forty_lines_at_most_and_is_no_hector(strider):
+    assert len(STRIDER.read_text().splitlines()) <= 40
+    hector = load_robot()
+    assert strider.mass > 1.5 * hector.mass
+    assert np.all(strider.joint_origin[:, 3:, 2] < 1.3 * hector.joint_origin[:, 3:, 2])
+    assert not np.allclose(strider.joint_origin[:, :3], hector.joint_origin[:, :3], atol=0.01)
+    config = walk_config(strider)
+    assert (config.gait.stance, config.mpc.max_force, config.footstep.width) == (22, 900.0, 0.1)
+    assert config.legs.kp == (150.0, 150.0, 150.0, 150.0, 50.0)
+    np.testing.assert_array_equal(expert(strider).R.force[1], [3.6e-5, 3.6e-5, 1.8e-4])
+
+
+def test_strider_stands_with_both_soles_on_the_floor(strider):
+    feet = foot_poses(strider, jnp.asarray(strider.standing_joints))
+    np.testing.assert_allclose(feet.position[:, 2], -strider.trunk_height, atol=1e-5)
+    assert -strider.heel < strider.com_offset[0] - feet.position[0, 0] < strider.toe
+
+
+def test_limits_of_a_fall_are_the_robots_own(strider):
+    zero = jnp.zeros(3)
+    low = State(zero, jnp.array([0.0, 0.0, 0.3]), zero, zero)
+    assert has_fallen(low, *strider.description.limits)
+    assert not has_fallen(low, *load_robot().description.limits)
+
+
+def test_imperfections_reach_the_joints_of_any_robot(strider):
+    world = build_world(hfs(), strider.description)
+    assert world.model.joint(int(world.slack[3])).name == "left_knee_backlash"
+    np.testing.assert_array_equal(world.model.dof_frictionloss[world.joint_dof], 0.3)
+    assert world.model.body_mass.sum() == pytest.approx(float(strider.mass))
+    heavy = build_world(ideal()._replace(mass=np.array(1.1)), strider.description)
+    assert heavy.model.body_mass.sum() == pytest.approx(1.1 * float(strider.mass))
+
+
+def test_mjx_takes_any_robot_and_knows_what_may_not_touch_the_floor(strider):
+    world = build_world(hfs(), strider.description)
+    model, _ = batched_model([world])
+    assert (model.nq, model.nu) == (27, 10)
+    places = _places(world)
+    parts = [world.model.geom(geom).name for geom in (*places.boxes, *places.capsules)]
+    assert parts == ["trunk", "left_thigh", "left_shin", "right_thigh", "right_shin"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[gait]", "[gate]", ["'gate'", "did you mean 'gait'?"]),
+        (
+            "stance = 22",
+            "stanse = 22",
+            ["robot.toml: gait: unknown field 'stanse'", "did you mean 'stance'?"],
+        ),
+        ("stance = 22", 'stance = "22"', ["gait: stance must be a whole number", "got '22'"]),
+        ("stance = 22", "stance = 2", ["gait: stance must be at least swing", "got stance 2"]),
+        ("= 900", "= nan", ["mpc: max_force must be a number", "got nan"]),
+        ("kp = [150,", "kp = [", ["legs: kp must be five gains", "got (150.0,"]),
+        ("min_height", "height", ["'limits.height'", "did you mean 'min_height'?"]),
+        ("= 0.35", "= -1", ["limits.min_height is -1", "a positive number"]),
+        ("= 0.35", "= 1" + 400 * "0", ["limits.min_height is 1000", "a positive number"]),
+        ("[mpc]", "[mpc]\nstep_ticks = 1", ["robot.toml: gait.tick must be at most half"]),
+        ('"left_yaw", ', "", ["joints.left is", "five names"]),
+        ('"left_yaw", ', '"left_roll", ', ["joints is", "ten different names"]),
+        ("toe = ", "tow = ", ["'feet.left.tow'", "did you mean 'toe'?"]),
+        ("[joints]", '[joints]\naxes = "zxyy"', ["joints.axes is 'zxyy'", "'zxyyy'"]),
+        ("nominal.force = 3.6e-5", "", ["weights.nominal.force is None", "or three"]),
+        ("nominal.force", "nominal.farce", ["'weights.nominal.farce'", "'force'?"]),
+        (
+            "nominal.euler = 50",
+            "nominal.euler = [50, 0, 50]",
+            ["weights.nominal.euler", "positive"],
+        ),
+        ('"strider.xml"', '"../strider.xml"', ["model is '../strider.xml'", "a file beside it"]),
+        ('"strider.xml"', '"other.xml"', ["other.xml", "cannot read"]),
+        ('"strider"', '"a/b"', ["name is 'a/b'", "names a folder"]),
+        ('"left_knee"', '"left_nee"', ["no joint 'left_nee'", "did you mean 'left_knee'?"]),
+        ('"left_sole"', '"left_soul"', ["no site 'left_soul'", "did you mean 'left_sole'?"]),
+        ('"home"', '"hom"', ["no keyframe 'hom'", "did you mean 'home'?"]),
+        ("[joints]", "[joints]\naxes = 'xzyyy'", ["axis of joint 'left_yaw'", "[1. 0. 0.]"]),
+        ("[gait]", "[gait", ["no valid TOML"]),
+    ],
+)
+def test_a_wrong_description_is_refused_in_one_line(tmp_path, old, new, words):
+    text = STRIDER.read_text()
+    assert old in text
+    path = copied(tmp_path, toml=lambda text: text.replace(old, new, 1))
+    with pytest.raises(ValueError, match=str(tmp_path)) as caught:
+        walk_config(load_robot(path))
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_a_description_that_is_missing_or_too_big_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="none.toml: cannot read the robot description"):
+        read_description(tmp_path / "none.toml")
+    (tmp_path / "big.toml").write_text("#" * 200_000)
+    with pytest.raises(ValueError, match="big.toml: 0.2 MB, expected at most 0.1 MB"):
+        describe(tmp_path / "big.toml")
+
+
+def test_the_same_legs_can_be_expected_to_walk_as_fast_in_any_order_of_their_joints(
+    strider, tmp_path
+):
+    gait = walk_config(strider).gait
+    expected = limits(strider, gait)
+    np.testing.assert_allclose(limits(load_robot(reordered("xzyyy", tmp_path)), gait), expected)
+    assert expected.ahead > limits(load_robot(), gait).ahead  # with longer legs
+
+
+# What a run leaves
+
+
+def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tmp_path):
+    settings = TuneConfig()
+    walk = replace(settings.rollout, walk=walk_config(strider))
+    flags = {"traj": "straight", "data": "data", "robot": str(STRIDER)}
+    write_json(
+        tmp_path / "config.json",
+        {"flags": flags, "tune": asdict(replace(settings, rollout=walk)) | {"loss": {}}},
+    )
+    save_weights(tmp_path / "weights" / "with.json", expert(strider))
+    weights = tmp_path / "weights" / "with.json"
+    assert find_weights(tmp_path, "with") == (weights, walk_config(strider), STRIDER)
+    assert progress.read_asked(tmp_path).robot == STRIDER
+    found, _ = progress.weights_of(tmp_path, "nominal", strider)
+    jax.tree.map(np.testing.assert_array_equal, found, nominal(strider))
+
+
+def test_a_dump_knows_the_robot_without_its_files(tmp_path):
+    robot = load_robot(copied(tmp_path))
+    one = pretend_history(1)[0]
+    fell = one._replace(evaluation=one.evaluation._replace(fallen=np.array(1.0)), reason="fell")
+    known = robot, named_command("straight"), standing_anchor(robot), None
+    path = replay.keep(tmp_path / "dumps", "without", TuneConfig(), *known, fell)
+    for file in tmp_path.glob("*r*.*"):
+        file.unlink()
+    found, _, _ = replay.load(path)
+    assert found.robot.description == robot.description
+    jax.tree.map(np.testing.assert_array_equal, found.robot, robot)
+
+
+# Feet from joints and joints from feet, in any order of the joints
+
+
+@pytest.mark.parametrize("axes", ["zxyyy", "xzyyy", "yxzyy"])
+def test_legs_of_any_order_reach_random_poses_of_mujoco(tmp_path, axes):
+    """By the closed form (zxyyy) or the damped Newton iteration, to 1e-6 m."""
+    path = reordered(axes, tmp_path)
+    robot, model = load_robot(path), load_model(path)
+    data, names = mujoco.MjData(model), robot.description.foot_points
+
+    def posed(joints):
+        data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *joints]
+        mujoco.mj_kinematics(model, data)
+        sites = [data.site(name) for name in names]
+        rotations = [site.xmat.reshape(3, 3) for site in sites]
+        return np.array([site.xpos for site in sites]), np.array(rotations)
+
+    rng, far = np.random.default_rng(0), 0.0
+    for _ in range(100):
+        joints = rng.uniform(robot.joint_lower, robot.joint_upper)
+        joints = robot.standing_joints + 0.8 * (joints - robot.standing_joints)
+        position, rotation = posed(joints)
+        feet = foot_poses_jit(robot, joints)
+        np.testing.assert_allclose(feet.position, position, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(feet.rotation, rotation, rtol=0, atol=1e-12)
+        yaw = np.arctan2(-rotation[:, 0, 1], rotation[:, 1, 1])  # square to the foot's y axis
+        heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(2)], axis=1)
+        along = np.einsum("fx,fxy->fy", heading, rotation)
+        pitch = np.arctan2(along[:, 2], along[:, 0])
+        back = np.asarray(inverse_legs_jit(robot, position, yaw, pitch))
+        reached, turned = posed(back)
+        far = max(far, np.abs(reached - position).max(), np.abs(turned - rotation).max())
+    assert far < 1e-6
+
+
+def test_a_searched_leg_is_differentiable_and_finite_out_of_reach(tmp_path):
+    robot = load_robot(reordered("xzyyy", tmp_path))
+    joints, rest = jnp.asarray(robot.standing_joints) + 0.05, jnp.zeros(2)
+    position = foot_poses_jit(robot, joints).position
+    back = inverse_legs_jit(robot, position, rest, rest)
+    np.testing.assert_allclose(foot_poses_jit(robot, back).position, position, rtol=0, atol=1e-9)
+    J_v, _ = foot_jacobians_jit(robot, back)
+    forward, reverse = (f(robot, position, rest, rest) for f in (inverse_forward, inverse_reverse))
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-9)
+    for side in range(2):
+        own = slice(5 * side, 5 * side + 5)
+        np.testing.assert_allclose(J_v[side] @ forward[own, side], np.eye(3), atol=1e-6)
+    for target in (jnp.full((2, 3), -5.0), robot.joint_origin[:, 0], jnp.zeros((2, 3))):
+        assert jnp.isfinite(inverse_legs_jit(robot, target, rest, rest)).all()
+        assert jnp.isfinite(inverse_forward(robot, target, rest, rest)).all()
+
+
+# It walks
+
+
+def walked(robot, plant, seconds):
+    found = walk(
+        walk_config(robot), robot, nominal(robot), named_command("straight"), plant, seconds
+    )
+    assert not found.fallen.any()
+    assert not found.legs_touch.any()
+    return found.state.position[-1] - found.initial.position
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", [ideal(), hfs()], ids=["ideal", "hfs"])
+def test_strider_walks_five_metres_untuned(strider, plant):
+    ahead, aside, up = walked(strider, plant, 10.5)
+    assert ahead > 5.0
+    assert abs(aside) < 0.5
+    assert abs(up) < 0.1
+
+
+@pytest.mark.slow
+def test_strider_walks_with_its_joints_in_another_order(tmp_path):
+    ahead, aside, _ = walked(load_robot(reordered("xzyyy", tmp_path)), hfs(), 4.0)
+    assert ahead > 1.8
+    assert abs(aside) < 0.3
+
+
+@pytest.mark.slow
+def test_strider_is_tuned_by_the_same_command(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    small = CollectConfig(walks=6, seconds=1.0)
+    monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
+    flags = ("--traj", "straight", "--seeds", "1", "--iterations", "11", "--no-video")
+    line = ["hector", "tune", "--robot", str(STRIDER), *flags, "--processes", "1"]
+    monkeypatch.setattr(sys, "argv", line)
+    assert cli.main() == 0
+    assert "with" in capsys.readouterr().out
+    strider = load_robot(STRIDER)
+    assert len(load_walks(tmp_path / "data" / "strider" / "walks", strider).job.seed) == 6
+    assert (tmp_path / "data" / "strider" / "grfm.npz").exists()
+    with pytest.raises(ValueError, match="made for robot"):
+        load_walks(tmp_path / "data" / "strider" / "walks", load_robot())
+    (run,) = (tmp_path / "runs" / "strider" / "straight").iterdir()
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    for name in ("without", "with"):
+        L = [line["L"] for line in lines if line["set"] == name and line["accepted"]]
+        assert L[-1] < 0.95 * L[0]
+    assert json.loads((run / "result.json").read_text())["sets"]["with"]["hfs"]["falls"] == 0
