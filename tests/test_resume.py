@@ -301,7 +301,8 @@ def test_a_run_of_other_versions_another_robot_or_none_is_not_taken_up(begun, mo
         with pytest.raises(ValueError, match="versions.json: made with jax .*, here is jax 0.0.1"):
             commands._tune(again)
     with monkeypatch.context() as patch:
-        patch.setattr(commands, "load_robot", lambda path=None: ROBOT._replace(mass=np.asarray(13.0)))
+        other = ROBOT._replace(mass=np.asarray(13.0))
+        patch.setattr(commands, "load_robot", lambda path=None: other)
         with pytest.raises(ValueError, match="run: begun with robot"):
             commands._tune(again)
     with pytest.raises(ValueError, match="none/config.json: no run to take up: No such file"):
