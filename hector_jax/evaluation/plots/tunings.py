@@ -80,7 +80,7 @@ def losses(
         legend(figure, panels[0])
     return (
         f"Loss on the model by iteration, whole and by part; the line is iteration {ten}, "
-        "a cross is a refused step."
+        "a cross is a refused step; every tenth accepted one has a marker."
     )
 
 
@@ -272,7 +272,7 @@ def _label_points(axes: Axes, labels: Sequence[str], points: Float[np.ndarray, "
         for side in _SIDES:
             box = _put(text, side)
             if not box.count_overlaps(taken):
-                away = np.linalg.norm(others - (box.min + box.max) / 2, axis=1)
+                away = np.linalg.norm(others - box.get_points().mean(axis=0), axis=1)
                 free[side] = min(25.0, away.min(initial=25.0))  # further off is no better
         if free:
             taken.append(_put(text, max(free, key=lambda side: free[side])))

@@ -159,6 +159,6 @@ def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | No
     seen = "" if image is None else "Snapshots; "
     return (
         f"{seen}path of the centre of mass from above, foot marks those of "
-        f"'{named(list(main)[-1])}'; centre of mass and Euler angles against the reference, of "
+        f"'{named(list(walks)[-1])}'; centre of mass and Euler angles against the reference, of "
         f"{', '.join(named(name) for name in main)}. One stand-in plant."
     )
