@@ -16,7 +16,7 @@ def run(args: Any) -> None:
     raise NotImplementedError(type(args))
 
 
-for command in (
+for _command in (
     data.collect,
     data.train,
     data.grfm,
@@ -32,4 +32,4 @@ for command in (
     machines.export_controller,
     machines.examine,
 ):
-    run.register(command)
+    run.register(_command)
