@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from PIL import Image
 from pretend import pretend_history, pretend_verdict, pretend_walk
 
 from hector_jax.control.weights import WEIGHT_NAMES
 from hector_jax.evaluation import plots
 from hector_jax.evaluation.fidelity import Drift
+from hector_jax.evaluation.plots.style import looks_of
 from hector_jax.grfm.training import History
 from hector_jax.tuning.loss import LossConfig
 
@@ -39,6 +41,21 @@ def test_tracking_and_path_are_drawn_up_to_a_fall(tmp_path, walks):
     assert plots.path_from_above(tmp_path / "path.png", fallen)
     assert _has_ink(tmp_path / "tracking.png")
     assert _has_ink(tmp_path / "path.png")
+
+
+def test_the_four_sets_of_most_pictures_stay_apart_in_grey():
+    names = ("with", "expert", "without", "nominal")
+    looks = looks_of(names)
+    greys = [np.dot(to_rgb(looks[name].color), (0.299, 0.587, 0.114)) for name in names]
+    assert np.diff(greys).min() > 0.12
+    assert len({look.marker for look in looks.values()}) == len(names)
+
+
+def test_the_collective_figure_names_the_few_sets_that_its_panels_show(tmp_path, walks):
+    more = {name: walks["expert"] for name in ("searched", "shared_mean", "ceiling")} | walks
+    caption = plots.collective(tmp_path / "more.png", more, None)
+    assert caption == plots.collective(tmp_path / "few.png", walks, None)
+    assert "nominal, expert, tuned without net, tuned with net" in caption
 
 
 def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):

@@ -207,7 +207,7 @@ def test_the_way_back_solves_no_qp_again(robot, anchor):
 
 
 def test_a_block_has_at_least_one_tick():
-    with pytest.raises(ValueError, match="block must be at least 1"):
+    with pytest.raises(ValueError, match="block must be a whole number of at least 1"):
         RolloutConfig(block=0)
 
 

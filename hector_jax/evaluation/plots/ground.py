@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -114,12 +115,20 @@ def training(path: Path, course: History) -> str:
     )
 
 
+class _Phi(NamedTuple):
+    """How what is learned or computed from one phi is drawn."""
+
+    color: str
+    marker: str
+    hatch: str | None = None  # of bars
+
+
 _PHI = {
-    "command": "black",
-    "linear": PURPLE,
-    "paper": ORANGE,
-    "net": GREEN,
-    "net without legs": BLUE,
+    "command": _Phi("black", "."),
+    "linear": _Phi(PURPLE, "^", "//////"),
+    "paper": _Phi(ORANGE, "x"),
+    "net": _Phi(GREEN, "o"),
+    "net without legs": _Phi(BLUE, "s", "......"),
 }
 
 
@@ -141,18 +150,19 @@ def gradients(
     with drawing(path, 10.0, 4.2) as figure:
         axes = figure.subplots()
 
-        def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, color: str) -> None:
+        def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, **look: Any) -> None:
             mean = rows.mean(axis=0)
             size = np.linalg.norm(mean)
-            axes.bar(x, mean / size, width, color=color, label=f"{name}, {size / 1e6:.1f}e6")
+            axes.bar(x, mean / size, width, label=f"{name}, {size / 1e6:.1f}e6", **look)
 
-        bars(at, simulator, 0.9, "hfs", "0.82")
+        bars(at, simulator, 0.9, "hfs", facecolor="0.95", edgecolor="0.3", linewidth=0.9)
         size = np.linalg.norm(simulator.mean(axis=0))
         low, high = simulator.min(axis=0) / size, simulator.max(axis=0) / size
         axes.vlines(at - 0.45, low, high, color="black", linewidth=2.0, zorder=3)
         for i, (name, rows) in enumerate(models.items()):
             x = at + width * (i - (len(models) - 1) / 2)
-            bars(x, rows, 0.8 * width, name, _PHI[name])
+            look = {"color": _PHI[name].color, "hatch": _PHI[name].hatch}
+            bars(x, rows, 0.8 * width, name, **look, edgecolor="white", linewidth=0.0)
         axes.axhline(0.0, color="black", linewidth=0.8)
         for edge in range(3, len(names), 3):  # Euler angles, position, and so on
             axes.axvline(edge - 0.5, color="0.8", linewidth=0.8, zorder=0)
@@ -163,8 +173,8 @@ def gradients(
         legend(figure, axes, columns=3)
     return (
         "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "
-        "lengths are in the legend. The line at the left of each grey bar spans the start phases "
-        "on the hfs."
+        "lengths are in the legend. The line at the left of each wide bar spans the start phases "
+        f"on the hfs; the narrow ones are, from the left, {', '.join(models)}."
     )
 
 
@@ -188,17 +198,18 @@ def ranks(
         panels = figure.subplots(len(factors), len(trajectories), squeeze=False)
         for (trajectory, factor), truth in simulator.items():
             panel = panels[factors.index(factor), trajectories.index(trajectory)]
-            for i, (name, found) in enumerate(models[trajectory, factor].items()):
-                color = _PHI[name]
-                panel.plot(truth / 1e6, found / 1e6, "o", color=color, alpha=0.6, markersize=2.5)
-                panel.text(
-                    0.03,
-                    0.97 - 0.075 * i,
-                    f"{name}: {correlations[trajectory, factor][name]:.2f}",
-                    color=color,
-                    transform=panel.transAxes,
-                    va="top",
+            for name, found in models[trajectory, factor].items():
+                panel.plot(
+                    truth / 1e6,
+                    found / 1e6,
+                    _PHI[name].marker,
+                    color=_PHI[name].color,
+                    markerfacecolor="none",
+                    markersize=3.5,
+                    mew=0.8,
+                    label=f"{name}: {correlations[trajectory, factor][name]:.2f}",
                 )
+            panel.legend(loc="upper left", handlelength=1.0, borderaxespad=0.2)
             panel.set(xscale="log", yscale="log", title=f"{trajectory}, within x/{factor}")
             low, high = panel.get_ylim()
             panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers

@@ -63,6 +63,10 @@ def changes(
             row[0].set_xticks(ticks, [f"{100 * (r - 1):+.0f}" if r != 1 else "0" for r in ticks])
         panels[0, 0].set_yticks(range(len(names)), [named(name) for name in names])
         panels[0, 0].set_ylim(len(names) - 0.5, -0.5)
+        for mark, label in {"o": "one plant", "x": "one plant, the set fell"}.items():
+            panels[0, 0].plot([], [], mark, color="0.4", label=label)
+        cross = {"color": "0.2", "markersize": 11, "mew": 2.2}
+        panels[0, 0].plot([], [], "+", **cross, label="median and its interval")
         legend(figure, panels[0, 0])
     return (
         "L of each set against that of nominal and expert on the same plant, one dot per plant, "

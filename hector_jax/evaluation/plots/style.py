@@ -31,17 +31,20 @@ _STYLE = {
     "svg.hashsalt": "hector_jax",  # the same picture gives the same bytes
 }
 
-BLUE, ORANGE, GREEN, GREY, PURPLE = "#0072b2", "#d55e00", "#007a5e", "0.55", "#7a3e9d"
+# from dark to light in grey: green, purple, blue, grey, orange
+GREEN, PURPLE, BLUE, GREY, ORANGE = "#00563f", "#7a3e9d", "#1480c4", "0.55", "#e07c24"
 
 SETS = {
-    "nominal": {"color": GREY, "linestyle": "-", "linewidth": 1.8},
+    "nominal": {"color": "0.7", "linestyle": "-", "linewidth": 2.2},
     "expert": {"color": BLUE, "linestyle": (0, (5, 1.5))},
     "without": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": GREEN, "linestyle": "-"},
-    "searched": {"color": PURPLE, "linestyle": (0, (1.2, 1.2))},
-    "without_ten": {"color": "#e8a36a", "linestyle": (0, (4, 1.2, 1, 1.2)), "linewidth": 0.9},
+    "searched": {"color": "#a566c7", "linestyle": (0, (1.2, 1.2))},
+    "without_ten": {"color": "#ecb27c", "linestyle": (0, (4, 1.2, 1, 1.2)), "linewidth": 0.9},
     "with_ten": {"color": "#63b89f", "linestyle": "-", "linewidth": 0.9},
-    "with_walks": {"color": "#00402f", "linestyle": (0, (3, 1))},
+    "with_walks": {"color": "#00805f", "linestyle": (0, (3, 1))},
+    "shared_mean": {"color": "#b0186a", "linestyle": (0, (8, 1.5))},
+    "shared_worst": {"color": "#d670a5", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5))},
     "ceiling": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},
 }
 """Lines of the weight sets that we know by name; `looks_of` has those of any."""
@@ -51,20 +54,28 @@ CURVES = {
     "commanded": {"color": "black", "linestyle": "-", "linewidth": 0.9},
     "measured": {"color": GREY, "linestyle": "-", "linewidth": 2.2},
     "predicted": {"color": GREEN, "linestyle": (0, (5, 1.2))},
-    "linear": {"color": PURPLE, "linestyle": (0, (1.2, 1.2))},
+    "linear": {"color": PURPLE, "linestyle": (0, (1.2, 0.7)), "linewidth": 1.9},
     "paper": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "gated": {"color": BLUE, "linestyle": (0, (5, 1.5))},
 }
 """Lines of what is no weight set."""
 CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 
-_MARKER = {"nominal": "o", "expert": "D", "without": "s", "with": "o"}
+_MARKER = {
+    "nominal": "v",
+    "expert": "D",
+    "without": "s",
+    "with": "o",
+    "ceiling": "*",
+    "shared_mean": "<",
+    "shared_worst": ">",
+}
 _SPARE = tuple(
     ({"color": color, "linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}, marker)
     for color, marker in (
         ("#b0186a", "s"),
-        ("#2f7fb8", "^"),
-        ("#8a8a00", "v"),
+        ("#6cb0dc", "^"),
+        ("#8a8a00", "h"),
         ("black", "P"),
         ("#c07a3a", "X"),
     )
@@ -77,6 +88,8 @@ _NAMES = {
     "with_walks": "with net, then along walks",
     "searched": "searched on the simulator",
     "ceiling": "long search",
+    "shared_mean": "one set for all, by the mean",
+    "shared_worst": "one set for all, by the worst",
     "predicted": "predicted by the net",
     "linear": "predicted by a linear map",
     "paper": "predicted by the paper's net",

@@ -1,11 +1,15 @@
 """What a tuning did, iteration by iteration, and tunings beside each other."""
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.text import Annotation
 from matplotlib.ticker import NullLocator
+from matplotlib.transforms import Bbox
 
 from hector_jax.evaluation.plots.style import (
     BLUE,
@@ -60,7 +64,8 @@ def losses(
                     values[kept],
                     **looks[name].line,
                     marker=looks[name].marker,
-                    markersize=2.6,
+                    markersize=3.2,
+                    markevery=10,  # at each they hide how the line is dashed
                     label=named(name),
                 )
                 if title == "$L$":
@@ -75,7 +80,7 @@ def losses(
         legend(figure, panels[0])
     return (
         f"Loss on the model by iteration, whole and by part; the line is iteration {ten}, "
-        "a cross is a refused step."
+        "a cross is a refused step; every tenth accepted one has a marker."
     )
 
 
@@ -233,10 +238,6 @@ def front(
         for panel, (world, values) in zip(panels, worlds.items(), strict=True):
             known = np.isfinite(values).all(axis=1)
             panel.plot(*values[known].T / 1e6, "o-", color=GREEN, label="tuned")
-            for price, (x, y) in zip(prices[known], values[known] / 1e6, strict=True):
-                panel.annotate(
-                    f"x{price:.2g}", (x, y), (4, 4), textcoords="offset points", fontsize=7
-                )
             if world == list(worlds)[-1]:
                 for name, look in looks_of(beside).items():
                     x, y = beside[name]
@@ -245,7 +246,46 @@ def front(
             panel.set(title=world, xlabel="tracking [10$^6$]")
         panels[0].set_ylabel(r"$L_\mathrm{ctrl}$ [10$^6$]")
         legend(figure, panels[-1])
-    return "Each point is a tuning, its tracking priced as the label says; left and down is better."
+        figure.draw_without_rendering()  # where things stand is known only then
+        for panel, values in zip(panels, worlds.values(), strict=True):
+            known = np.isfinite(values).all(axis=1)
+            labels = [f"x{float(f'{price:.2g}'):g}" for price in prices[known]]
+            _label_points(panel, labels, values[known] / 1e6)
+    return (
+        "Each point is a tuning, its tracking priced as the label says, where there is room for "
+        "one; the line joins them in the order of prices. Left and down is better."
+    )
+
+
+_SIDES = ((4, 4), (5, 0), (4, -4), (-4, 4), (-5, 0), (-4, -4), (0, 6), (0, -6))  # [pt]
+
+
+def _label_points(axes: Axes, labels: Sequence[str], points: Float[np.ndarray, "n 2"]) -> None:
+    """Labels beside points of a line, away from it and from other points; without room, none."""
+    spots = axes.transData.transform(points)
+    line = [spot for ends in pairwise(spots) for spot in np.linspace(*ends, 40)]
+    taken = [Bbox.from_bounds(x - 3.0, y - 3.0, 6.0, 6.0) for x, y in line]
+    taken += [axes.spines[side].get_window_extent() for side in ("left", "bottom")]
+    for i, label in enumerate(labels):
+        text = axes.annotate(label, points[i], (0, 0), textcoords="offset points", fontsize=7)
+        others, free = np.delete(spots, i, axis=0), {}
+        for side in _SIDES:
+            box = _put(text, side)
+            if not box.count_overlaps(taken):
+                away = np.linalg.norm(others - box.get_points().mean(axis=0), axis=1)
+                free[side] = min(25.0, away.min(initial=25.0))  # further off is no better
+        if free:
+            taken.append(_put(text, max(free, key=lambda side: free[side])))
+        else:
+            text.remove()
+
+
+def _put(text: Annotation, side: tuple[int, int]) -> Bbox:
+    """Where the text stands once it is put to this side of its point."""
+    text.set_position(side)
+    text.set_ha(("center", "left", "right")[np.sign(side[0])])
+    text.set_va(("center", "bottom", "top")[np.sign(side[1])])
+    return text.get_window_extent()
 
 
 def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:

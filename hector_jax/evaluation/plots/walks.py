@@ -89,7 +89,8 @@ def _span(walks: Mapping[str, Trajectory]) -> np.ndarray:
     return np.ptp(np.concatenate([points, reference[:, :2]]), axis=0) + 0.35
 
 
-def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
+def _draw_path(axes: Axes, walks: Mapping[str, Trajectory], extra: str = "") -> None:
+    """The paths, that of the set `extra` labelled as drawn nowhere else."""
     last, looks = list(walks.values())[-1], looks_of(walks)
     reference = next(iter(walks.values())).reference.position
     stands = np.asarray(last.contact)
@@ -97,7 +98,8 @@ def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     landed[0] = stands[0]
     for name, walk in walks.items():
         kept = _standing(walk, np.asarray(walk.state.position))
-        axes.plot(kept[:, 0], kept[:, 1], **looks[name].line, label=named(name))
+        label = f"{named(name)} (path only)" if name == extra else named(name)
+        axes.plot(kept[:, 0], kept[:, 1], **looks[name].line, label=label)
     axes.plot(*np.asarray(reference)[:, :2].T, **CURVES["reference"], label="reference")
     for foot, marker in enumerate((4, 5)):
         spots = np.asarray(last.feet)[landed[:, foot] & ~np.asarray(last.fallen), foot]
@@ -115,14 +117,21 @@ def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     axes.margins(0.05)
 
 
+_MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be told apart
+_BEST = "ceiling"
+
+
 def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | None) -> str:
-    """The paper's collective figure: snapshots, path from above, and tracking of all sets.
+    """The paper's collective figure: snapshots, path from above, and tracking.
 
     Args:
         path: file to write.
-        walks: by set, on the same plant and command.
+        walks: by set, on the same plant and command. Drawn are nominal, expert, without and with,
+            of which there is at least one, and, on the path only, the long search.
         snapshots: picture of the walk, two rows of tiles; None where there is none.
     """
+    main = {name: walk for name, walk in walks.items() if name in _MAIN}
+    walks = {name: walk for name, walk in walks.items() if name in (*_MAIN, _BEST)}
     width = 10.0
     image = None if snapshots is None else imread(snapshots)
     top = 0.0 if image is None else 0.97 * width * image.shape[0] / image.shape[1] + 0.1
@@ -144,12 +153,12 @@ def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | No
             share = float(np.clip(bottom * span[0] / span[1] / width, 0.25, 0.42))
             above, beside = next(rows).subfigures(1, 2, width_ratios=[share, 1.0 - share])
         axes = above.subplots()
-        _draw_path(axes, walks)
-        _draw_tracking(beside.subplots(3, 3, sharex=True), walks)
+        _draw_path(axes, walks, extra=_BEST)
+        _draw_tracking(beside.subplots(3, 3, sharex=True), main)
         legend(figure, axes, columns=4)
     seen = "" if image is None else "Snapshots; "
     return (
         f"{seen}path of the centre of mass from above, foot marks those of "
-        f"'{named(list(walks)[-1])}'; centre of mass and Euler angles of all sets against the "
-        "reference. One stand-in plant."
+        f"'{named(list(walks)[-1])}'; centre of mass and Euler angles against the reference, of "
+        f"{', '.join(named(name) for name in main)}. One stand-in plant."
     )
