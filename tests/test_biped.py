@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from pretend import pretend_history
 
-from hector_jax import cli, commands, replay
+from hector_jax import cli, pipeline, replay
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.trajectories import limits
 from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.description import Description, read_description
-from hector_jax.evaluation import progress
+from hector_jax.evaluation import runs
 from hector_jax.export import find_weights
 from hector_jax.grfm.dataset import load_walks
 from hector_jax.model.kinematics import foot_jacobians, foot_poses, inverse_legs
@@ -217,8 +217,8 @@ def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tm
     save_weights(tmp_path / "weights" / "with.json", expert(strider))
     weights = tmp_path / "weights" / "with.json"
     assert find_weights(tmp_path, "with") == (weights, walk_config(strider), STRIDER)
-    assert progress.read_asked(tmp_path).robot == STRIDER
-    found, _ = progress.weights_of(tmp_path, "nominal", strider)
+    assert runs.read_asked(tmp_path).robot == STRIDER
+    found, _ = runs.weights_of(tmp_path, "nominal", strider)
     jax.tree.map(np.testing.assert_array_equal, found, nominal(strider))
 
 
@@ -319,7 +319,7 @@ def test_strider_walks_with_its_joints_in_another_order(tmp_path):
 def test_strider_is_tuned_by_the_same_command(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
-    monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
+    monkeypatch.setattr(pipeline, "CollectConfig", lambda: small)
     flags = ("--traj", "straight", "--seeds", "1", "--iterations", "11", "--no-video")
     line = ["hector", "tune", "--robot", str(STRIDER), *flags, "--processes", "1"]
     monkeypatch.setattr(sys, "argv", line)

@@ -16,9 +16,11 @@ import pytest
 from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
-from hector_jax import commands, doctor
+from hector_jax import doctor, pipeline, study
 from hector_jax.cli import main
+from hector_jax.commands import asked, judging
 from hector_jax.control.weights import expert
+from hector_jax.evaluation import fidelity
 from hector_jax.flags import Command, Tune, command_name, from_file
 from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
 from hector_jax.model.effect import last_command
@@ -152,14 +154,14 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
 def test_collection_refuses_what_it_cannot_walk_at_once(
     monkeypatch, capsys, tmp_path, wrong, expected
 ):
-    monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
+    monkeypatch.setattr(pipeline, "tuning_paths", None)  # nothing may be computed before
     assert expected in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "walks", *wrong)
     assert not (tmp_path / "walks").exists()
 
 
 def test_collection_refuses_a_folder_it_cannot_write(monkeypatch, capsys, tmp_path):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr(commands.pipeline, "tuning_paths", None)  # nothing may be computed before
+    monkeypatch.setattr(pipeline, "tuning_paths", None)  # nothing may be computed before
     assert "file" in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "file" / "walks")
 
 
@@ -168,8 +170,8 @@ def test_curves_leave_a_gap_where_a_tick_is_no_sample():
     one = jax.tree.map(lambda x: np.asarray(x)[None], whole)
     unsolved = np.zeros((1, 30))
     unsolved[0, 11] = 1.0
-    curves = commands._curves(load_robot(), one, {"residual": last_command})
-    gapped = commands._curves(
+    curves = fidelity.curves(load_robot(), one, {"residual": last_command})
+    gapped = fidelity.curves(
         load_robot(), one._replace(residual=unsolved), {"residual": last_command}
     )
     assert curves.keys() == gapped.keys() == {"commanded", "measured", "predicted"}
@@ -184,7 +186,7 @@ def test_curves_leave_a_gap_where_a_tick_is_no_sample():
 @pytest.mark.slow
 def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
     """Both leave shards of one layout; the card names the engine, and resuming keeps to it."""
-    monkeypatch.setattr(commands.pipeline, "tuning_paths", lambda *args: [])
+    monkeypatch.setattr(pipeline, "tuning_paths", lambda *args: [])
     flags = ("collect", "--walks", "3", "--seconds", "0.1")
     found = {}
     for engine in ("c", "mjx"):
@@ -225,7 +227,7 @@ def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
 def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     path = tmp_path / "hector.xml"
     path.write_text(change(MODEL_PATH.read_text()))
-    monkeypatch.setattr(commands, "load_robot", lambda _: load_robot(path))
+    monkeypatch.setattr(judging, "load_robot", lambda _: load_robot(path))
     line = refused(monkeypatch, capsys, "walk")
     assert "hector.xml" in line
     assert expected in line
@@ -251,7 +253,7 @@ def test_a_search_refuses_wrong_input_before_it_makes_a_folder(
 def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch, capsys, tmp_path):
     """Two generations of short walks on all trajectories; the second call finds all done."""
     short = TuneConfig(rollout=RolloutConfig(ticks=20))
-    monkeypatch.setattr(commands, "TuneConfig", lambda rollout: short)
+    monkeypatch.setattr(asked, "TuneConfig", lambda rollout: short)
     flags = ("search", "--traj", "all", "--budget", "9", "--population", "4", "--engine", "c")
     folders = ("--out", tmp_path / "found", "--record", tmp_path / "record", "--processes", "1")
     assert call(monkeypatch, *flags, *folders) == 0
@@ -278,9 +280,7 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
 @pytest.mark.parametrize("asked", ["json", "words"])
 def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_path, asked):
     errors = {"raw": {"force": 2.0, "moment": 1.0}, "net": {"force": 0.5, "moment": 0.25}}
-    monkeypatch.setattr(
-        commands.pipeline, "train", lambda *args: SimpleNamespace(errors=errors, args=args)
-    )
+    monkeypatch.setattr(pipeline, "train", lambda *args: SimpleNamespace(errors=errors, args=args))
     more = ("--json",) if asked == "json" else ()
     assert call(monkeypatch, "train", "--out", tmp_path / "net.npz", *more) == 0
     out = capsys.readouterr().out
@@ -293,7 +293,7 @@ def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_pa
 def test_a_table_prints_json_and_nothing_else(monkeypatch, capsys, tmp_path):
     verdict = pretend_verdict()
     made = (tmp_path / "report.md", {"c": verdict, "s": verdict})
-    monkeypatch.setattr(commands.study, "make_table", lambda *args: made)
+    monkeypatch.setattr(study, "make_table", lambda *args: made)
     assert call(monkeypatch, "table", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["report"] == str(made[0])
@@ -306,8 +306,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     """From nothing to a verdict, small: data, net, two tunings, one refresh, judges, report."""
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
-    monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
-    monkeypatch.setattr(commands.pipeline, "REFRESH", replace(small, walks=4))
+    monkeypatch.setattr(pipeline, "CollectConfig", lambda: small)
+    monkeypatch.setattr(pipeline, "REFRESH", replace(small, walks=4))
     flags = ("--seeds", "2", "--iterations", "11", "--refresh", "1")
     assert call(monkeypatch, "tune", *flags, "--run", "run", "--json") == 0
     out = capsys.readouterr().out
@@ -351,22 +351,22 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     """One plant and one trajectory, really searched, tuned and walked; then all is taken up."""
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
-    monkeypatch.setattr(commands.pipeline, "CollectConfig", lambda: small)
+    monkeypatch.setattr(pipeline, "CollectConfig", lambda: small)
     flags = ("--trajectories", "c", "--seeds", "1", "--rollouts", "10", "--iterations", "10")
     assert call(monkeypatch, "table", *flags) == 0
     first = (tmp_path / "runs/table/table.csv").read_bytes()
-    monkeypatch.setattr(commands.pipeline, "walks_of", None)
-    monkeypatch.setattr(commands.pipeline, "tune_many", None)
-    monkeypatch.setattr(commands.pipeline, "losses_on_hfs", None)
+    monkeypatch.setattr(pipeline, "walks_of", None)
+    monkeypatch.setattr(pipeline, "tune_many", None)
+    monkeypatch.setattr(pipeline, "losses_on_hfs", None)
     capsys.readouterr()
     assert call(monkeypatch, "table", *flags) == 0
     assert (tmp_path / "runs/table/table.csv").read_bytes() == first
     out = capsys.readouterr().out
-    for name in commands.study.SETS:
+    for name in study.SETS:
         assert name in out
     assert call(monkeypatch, "table", *flags, "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert set(commands.study.SETS) <= told["trajectories"]["c"]["sets"].keys()
+    assert set(study.SETS) <= told["trajectories"]["c"]["sets"].keys()
     assert Path(told["report"]).exists()
     assert (tmp_path / "runs/table/pictures/c.png").stat().st_size > 50_000
 

@@ -112,8 +112,8 @@ def test_what_a_run_wrote_can_be_asked_for_again(runs):
         ("result.json", '{"sets": {"with": {"hfs": {}}}}', "set with has no verdict"),
         ("config.json", None, "cannot read .*config.json"),
         ("versions.json", "3", "versions.json: expected an object"),
-        ("metrics.jsonl", "{}\n", "metrics.jsonl: line 1 is no iteration"),
-        ("metrics.jsonl", '"a"\n', "metrics.jsonl: line 1 is no iteration"),
+        ("metrics.jsonl", "{}\n", "metrics.jsonl, line 1: an iteration"),
+        ("metrics.jsonl", '"a"\n', "metrics.jsonl, line 1: an iteration"),
     ],
 )
 def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):

@@ -16,7 +16,7 @@ import pytest
 from oracles import exact_solution
 from scipy.spatial.transform import Rotation
 
-from hector_jax import commands
+from hector_jax import export
 from hector_jax.cli import main
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
@@ -355,9 +355,9 @@ def test_the_command_writes_files_that_run_without_us(monkeypatch, capsys, run):
 
 def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsys, run):
     for part in ("export_controller", "record", "load_controller"):
-        monkeypatch.setattr(commands.export, part, lambda *known: None)
+        monkeypatch.setattr(export, part, lambda *known: None)
     found = Check(2e-6, 0.0, 0.0, 0, {}, {})
-    monkeypatch.setattr(commands.export, "check", lambda *known: found)
+    monkeypatch.setattr(export, "check", lambda *known: found)
     assert call(monkeypatch, run) == 2
     assert "2.0e-06 N" in capsys.readouterr().err
     assert list((run / "export").iterdir()) == []
@@ -418,7 +418,7 @@ def test_a_run_without_settings_is_refused_by_name(run, text):
 
 def test_a_weights_file_is_exported_by_its_name(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(commands.export, "export", lambda *known, **kw: asked.append(kw) or {})
+    monkeypatch.setattr(export, "export", lambda *known, **kw: asked.append(kw) or {})
     path = tmp_path / "mine.json"
     save_weights(path, expert())
     assert call(monkeypatch, path, "--json") == 0

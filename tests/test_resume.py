@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from killed import look
 
-from hector_jax import commands, flags, storage
+from hector_jax import flags, storage
+from hector_jax.commands import tuning
 from hector_jax.console import exit_code
 from hector_jax.control.weights import nominal
 from hector_jax.robot import load_robot
@@ -264,15 +265,15 @@ def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
 @pytest.fixture
 def begun(tmp_path, monkeypatch):
     """A run that was cut at once."""
-    monkeypatch.setattr(commands, "_tune_in", lambda folder, args: told.append(args))
+    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: told.append(args))
     told = []
-    commands._tune(flags.Tune(traj="c", seeds=3, run=tmp_path / "run"))
+    tuning.tune(flags.Tune(traj="c", seeds=3, run=tmp_path / "run"))
     return tmp_path / "run", told
 
 
 def test_a_run_is_taken_up_with_the_flags_it_was_begun_with(begun):
     folder, told = begun
-    commands._tune(flags.Tune(resume=folder, processes=1))
+    tuning.tune(flags.Tune(resume=folder, processes=1))
     assert (told[-1].traj, told[-1].seeds, told[-1].processes) == ("c", 3, 1)
 
 
@@ -288,7 +289,7 @@ def test_another_configuration_is_not_taken_up(begun, asked, message):
     folder, told = begun
     before = files(folder)
     with pytest.raises(ValueError, match=message):
-        commands._tune(flags.Tune(**{"resume": folder, **asked}))
+        tuning.tune(flags.Tune(**{"resume": folder, **asked}))
     assert len(told) == 1
     assert files(folder) == before
 
@@ -299,16 +300,16 @@ def test_a_run_of_other_versions_another_robot_or_none_is_not_taken_up(begun, mo
     with monkeypatch.context() as patch:
         patch.setattr(storage, "versions", lambda: {"jax": "0.0.1"})
         with pytest.raises(ValueError, match="versions.json: made with jax .*, here is jax 0.0.1"):
-            commands._tune(again)
+            tuning.tune(again)
     with monkeypatch.context() as patch:
         other = ROBOT._replace(mass=np.asarray(13.0))
-        patch.setattr(commands, "load_robot", lambda path=None: other)
+        patch.setattr(tuning, "load_robot", lambda path=None: other)
         with pytest.raises(ValueError, match="run: begun with robot"):
-            commands._tune(again)
+            tuning.tune(again)
     with pytest.raises(ValueError, match="none/config.json: no run to take up: No such file"):
-        commands._tune(flags.Tune(resume=folder / "none"))
+        tuning.tune(flags.Tune(resume=folder / "none"))
     with locked(folder), pytest.raises(OSError, match="another process is writing there"):
-        commands._tune(again)
+        tuning.tune(again)
 
 
 @pytest.mark.slow

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from pretend import pretend_history, pretend_walk
 
-from hector_jax import commands, flags, kept, pipeline, study
+from hector_jax import flags, kept, pipeline, study
+from hector_jax.commands import tuning
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation.video import VideoUnavailable
 from hector_jax.flags import Table, as_command
@@ -159,12 +160,12 @@ def test_the_line_that_asks_again_names_what_is_not_default():
 
 def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(commands, "_tune_in", lambda folder, args: asked.append((folder, args)))
-    commands._tune(flags.Tune(traj="all", run=tmp_path / "run", seeds=2))
+    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: asked.append((folder, args)))
+    tuning.tune(flags.Tune(traj="all", run=tmp_path / "run", seeds=2))
     assert [one.traj for _, one in asked] == ["straight", "c", "s"]
     assert [folder.name for folder, _ in asked] == ["straight", "c", "s"]
     assert {one.seeds for _, one in asked} == {2}
-    commands._tune(flags.Tune(traj="all", resume=tmp_path / "run"))
+    tuning.tune(flags.Tune(traj="all", resume=tmp_path / "run"))
     assert [one.seeds for _, one in asked[3:]] == [2, 2, 2]
-    commands._tune(flags.Tune(traj="all", runs=tmp_path / "runs"))
+    tuning.tune(flags.Tune(traj="all", runs=tmp_path / "runs"))
     assert [folder.parent.name for folder, _ in asked[6:]] == ["straight", "c", "s"]

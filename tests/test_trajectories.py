@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hector_jax import commands
 from hector_jax.cli import main
+from hector_jax.commands import asked
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import (
     COMMANDS,
@@ -147,14 +147,14 @@ def call(monkeypatch, *words):
 @pytest.fixture
 def walked(monkeypatch):
     """What would have been walked, and for how long."""
-    asked = []
+    walks = []
 
     def pretend(config, robot, weights, command, plant, seconds, seed):
-        asked.append((command, seconds))
+        walks.append((command, seconds))
         raise ValueError("walked")
 
-    monkeypatch.setattr(commands, "walk", pretend)
-    return asked
+    monkeypatch.setattr(asked, "walk", pretend)
+    return walks
 
 
 def test_a_walk_lasts_as_long_as_its_file_says(monkeypatch, capsys, walked):
@@ -177,8 +177,8 @@ def test_what_is_beyond_the_robot_is_walked_with_a_warning(monkeypatch, capsys, 
 
 def test_rollouts_are_as_long_as_the_file_says():
     config = TuneConfig()
-    assert commands._lasting(config, course(str(SLALOM))).rollout.ticks == 600
-    assert commands._lasting(config, course("c")) == config
+    assert asked.lasting(config, course(str(SLALOM))).rollout.ticks == 600
+    assert asked.lasting(config, course("c")) == config
 
 
 def test_a_refresh_of_too_many_segments_is_refused_before_anything(monkeypatch, capsys, tmp_path):

@@ -11,10 +11,11 @@ import pytest
 from browser import CHROMIUM, opened
 from pretend import pretend_history, pretend_walk
 
-from hector_jax import commands, pipeline
+from hector_jax import pipeline
 from hector_jax.cli import main
+from hector_jax.commands import asked
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.evaluation import progress, view
+from hector_jax.evaluation import pictures, runs, view
 from hector_jax.evaluation.view import Shown, motion
 from hector_jax.robot import load_model, load_robot
 from hector_jax.storage import save_weights, write_json
@@ -112,23 +113,23 @@ def test_a_robot_that_fell_stays_where_it_was_last_seen(robot, model):
 
 def test_metrics_are_read_back_as_they_were_written(tmp_path):
     write_metrics(tmp_path, 6, refused=(3,))
-    found = progress.read_metrics(tmp_path)
+    found = runs.read_histories(tmp_path)
     assert list(found) == ["without", "with"]
     assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
     written = (tmp_path / "metrics.jsonl").read_text()
     again = [pipeline.as_line(name, i) for name, history in found.items() for i in history]
     assert "".join(again) == written
-    curve = progress.curves(found)["with"]
+    curve = runs.curves(found)["with"]
     assert np.isnan(curve[3])
     assert curve[6] < curve[0]
 
 
 def test_a_line_that_is_being_written_is_left_for_later(tmp_path):
     write_metrics(tmp_path, 4)
-    whole = progress.read_metrics(tmp_path)
+    whole = runs.read_histories(tmp_path)
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"set": "with", "itera')
-    assert len(progress.read_metrics(tmp_path)["with"]) == len(whole["with"])
+    assert len(runs.read_histories(tmp_path)["with"]) == len(whole["with"])
 
 
 def test_a_damaged_line_is_named(tmp_path):
@@ -136,16 +137,16 @@ def test_a_damaged_line_is_named(tmp_path):
     text = (tmp_path / "metrics.jsonl").read_text().replace('"iteration": 2', '"number": 2', 1)
     (tmp_path / "metrics.jsonl").write_text(text)
     with pytest.raises(ValueError, match=r"metrics.jsonl, line 3: an iteration .*'iteration'"):
-        progress.read_metrics(tmp_path)
+        runs.read_histories(tmp_path)
 
 
 def test_a_run_that_goes_on_lends_its_newest_weights(tmp_path):
     run = pretend_run(tmp_path)
-    weights, told = progress.weights_of(run, "with")
+    weights, told = runs.weights_of(run, "with")
     np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(nominal()))
     assert told == "with at iteration 12, so far"
     save_weights(run / "weights" / "with.json", expert())
-    weights, told = progress.weights_of(run, "with")
+    weights, told = runs.weights_of(run, "with")
     np.testing.assert_array_equal(weights_to_vector(weights), weights_to_vector(expert()))
     assert told == "with"
 
@@ -154,7 +155,7 @@ def test_an_unknown_set_is_told_those_that_there_are(tmp_path):
     run = pretend_run(tmp_path, weights=["with_ten"])
     expected = "no weight set 'witth'; it has expert, nominal, with, with_ten, without"
     with pytest.raises(ValueError, match=expected):
-        progress.weights_of(run, "witth")
+        runs.weights_of(run, "witth")
 
 
 def refused(monkeypatch, capsys, *arguments):
@@ -192,9 +193,9 @@ def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys,
 def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path):
     filmed = []
     monkeypatch.setattr(
-        commands, "write_video", lambda *film, arrows: filmed.append((film, arrows))
+        pictures, "write_video", lambda *film, arrows: filmed.append((film, arrows))
     )
-    monkeypatch.setattr(commands, "_walked", lambda *_: pretend_walk(seconds=0.3))
+    monkeypatch.setattr(asked, "walked", lambda *_: pretend_walk(seconds=0.3))
     monkeypatch.setattr(view, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]
@@ -205,8 +206,8 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     assert (path.name, strip.name) == ("film.mp4", "film.png")
     assert list(walks) == ["before: nominal", "after: expert"]
     assert [one.words for one in arrows] == ["commanded", "measured"]
-    pictures = {"losses.png", "path.png", "tracking.png", "wrenches.png"}
-    assert {file.name for file in out.iterdir()} == pictures
+    drawn = {"losses.png", "path.png", "tracking.png", "wrenches.png"}
+    assert {file.name for file in out.iterdir()} == drawn
 
 
 @pytest.fixture

@@ -17,12 +17,12 @@ from jaxtyping import Array, Float, Int
 from hector_jax.control import gait
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.walking import walk_config
-from hector_jax.grfm.dataset import Dataset
+from hector_jax.grfm.dataset import Dataset, make_dataset
 from hector_jax.grfm.training import predict
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Trajectory
+from hector_jax.trajectory import State, Trajectory, Wrench
 
 PHASES = {  # time [s] since the switch of stance
     "first 30 ms": (0.0, 0.03),
@@ -180,3 +180,35 @@ def as_result(
         for name, one in found.items()
     }
     return {"errors": dict(whole), "phases": dict(phases), "open_loop": ahead}
+
+
+def curves(
+    robot: Robot, walks: Trajectory, effects: Mapping[str, jax.tree_util.Partial]
+) -> dict[str, Wrench]:
+    """Command, predictions and measurement of the first of some walks, for a picture.
+
+    Args:
+        robot: the body that walked.
+        walks: as `make_dataset` takes them.
+        effects: phis by name; drawn are `linear`, `paper` and `residual`, the last as `predicted`.
+
+    Returns:
+        Wrenches (ticks, 2, 3) in the yaw frame, from t = 0; NaN at ticks that are no samples.
+    """
+    one = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
+    samples, _ = make_dataset(robot, one)
+    window = jax.tree.map(jnp.asarray, samples.window)
+    names = {"linear": "linear", "paper": "paper", "residual": "predicted"}
+    found = {
+        "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
+        "measured": samples.label,
+        **{names[n]: predict(effect, window) for n, effect in effects.items() if n in names},
+    }
+
+    def by_tick(values: Any) -> np.ndarray:
+        """NaN at ticks that are no samples: the first, unsolved ones, those after a fall."""
+        rows = np.full((one.fallen.shape[1], *values.shape[1:]), np.nan)
+        rows[samples.tick] = values
+        return rows
+
+    return {name: jax.tree.map(by_tick, wrench) for name, wrench in found.items()}

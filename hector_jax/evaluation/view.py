@@ -11,7 +11,7 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import redirect_stdout
 from importlib.util import find_spec
 from itertools import cycle
@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.evaluation.progress import METRICS, RESULT, as_sentence, curves, read_metrics
+from hector_jax.evaluation.runs import METRICS, RESULT, as_sentence, curves, read_histories
 from hector_jax.evaluation.video import LEAST_ARROW, METRES_PER_NEWTON, Arrows, poses
 from hector_jax.geometry import rot_z
 from hector_jax.robot import Robot
@@ -125,6 +125,11 @@ def motion(robot: Robot, model: mujoco.MjModel, shown: Shown) -> Motion:
         soles=np.stack(soles, axis=1),
         fall=period * up if fallen.any() else np.inf,
     )
+
+
+def titles(names: Iterable[str]) -> list[str]:
+    """What stands above two walks."""
+    return [f"{when}: {name}" for when, name in zip(("before", "after"), names, strict=True)]
 
 
 def film_arrows(motions: Sequence[Motion]) -> list[Arrows]:
@@ -374,7 +379,7 @@ class Page:
         if now == self._read:
             return
         self._read = now
-        histories = read_metrics(self._folder)
+        histories = read_histories(self._folder)
         found = curves(histories) or _NONE_YET
         iterations = np.arange(float(len(next(iter(found.values())))))
         with self._server.atomic():

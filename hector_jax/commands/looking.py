@@ -1,0 +1,98 @@
+"""Runs to look at, and iterations that failed once more."""
+
+import shlex
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from hector_jax import pipeline, replay
+from hector_jax.commands import asked
+from hector_jax.console import Broken, say
+from hector_jax.control.walking import walk_config
+from hector_jax.evaluation import fidelity, metrics, pictures, runs, view
+from hector_jax.evaluation.report import WORLDS
+from hector_jax.evaluation.tensorboard import write_events
+from hector_jax.flags import Replay, Tensorboard, View
+from hector_jax.grfm.dataset import at_interval
+from hector_jax.grfm.network import as_effect, load_net
+from hector_jax.robot import Robot, compile_model, load_robot
+from hector_jax.storage import as_json, make_folder
+
+
+def view_run(args: View) -> None:
+    """Show a run on a page, or leave its film and pictures."""
+    beside = args.run.with_name(f"{args.run.name}-view")
+    folder = args.out or (beside if args.headless else None)
+    if folder is None:
+        view.check_viser()
+    if args.seconds < 0.1:
+        raise ValueError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
+    if args.sets[0] == args.sets[1]:
+        raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
+    begun = runs.read_asked(args.run)
+    robot = load_robot(begun.robot)
+    wanted = asked.course(begun.trajectory, robot)
+    if folder is not None:
+        if folder.resolve() == args.run.resolve():
+            raise ValueError(f"--out must not be the folder of the run, got {folder}")
+        make_folder(folder)
+    sets = {name: runs.weights_of(args.run, name, robot) for name in args.sets}
+    data = asked.folder_of(args.data or begun.data, begun.robot, robot)
+    effect = _phi_of(data, begun.variant, robot)
+    story = [f"**{begun.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
+    shown: dict[str, view.Shown] = {}
+    say(f"walking anew in {args.world}, seed {args.seed}")
+    for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
+        walked = asked.walked(args, robot, wanted, weights)
+        loss = metrics.score(begun.loss, walked).L / 1e6
+        story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
+        say(f"  {story[-1]}")
+        walked = at_interval(walked, walk_config(robot).gait.tick)
+        stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
+        effects = {} if effect is None else {"residual": effect}
+        curves = fidelity.curves(robot, stacked, effects)
+        shown[name] = view.Shown(walked, curves)
+    model = compile_model(robot.description)
+    motions = [view.motion(robot, model, one) for one in shown.values()]
+    if folder is not None:
+        pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown, motions)
+        say(f"film and pictures are in {folder}")
+        return
+    view.serve(
+        dict(zip(view.titles(shown), motions, strict=True)),
+        model,
+        args.run,
+        "\n\n".join(story),
+        lambda address: say(f"open {address} in a browser; Ctrl-C ends it"),
+        args.host,
+        args.port,
+    )
+
+
+def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
+    """Phi of the net that is kept under `data`; where there is none, a line says so."""
+    path = pipeline.net_path(data, variant)
+    if not path.exists():
+        say(f"no net at {path}, so none of its predictions; --data names another folder")
+        return None
+    return as_effect(load_net(path, robot, variant)[0])
+
+
+def replay_dump(args: Replay) -> None:
+    """Do a dumped iteration again.
+
+    Raises:
+        Broken: it does not come out the same.
+    """
+    found = replay.again(args.dump)
+    print(as_json(found._asdict(), indent=2) if args.json else replay.in_words(found))
+    if not found.same:
+        raise Broken(f"{args.dump}: {replay.verdict(found)}")
+
+
+def tensorboard(args: Tensorboard) -> None:
+    """Write the event files of a run."""
+    out = args.out or args.run / "tensorboard"
+    write_events(args.run, out)
+    print(f"tensorboard --logdir {shlex.quote(str(out))}")

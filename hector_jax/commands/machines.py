@@ -1,0 +1,49 @@
+"""A tuned controller for other machines, and how this one is."""
+
+import jax
+
+from hector_jax import doctor, export
+from hector_jax.console import Broken, say
+from hector_jax.control.reference import named_command
+from hector_jax.flags import Doctor, Export
+from hector_jax.robot import load_robot
+from hector_jax.storage import as_json, load_weights
+
+
+def export_controller(args: Export) -> None:
+    """Export the controller of a run, checked against the live one."""
+    # before the first array: see hector_jax.export
+    jax.config.update("jax_platforms", "cpu")
+    command = named_command(args.traj)
+    path, config, robot = export.find_weights(args.run, args.set)
+    weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
+    folder = args.out or (args.run if args.run.is_dir() else args.run.parent) / "export"
+    say("exporting, walking once and asking both controllers")
+    known = (config, load_robot(robot), weights, command, folder)
+    card = export.export(*known, name=name, seconds=args.seconds)
+    if args.json:
+        print(as_json(card))
+        return
+    found = card["check"]
+    differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
+    print(f"largest difference from the live controller: {differences.format(**found)}")
+    for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
+        times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+        print(f"a call {text} [ms]: {times.format(**found[what])}")
+    say(f"all of it is in {folder}")
+
+
+def examine(args: Doctor) -> None:
+    """Tell what is installed here, and whether it works.
+
+    Raises:
+        Broken: something does not.
+    """
+    told, faults = doctor.examine()
+    if args.json:
+        print(as_json({**told, "faults": faults}))
+    else:
+        for name, text in told.items():
+            print(f"{name:12s} {text}")
+    if faults:
+        raise Broken("; ".join(faults))
