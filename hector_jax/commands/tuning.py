@@ -32,6 +32,7 @@ from hector_jax.sim.world import hfs
 from hector_jax.storage import (
     as_json,
     check_versions,
+    digest,
     fingerprint,
     locked,
     make_folder,
@@ -84,7 +85,7 @@ def _begin(folder: Path, args: Tune) -> None:
         write_json(new / "versions.json", environment())
         # without the folder, so that `--config` can ask for the same in another one
         flags = settings(replace(args, run=None, resume=None))
-        body = fingerprint(load_robot(args.robot))
+        body = digest(load_robot(args.robot))  # numbers, description and MJCF
         write_json(new / "config.json", {"flags": flags, "robot": body})
         try:
             new.rename(folder)
@@ -101,7 +102,7 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
     as_asked = _read_json(folder / "config.json")
     check_versions(folder / "versions.json", _read_json(folder / "versions.json"))
     begun, taken = from_file(Tune, folder / "config.json"), {}
-    _agree(folder, as_asked, {"robot": fingerprint(load_robot(begun.robot))})
+    _agree(folder, as_asked, {"robot": digest(load_robot(begun.robot))})
     for field in dataclasses.fields(Tune):
         name = field.name
         if name in _FREE:
