@@ -70,22 +70,21 @@ TOLERANCE = 1e-6
 Config = TypeVar("Config")
 
 
-def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig, Path | None]:
-    """A weight set's file, and the controller and the robot that it was tuned for.
+def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
+    """A weight set's file, and the controller that it was tuned for.
 
     Args:
-        run: folder of a run, or a weights file, which is taken to be of HECTOR and the default
-            controller.
+        run: folder of a run, or a weights file.
         name: of the set in the folder.
 
     Returns:
-        The file, the controller, and the robot's TOML (None: HECTOR).
+        The file, and the controller; None where a file does not tell it.
 
     Raises:
         ValueError: one line with what is missing or odd, and what there is.
     """
     if not run.is_dir():
-        return run, WalkConfig(), None
+        return run, None
     sets = sorted(path.stem for path in (run / "weights").glob("*.json"))
     if name not in sets:
         near = get_close_matches(name, sets, n=1)
@@ -95,13 +94,11 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig, Path | None]:
     try:
         kept = json.loads(path.read_text())
         config = _restored(WalkConfig(), kept["tune"]["rollout"]["walk"])
-        robot = kept.get("flags", {}).get("robot")
-        robot = Path(robot) if robot else None
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: no settings of a walking controller: {error}") from error
-    return run / "weights" / f"{name}.json", config, robot
+    return run / "weights" / f"{name}.json", config
 
 
 def _restored(default: Config, kept: dict[str, Any]) -> Config:
@@ -550,14 +547,19 @@ def export(
             f"{found.moment:.1e} N m and {found.torque:.1e} N m at the joints, at most "
             f"{TOLERANCE:g} was expected; nothing was written"
         )
+    # the card vouches for the others: it goes first and comes last
+    (folder / "controller.json").unlink(missing_ok=True)
     save_weights(folder / "weights.json", weights, SCHEMA)
     write_json(folder / SCHEMA, weights_schema())
     write_file(folder / "weights.cpp", weights_cpp(weights, config, robot, name).encode())
     rows = io.BytesIO()
     np.savez(rows, **_as_arrays(walked))
     contents = {f"controller-{place}.jaxexport": blob for place, blob in blobs.items()}
-    for file, content in {**contents, "check.npz": rows.getvalue()}.items():
+    contents["check.npz"] = rows.getvalue()
+    for file, content in contents.items():
         write_file(folder / file, content)
+    for file in ("weights.json", SCHEMA, "weights.cpp"):
+        contents[file] = (folder / file).read_bytes()
     card = {
         "name": name,
         "sha256": {file: hashlib.sha256(blob).hexdigest() for file, blob in contents.items()},

@@ -208,8 +208,9 @@ class Export:
     run: Path  # folder of a run, or a weights file
     set: str = "with"  # weight set of the run
     out: Path | None = None  # folder; `export` in the run or beside the file by default
-    traj: str = "straight"  # walked in the ideal world to check the exported controller
+    traj: str | None = None  # to check by, in the ideal world; the run's own, straight for a file
     seconds: Seconds = 1.0  # of that walk, after the start-up
+    robot: Path | None = None  # TOML of the biped that a weights file is for; HECTOR by default
     json: bool = False  # print JSON instead of words
 
 

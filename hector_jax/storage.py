@@ -83,18 +83,32 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()[:16]
 
 
+def identity(robot: Robot) -> str:
+    """Sixteen digits for a robot: its numbers, what its TOML says and its MJCF."""
+    body = robot.description
+    said = replace(body, path=Path(), model=Path(body.model.name))
+    told = f"{fingerprint(robot)} {said!r} ".encode() + body.model.read_bytes()
+    return hashlib.sha256(told).hexdigest()[:16]
+
+
 def digest(*parts: Any) -> str:
-    """Twelve digits for settings (by their repr), trees of numbers and robots with their XML."""
-    is_tree = lambda x: isinstance(x, tuple) or x is None  # noqa: E731
-    told = [fingerprint(part) if is_tree(part) else repr(part) for part in parts]
-    bodies = [part.description for part in parts if isinstance(part, Robot)]
-    told += [
-        repr(replace(body, model=Path(body.model.name))) for body in bodies
-    ]  # anywhere on disk
-    key = "\n".join([*told, repr(versions())]).encode()
-    for model in [body.model for body in bodies] or [MODEL_PATH]:
-        key += model.read_bytes()
+    """Twelve digits for settings (by their repr), robots and trees of numbers, to the last bit."""
+
+    def told(part: Any) -> str:
+        if isinstance(part, Robot):
+            return identity(part)
+        return _bits(part) if isinstance(part, tuple) or part is None else repr(part)
+
+    key = "\n".join([*map(told, parts), repr(versions())]).encode() + MODEL_PATH.read_bytes()
     return hashlib.sha256(key).hexdigest()[:12]
+
+
+def _bits(tree: Any) -> str:
+    found = hashlib.sha256()
+    for name, leaf in _named_leaves(tree).items():
+        array = np.asarray(leaf)
+        found.update(f"{name}{array.dtype}{array.shape}".encode() + array.tobytes())
+    return found.hexdigest()
 
 
 def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
@@ -366,10 +380,10 @@ class Checkpoint:
                 check_versions(path, card["versions"])
             except ValueError as error:
                 say(f"not taken up: {error}")
+                if path == self.path:
+                    # out of the way: the next save must not put it in the place of a sound one
+                    os.replace(path, self._beside("refused"))
                 continue
-            if path == self.before and self.path.exists():
-                # out of the way: the next save must not put it in the place of the sound one
-                os.replace(self.path, self._beside("refused"))
             return tree, card["about"]
         return None
 

@@ -216,7 +216,7 @@ def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tm
     )
     save_weights(tmp_path / "weights" / "with.json", expert(strider))
     weights = tmp_path / "weights" / "with.json"
-    assert find_weights(tmp_path, "with") == (weights, walk_config(strider), STRIDER)
+    assert find_weights(tmp_path, "with") == (weights, walk_config(strider))
     assert runs.read_asked(tmp_path).robot == STRIDER
     found, _ = runs.weights_of(tmp_path, "nominal", strider)
     jax.tree.map(np.testing.assert_array_equal, found, nominal(strider))

@@ -314,7 +314,9 @@ def run(tmp_path):
     """A finished run, as far as export reads it."""
     walk = asdict(CONFIG)
     save_weights(tmp_path / "weights" / "with.json", expert())
-    (tmp_path / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": walk}}}))
+    flags = {"traj": "straight", "data": "data"}
+    config = {"flags": flags, "tune": {"rollout": {"walk": walk}}}
+    (tmp_path / "config.json").write_text(json.dumps(config))
     return tmp_path
 
 
@@ -327,7 +329,7 @@ def test_the_command_writes_files_that_run_without_us(monkeypatch, capsys, run):
     assert call(monkeypatch, run, "--seconds", "0.1", "--json") == 0
     card = json.loads(capsys.readouterr().out)
     folder = run / "export"
-    assert sorted(path.name for path in folder.iterdir()) == [
+    assert sorted(path.name for path in folder.glob("[!.]*")) == [
         "check.npz",
         "controller-cpu.jaxexport",
         "controller-cuda.jaxexport",
@@ -360,7 +362,7 @@ def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsy
     monkeypatch.setattr(export, "check", lambda *known: found)
     assert call(monkeypatch, run) == 2
     assert "2.0e-06 N" in capsys.readouterr().err
-    assert list((run / "export").iterdir()) == []
+    assert list((run / "export").glob("[!.]*")) == []
 
 
 def test_the_example_knows_nothing_of_us():
@@ -384,10 +386,10 @@ def test_a_run_is_exported_with_its_own_controller(run):
     kept = asdict(own)
     del kept["mpc"]["effort_about"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
-    assert find_weights(run, "with") == (run / "weights" / "with.json", own, None)
+    assert find_weights(run, "with") == (run / "weights" / "with.json", own)
     hash(find_weights(run, "with")[1])
     path = run / "weights" / "with.json"
-    assert find_weights(path, "with") == (path, CONFIG, None)
+    assert find_weights(path, "with") == (path, None)
 
 
 @pytest.mark.parametrize(

@@ -337,3 +337,11 @@ def test_killed_25_times_on_all_cores_it_ends_in_the_bytes_of_an_unbroken_run_on
     if job != "training":
         more = len(looks(tmp_path / "cut" / job)) - len(looks(tmp_path / "whole" / job))
         assert more <= hits  # each kill costs one piece of work, at most
+
+
+def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
+    begun = {"command": {"velocity": [[0.3, 0.0]]}, "seconds": 2.0}
+    with pytest.raises(ValueError, match="begun with velocity .*0.3.*, here is .*0.5"):
+        tuning._agree(tmp_path, begun, {"command": {"velocity": [[0.5, 0.0]]}, "seconds": 2.0})
+    with pytest.raises(ValueError, match="config.json: tune: no settings: 5"):
+        tuning._agree(tmp_path, {"tune": 5}, {"tune": {"iterations": 10}})

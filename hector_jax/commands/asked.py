@@ -10,13 +10,14 @@ from hector_jax.control import trajectories
 from hector_jax.control.trajectories import Course, beyond, limits
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.evaluation.runs import Asked
 from hector_jax.flags import View, Walk
 from hector_jax.inputs import did_you_mean, shown
-from hector_jax.robot import Robot
+from hector_jax.robot import Robot, load_robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import load_weights
+from hector_jax.storage import identity, load_weights
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
@@ -45,6 +46,26 @@ def tune_config(robot: Robot, **others: Any) -> TuneConfig:
 def folder_of(folder: Path, path: Path | None, robot: Robot) -> Path:
     """Another robot than the packaged one, so one with a `path`, has its own folder in there."""
     return folder if path is None else folder / robot.description.name
+
+
+def robot_of(run: Path, begun: Asked) -> Robot:
+    """The robot that a run was tuned for.
+
+    Raises:
+        ValueError: its files say something else now.
+    """
+    robot = load_robot(begun.robot)
+    if begun.body not in (None, identity(robot)):
+        path = robot.description.path
+        raise ValueError(f"{run} was tuned for another robot than {path} and its MJCF are now")
+    return robot
+
+
+def default_of(flag: Path, usual: Path, path: Path | None, robot: Robot) -> Path:
+    """A folder as it was given; where it was not, that of the robot: DATA/NAME for DATA/..."""
+    if path is None or flag != usual:
+        return flag
+    return folder_of(Path(usual.parts[0]), path, robot).joinpath(*usual.parts[1:])
 
 
 def plants(world: str, seeds: range) -> list[Imperfections]:

@@ -34,15 +34,18 @@ def collect(args: Collect) -> None:
     robot = load_robot(args.robot)
     tune = asked.tune_config(robot)
     with workers(args.processes) as pool:
-        pipeline.collect(pool, config, tune, robot, args.out)
-    say(f"walks are in {args.out}")
+        out = asked.default_of(args.out, Collect.out, args.robot, robot)
+        pipeline.collect(pool, config, tune, robot, out)
+    say(f"walks are in {out}")
 
 
 def train(args: Train) -> None:
     """Train a net on walks."""
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
-    path = args.out or pipeline.net_path(args.data.parent, args.variant)
-    found = pipeline.train(config, load_robot(args.robot), args.data, path)
+    robot = load_robot(args.robot)
+    data = asked.default_of(args.data, Train.data, args.robot, robot)
+    path = args.out or pipeline.net_path(data.parent, args.variant)
+    found = pipeline.train(config, robot, data, path)
     if args.json:
         print(as_json({"net": str(path), "errors": found.errors}))
     else:

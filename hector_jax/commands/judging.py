@@ -101,7 +101,11 @@ def table(args: Table) -> None:
 
 def compare(args: Compare) -> None:
     """Put finished runs side by side."""
-    told = runs.compare_runs([runs.load_run(folder) for folder in args.runs])
+    finished = [folder for folder in args.runs if (folder / runs.RESULT).exists()]
+    for folder in args.runs:
+        if finished and folder not in finished:
+            say(f"{folder}: left out, no finished run")
+    told = runs.compare_runs([runs.load_run(folder) for folder in finished or args.runs])
     if args.json:
         print(as_json(told))
     else:

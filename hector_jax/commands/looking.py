@@ -16,13 +16,13 @@ from hector_jax.evaluation.tensorboard import write_events
 from hector_jax.flags import Replay, Tensorboard, View
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
-from hector_jax.robot import Robot, compile_model, load_robot
+from hector_jax.robot import Robot, compile_model
 from hector_jax.storage import as_json, make_folder
 
 
 def view_run(args: View) -> None:
     """Show a run on a page, or leave its film and pictures."""
-    beside = args.run.with_name(f"{args.run.name}-view")
+    beside = args.run / "view"
     folder = args.out or (beside if args.headless else None)
     if folder is None:
         view.check_viser()
@@ -31,7 +31,7 @@ def view_run(args: View) -> None:
     if args.sets[0] == args.sets[1]:
         raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
     begun = runs.read_asked(args.run)
-    robot = load_robot(begun.robot)
+    robot = asked.robot_of(args.run, begun)
     wanted = asked.course(begun.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():

@@ -3,24 +3,32 @@
 import jax
 
 from hector_jax import doctor, export
+from hector_jax.commands import asked
 from hector_jax.console import Broken, say
-from hector_jax.control.reference import named_command
+from hector_jax.control.walking import walk_config
+from hector_jax.evaluation import runs
 from hector_jax.flags import Doctor, Export
 from hector_jax.robot import load_robot
-from hector_jax.storage import as_json, load_weights
+from hector_jax.storage import as_json, load_weights, locked
 
 
 def export_controller(args: Export) -> None:
     """Export the controller of a run, checked against the live one."""
     # before the first array: see hector_jax.export
     jax.config.update("jax_platforms", "cpu")
-    command = named_command(args.traj)
-    path, config, robot = export.find_weights(args.run, args.set)
+    is_run = args.run.is_dir()
+    if is_run and args.robot:
+        raise ValueError(f"--robot is for a weights file; {args.run} tells its own")
+    path, config = export.find_weights(args.run, args.set)
+    begun = runs.read_asked(args.run) if is_run else None
+    robot = asked.robot_of(args.run, begun) if begun else load_robot(args.robot)
+    wanted = asked.course(args.traj or (begun.trajectory if begun else "straight"), robot)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
-    folder = args.out or (args.run if args.run.is_dir() else args.run.parent) / "export"
+    folder = args.out or (args.run if is_run else args.run.parent) / "export"
     say("exporting, walking once and asking both controllers")
-    known = (config, load_robot(robot), weights, command, folder)
-    card = export.export(*known, name=name, seconds=args.seconds)
+    known = (config or walk_config(robot), robot, weights, wanted.command, folder)
+    with locked(folder):
+        card = export.export(*known, name=name, seconds=args.seconds)
     if args.json:
         print(as_json(card))
         return

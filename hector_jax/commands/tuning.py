@@ -32,8 +32,8 @@ from hector_jax.sim.world import hfs
 from hector_jax.storage import (
     as_json,
     check_versions,
-    digest,
     fingerprint,
+    identity,
     locked,
     make_folder,
     save_weights,
@@ -85,7 +85,7 @@ def _begin(folder: Path, args: Tune) -> None:
         write_json(new / "versions.json", environment())
         # without the folder, so that `--config` can ask for the same in another one
         flags = settings(replace(args, run=None, resume=None))
-        body = digest(load_robot(args.robot))  # numbers, description and MJCF
+        body = identity(load_robot(args.robot))
         write_json(new / "config.json", {"flags": flags, "robot": body})
         try:
             new.rename(folder)
@@ -96,13 +96,20 @@ def _begin(folder: Path, args: Tune) -> None:
 def _as_begun(folder: Path, args: Tune) -> Tune:
     """The flags of the run in `folder`; those given beside --resume have to agree.
 
+    A flag at its default counts as not given.
+
     Raises:
         ValueError: one line naming the file: no run, one of other flags, versions or another robot.
     """
-    as_asked = _read_json(folder / "config.json")
-    check_versions(folder / "versions.json", _read_json(folder / "versions.json"))
+    as_asked, made_with = (_read_json(folder / f"{name}.json") for name in ("config", "versions"))
+    check_versions(folder / "versions.json", made_with)
     begun, taken = from_file(Tune, folder / "config.json"), {}
-    _agree(folder, as_asked, {"robot": digest(load_robot(begun.robot))})
+    if "robot" not in as_asked:
+        raise ValueError(f"{folder / 'config.json'}: no robot told; expected that of a run")
+    _agree(folder, as_asked, {"robot": identity(load_robot(begun.robot))})
+    before, here = (told.get("commit", "none") for told in (made_with, environment()))
+    if before != here:
+        say(f"warning: {folder} was begun at commit {before}, here is {here}")
     for field in dataclasses.fields(Tune):
         name = field.name
         if name in _FREE:
@@ -130,7 +137,10 @@ def _agree(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> No
     """Hold what a run follows from against what it followed from when it was begun."""
     for name, value in now.items():
         if isinstance(value, dict):
-            _agree(folder, begun.get(name, {}), value)
+            before = begun.get(name, {})
+            if not isinstance(before, dict):
+                raise ValueError(f"{folder / 'config.json'}: {name}: no settings: {before!r}")
+            _agree(folder, before, value)
         elif begun.get(name, value) != value:
             raise ValueError(f"{folder}: begun with {name} {begun[name]}, here is {value}")
 
@@ -169,6 +179,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
         begun = _read_json(folder / "config.json")
         now = {"tune": dataclasses.asdict(config), "net": fingerprint(net.params)}
+        now |= {"command": command._asdict(), "seconds": lasts}
         _agree(folder, begun, json.loads(as_json(now)))
         resolved = {**begun, **now}
         write_json(folder / "config.json", resolved)
@@ -281,7 +292,8 @@ def search(args: Search) -> None:
         asked.lasting(asked.tune_config(robot), wanted[0]),
         asked.weights(args.start, robot),
     )
-    make_folder(args.out)
+    out = asked.default_of(args.out, Search.out, args.robot, robot)
+    make_folder(out)
     with workers(args.processes) as pool:
         found = pipeline.search(
             pool,
@@ -290,7 +302,7 @@ def search(args: Search) -> None:
             robot,
             dict.fromkeys(own, start),
             engine,
-            args.record or args.out,
+            args.record or out,
             own,
         )
         say("walking start, expert and the best once more")
@@ -315,14 +327,14 @@ def search(args: Search) -> None:
             "loss": dataclasses.asdict(tune.loss),
             "versions": versions(),
         }
-        save_weights(args.out / f"{name}.json", one.weights)
-        write_json(args.out / f"{name}-card.json", cards[name])
+        save_weights(out / f"{name}.json", one.weights)
+        write_json(out / f"{name}-card.json", cards[name])
     if args.json:
-        print(as_json({"weights": str(args.out), "cards": cards}))
+        print(as_json({"weights": str(out), "cards": cards}))
     else:
         print("L in 1e6 on the high-fidelity simulator")
         print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
         for name, card in cards.items():
             shown = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
             print(f"{name:10s}{shown}{card['walks']:8d}{card['best_at']:9d}")
-    say(f"weights are in {args.out}")
+    say(f"weights are in {out}")

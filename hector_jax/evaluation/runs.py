@@ -60,6 +60,7 @@ class Asked(NamedTuple):
     data: Path  # folder of its net
     variant: str  # of the net
     robot: Path | None  # TOML of the biped; None: HECTOR
+    body: str | None  # its `storage.identity` then; None: not told
 
 
 def read_asked(folder: Path) -> Asked:
@@ -78,6 +79,7 @@ def read_asked(folder: Path) -> Asked:
             data=Path(flags["data"]),
             variant=str(flags.get("variant", "residual")),
             robot=Path(flags["robot"]) if flags.get("robot") else None,
+            body=config.get("robot"),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         told = getattr(error, "strerror", None) or repr(error)
