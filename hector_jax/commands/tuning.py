@@ -178,8 +178,12 @@ def _tune_in(folder: Path, args: Tune) -> None:
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
         begun = _read_json(folder / "config.json")
-        now = {"tune": dataclasses.asdict(config), "net": fingerprint(net.params)}
-        now |= {"command": command._asdict(), "seconds": lasts}
+        now = {
+            "tune": dataclasses.asdict(config),
+            "net": fingerprint(net.params),
+            "command": {name: np.asarray(x).tolist() for name, x in command._asdict().items()},
+            "seconds": lasts,
+        }
         _agree(folder, begun, json.loads(as_json(now)))
         resolved = {**begun, **now}
         write_json(folder / "config.json", resolved)
