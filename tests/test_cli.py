@@ -353,10 +353,11 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(pipeline, "CollectConfig", lambda: small)
     flags = ("--trajectories", "c", "--seeds", "1", "--rollouts", "10", "--iterations", "10")
+    flags += ("--steps", "2", "--step-plants", "1")
     assert call(monkeypatch, "table", *flags) == 0
     first = (tmp_path / "runs/table/table.csv").read_bytes()
     monkeypatch.setattr(pipeline, "walks_of", None)
-    monkeypatch.setattr(pipeline, "tune_many", None)
+    monkeypatch.setattr(pipeline, "_tune_job", None)
     monkeypatch.setattr(pipeline, "losses_on_hfs", None)
     capsys.readouterr()
     assert call(monkeypatch, "table", *flags) == 0
