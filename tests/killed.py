@@ -99,7 +99,7 @@ def table(folder: Path) -> None:
             done(folder, f"{job.seed} {float(job.weights.Q.euler[0])}")
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
-    def tune_many(pool, config, robot, problems, title, records):
+    def tune_many(pool, config, robot, problems, title, records, dumps):
         (record,) = records.values()
         past = record.past.history if record.past else ()
         keep = partial(save_tuning, record.kept)
