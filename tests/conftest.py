@@ -1,11 +1,17 @@
 """Shared set-up of the tests: 64 bits and the compilation cache, before the first array."""
 
+import tempfile
+from pathlib import Path
+
 import jax
 import pytest
+from hypothesis import configuration
 
 from hector_jax.runtime import setup_jax
 
 setup_jax()
+# what it notes about the code names the machine's paths: not into the checkout
+configuration.set_hypothesis_home_dir(Path(tempfile.gettempdir()) / "hypothesis")
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -7,15 +7,13 @@ import dataclasses
 import hashlib
 import io
 import json
-import tempfile
 import zipfile
-from pathlib import Path
 from typing import get_args, get_origin
 
 import jax
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, configuration, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from hector_jax.control.footstep import FootstepConfig
@@ -40,7 +38,6 @@ from hector_jax.tuning.online import OnlineConfig
 from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.search import SearchConfig
 
-configuration.set_hypothesis_home_dir(Path(tempfile.gettempdir()) / "hypothesis")  # not in here
 ROBOT = load_robot()
 
 hundreds = settings(
