@@ -22,6 +22,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation import fidelity, metrics, pictures
 from hector_jax.evaluation.metrics import Score
 from hector_jax.evaluation.report import Picture, Report, environment, print_table, write_report
+from hector_jax.evaluation.runs import read_json
 from hector_jax.flags import Search, Tune, Walk, as_command, from_file, settings
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
@@ -101,7 +102,7 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
     Raises:
         ValueError: one line naming the file: no run, one of other flags, versions or another robot.
     """
-    as_asked, made_with = (_read_json(folder / f"{name}.json") for name in ("config", "versions"))
+    as_asked, made_with = (read_json(folder / f"{name}.json") for name in ("config", "versions"))
     check_versions(folder / "versions.json", made_with)
     begun, taken = from_file(Tune, folder / "config.json"), {}
     if "robot" not in as_asked:
@@ -119,18 +120,6 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
             raise ValueError(f"{folder}: begun with --{name} {before}, got {given}")
         taken[name] = before
     return replace(args, **taken)
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_bytes())
-    except OSError as error:
-        raise ValueError(f"{path}: no run to take up: {error.strerror}") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: no run to take up: {error}") from None
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: no run to take up: expected an object")
-    return found
 
 
 def _agree(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -177,7 +166,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         if args.alpha == "auto":
             config = replace(config, loss=aligned(config.loss, norms["with"]))
             say(f"loss weights alpha: {config.loss.euler:g} (Euler), {config.loss.position:g}")
-        begun = _read_json(folder / "config.json")
+        begun = read_json(folder / "config.json")
         now = {
             "tune": dataclasses.asdict(config),
             "net": fingerprint(net.params),

@@ -45,7 +45,7 @@ def load_run(folder: Path) -> Run:
         ValueError: one line naming the file that is missing or is not what a run leaves.
     """
     result, config, made_with = (
-        _read_json(folder / name) for name in (RESULT, "config.json", "versions.json")
+        read_json(folder / name) for name in (RESULT, "config.json", "versions.json")
     )
     if not isinstance(result.get("sets"), dict):
         raise ValueError(f"{folder / RESULT}: no `sets` inside; expected that of a tuning")
@@ -162,7 +162,12 @@ def _read(path: Path) -> bytes:
         ) from None
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object of a run's folder.
+
+    Raises:
+        ValueError: one line naming the file that is missing or holds something else.
+    """
     try:
         found = json.loads(_read(path).decode())
     except json.JSONDecodeError as error:
