@@ -24,6 +24,7 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.evaluation.transfer import disturbed
 from hector_jax.grfm.network import as_effect, load_net
+from hector_jax.inputs import InputError
 from hector_jax.model.effect import last_command
 from hector_jax.robot import load_robot
 from hector_jax.runtime import all_devices, setup_jax
@@ -124,7 +125,7 @@ def measure(
     base = None
     for used in counts:
         if used > len(devices):
-            raise ValueError(f"--devices {used}: there are {len(devices)}")
+            raise InputError(f"--devices {used}: there are {len(devices)}")
         strong = at_once(many, devices[:used])
         weak = at_once(many * used, devices[:used]) if used > 1 else strong
         base = base or strong.wall * used  # of one device, where the table begins with one

@@ -32,6 +32,7 @@ from hector_jax.evaluation.metrics import Score
 from hector_jax.evaluation.report import environment, markdown_table
 from hector_jax.evaluation.transfer import disturbed
 from hector_jax.grfm.network import as_effect, load_net, member_effects
+from hector_jax.inputs import InputError
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import all_devices, setup_jax, workers
@@ -468,7 +469,7 @@ def verdict(flags: Verdict) -> None:
     """Walk the weights of a report on the hardware stand-in and write verdict.md beside it."""
     paths = sorted((flags.out / "weights").glob("*.json"))
     if not paths:
-        raise ValueError(f"{flags.out}: no weights/*.json; expected the folder of a report")
+        raise InputError(f"{flags.out}: no weights/*.json; expected the folder of a report")
     sets = {"nominal": nominal(), "expert": expert()}
     sets |= {path.stem: load_weights(path) for path in paths}
     plants = [standin(seed) for seed in range(flags.first_seed, flags.first_seed + flags.seeds)]

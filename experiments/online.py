@@ -42,6 +42,7 @@ from hector_jax.control.weights import (
 from hector_jax.evaluation import plots
 from hector_jax.evaluation.report import environment, markdown_table
 from hector_jax.grfm.network import as_effect
+from hector_jax.inputs import InputError
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
@@ -89,18 +90,18 @@ class Flags:
     def __post_init__(self) -> None:
         for name in self.arms:
             if name not in ARMS:
-                raise ValueError(f"Flags.arms must be of {', '.join(ARMS)}, got {name!r}")
+                raise InputError(f"Flags.arms must be of {', '.join(ARMS)}, got {name!r}")
         for name in self.sets:
             if name not in SETS:
-                raise ValueError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
+                raise InputError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
         count = round(self.seconds / WINDOW)
         if count < 2 or abs(self.seconds - count * WINDOW) > 1e-9:
-            raise ValueError(
+            raise InputError(
                 f"Flags.seconds must be a multiple of {WINDOW:g} s, two at least, "
                 f"got {self.seconds:g}"
             )
         if not 0.0 < self.change < self.seconds:
-            raise ValueError(f"Flags.change must lie within the walk, got {self.change} s")
+            raise InputError(f"Flags.change must lie within the walk, got {self.change} s")
 
 
 class Case(NamedTuple):
@@ -190,12 +191,12 @@ def start_weights(flags: Flags, trajectory: str, which: str) -> Weights:
     """Start weights by name.
 
     Raises:
-        ValueError: tuned ones without a file.
+        InputError: tuned ones without a file.
     """
     if which != "tuned":
         return {"nominal": nominal, "expert": expert}[which]()
     if trajectory not in flags.tuned:
-        raise ValueError(f"--tuned: no weights file for {trajectory}, which --sets asks for")
+        raise InputError(f"--tuned: no weights file for {trajectory}, which --sets asks for")
     return load_weights(flags.tuned[trajectory])
 
 

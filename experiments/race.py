@@ -35,6 +35,7 @@ from hector_jax.evaluation import plots
 from hector_jax.evaluation.report import environment, markdown_table
 from hector_jax.grfm.network import Params, as_effect, load_net
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.inputs import InputError
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
@@ -82,7 +83,7 @@ class Flags:
     def __post_init__(self) -> None:
         for name, least in {"rollouts": 1, "repeats": 1, "batch": 4, "processes": 1}.items():
             if getattr(self, name) < least:
-                raise ValueError(f"--{name} must be at least {least}, got {getattr(self, name)}")
+                raise InputError(f"--{name} must be at least {least}, got {getattr(self, name)}")
 
 
 class Course(NamedTuple):
@@ -286,7 +287,7 @@ def main() -> None:
     setup_jax()
     command, engine = named_command(flags.traj), pipeline.choose_engine(flags.engine)
     if not all(find_spec(package) for package in ("cmaes", "sklearn")):
-        raise ValueError('the race needs its extra: pip install "hector-jax[race]"')
+        raise InputError('the race needs its extra: pip install "hector-jax[race]"')
     make_folder(flags.out)
     robot = jax.tree.map(np.asarray, load_robot())
     config = TuneConfig(RolloutConfig(ticks=flags.ticks), iterations=flags.rollouts)

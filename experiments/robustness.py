@@ -41,6 +41,7 @@ from hector_jax.evaluation.robustness import (
     table,
 )
 from hector_jax.grfm.dataset import SOLVED
+from hector_jax.inputs import InputError
 from hector_jax.robot import load_robot
 from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.standin import standin
@@ -69,7 +70,7 @@ class Flags:
     def __post_init__(self) -> None:
         for name in ("seeds", "processes"):
             if getattr(self, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+                raise InputError(f"--{name} must be at least 1, got {getattr(self, name)}")
 
 
 class Found(NamedTuple):
@@ -85,14 +86,14 @@ def weight_sets(named: Sequence[str]) -> dict[str, Weights]:
     """Nominal, expert and the files of NAME=FILE.
 
     Raises:
-        ValueError: no NAME=FILE, a name that is taken, or a file that holds no weights.
+        InputError: no NAME=FILE, a name that is taken, or a file that holds no weights.
     """
     sets = {BASELINE: nominal(), "expert": expert()}
     for text in named:
         name, _, file = text.partition("=")
         # names are parts of files' names, where other characters might make two of them one
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not file or name in sets:
-            raise ValueError(
+            raise InputError(
                 f"--set must be NAME=FILE, a new NAME of letters, digits and _, got {text!r}"
             )
         sets[name] = load_weights(Path(file))

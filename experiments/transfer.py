@@ -38,6 +38,7 @@ from hector_jax.evaluation import plots, transfer
 from hector_jax.evaluation.report import environment
 from hector_jax.grfm.dataset import walked_with
 from hector_jax.grfm.network import Params, as_effect, linear_effect
+from hector_jax.inputs import InputError
 from hector_jax.model.effect import Effect, Window, last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
@@ -72,13 +73,13 @@ class Flags:
 
     def __post_init__(self) -> None:
         if not self.sets:
-            raise ValueError(f"Flags.sets must name one at least of {', '.join(SETS)}, got none")
+            raise InputError(f"Flags.sets must name one at least of {', '.join(SETS)}, got none")
         for name in self.sets:
             if name not in SETS:
-                raise ValueError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
+                raise InputError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
         for name in self.tuned:
             if name not in self.trajectories:
-                raise ValueError(
+                raise InputError(
                     f"Flags.tuned must be of the trajectories {', '.join(self.trajectories)}, "
                     f"got {name!r}"
                 )

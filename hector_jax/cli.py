@@ -46,7 +46,7 @@ def _parsed(words: Sequence[str]) -> Any:
     """The command that the words ask for; leaves by SystemExit after help or a wrong flag.
 
     Raises:
-        ValueError: the file of `--config` is wrong.
+        InputError: the file of `--config` is wrong.
     """
     file = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     file.add_argument("--config", nargs="?", type=Path)

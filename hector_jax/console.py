@@ -15,6 +15,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from hector_jax.inputs import InputError
+
 console = Console(stderr=True, highlight=False)
 
 Tell = Callable[[int, int, str], None]  # (done, all, remark)
@@ -109,9 +111,11 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
 
     Args:
         name: of the program, before the line.
-        work: ValueError and OSError are told as bad input (2), `Broken` and a worker process that
-            was killed as such (1), SIGINT (130) and SIGTERM (143) too; a second signal does not
-            wait. Where nobody reads standard output any more, it ends without a word (141).
+        work: `InputError` is bad input (2); `Broken` and a worker process that was killed are told
+            as such (1), SIGINT (130) and SIGTERM (143) too; a second signal does not wait. Where
+            nobody reads standard output any more, it ends without a word (141). Any other exception
+            is a fault of the program: it goes on to the caller with its traceback, which for a
+            script means exit code 1.
     """
     try:
         with _stoppable(name):
@@ -120,7 +124,7 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
         return 141
-    except (ValueError, OSError) as error:
+    except InputError as error:
         code, text = 2, " ".join(str(error).split())
     except Broken as error:
         code, text = 1, str(error)

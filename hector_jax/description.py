@@ -25,7 +25,15 @@ from typing import Any
 
 import jax
 
-from hector_jax.inputs import POSITIVE, did_you_mean, one_line, problem, read_text, shown
+from hector_jax.inputs import (
+    POSITIVE,
+    InputError,
+    did_you_mean,
+    one_line,
+    problem,
+    read_text,
+    shown,
+)
 from hector_jax.trajectory import MAX_TILT, MIN_HEIGHT
 
 _PACKAGE = Path(__file__).parent
@@ -98,7 +106,7 @@ def read_description(path: Path) -> Description:
     What the sections of the controller may hold is known there: see `walking.walk_config`.
 
     Raises:
-        ValueError: one line naming file, key, what came and what was expected.
+        InputError: one line naming file, key, what came and what was expected.
     """
     path = Path(path)
     told = _parse(path)
@@ -110,7 +118,7 @@ def read_description(path: Path) -> Description:
     _known(path, joints, (*SIDES, "axes"), "joints.")
     axes = _text(path, joints, "axes", "joints.", HECTOR_AXES)
     if sorted(axes) != sorted(HECTOR_AXES):
-        raise ValueError(
+        raise InputError(
             f"{path}: joints.axes is {shown(axes)}, expected {HECTOR_AXES!r} in the "
             "order of the leg"
         )
@@ -160,20 +168,20 @@ def _parse(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: no valid TOML: {one_line(error)}") from None
+        raise InputError(f"{path}: no valid TOML: {one_line(error)}") from None
 
 
 def _known(path: Path, table: Mapping[str, Any], names: tuple[str, ...], prefix: str) -> None:
     for key in table:
         if key not in names:
-            raise ValueError(
+            raise InputError(
                 f"{path}: unknown key {shown(prefix + key)}{did_you_mean(key, names)}; "
                 f"there are: {', '.join(names)}"
             )
 
 
-def _wrong(path: Path, name: str, got: Any, expected: str) -> ValueError:
-    return ValueError(f"{path}: {name} is {shown(got)}, expected {expected}")
+def _wrong(path: Path, name: str, got: Any, expected: str) -> InputError:
+    return InputError(f"{path}: {name} is {shown(got)}, expected {expected}")
 
 
 def _table(path: Path, told: Mapping[str, Any], name: str) -> dict[str, Any]:

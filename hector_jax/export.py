@@ -47,6 +47,7 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.walk import first_tick, substeps, walk
@@ -81,7 +82,7 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
         The file, and the controller; None where a file does not tell it.
 
     Raises:
-        ValueError: one line with what is missing or odd, and what there is.
+        InputError: one line with what is missing or odd, and what there is.
     """
     if not run.is_dir():
         return run, None
@@ -89,15 +90,15 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
     if name not in sets:
         near = get_close_matches(name, sets, n=1)
         hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(sets) or 'none'}"
-        raise ValueError(f"{run}: no weight set {name!r}; {hint}")
+        raise InputError(f"{run}: no weight set {name!r}; {hint}")
     path = run / "config.json"
     try:
         kept = json.loads(path.read_text())
         config = _restored(WalkConfig(), kept["tune"]["rollout"]["walk"])
     except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: no settings of a walking controller: {error}") from error
+        raise InputError(f"{path}: no settings of a walking controller: {error}") from error
     return run / "weights" / f"{name}.json", config
 
 
@@ -346,12 +347,12 @@ def export_controller(
         platform: cpu or cuda, which need not be here.
 
     Raises:
-        ValueError: flatbuffers is not installed, or JAX runs with 32 bits or not on the CPU.
+        InputError: flatbuffers is not installed, or JAX runs with 32 bits or not on the CPU.
     """
     if find_spec("flatbuffers") is None:
-        raise ValueError("exporting needs flatbuffers: pip install 'hector-jax[export]'")
+        raise InputError("exporting needs flatbuffers: pip install 'hector-jax[export]'")
     if jax.default_backend() != "cpu" or not jax.config.read("jax_enable_x64"):
-        raise ValueError("exporting needs JAX on the CPU (JAX_PLATFORMS=cpu) and with 64 bits")
+        raise InputError("exporting needs JAX on the CPU (JAX_PLATFORMS=cpu) and with 64 bits")
     control, example = controller(config, robot, weights)
     return bytes(jax.export.export(jax.jit(control), platforms=[platform])(*example).serialize())
 
@@ -388,7 +389,7 @@ def record(
     """Walk in the ideal world and keep what went into the controller and came out.
 
     Raises:
-        ValueError: the robot falls.
+        InputError: the robot falls.
     """
     plant = ideal()
     world = build_world(plant, robot.description)
@@ -403,7 +404,7 @@ def record(
 
     walked = walk(config, robot, weights, command, plant, seconds, on_sample=keep)
     if np.asarray(walked.fallen).any():
-        raise ValueError(
+        raise InputError(
             f"these weights fall within {seconds:g} s in the ideal world: no walk to check by"
         )
 
@@ -532,9 +533,9 @@ def export(
         units, what the robot's own code needs to know, weights, settings, and the check.
 
     Raises:
-        ValueError: as `record` and `export_controller`; or the exported controller differs from the
+        InputError: as `record` and `export_controller`; or the exported controller differs from the
             live one by more than TOLERANCE, and then nothing is written.
-        OSError: the folder cannot be written.
+        InputError: the folder cannot be written.
     """
     make_folder(folder)
     blobs = {place: export_controller(config, robot, weights, place) for place in PLATFORMS}
@@ -542,7 +543,7 @@ def export(
     _, example = controller(config, robot, weights)
     found = check(config, load_controller(blobs["cpu"]), example, walked)
     if not max(found.force, found.moment, found.torque) <= TOLERANCE:
-        raise ValueError(
+        raise InputError(
             f"the exported controller differs from the live one by {found.force:.1e} N, "
             f"{found.moment:.1e} N m and {found.torque:.1e} N m at the joints, at most "
             f"{TOLERANCE:g} was expected; nothing was written"

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 
 from hector_jax.inputs import (
     SEED,
+    InputError,
     Interval,
     did_you_mean,
     one_line,
@@ -306,11 +307,11 @@ def check(flags: Any) -> None:
     """Hold flags to their types and ranges.
 
     Raises:
-        ValueError: one line with the flag, what was expected and what came.
+        InputError: one line with the flag, what was expected and what came.
     """
     for name, hint in _hints(type(flags)).items():
         if told := problem(getattr(flags, name), *_rule(hint)):
-            raise ValueError(f"--{name.replace('_', '-')} {told}")
+            raise InputError(f"--{name.replace('_', '-')} {told}")
 
 
 def from_file(kind: type[Flags], path: Path) -> Flags:
@@ -323,7 +324,7 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
             is called, as on its line.
 
     Raises:
-        ValueError: one line naming file and key, for one that is unknown, with the nearest known
+        InputError: one line naming file and key, for one that is unknown, with the nearest known
             name, of a wrong type or out of range; or the file, where it cannot be read.
     """
     hints, values = _hints(kind), {}
@@ -333,13 +334,13 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
             known = sorted(flag.replace("_", "-") for flag in hints)
             hint = did_you_mean(name.replace("_", "-"), known)
             hint = hint or f"; known: {', '.join(known)}"
-            raise ValueError(f"{path}: unknown key {shown(key)}{hint}")
+            raise InputError(f"{path}: unknown key {shown(key)}{hint}")
         if name in values:
-            raise ValueError(f"{path}: {key} is given twice")
+            raise InputError(f"{path}: {key} is given twice")
         values[name] = _value(hints[name], value)
         if told := problem(values[name], *_rule(hints[name])):
             told = told.replace("a tuple", "a list")
-            raise ValueError(f"{path}: {key} {told}")
+            raise InputError(f"{path}: {key} {told}")
     return kind(**values)
 
 
@@ -349,11 +350,11 @@ def _table(path: Path) -> dict[str, Any]:
     try:
         found = read(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: no valid {kind}: {one_line(error)}") from None
+        raise InputError(f"{path}: no valid {kind}: {one_line(error)}") from None
     if kind == "JSON":
         found = found.get("flags") if isinstance(found, dict) else None
     if not isinstance(found, dict):
-        raise ValueError(f"{path}: no `flags` inside; expected the config.json of a run")
+        raise InputError(f"{path}: no `flags` inside; expected the config.json of a run")
     return found
 
 

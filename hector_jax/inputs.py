@@ -19,6 +19,14 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 
+class InputError(ValueError):
+    """What a person handed in is wrong; the one line says what came and what was expected.
+
+    The programs end with exit code 2 and that line. Every other exception is a fault of the program
+    and keeps its traceback.
+    """
+
+
 @dataclass(frozen=True)
 class Interval:
     """Finite numbers from `low` to `high`, both allowed."""
@@ -120,22 +128,22 @@ def check(settings: Any, /, **rules: Rule) -> None:
     """Check the fields of a dataclass against their types and rules; for `__post_init__`.
 
     Raises:
-        ValueError: `CLASS.FIELD must be ..., got ...`.
+        InputError: `CLASS.FIELD must be ..., got ...`.
     """
     for field in dataclasses.fields(settings):
         told = problem(getattr(settings, field.name), field.type, rules.get(field.name))
         if told:
-            raise ValueError(f"{type(settings).__name__}.{field.name} {told}")
+            raise InputError(f"{type(settings).__name__}.{field.name} {told}")
 
 
 def choose(name: str, word: str, choices: Iterable[str]) -> str:
     """The word, one of those there are.
 
     Raises:
-        ValueError: `NAME must be ..., got ...`.
+        InputError: `NAME must be ..., got ...`.
     """
     if told := problem(word, str, tuple(choices)):
-        raise ValueError(f"{name} {told}")
+        raise InputError(f"{name} {told}")
     return word
 
 
@@ -148,19 +156,19 @@ def read_text(path: Path, what: str, most: int) -> str:
         most: bytes it may have.
 
     Raises:
-        ValueError: one line naming the file: missing, too large, no text.
+        InputError: one line naming the file: missing, too large, no text.
     """
     try:
         size = path.stat().st_size
         if not path.is_file():  # a pipe or a device might never end
-            raise ValueError(f"{path}: cannot read {what}: not a plain file")
+            raise InputError(f"{path}: cannot read {what}: not a plain file")
         if size > most:
-            raise ValueError(f"{path}: {size / 1e6:.1f} MB, expected at most {most / 1e6:g} MB")
+            raise InputError(f"{path}: {size / 1e6:.1f} MB, expected at most {most / 1e6:g} MB")
         return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise ValueError(f"{path}: cannot read {what}: {error.strerror}") from None
+        raise InputError(f"{path}: cannot read {what}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a text file, expected {what} in UTF-8") from None
+        raise InputError(f"{path}: not a text file, expected {what} in UTF-8") from None
 
 
 def from_table(where: str, kind: type[T], table: Any) -> T:
@@ -173,30 +181,30 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         table: what was read.
 
     Raises:
-        ValueError: one line naming `where` and the field that is unknown, missing or wrong.
+        InputError: one line naming `where` and the field that is unknown, missing or wrong.
     """
     fields = {field.name: field for field in dataclasses.fields(kind)}
     if not isinstance(table, Mapping):
-        raise ValueError(f"{where} must be a table of {', '.join(fields)}, got {shown(table)}")
+        raise InputError(f"{where} must be a table of {', '.join(fields)}, got {shown(table)}")
     for name in table:
         if name not in fields:
-            raise ValueError(
+            raise InputError(
                 f"{where}: unknown field {shown(name)}{did_you_mean(name, fields)}; "
                 f"there are: {', '.join(fields)}"
             )
     for name, field in fields.items():
         if name not in table and field.default is dataclasses.MISSING:
-            raise ValueError(f"{where}: missing field {name!r}; there are: {', '.join(fields)}")
+            raise InputError(f"{where}: missing field {name!r}; there are: {', '.join(fields)}")
     values = {name: _as_float(fields[name].type, value) for name, value in table.items()}
     rules = getattr(kind, "RULES", {})
     for name, value in values.items():
         if told := problem(value, fields[name].type, rules.get(name)):
-            raise ValueError(f"{where}: {name} {told}")
+            raise InputError(f"{where}: {name} {told}")
     try:
         return kind(**values)
-    except ValueError as error:
+    except InputError as error:
         told = str(error).removeprefix(f"{kind.__name__}.")
-        raise ValueError(f"{where}: {told}") from None
+        raise InputError(f"{where}: {told}") from None
 
 
 def _as_float(kind: Any, value: Any) -> Any:

@@ -77,7 +77,7 @@ class Journal:
         """Write the file anew, with these tunings after or instead of those written before.
 
         Raises:
-            OSError: where the file cannot be written; the old one stays.
+            WriteError: where the file cannot be written; the old one stays.
         """
         self._known.update(histories)
         lines = (as_line(name, i) for name, history in self._known.items() for i in history)
@@ -87,7 +87,7 @@ class Journal:
         """Write one line more.
 
         Raises:
-            OSError: where the file cannot be written.
+            WriteError: where the file cannot be written.
         """
         append_file(self.path, as_line(name, iteration).encode())
 
@@ -113,7 +113,7 @@ def tune(
         dumps: folder for what was refused; that of the tunings' own by default.
 
     Raises:
-        OSError: the folder cannot be written, or another process is writing there.
+        InputError: the folder cannot be written.
     """
     with locked(folder):
         records = pipeline.records_in(folder, config, robot, problems, {"commit": commit})
@@ -147,8 +147,8 @@ def tune_measured(
     """`pipeline.tune_measured`, taking up what is in `folder`.
 
     Raises:
-        ValueError: a walk with the starting weights falls or cannot be believed.
-        OSError: the folder cannot be written, or another process is writing there.
+        InputError: a walk with the starting weights falls or cannot be believed.
+        InputError: the folder cannot be written.
     """
     key = digest(config, robot, weights, command, params, *plants)
     with locked(folder):
@@ -220,7 +220,7 @@ def judge(
         seconds: of each walk.
 
     Raises:
-        OSError: the folder cannot be written, or another process is writing there.
+        InputError: the folder cannot be written.
     """
     jobs = {
         (name, seed): Job(weights, command, plant, seconds, seed)

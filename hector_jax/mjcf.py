@@ -15,6 +15,7 @@ from pathlib import Path
 from hector_jax.inputs import (
     NOT_NEGATIVE,
     POSITIVE,
+    InputError,
     Interval,
     did_you_mean,
     one_line,
@@ -73,37 +74,37 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     """The elements of a description that MuJoCo may open, see the module.
 
     Raises:
-        ValueError: one line naming the file and what is wrong in it.
+        InputError: one line naming the file and what is wrong in it.
     """
     text = read_text(path, "the robot description", _MOST_BYTES)
     found = re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE)
     if found:
-        raise ValueError(f"{path}: {found[1].upper()} is not accepted, expected plain MJCF")
+        raise InputError(f"{path}: {found[1].upper()} is not accepted, expected plain MJCF")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
-        raise ValueError(f"{path}: malformed XML: {one_line(error)}") from None
+        raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
     if root.tag != "mujoco":
-        raise ValueError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco>")
+        raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco>")
     bodies = 0
     for element, label in _labelled(path, root):
         if element.tag in _PARTS_FROM_ELSEWHERE:
             of = f" of {shown(element.get('file'))}" if "file" in element.attrib else ""
-            raise ValueError(
+            raise InputError(
                 f"{path}: <{element.tag}>{of} is not accepted, expected one self-contained file"
             )
         bodies += element.tag == "body"
         for name, value in element.attrib.items():
             told = _problem(element.tag, name, value)
             if told:
-                raise ValueError(f"{path}: {label}: {name} is {shown(value)}, expected {told}")
+                raise InputError(f"{path}: {label}: {name} is {shown(value)}, expected {told}")
     if bodies > _MOST_BODIES:
-        raise ValueError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
+        raise InputError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
     _check_files(path, root)
     return root
 
 
-def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception) -> ValueError:
+def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception) -> InputError:
     """What MuJoCo says of a description, on one line, with the nearest name that it would know.
 
     Args:
@@ -117,7 +118,7 @@ def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception
     # MuJoCo quotes what it does not know and what the matter is about: the first unknown one counts
     unknown = [word for word in re.findall(r"'([^']*)'", told) if word not in names]
     hint = did_you_mean(unknown[0], names) if unknown else ""
-    return ValueError(f"{path}: MuJoCo refuses it: {told}{hint}")
+    return InputError(f"{path}: MuJoCo refuses it: {told}{hint}")
 
 
 def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:
@@ -126,7 +127,7 @@ def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTr
     yield root, "<mujoco>"
     for parent in root.iter():
         if depth[parent] > _DEEPEST:
-            raise ValueError(f"{path}: elements are nested deeper than {_DEEPEST}")
+            raise InputError(f"{path}: elements are nested deeper than {_DEEPEST}")
         for child in parent:
             depth[child] = depth[parent] + 1
             name, of = child.get("name"), parent.get("name") or parent.get("class")
@@ -184,9 +185,9 @@ def _check_files(path: Path, root: ElementTree.Element) -> None:
             if not there:
                 near = [p.name for place in places if place.is_dir() for p in place.iterdir()]
                 hint = did_you_mean(Path(value).name, near)
-                raise ValueError(f"{path}: {label}: no file {shown(value)}{hint}")
+                raise InputError(f"{path}: {label}: no file {shown(value)}{hint}")
             if (size := there[0].stat().st_size) > _MOST_MESH_BYTES:
-                raise ValueError(
+                raise InputError(
                     f"{path}: {label}: {value} has {size / 1e6:.1f} MB, "
                     f"expected at most {_MOST_MESH_BYTES / 1e6:.0f} MB"
                 )
@@ -198,7 +199,7 @@ def _inside(path: Path, home: Path, place: Path, label: str, value: str) -> Path
     except (OSError, ValueError):  # too long, or a loop of links
         found = Path("/")
     if not found.is_relative_to(home):
-        raise ValueError(
+        raise InputError(
             f"{path}: {label} refers to {shown(value)}, expected a file in its own folder"
         )
     return found

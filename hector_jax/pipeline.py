@@ -26,7 +26,7 @@ from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
-from hector_jax.inputs import POSITIVE, SEED, SOME, check, choose, from_table, shown
+from hector_jax.inputs import POSITIVE, SEED, SOME, InputError, check, choose, from_table, shown
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.runtime import letters
@@ -51,7 +51,7 @@ def choose_engine(asked: str) -> str:
     """The engine of walks in MuJoCo: `c` or `mjx`; `auto` is mjx where JAX sees an accelerator.
 
     Raises:
-        ValueError: none of the three.
+        InputError: none of the three.
     """
     if choose("engine", asked, ENGINES) == "auto":
         return "c" if jax.default_backend() == "cpu" else "mjx"
@@ -71,13 +71,13 @@ class CollectConfig:
         # devices stay unasked: their number may not be set up yet
         check(self, walks=SOME, seconds=POSITIVE, seed=SEED, engine=ENGINES)
         if self.walks < 3:
-            raise ValueError(
+            raise InputError(
                 "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
                 f"by), got {self.walks}"
             )
         least = HISTORY * GaitConfig.tick
         if self.seconds < least:
-            raise ValueError(
+            raise InputError(
                 f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
                 f"sample, got {shown(self.seconds)}"
             )
@@ -156,7 +156,7 @@ def tune_many(
         dumps: folder for what was refused, see `replay.keep`; None: nothing is kept.
 
     Raises:
-        ValueError: the starting weights fall or cannot be solved on the model.
+        InputError: the starting weights fall or cannot be solved on the model.
     """
     records = records or {}
     found = {n: r.past for n, r in records.items() if n in problems and r.is_finished and r.past}
@@ -231,7 +231,7 @@ def tune_measured(
         record: where it is kept, iteration by iteration, and taken up from.
 
     Raises:
-        ValueError: a walk with the starting weights falls or cannot be believed.
+        InputError: a walk with the starting weights falls or cannot be believed.
     """
     job = partial(_measured_job, config, robot, command, params)
     with bar(title) as tell:
@@ -314,9 +314,9 @@ def collect(
     """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there.
 
     Raises:
-        OSError: the folder cannot be written, or another process is writing there; told before
+        InputError: the folder cannot be written; told before
             anything is walked.
-        ValueError: it holds walks of other jobs, another robot, controller or engine.
+        InputError: it holds walks of other jobs, another robot, controller or engine.
     """
     with locked(folder):
         paths = tuning_paths(pool, tune, robot, folder / "paths")
@@ -437,8 +437,8 @@ def train(
     up from the epoch that it kept beside `path`.
 
     Raises:
-        OSError: the folder of `path` cannot be written, or another process is writing there.
-        ValueError: no walks, or damaged ones.
+        InputError: the folder cannot be written.
+        InputError: no walks, or damaged ones.
     """
     with locked(path.parent):
         return _train(config, robot, (folder, *more), path)
@@ -490,7 +490,7 @@ def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Lear
     Stale is a net of other walks or of another controller than those under `folder`.
 
     Raises:
-        ValueError: one line naming the file that is damaged, of another robot or another variant.
+        InputError: one line naming the file that is damaged, of another robot or another variant.
     """
     made_of = dataset.walked_with(folder)
     if not path.exists():
@@ -505,7 +505,7 @@ def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Lear
         course = History(**{n: np.array(about["course"][n], float) for n in History._fields})
         errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: its card does not tell its training: {error!r}") from None
+        raise InputError(f"{path}: its card does not tell its training: {error!r}") from None
     linear = network.fit_linear(samples(robot, folder).training)
     return Learned(params, linear, errors, course, config, (folder,))
 
@@ -523,7 +523,7 @@ def ground(
         variant: of the net; None takes the default one.
 
     Raises:
-        ValueError: the walks are of another controller or robot, the net's file is of another
+        InputError: the walks are of another controller or robot, the net's file is of another
             variant, or a file is damaged.
     """
     train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
@@ -531,7 +531,7 @@ def ground(
     if not (walks / "card.json").exists():
         collect(pool, CollectConfig(), config, robot, walks)
     if dataset.walked_with(walks).get("controller") != repr(config.rollout.walk):
-        raise ValueError(f"{walks}: walked by another controller; choose another folder")
+        raise InputError(f"{walks}: walked by another controller; choose another folder")
     return learned(train_config, robot, walks, net_path(data, train_config.variant))
 
 
@@ -600,8 +600,8 @@ def search(
         own: commands of trajectories that are not built in, by their name.
 
     Raises:
-        ValueError: see `choose_engine`, `named_command` and `tuning.search.search`.
-        OSError: the folder cannot be written, or another process is writing there; told before
+        InputError: see `choose_engine`, `named_command` and `tuning.search.search`.
+        InputError: the folder cannot be written; told before
             anything is walked.
     """
     engine = choose_engine(engine)

@@ -20,9 +20,10 @@ from hector_jax.control.weights import Weights, nominal
 from hector_jax.description import as_table, from_card
 from hector_jax.evaluation.report import environment
 from hector_jax.grfm.network import NetParams, Params, as_effect, layout, widths
+from hector_jax.inputs import InputError
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
-from hector_jax.storage import load_tree, read_card, save_tree
+from hector_jax.storage import WriteError, load_tree, read_card, save_tree
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import (
     Evaluation,
@@ -111,7 +112,7 @@ def keep(
     }
     try:
         save_tree(path, dump, kind=_KIND, robot=robot, about=about)
-    except OSError as error:
+    except WriteError as error:
         say(f"no dump of a refused step: {error}")
         return None
     say(f"{name}, iteration {iteration.iteration}: {iteration.reason}; hector replay {path}")
@@ -122,7 +123,7 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
     """A dump with its settings and the notes on its card.
 
     Raises:
-        ValueError: one line naming the file that is damaged, no dump or of another version.
+        InputError: one line naming the file that is damaged, no dump or of another version.
     """
     about = read_card(path)["about"]
     net, none = about.get("net"), np.zeros(())
@@ -131,7 +132,7 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         config = _made(TuneConfig, about.get("config", {}))
         description = from_card(about.get("description", {}))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: settings that this version does not know: {error}") from error
+        raise InputError(f"{path}: settings that this version does not know: {error}") from error
     like = Dump(
         load_robot()._replace(description=description),
         nominal(),
@@ -169,7 +170,7 @@ def again(path: Path) -> Replayed:
     """Do the evaluation of a dump again, on the CPU, where tunings run.
 
     Raises:
-        ValueError: see `load`.
+        InputError: see `load`.
     """
     dump, config, about = load(path)
     effect = last_command if dump.params is None else as_effect(dump.params)

@@ -25,6 +25,7 @@ from hector_jax.description import (
     Description,
     read_description,
 )
+from hector_jax.inputs import InputError
 from hector_jax.mjcf import read_mjcf, refusal
 
 # HECTOR's
@@ -74,7 +75,7 @@ def describe(path: Path | None = None) -> Description:
             None takes the packaged hector.toml.
 
     Raises:
-        ValueError: as `read_description`.
+        InputError: as `read_description`.
     """
     path = DESCRIPTION_PATH if path is None else Path(path)
     if path.suffix == ".toml":
@@ -86,7 +87,7 @@ def load_robot(path: Path | None = None) -> Robot:
     """The robot of a file, see `describe`.
 
     Raises:
-        ValueError: as `describe` and `compile_model`.
+        InputError: as `describe` and `compile_model`.
     """
     description = describe(path)
     model = compile_model(description)
@@ -134,7 +135,7 @@ def compile_model(description: Description) -> mujoco.MjModel:
     """The compiled and checked model of a description.
 
     Raises:
-        ValueError: one line saying what came, what was expected and what there is. The MJCF must be
+        InputError: one line saying what came, what was expected and what there is. The MJCF must be
             one that `mjcf.read_mjcf` lets pass and that compiles to the biped of this module's
             docstring.
     """
@@ -154,7 +155,7 @@ def compile_model(description: Description) -> mujoco.MjModel:
 def _check_base(path: Path, model: mujoco.MjModel) -> None:
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     if len(free) != 1 or free[0] != 0:
-        raise ValueError(
+        raise InputError(
             f"{path}: {len(free)} free joints, expected exactly one, the first; "
             f"joints: {_listed(_joints(model))}"
         )
@@ -167,36 +168,36 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
         _require(path, "joint", name, names)
     got = [name for name in names if name in joints]
     if got != list(joints) or len(names) != 1 + len(joints):
-        raise ValueError(
+        raise InputError(
             f"{path}: joints are {_listed(names)}; expected a free joint, then {_listed(joints)}"
         )
     for index, name in enumerate(joints):
         joint = model.joint(name)
         which = index % 5
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise ValueError(f"{path}: joint {name!r} is no hinge, expected a hinge")
+            raise InputError(f"{path}: joint {name!r} is no hinge, expected a hinge")
         axis = _AXES[description.axes[which]]
         if not np.allclose(joint.axis, axis, atol=_SAME):
-            raise ValueError(f"{path}: axis of joint {name!r} is {joint.axis}, expected {axis}")
+            raise InputError(f"{path}: axis of joint {name!r} is {joint.axis}, expected {axis}")
         if not joint.limited[0]:
-            raise ValueError(f"{path}: joint {name!r} has no range, expected limits in radians")
+            raise InputError(f"{path}: joint {name!r} has no range, expected limits in radians")
         body = joint.bodyid[0]
         parent = model.body_parentid[body]
         expected = _trunk(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
         if parent != expected:
-            raise ValueError(
+            raise InputError(
                 f"{path}: joint {name!r} hangs on body {model.body(parent).name!r}, "
                 f"expected {model.body(expected).name!r}"
             )
         if np.abs(joint.pos).max() > _SAME or abs(model.body_quat[body][0]) < 1 - _SAME:
-            raise ValueError(
+            raise InputError(
                 f"{path}: joint {name!r} is off its body's origin or its body is turned, "
                 "expected neither pos on the joint nor an orientation on the body"
             )
         # Two parallel links in one plane: what the closed-form inverse kinematics solves.
         closed = description.axes == HECTOR_AXES and which >= 3
         if closed and (model.body_pos[body][0] != 0.0 or model.body_pos[body][2] >= 0.0):
-            raise ValueError(
+            raise InputError(
                 f"{path}: body of joint {name!r} is at {model.body_pos[body]}, "
                 "expected x = 0 and z < 0"
             )
@@ -205,7 +206,7 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
 def _check_motors(description: Description, model: mujoco.MjModel) -> None:
     path, joints = description.model, description.joints
     if model.nu != len(joints):
-        raise ValueError(
+        raise InputError(
             f"{path}: {model.nu} actuators, expected {len(joints)}, "
             f"one per joint: {_listed(joints)}"
         )
@@ -213,9 +214,9 @@ def _check_motors(description: Description, model: mujoco.MjModel) -> None:
         motor = model.actuator(index)
         driven = model.joint(motor.trnid[0]).name
         if driven != name:
-            raise ValueError(f"{path}: actuator {index} drives joint {driven!r}, expected {name!r}")
+            raise InputError(f"{path}: actuator {index} drives joint {driven!r}, expected {name!r}")
         if not motor.ctrllimited[0] or motor.ctrlrange[1] <= 0 or motor.gear[0] != 1.0:
-            raise ValueError(
+            raise InputError(
                 f"{path}: actuator of joint {name!r} has ctrlrange {motor.ctrlrange} and gear "
                 f"{motor.gear[0]}, expected a torque range and gear 1"
             )
@@ -224,7 +225,7 @@ def _check_motors(description: Description, model: mujoco.MjModel) -> None:
 def _check_feet(description: Description, model: mujoco.MjModel) -> None:
     path, toes, heels = description.model, description.toes, description.heels
     if description.standing not in (keys := [model.key(i).name for i in range(model.nkey)]):
-        raise ValueError(f"{path}: {_missing('keyframe', description.standing, keys)}")
+        raise InputError(f"{path}: {_missing('keyframe', description.standing, keys)}")
     sites = [model.site(i).name for i in range(model.nsite)]
     geoms = [model.geom(i).name for i in range(model.ngeom)]
     for side, foot in enumerate(description.foot_points):
@@ -232,26 +233,26 @@ def _check_feet(description: Description, model: mujoco.MjModel) -> None:
         body = model.joint(description.joints[5 * side + 4]).bodyid[0]
         point = model.site(foot).pos
         if model.site(foot).bodyid[0] != body:
-            raise ValueError(
+            raise InputError(
                 f"{path}: site {foot!r} is not on the foot, body {model.body(body).name!r}"
             )
         for name, ahead in ((toes[side], 1), (heels[side], -1)):
             _require(path, "geom", name, geoms)
             geom = model.geom(name)
             if geom.bodyid[0] != body or geom.type[0] != mujoco.mjtGeom.mjGEOM_SPHERE:
-                raise ValueError(
+                raise InputError(
                     f"{path}: geom {name!r} is no sphere on body {model.body(body).name!r}"
                 )
             reach = geom.pos - [0, 0, geom.size[0]] - point
             if ahead * reach[0] <= 0 or np.abs(reach[1:]).max() > 1e-3:
-                raise ValueError(
+                raise InputError(
                     f"{path}: lowest point of geom {name!r} is {reach} from site {foot!r}, "
                     f"expected it {'ahead' if ahead > 0 else 'behind'} on the same sole"
                 )
     for names in (toes, heels):
         left, right = (model.geom(name).pos[0] for name in names)
         if abs(left - right) > _SAME:
-            raise ValueError(
+            raise InputError(
                 f"{path}: {names[0]} at x = {left}, {names[1]} at x = {right}, expected the same"
             )
 
@@ -278,7 +279,7 @@ def _joints(model: mujoco.MjModel) -> list[str]:
 
 def _require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
     if name not in names:
-        raise ValueError(f"{path}: {_missing(kind, name, names)}")
+        raise InputError(f"{path}: {_missing(kind, name, names)}")
 
 
 def _missing(kind: str, name: str, names: Sequence[str]) -> str:

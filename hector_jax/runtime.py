@@ -18,9 +18,15 @@ from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
+from hector_jax.inputs import InputError
+
 
 def cache_folder() -> Path:
-    """Folder of the user's compilation cache; a temporary one where the home cannot be written."""
+    """Folder of the user's compilation cache; a temporary one where the home cannot be written.
+
+    Raises:
+        InputError: there is none that this user alone can write.
+    """
     base = os.environ.get("XDG_CACHE_HOME")
     folder = Path(base) if base else Path(os.path.expanduser("~")) / ".cache"
     folder = folder / "hector_jax" / "jax"
@@ -28,9 +34,23 @@ def cache_folder() -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         probe = tempfile.TemporaryFile(dir=folder)
         probe.close()
-    except OSError:
-        folder = Path(tempfile.gettempdir()) / f"hector_jax-{os.getuid()}" / "jax"
-        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as refused:
+        own = Path(tempfile.gettempdir()) / f"hector_jax-{os.getuid()}"
+        try:
+            own.mkdir(mode=0o700, exist_ok=True)
+        except OSError:
+            raise InputError(
+                f"no folder for compiled programs: {folder}: {refused.strerror}, and {own} cannot "
+                "be made; set XDG_CACHE_HOME to a folder that can be written"
+            ) from None
+        # compiled programs are run: nobody else may have put them there
+        if own.is_symlink() or own.stat().st_uid != os.getuid() or own.stat().st_mode & 0o077:
+            raise InputError(
+                f"{own} is open to others or of another user, so no programs are loaded from it; "
+                "remove it, or set XDG_CACHE_HOME to a folder that can be written"
+            )
+        folder = own / "jax"
+        folder.mkdir(exist_ok=True)
     return folder
 
 

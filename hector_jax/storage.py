@@ -12,8 +12,6 @@ in a folder that `locked` gives to one process.
 """
 
 import difflib
-import errno
-import fcntl
 import hashlib
 import io
 import json
@@ -31,16 +29,17 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from filelock import FileLock, Timeout
 
-from hector_jax.console import say
+from hector_jax.console import Broken, say
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import one_line, problem, read_text, shown
+from hector_jax.inputs import InputError, one_line, problem, read_text, shown
 from hector_jax.robot import MODEL_PATH, Robot
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
 _MOST_WEIGHTS = 1_000_000  # bytes
-_PART = ".part"  # ends the name of a file that is being written
+_PART = ".hector_jax-part"  # ends the name of a file that is being written, and of no other
 _DIGEST = 64  # hexadecimal digits of a sha256
 _PACKAGES = (
     "hector-jax",
@@ -55,6 +54,15 @@ _PACKAGES = (
 )
 
 Tree = TypeVar("Tree")
+
+
+class WriteError(Broken):
+    """A file cannot be written, such as on a full disk; the one line names it."""
+
+
+def _cannot_write(path: Path, error: OSError) -> WriteError:
+    # files appear whole, and a run goes on from them
+    return WriteError(f"cannot write {path}: {error.strerror}; what was written before it is kept")
 
 
 def versions() -> dict[str, str]:
@@ -120,14 +128,14 @@ def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
         before: name that the file which is replaced goes to.
 
     Raises:
-        OSError: one line with the path, where the folder or the disk refuses.
+        WriteError: one line with the path, where the folder or the disk refuses.
     """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(_PART, f".{path.name}.", path.parent)
     except OSError as error:
-        raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
+        raise _cannot_write(path, error) from error
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
@@ -141,7 +149,7 @@ def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
+            raise _cannot_write(path, error) from error
         raise
 
 
@@ -149,7 +157,7 @@ def append_file(path: Path, data: bytes) -> None:
     """Add `data` to a file; a stop in the midst may leave part of it.
 
     Raises:
-        OSError: one line with the path, where the folder or the disk refuses.
+        WriteError: one line with the path, where the folder or the disk refuses.
     """
     try:
         with Path(path).open("ab") as file:
@@ -157,7 +165,7 @@ def append_file(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise OSError(error.errno, f"cannot write {path}: {error.strerror}") from error
+        raise _cannot_write(path, error) from error
 
 
 def _sync(folder: Path) -> None:
@@ -173,36 +181,39 @@ def make_folder(folder: Path) -> None:
     """Make a folder, and find out that it can be written before anything is computed for it.
 
     Raises:
-        OSError: one line with the folder, where it cannot be made or written.
+        InputError: one line with the folder, where it cannot be made or written.
     """
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise OSError(error.errno, f"cannot write to {folder}: {error.strerror}") from error
+        raise InputError(f"cannot write to {folder}: {error.strerror}") from error
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Be the only process that writes to `folder`, which is made, as long as the block lasts.
 
-    A process that is killed lets go of the lock; what it left half-written is removed here.
+    Waits, with a line on stderr, for another process that has the lock. A process that is killed
+    lets go of it; what `write_file` left half-written there is removed here.
 
     Raises:
-        OSError: one line with the folder, where another process has the lock, or where the folder
-            cannot be made or written.
+        InputError: one line with the folder, where it cannot be made or written.
     """
     make_folder(folder)
-    with (Path(folder) / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            told = f"{folder}: another process is writing there; wait for it or name another folder"
-            raise OSError(errno.EAGAIN, told) from error
-        for left in Path(folder).glob(f".*{_PART}"):
-            left.unlink(missing_ok=True)
+    lock = FileLock(Path(folder) / ".lock")
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        say(f"{folder}: another process is writing there; waiting for it to end")
+        lock.acquire()
+    try:
+        for part in Path(folder).glob(f".*{_PART}"):
+            part.unlink(missing_ok=True)
         yield
+    finally:
+        lock.release()
 
 
 def save_tree(
@@ -218,7 +229,7 @@ def save_tree(
         about: JSON values for the card: units, frames, seeds, settings.
 
     Raises:
-        OSError: where the file cannot be written.
+        WriteError: where the file cannot be written.
     """
     write_file(path, _packed(tree, kind, robot, about))
 
@@ -259,28 +270,28 @@ def load_tree(
         The tree, with numpy arrays, and its card.
 
     Raises:
-        ValueError: one line naming the file, for one that is missing, cut, changed, of another
+        InputError: one line naming the file, for one that is missing, cut, changed, of another
             kind, format, layout or robot.
     """
     arrays, card = _read(path)
     if card["kind"] != kind:
-        raise ValueError(f"{path}: holds {shown(card['kind'])[1:-1]}, expected {kind}")
+        raise InputError(f"{path}: holds {shown(card['kind'])[1:-1]}, expected {kind}")
     if robot is not None and card["robot"] != (expected := fingerprint(robot)):
-        raise ValueError(
+        raise InputError(
             f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
         )
     wanted = _named_leaves(like)
     if arrays.keys() != wanted.keys():
         odd = sorted(arrays.keys() ^ wanted.keys())
         told = one_line(", ".join(odd))
-        raise ValueError(f"{path}: another layout of {kind}; fields that differ: {told}")
+        raise InputError(f"{path}: another layout of {kind}; fields that differ: {told}")
     for name, leaf in wanted.items():
         if (dtype := arrays[name].dtype).kind not in "biuf":
-            raise ValueError(f"{path}: {name} has type {dtype}, expected numbers")
+            raise InputError(f"{path}: {name} has type {dtype}, expected numbers")
         shape, got = np.shape(leaf), arrays[name].shape
         if len(shape) != len(got) or any(s not in (0, g) for s, g in zip(shape, got, strict=True)):
             text = ", ".join("any" if s == 0 else str(s) for s in shape)
-            raise ValueError(f"{path}: {name} has shape {got}, expected ({text})")
+            raise InputError(f"{path}: {name} has shape {got}, expected ({text})")
     leaves = [arrays[name] for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), card
 
@@ -289,7 +300,7 @@ def read_card(path: Path) -> dict[str, Any]:
     """The card of a file that `save_tree` wrote, once the file as a whole is found sound.
 
     Raises:
-        ValueError: one line naming the file, as `load_tree`.
+        InputError: one line naming the file, as `load_tree`.
     """
     return _read(path)[1]
 
@@ -298,7 +309,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     data = _read_bytes(Path(path))
     content, digest = data[:-_DIGEST], data[-_DIGEST:]
     if hashlib.sha256(content).hexdigest().encode() != digest:
-        raise ValueError(f"{path}: cut or changed since it was written, or not a hector_jax file")
+        raise InputError(f"{path}: cut or changed since it was written, or not a hector_jax file")
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
@@ -307,31 +318,31 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             arrays = {name: archive[name] for name in archive.files}
         card = json.loads(str(arrays.pop("card")))
     except Exception as error:  # whoever made the archive chose what goes wrong
-        raise ValueError(f"{path}: no card or no plain arrays inside: {one_line(error)}") from error
+        raise InputError(f"{path}: no card or no plain arrays inside: {one_line(error)}") from error
     _check_card(path, card)
     return arrays, card
 
 
 def _check_card(path: Path, card: Any) -> None:
     if not isinstance(card, dict):
-        raise ValueError(f"{path}: card must be an object, got {shown(card)}")
+        raise InputError(f"{path}: card must be an object, got {shown(card)}")
     if card.get("format") != FORMAT:
-        raise ValueError(
+        raise InputError(
             f"{path}: file format {shown(card.get('format'))}, this version reads {FORMAT}"
         )
     kinds = {"kind": str, "robot": str | None, "about": dict}
     for name, kind in kinds.items():
         if told := problem(card.get(name), kind):
-            raise ValueError(f"{path}: card.{name} {told}")
+            raise InputError(f"{path}: card.{name} {told}")
 
 
 def _read_bytes(path: Path) -> bytes:
     try:
         if path.exists() and not path.is_file():  # a pipe or a device might never end
-            raise ValueError(f"cannot read {path}: not a plain file")
+            raise InputError(f"cannot read {path}: not a plain file")
         return path.read_bytes()
     except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
 
 
 def _named_leaves(tree: Any) -> dict[str, Any]:
@@ -365,7 +376,7 @@ class Checkpoint:
         """Keep a state, with more notes for its card.
 
         Raises:
-            OSError: where the file cannot be written; what was kept stays.
+            WriteError: where the file cannot be written; what was kept stays.
         """
         data = _packed(tree, self.kind, self.robot, {**self.about, **(about or {})})
         write_file(self.path, data, self.before)
@@ -378,7 +389,7 @@ class Checkpoint:
             try:
                 tree, card = load_tree(path, like, kind=self.kind, robot=self.robot)
                 check_versions(path, card["versions"])
-            except ValueError as error:
+            except InputError as error:
                 say(f"not taken up: {error}")
                 if path == self.path:
                     # out of the way: the next save must not put it in the place of a sound one
@@ -397,11 +408,11 @@ def check_versions(path: Path, made_with: Mapping[str, str]) -> None:
     """Hold what a file was made with against what is installed.
 
     Raises:
-        ValueError: one line naming the file and the first package that differs.
+        InputError: one line naming the file and the first package that differs.
     """
     for name, here in versions().items():
         if (made := made_with.get(name)) != here:
-            raise ValueError(f"{path}: made with {name} {made}, here is {name} {here}")
+            raise InputError(f"{path}: made with {name} {made}, here is {name} {here}")
 
 
 def as_json(value: Any, indent: int | None = None) -> str:
@@ -417,7 +428,7 @@ def write_json(path: Path, value: Any) -> None:
     """Write nested values as JSON, `as_json` with line breaks.
 
     Raises:
-        OSError: where the file cannot be written.
+        WriteError: where the file cannot be written.
     """
     write_file(path, (as_json(value, indent=2) + "\n").encode())
 
@@ -442,7 +453,7 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
     """Write weights as JSON, as `weights_tree`; with the place of a schema it names that first.
 
     Raises:
-        OSError: where the file cannot be written.
+        WriteError: where the file cannot be written.
     """
     tree = {} if schema is None else {"$schema": schema}
     write_file(path, (json.dumps(tree | weights_tree(weights), indent=2) + "\n").encode())
@@ -452,7 +463,7 @@ def load_weights(path: Path) -> Weights:
     """Read weights that `save_weights` or a person wrote; positive, but not held to the box.
 
     Raises:
-        ValueError: one line naming the file and the entry that is missing, unknown, of the wrong
+        InputError: one line naming the file and the entry that is missing, unknown, of the wrong
             shape, or not a positive number.
     """
     path = Path(path)
@@ -460,9 +471,9 @@ def load_weights(path: Path) -> Weights:
     try:
         tree = json.loads(text, object_pairs_hook=_no_twins)
     except ValueError as error:  # JSONDecodeError is one too
-        raise ValueError(f"{path}: no valid JSON: {error}") from error
+        raise InputError(f"{path}: no valid JSON: {error}") from error
     except RecursionError as error:
-        raise ValueError(f"{path}: no valid JSON: nested too deeply") from error
+        raise InputError(f"{path}: no valid JSON: nested too deeply") from error
     if isinstance(tree, dict):
         tree.pop("$schema", None)  # for editors; what is in a file is checked here
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
@@ -493,15 +504,15 @@ def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
     expected = f"expected {', '.join(names)}"
     if not isinstance(tree, dict):
         where = prefix.rstrip(".") or "the file"
-        raise ValueError(f"{path}: {where} must be an object; {expected}")
+        raise InputError(f"{path}: {where} must be an object; {expected}")
     for key in tree:
         if key not in names:
             near = difflib.get_close_matches(key, names, n=1)
             hint = f'did you mean "{prefix}{near[0]}"?' if near else expected
-            raise ValueError(f"{path}: unknown weight {json.dumps(prefix + key[:40])}; {hint}")
+            raise InputError(f"{path}: unknown weight {json.dumps(prefix + key[:40])}; {hint}")
     for name in names:
         if name not in tree:
-            raise ValueError(f'{path}: missing weight "{prefix}{name}"; {expected}')
+            raise InputError(f'{path}: missing weight "{prefix}{name}"; {expected}')
 
 
 def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -511,10 +522,10 @@ def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.n
     except (ValueError, OverflowError):
         array = np.array(None)
     if array.shape != shape or array.dtype.kind not in "if":
-        raise ValueError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
+        raise InputError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
     array = array.astype(float)
     bad = ~(np.isfinite(array) & (array > 0))
     if bad.any():
         place = "".join(f"[{i}]" for i in np.argwhere(bad)[0])
-        raise ValueError(f"{path}: {name}{place} must be positive, got {array[bad][0]:g}")
+        raise InputError(f"{path}: {name}{place} must be positive, got {array[bad][0]:g}")
     return array

@@ -22,6 +22,7 @@ from hector_jax.evaluation.report import Picture, environment
 from hector_jax.evaluation.table import PAPER, Earlier, Fall, Search, Table
 from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_video
 from hector_jax.grfm.network import Params
+from hector_jax.inputs import InputError
 from hector_jax.kept import Judged, Tuned
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -66,14 +67,14 @@ class _Plan:
 
 
 def _plan(args: flags.Table) -> _Plan:
-    """Raises ValueError, before anything is computed, where the flags ask for what cannot be."""
+    """Raises InputError, before anything is computed, where the flags ask for what cannot be."""
     flags.check(args)
     for name in args.trajectories:
         if name not in COMMANDS:
-            raise ValueError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
+            raise InputError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
     commands = {name: named_command(name) for name in args.trajectories}
     if len(commands) < len(args.trajectories) or not commands:
-        raise ValueError(f"--trajectories must name each once, got {' '.join(args.trajectories)}")
+        raise InputError(f"--trajectories must name each once, got {' '.join(args.trajectories)}")
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     return _Plan(
         commands,
@@ -98,9 +99,9 @@ def _sets_from_files(args: flags.Table) -> dict[str, dict[str, Weights]]:
     for text in args.extra:
         name, _, folder = text.partition("=")
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not folder:
-            raise ValueError(f"--extra must be NAME=FOLDER, NAME of letters and digits, got {text}")
+            raise InputError(f"--extra must be NAME=FOLDER, NAME of letters and digits, got {text}")
         if name in (*SETS, CEILING, *folders):
-            raise ValueError(f"--extra {text}: there is a set '{name}' already")
+            raise InputError(f"--extra {text}: there is a set '{name}' already")
         folders[name] = Path(folder)
     found = {}
     for trajectory in args.trajectories:
@@ -117,7 +118,7 @@ def _long_search(card: Path) -> Search:
         told = json.loads(card.read_bytes())
         return Search(told["walks"], told["best_at"], told["L"]["best"], told["stop"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(
+        raise InputError(
             f"{card}: no card of a search, so its weights are of none: {error}"
         ) from None
 
@@ -135,8 +136,8 @@ def make_table(
         report.md, and the verdict of each trajectory.
 
     Raises:
-        ValueError: the flags ask for what cannot be, or a file is damaged.
-        OSError: a folder cannot be written, or another process is writing there.
+        InputError: the flags ask for what cannot be, or a file is damaged.
+        InputError: the folder cannot be written.
     """
     asked = args
     if args.quick:
@@ -237,7 +238,7 @@ def _tune(
                 commit,
                 f"tuning {name} further, along walks on the simulator",
             )
-        except ValueError as error:  # a walk with the tuned weights falls
+        except InputError as error:  # a walk with the tuned weights falls
             say(f"{name}: no row {WALKS}: {error}")
     return tuned
 

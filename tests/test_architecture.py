@@ -7,7 +7,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
-    ["console", "runtime", "geometry", "inputs"],
+    ["inputs", "geometry"],
+    ["console", "runtime"],
     ["trajectory", "mjcf"],
     ["description"],
     ["robot"],

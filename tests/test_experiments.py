@@ -10,7 +10,8 @@ import pytest
 
 from hector_jax.console import exit_code, made_at
 from hector_jax.control.weights import nominal
-from hector_jax.storage import save_weights
+from hector_jax.inputs import InputError
+from hector_jax.storage import WriteError, save_weights
 
 FOLDER = Path(__file__).parents[1] / "experiments"
 
@@ -22,15 +23,28 @@ def script(name):
     return module
 
 
+def failing(error):
+    def work():
+        raise error
+
+    return work
+
+
 @pytest.mark.parametrize(
-    ("error", "code"), [(ValueError, 2), (OSError, 2), (KeyboardInterrupt, 130)]
+    ("error", "code"),
+    [(InputError("no\nsuch thing"), 2), (WriteError("full"), 1), (KeyboardInterrupt(), 130)],
 )
 def test_a_script_ends_in_one_line_and_a_code(capsys, error, code):
-    def work():
-        raise error("no\nsuch thing")
+    assert exit_code("race", failing(error)) == code
+    told = capsys.readouterr().err
+    assert told.startswith("race: ")
+    assert told.count("\n") == 1
 
-    assert exit_code("race", work) == code
-    assert capsys.readouterr().err.startswith("race: ")
+
+@pytest.mark.parametrize("error", [ValueError("zip() argument 2 is shorter"), OSError("odd")])
+def test_a_fault_of_the_program_keeps_its_traceback(error):
+    with pytest.raises(type(error), match=str(error)[:5]):
+        exit_code("race", failing(error))
 
 
 def test_a_report_tells_commit_and_command(monkeypatch):

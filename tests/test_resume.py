@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,9 +18,10 @@ from hector_jax import flags, storage
 from hector_jax.commands import tuning
 from hector_jax.console import exit_code
 from hector_jax.control.weights import nominal
+from hector_jax.inputs import InputError
 from hector_jax.robot import load_robot
 from hector_jax.runtime import workers
-from hector_jax.storage import Checkpoint, locked, write_file
+from hector_jax.storage import Checkpoint, WriteError, locked, write_file
 from hector_jax.tuning.course import KIND, load_tuning, save_tuning
 from hector_jax.tuning.difftune import TuneConfig, descend
 
@@ -131,25 +133,41 @@ def test_a_disk_that_refuses_is_one_line_and_loses_nothing(tmp_path, monkeypatch
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match=f"cannot write {kept.path}: {os.strerror(code)}"):
+    with pytest.raises(WriteError, match=f"cannot write {kept.path}: {os.strerror(code)}"):
         kept.save(STATE)
     assert files(tmp_path) == before
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_anything_is_computed():
-    with pytest.raises(OSError, match="cannot write to /proc"), locked(Path("/proc")):
+    with pytest.raises(InputError, match="cannot write to /proc"), locked(Path("/proc")):
         pass
 
 
-def test_a_folder_has_one_writer_and_a_half_written_file_is_swept(tmp_path):
-    left = tmp_path / ".state.npz.abc.part"
-    left.write_bytes(b"half")
+def test_a_half_written_file_of_ours_is_swept_and_nobody_else_s(tmp_path):
+    ours = tmp_path / ".state.npz.abc.hector_jax-part"
+    theirs = tmp_path / ".film.part"
+    for file in (ours, theirs):
+        file.write_bytes(b"half")
     with locked(tmp_path):
-        assert not left.exists()
-        with pytest.raises(OSError, match="another process is writing there"), locked(tmp_path):
-            pass
+        assert not ours.exists()
+        assert theirs.exists()
+
+
+def test_a_second_writer_waits_for_the_first_and_says_so(tmp_path, capsys):
+    order = []
+
+    def second():
+        with locked(tmp_path):
+            order.append("second")
+
+    other = threading.Thread(target=second)
     with locked(tmp_path):
-        pass
+        other.start()
+        time.sleep(0.2)
+        order.append("first")
+    other.join()
+    assert order == ["first", "second"]
+    assert "another process is writing there; waiting" in " ".join(capsys.readouterr().err.split())
 
 
 def test_what_stands_is_never_half_of_a_file(tmp_path):
@@ -310,8 +328,6 @@ def test_a_run_of_other_versions_another_robot_or_none_is_not_taken_up(begun, mo
         ValueError, match="cannot read .*none/config.json: No such file.* expected a run folder"
     ):
         tuning.tune(flags.Tune(resume=folder / "none"))
-    with locked(folder), pytest.raises(OSError, match="another process is writing there"):
-        tuning.tune(again)
 
 
 @pytest.mark.slow

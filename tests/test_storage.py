@@ -10,7 +10,14 @@ import pytest
 
 from hector_jax import storage
 from hector_jax.control.weights import expert, nominal
-from hector_jax.storage import load_tree, load_weights, read_card, save_tree, save_weights
+from hector_jax.storage import (
+    WriteError,
+    load_tree,
+    load_weights,
+    read_card,
+    save_tree,
+    save_weights,
+)
 
 
 class Leaf(NamedTuple):
@@ -123,7 +130,7 @@ def test_a_missing_file_is_one_line_with_its_name(tmp_path):
 
 def test_an_unwritable_folder_is_one_line_with_its_name(tmp_path):
     (tmp_path / "wall").write_text("a file, no folder")
-    with pytest.raises(OSError, match="cannot write .*wall/tree.npz"):
+    with pytest.raises(WriteError, match="cannot write .*wall/tree.npz"):
         save_tree(tmp_path / "wall" / "tree.npz", TREE, kind="thing")
 
 
@@ -134,7 +141,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(storage.os, "fsync", full_disk)
-    with pytest.raises(OSError, match="cannot write .*tree.npz: No space left"):
+    with pytest.raises(WriteError, match="cannot write .*tree.npz: No space left"):
         save_tree(saved, TREE, kind="other")
     assert saved.read_bytes() == before
     assert [p.name for p in saved.parent.iterdir()] == ["tree.npz"]

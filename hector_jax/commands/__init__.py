@@ -11,7 +11,7 @@ def run(args: Any) -> None:
     """Do what the flags of a command ask for.
 
     Raises:
-        ValueError, OSError: one line that says what is wrong with the input.
+        InputError: one line that says what is wrong with the input.
     """
     raise NotImplementedError(type(args))
 

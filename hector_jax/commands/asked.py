@@ -12,7 +12,7 @@ from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation.runs import Asked
 from hector_jax.flags import View, Walk
-from hector_jax.inputs import did_you_mean, shown
+from hector_jax.inputs import InputError, did_you_mean, shown
 from hector_jax.robot import Robot, load_robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
@@ -27,11 +27,11 @@ def weights(text: str, robot: Robot) -> Weights:
     """A weight set by its name, or from a file.
 
     Raises:
-        ValueError: there is no such set, or the file holds none.
+        InputError: there is no such set, or the file holds none.
     """
     named = {"nominal": nominal, "expert": expert}
     if text not in named and not Path(text).suffix and not Path(text).exists():
-        raise ValueError(
+        raise InputError(
             f"no weights {shown(text)}{did_you_mean(text, named)}; there are: "
             f"{', '.join(named)}, or a file"
         )
@@ -52,12 +52,12 @@ def robot_of(run: Path, begun: Asked) -> Robot:
     """The robot that a run was tuned for.
 
     Raises:
-        ValueError: its files say something else now.
+        InputError: its files say something else now.
     """
     robot = load_robot(begun.robot)
     if begun.body not in (None, identity(robot)):
         path = robot.description.path
-        raise ValueError(f"{run} was tuned for another robot than {path} and its MJCF are now")
+        raise InputError(f"{run} was tuned for another robot than {path} and its MJCF are now")
     return robot
 
 
@@ -79,7 +79,7 @@ def course(text: str, robot: Robot) -> Course:
     """What to walk; one line says where a file asks for more than the robot may be able to.
 
     Raises:
-        ValueError: there is no such trajectory, or its file is wrong.
+        InputError: there is no such trajectory, or its file is wrong.
     """
     found = trajectories.course(text)
     if found.seconds and (told := beyond(limits(robot, walk_config(robot).gait), found.command)):
@@ -91,12 +91,12 @@ def seconds(given: float, wanted: Course) -> float:
     """Length of a walk [s]: what the trajectory's file says, else what the flag does.
 
     Raises:
-        ValueError: both say one.
+        InputError: both say one.
     """
     if wanted.seconds is None:
         return given
     if given != Walk.seconds:
-        raise ValueError(
+        raise InputError(
             f"--seconds is for built-in trajectories: {wanted.name} lasts {wanted.seconds:g} s, "
             f"as its file says, got {given:g}"
         )

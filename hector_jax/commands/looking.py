@@ -16,6 +16,7 @@ from hector_jax.evaluation.tensorboard import write_events
 from hector_jax.flags import Replay, Tensorboard, View
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot, compile_model
 from hector_jax.storage import as_json, make_folder
 
@@ -27,15 +28,15 @@ def view_run(args: View) -> None:
     if folder is None:
         view.check_viser()
     if args.seconds < 0.1:
-        raise ValueError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
+        raise InputError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
     if args.sets[0] == args.sets[1]:
-        raise ValueError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
+        raise InputError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
     begun = runs.read_asked(args.run)
     robot = asked.robot_of(args.run, begun)
     wanted = asked.course(begun.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
-            raise ValueError(f"--out must not be the folder of the run, got {folder}")
+            raise InputError(f"--out must not be the folder of the run, got {folder}")
         make_folder(folder)
     sets = {name: runs.weights_of(args.run, name, robot) for name in args.sets}
     data = asked.folder_of(args.data or begun.data, begun.robot, robot)

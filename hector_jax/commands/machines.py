@@ -8,6 +8,7 @@ from hector_jax.console import Broken, say
 from hector_jax.control.walking import walk_config
 from hector_jax.evaluation import runs
 from hector_jax.flags import Doctor, Export
+from hector_jax.inputs import InputError
 from hector_jax.robot import load_robot
 from hector_jax.storage import as_json, load_weights, locked
 
@@ -18,7 +19,7 @@ def export_controller(args: Export) -> None:
     jax.config.update("jax_platforms", "cpu")
     is_run = args.run.is_dir()
     if is_run and args.robot:
-        raise ValueError(f"--robot is for a weights file; {args.run} tells its own")
+        raise InputError(f"--robot is for a weights file; {args.run} tells its own")
     path, config = export.find_weights(args.run, args.set)
     begun = runs.read_asked(args.run) if is_run else None
     robot = asked.robot_of(args.run, begun) if begun else load_robot(args.robot)

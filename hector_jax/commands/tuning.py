@@ -26,6 +26,7 @@ from hector_jax.evaluation.runs import read_json
 from hector_jax.flags import Search, Tune, Walk, as_command, from_file, settings
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.inputs import InputError
 from hector_jax.kept import Journal, Judged
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -50,7 +51,7 @@ _FREE = ("config", "json", "processes", "resume", "run", "runs", "video")  # cha
 def tune(args: Tune) -> None:
     """Tune on the trajectories asked for, anew or where a run was left."""
     if args.run and args.resume:
-        raise ValueError(f"--run {args.run} and --resume {args.resume}: only one can be given")
+        raise InputError(f"--run {args.run} and --resume {args.resume}: only one can be given")
     texts = COMMANDS if args.traj == "all" else (args.traj,)
     base = args.resume or args.run
     if base is None:
@@ -66,7 +67,7 @@ def tune(args: Tune) -> None:
         for folder, one in several.items():
             _asked_for(one, load_robot(args.robot))
             if folder.exists():
-                raise ValueError(_taken(folder))
+                raise InputError(_taken(folder))
         for folder, one in several.items():
             _begin(folder, one)
     for folder, one in several.items():
@@ -80,7 +81,7 @@ def _taken(folder: Path) -> str:
 
 def _begin(folder: Path, args: Tune) -> None:
     """Make the folder of a new run, at once with its flags: one that is there can be resumed."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
         new = Path(part) / "run"
         write_json(new / "versions.json", environment())
@@ -91,7 +92,7 @@ def _begin(folder: Path, args: Tune) -> None:
         try:
             new.rename(folder)
         except OSError:
-            raise ValueError(_taken(folder)) from None
+            raise InputError(_taken(folder)) from None
 
 
 def _as_begun(folder: Path, args: Tune) -> Tune:
@@ -100,13 +101,13 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
     A flag at its default counts as not given.
 
     Raises:
-        ValueError: one line naming the file: no run, one of other flags, versions or another robot.
+        InputError: one line naming the file: no run, one of other flags, versions or another robot.
     """
     as_asked, made_with = (read_json(folder / f"{name}.json") for name in ("config", "versions"))
     check_versions(folder / "versions.json", made_with)
     begun, taken = from_file(Tune, folder / "config.json"), {}
     if "robot" not in as_asked:
-        raise ValueError(f"{folder / 'config.json'}: no robot told; expected that of a run")
+        raise InputError(f"{folder / 'config.json'}: no robot told; expected that of a run")
     _agree(folder, as_asked, {"robot": identity(load_robot(begun.robot))})
     before, here = (told.get("commit", "none") for told in (made_with, environment()))
     if before != here:
@@ -117,7 +118,7 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
             continue
         before, given = getattr(begun, name), getattr(args, name)
         if given not in (before, field.default):
-            raise ValueError(f"{folder}: begun with --{name} {before}, got {given}")
+            raise InputError(f"{folder}: begun with --{name} {before}, got {given}")
         taken[name] = before
     return replace(args, **taken)
 
@@ -128,21 +129,21 @@ def _agree(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> No
         if isinstance(value, dict):
             before = begun.get(name, {})
             if not isinstance(before, dict):
-                raise ValueError(f"{folder / 'config.json'}: {name}: no settings: {before!r}")
+                raise InputError(f"{folder / 'config.json'}: {name}: no settings: {before!r}")
             _agree(folder, before, value)
         elif begun.get(name, value) != value:
-            raise ValueError(f"{folder}: begun with {name} {begun[name]}, here is {value}")
+            raise InputError(f"{folder}: begun with {name} {begun[name]}, here is {value}")
 
 
 def _asked_for(args: Tune, robot: Robot) -> Course:
     """What a tuning is to walk.
 
     Raises:
-        ValueError: there is no such trajectory, or none that --refresh can take.
+        InputError: there is no such trajectory, or none that --refresh can take.
     """
     wanted = asked.course(args.traj, robot)
     if args.refresh and len(wanted.command.duration) > PIECES:
-        raise ValueError(
+        raise InputError(
             f"--refresh takes trajectories of at most {PIECES} segments, {wanted.name} has "
             f"{len(wanted.command.duration)}"
         )

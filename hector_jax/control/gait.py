@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, check
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, InputError, check
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class GaitConfig:
         rules = {"tick": POSITIVE, "stance": SOME, "swing": SOME}
         check(self, **rules, stand=NOT_NEGATIVE, cycles=NOT_NEGATIVE)
         if self.stance < self.swing or (self.stance + self.swing) % 2:
-            raise ValueError(
+            raise InputError(
                 "GaitConfig.stance must be at least swing and make an even cycle with it, "
                 f"got stance {self.stance}, swing {self.swing}"
             )

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
-from hector_jax.inputs import did_you_mean, shown
+from hector_jax.inputs import InputError, did_you_mean, shown
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State
 
@@ -76,10 +76,10 @@ def named_command(name: str) -> Command:
     [[0.5, 0.0], [0.0, 0.0]]
 
     Raises:
-        ValueError: the name is none of them.
+        InputError: the name is none of them.
     """
     if name not in _PIECES:
-        raise ValueError(
+        raise InputError(
             f"unknown trajectory {shown(name)}{did_you_mean(name, _PIECES)}; "
             f"there are: {', '.join(_PIECES)}"
         )

@@ -23,7 +23,7 @@ import numpy as np
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
-from hector_jax.inputs import Interval, check, from_table, one_line, read_text, shown
+from hector_jax.inputs import InputError, Interval, check, from_table, one_line, read_text, shown
 from hector_jax.robot import Robot
 
 _MOST_SECONDS = 600.0
@@ -58,7 +58,7 @@ class Segment:
     def __post_init__(self) -> None:
         check(self, **self.RULES)
         if abs(self.seconds / _GRID - round(self.seconds / _GRID)) > 1e-6:
-            raise ValueError(
+            raise InputError(
                 f"Segment.seconds must be a multiple of {_GRID} s, got {shown(self.seconds)}"
             )
 
@@ -71,14 +71,14 @@ class _File:
     def __post_init__(self) -> None:
         check(self)
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}", self.name):
-            raise ValueError(
+            raise InputError(
                 "name must be 1 to 40 letters, digits, - or _, the first neither - nor _, "
                 f"got {shown(self.name)}"
             )
         if self.name in (*COMMANDS, *UNSEEN, "all"):
-            raise ValueError(f"name must not be that of a built-in trajectory, got {self.name!r}")
+            raise InputError(f"name must not be that of a built-in trajectory, got {self.name!r}")
         if not 1 <= len(self.segment) <= _MOST_SEGMENTS:
-            raise ValueError(
+            raise InputError(
                 f"[[segment]] must be there 1 to {_MOST_SEGMENTS} times, got {len(self.segment)}"
             )
 
@@ -87,14 +87,14 @@ def load_course(path: Path) -> Course:
     """The course of a TOML file, see the module.
 
     Raises:
-        ValueError: one line naming the file and the field that is unknown, missing or out of range.
+        InputError: one line naming the file and the field that is unknown, missing or out of range.
     """
     path = Path(path)
     text = read_text(path, "a trajectory", _MOST_BYTES)
     try:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: no valid TOML: {one_line(error)}") from None
+        raise InputError(f"{path}: no valid TOML: {one_line(error)}") from None
     told = from_table(str(path), _File, table)
     segments = [
         from_table(f"{path}: segment {number}", Segment, one)
@@ -102,7 +102,7 @@ def load_course(path: Path) -> Course:
     ]
     seconds = sum(one.seconds for one in segments)
     if seconds > _MOST_SECONDS:
-        raise ValueError(
+        raise InputError(
             f"{path}: the segments must last at most {_MOST_SECONDS:g} s together, got {seconds:g}"
         )
     command = Command(
@@ -117,14 +117,14 @@ def course(text: str) -> Course:
     """A trajectory by its name, or from the TOML file of that path.
 
     Raises:
-        ValueError: `named_command` knows no such name, or see `load_course`.
+        InputError: `named_command` knows no such name, or see `load_course`.
     """
     if text.endswith(".toml"):
         return load_course(Path(text))
     try:
         return Course(text, named_command(text))
-    except ValueError as error:
-        raise ValueError(f"{error}, or a file NAME.toml") from None
+    except InputError as error:
+        raise InputError(f"{error}, or a file NAME.toml") from None
 
 
 class Limits(NamedTuple):

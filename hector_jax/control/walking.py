@@ -20,7 +20,7 @@ from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.geometry import rotation_from_euler, wrap_angle
-from hector_jax.inputs import check, from_table
+from hector_jax.inputs import InputError, check, from_table
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
@@ -38,7 +38,7 @@ class WalkConfig:
     def __post_init__(self) -> None:
         check(self)
         if 2 * self.gait.tick > self.mpc_step + 1e-12:
-            raise ValueError(
+            raise InputError(
                 "WalkConfig.gait.tick must be at most half the MPC step, "
                 f"got tick {self.gait.tick} s and step {self.mpc_step} s"
             )
@@ -53,7 +53,7 @@ def walk_config(robot: Robot) -> WalkConfig:
     """The controller that a robot's description asks for.
 
     Raises:
-        ValueError: one line naming the file, the key and what was expected.
+        InputError: one line naming the file, the key and what was expected.
     """
     path, given = robot.description.path, dict(robot.description.control)
     kinds = {"gait": GaitConfig, "mpc": MpcConfig, "footstep": FootstepConfig, "legs": LegConfig}

@@ -19,6 +19,7 @@ from hector_jax.control.gait import GaitConfig
 from hector_jax.control.walking import walk_config
 from hector_jax.grfm.dataset import Dataset, make_dataset
 from hector_jax.grfm.training import predict
+from hector_jax.inputs import InputError
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
@@ -124,14 +125,14 @@ def drift(
         config: the gait that was walked.
 
     Raises:
-        ValueError: no walk is long enough to predict in.
+        InputError: no walk is long enough to predict in.
     """
     config = config or walk_config(robot).gait
     ticks = round(HORIZONS[-1] / config.tick)
     fallen = np.asarray(walks.fallen)
     starts = np.arange(FIRST, fallen.shape[1] - ticks + 1, APART)
     if not len(starts):
-        raise ValueError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
+        raise InputError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
 
     def errors(
         effect: jax.tree_util.Partial | None, walk: Trajectory, start_tick: Array, first: Array

@@ -13,6 +13,7 @@ from hector_jax.evaluation.report import WORLDS, Picture
 from hector_jax.evaluation.runs import Histories
 from hector_jax.evaluation.video import VideoUnavailable, write_video
 from hector_jax.grfm.training import History
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import TuneConfig, Tuning
@@ -107,7 +108,7 @@ def of_view(
         motions: of the same walks.
 
     Raises:
-        ValueError: no film can be made here.
+        InputError: no film can be made here.
     """
     walks = {name: one.walk for name, one in shown.items()}
     plots.tracking(folder / "tracking.png", walks)
@@ -125,7 +126,7 @@ def of_view(
     try:
         write_video(folder / "film.mp4", robot, titled, folder / "film.png", arrows=arrows)
     except VideoUnavailable as error:
-        raise ValueError(str(error)) from None
+        raise InputError(str(error)) from None
 
 
 def film(

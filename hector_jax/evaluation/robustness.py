@@ -19,7 +19,7 @@ from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_comman
 from hector_jax.control.weights import Weights
 from hector_jax.evaluation.metrics import FALL_MARGIN, Interval, Score, bootstrap
 from hector_jax.evaluation.report import markdown_table
-from hector_jax.inputs import POSITIVE, SOME, check, shown
+from hector_jax.inputs import POSITIVE, SOME, InputError, check, shown
 from hector_jax.sim.changes import Change
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push
@@ -80,7 +80,7 @@ class SceneConfig:
         for name in ("forces", "frictions"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
-                raise ValueError(
+                raise InputError(
                     f"SceneConfig.{name} must differ, at least one, got {shown(values)}"
                 )
 

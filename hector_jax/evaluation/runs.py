@@ -18,6 +18,7 @@ from rich.text import Text
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, vector_to_weights
 from hector_jax.evaluation.metrics import BASELINES, Interval
 from hector_jax.evaluation.report import VOID, change_text
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.storage import load_weights
 from hector_jax.tuning.difftune import Evaluation, Iteration
@@ -42,13 +43,13 @@ def load_run(folder: Path) -> Run:
     """Read a finished run.
 
     Raises:
-        ValueError: one line naming the file that is missing or is not what a run leaves.
+        InputError: one line naming the file that is missing or is not what a run leaves.
     """
     result, config, made_with = (
         read_json(folder / name) for name in (RESULT, "config.json", "versions.json")
     )
     if not isinstance(result.get("sets"), dict):
-        raise ValueError(f"{folder / RESULT}: no `sets` inside; expected that of a tuning")
+        raise InputError(f"{folder / RESULT}: no `sets` inside; expected that of a tuning")
     return Run(str(folder), result, read_metrics(folder), _flat(config), made_with)
 
 
@@ -67,7 +68,7 @@ def read_asked(folder: Path) -> Asked:
     """What the run in a folder was asked for.
 
     Raises:
-        ValueError: the folder is none of a run.
+        InputError: the folder is none of a run.
     """
     try:
         config = json.loads((folder / "config.json").read_text())
@@ -83,7 +84,7 @@ def read_asked(folder: Path) -> Asked:
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         told = getattr(error, "strerror", None) or repr(error)
-        raise ValueError(
+        raise InputError(
             f"{folder} is no run of `hector tune`: its config.json was expected there ({told})"
         ) from None
 
@@ -92,7 +93,7 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """Lines of a run's metrics.jsonl, also while it is written: a last, cut line is left out.
 
     Raises:
-        ValueError: one line naming the file and, where it is damaged, its line.
+        InputError: one line naming the file and, where it is damaged, its line.
     """
     path = folder / METRICS
     rows = []
@@ -112,7 +113,7 @@ def read_histories(folder: Path) -> Histories:
     """The iterations of a run so far, by set; none where nothing was written yet.
 
     Raises:
-        ValueError: one line naming the file and the line that is none of an iteration.
+        InputError: one line naming the file and the line that is none of an iteration.
     """
     path, found = folder / METRICS, {}
     for number, row in enumerate(read_metrics(folder) if path.exists() else [], 1):
@@ -128,7 +129,7 @@ def _line(path: Path, number: int) -> Iterator[None]:
         yield
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         told = f"{path}, line {number}: an iteration of a tuning was expected ({error!r})"
-        raise ValueError(told) from None
+        raise InputError(told) from None
 
 
 def _iteration(row: Mapping[str, Any]) -> Iteration:
@@ -157,7 +158,7 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise ValueError(
+        raise InputError(
             f"cannot read {path}: {error.strerror}; expected a run folder of `hector tune`"
         ) from None
 
@@ -166,16 +167,16 @@ def read_json(path: Path) -> dict[str, Any]:
     """A JSON object of a run's folder.
 
     Raises:
-        ValueError: one line naming the file that is missing or holds something else.
+        InputError: one line naming the file that is missing or holds something else.
     """
     try:
         found = json.loads(_read(path).decode())
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: no valid JSON: {error}") from None
+        raise InputError(f"{path}: no valid JSON: {error}") from None
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: no text: {error}") from None
+        raise InputError(f"{path}: no text: {error}") from None
     if not isinstance(found, dict):
-        raise ValueError(f"{path}: expected an object, got {str(found)[:40]}")
+        raise InputError(f"{path}: expected an object, got {str(found)[:40]}")
     return found
 
 
@@ -198,7 +199,7 @@ def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Wei
         robot: whose nominal and expert weights they are; HECTOR by default.
 
     Raises:
-        ValueError: there is no such set; names those that there are.
+        InputError: there is no such set; names those that there are.
     """
     path = folder / "weights" / f"{name}.json"
     if path.exists():
@@ -210,7 +211,7 @@ def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Wei
     if name in newest:
         return newest[name].weights, f"{name} at iteration {newest[name].iteration}, so far"
     there = sorted({*published, *newest, *(file.stem for file in path.parent.glob("*.json"))})
-    raise ValueError(f"{folder} has no weight set {name!r}; it has {', '.join(there)}")
+    raise InputError(f"{folder} has no weight set {name!r}; it has {', '.join(there)}")
 
 
 def _newest(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Iteration]:
@@ -248,10 +249,10 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
     the same in all, a value for each run, null where a run does not know it.
 
     Raises:
-        ValueError: no run, or one without a verdict on the stand-in.
+        InputError: no run, or one without a verdict on the stand-in.
     """
     if not runs:
-        raise ValueError("expected at least one run folder, got none")
+        raise InputError("expected at least one run folder, got none")
     told = [
         {
             "run": run.name,
@@ -280,7 +281,7 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
         assert all({"median", "low", "high", "counts"} <= change.keys() for change in changes)
         return {**found, "seeds": len(found["seeds"]), "falls": int(found["falls"])}
     except (KeyError, TypeError, AttributeError, ValueError, AssertionError):
-        raise ValueError(
+        raise InputError(
             f"{Path(run.name) / RESULT}: set {name} has no verdict on the stand-in"
         ) from None
 

@@ -33,6 +33,7 @@ from hector_jax.evaluation.report import (
     tuning_section,
     verdict_table,
 )
+from hector_jax.inputs import InputError
 from hector_jax.storage import write_file, write_json
 from hector_jax.tuning.difftune import Tuning
 
@@ -225,12 +226,12 @@ def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
     """The order of the sets in a table.json of other plants than those of `seeds`.
 
     Raises:
-        ValueError: one line naming the file, where it cannot be read, is no such file, or is of the
+        InputError: one line naming the file, where it cannot be read, is no such file, or is of the
             same plants, on which the order would be the same by itself.
     """
     earlier = _load_earlier(path)
     if earlier.seeds == seeds_text(seeds):
-        raise ValueError(
+        raise InputError(
             f"{path}: a table of seeds {earlier.seeds} too; the order is to be held against that "
             "on other plants"
         )
@@ -243,9 +244,9 @@ def _load_earlier(path: Path) -> Earlier:
         rankings = {name: list(one["ranking"]) for name, one in told["trajectories"].items()}
         return Earlier(str(told["seeds"]), rankings)
     except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path}: no table.json of `hector table`: {error}") from error
+        raise InputError(f"{path}: no table.json of `hector table`: {error}") from error
 
 
 def same_order(verdicts: Mapping[str, Verdict], earlier: Earlier) -> list[Bar]:
@@ -281,7 +282,7 @@ def write_table(folder: Path, table: Table) -> Path:
         report.md.
 
     Raises:
-        OSError: a file cannot be written.
+        WriteError: a file cannot be written.
     """
     found = lines(table.verdicts)
     write_file(folder / "table.csv", _csv(found).encode())

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from hector_jax.evaluation.runs import read_metrics
+from hector_jax.inputs import InputError
 
 
 def write_events(folder: Path, out: Path) -> list[Path]:
@@ -20,13 +21,13 @@ def write_events(folder: Path, out: Path) -> list[Path]:
         The folders, one for each tuned set.
 
     Raises:
-        ValueError: no run, or tensorboardX is not installed.
-        OSError: a folder cannot be written.
+        InputError: no run, or tensorboardX is not installed.
+        InputError: a folder cannot be written.
     """
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
-        raise ValueError(
+        raise InputError(
             "TensorBoard's files need tensorboardX: pip install 'hector-jax[tensorboard]'"
         ) from None
     lines = read_metrics(folder)

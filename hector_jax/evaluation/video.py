@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from hector_jax.geometry import rotation_from_euler
-from hector_jax.inputs import POSITIVE, SOME, Interval, check
+from hector_jax.inputs import POSITIVE, SOME, InputError, Interval, check
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory
 
@@ -68,7 +68,7 @@ class VideoConfig:
         check(self, width=size, height=size, rate=SOME, speed=POSITIVE, tiles=SOME)
         for name, of in (("width", 4), ("height", 2)):
             if getattr(self, name) % of:
-                raise ValueError(
+                raise InputError(
                     f"VideoConfig.{name} must be a multiple of {of}, got {getattr(self, name)}"
                 )
 
@@ -112,7 +112,7 @@ def write_video(
 
     Raises:
         VideoUnavailable: no back end works here, or there is no encoder.
-        ValueError: not two walks.
+        InputError: not two walks.
     """
     config = config or VideoConfig()
     if len(walks) != 2:

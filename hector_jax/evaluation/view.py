@@ -26,6 +26,7 @@ from jaxtyping import Float
 from hector_jax.evaluation.runs import METRICS, RESULT, as_sentence, curves, read_histories
 from hector_jax.evaluation.video import LEAST_ARROW, METRES_PER_NEWTON, Arrows, poses
 from hector_jax.geometry import rot_z
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.trajectory import Trajectory, Wrench
 
@@ -159,10 +160,10 @@ def check_viser() -> None:
     """Find out, before anything is walked, whether the page can be drawn.
 
     Raises:
-        ValueError: viser is not installed.
+        InputError: viser is not installed.
     """
     if find_spec("viser") is None:
-        raise ValueError(
+        raise InputError(
             "the page needs the package viser: pip install 'hector-jax[view]' "
             "(--headless writes a film without it)"
         )
@@ -189,8 +190,8 @@ def serve(
         port: where it is taken, a free one is used instead.
 
     Raises:
-        ValueError: viser is not installed, or there is no such port.
-        OSError: the address cannot be listened on.
+        InputError: viser is not installed, or there is no such port.
+        InputError: the address cannot be listened on.
     """
     check_viser()
     import viser
@@ -215,7 +216,7 @@ def serve(
 def _free_port(host: str, asked: int) -> int:
     """The port, or a free one where it is taken."""
     if not 0 <= asked <= 65535:
-        raise ValueError(f"--port must be 0 (any free one) to 65535, got {asked}")
+        raise InputError(f"--port must be 0 (any free one) to 65535, got {asked}")
     for port in (asked, 0):
         try:
             with socket.create_server((host, port)) as listening:
@@ -223,8 +224,8 @@ def _free_port(host: str, asked: int) -> int:
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 told = f"cannot listen on {host}, port {port}: {error.strerror}"
-                raise OSError(error.errno, told) from None
-    raise OSError(errno.EADDRINUSE, f"no free port on {host}")
+                raise InputError(told) from None
+    raise InputError(f"no free port on {host}")
 
 
 class Page:

@@ -28,7 +28,7 @@ from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.inputs import shown
+from hector_jax.inputs import InputError, shown
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
@@ -265,9 +265,9 @@ def collect(
         progress: called with walks done and walks in all.
 
     Raises:
-        ValueError: a shard in the folder is of other jobs, another robot or another `about`, or
+        InputError: a shard in the folder is of other jobs, another robot or another `about`, or
             walks are missing or too short.
-        OSError: the folder cannot be written.
+        InputError: the folder cannot be written.
     """
     interval = walk_config(robot).gait.tick if interval is None else interval
     told = json.loads(json.dumps({"interval": interval, **(about or {})}))  # as it is read back
@@ -317,7 +317,7 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
     """All walks that `collect` left in a folder.
 
     Raises:
-        ValueError: one line naming folder or file: nothing collected, not finished, damaged, or of
+        InputError: one line naming folder or file: nothing collected, not finished, damaged, or of
             another robot.
     """
     shards = [
@@ -330,7 +330,7 @@ def walked_with(folder: Path) -> dict[str, Any]:
     """What tells one collection from another: a hash of its walks, and the settings it was told.
 
     Raises:
-        ValueError: nothing collected, not finished, or a card that is none.
+        InputError: nothing collected, not finished, or a card that is none.
     """
     card = _read_collection(folder)
     digest = hashlib.sha256()
@@ -347,14 +347,14 @@ def _read_collection(folder: Path) -> dict[str, Any]:
         if not shards or not all(re.fullmatch(r"shard-\d+\.npz", name) for name in shards):
             raise ValueError(f"shards are {shown(shards)}")
     except FileNotFoundError:
-        raise ValueError(
+        raise InputError(
             f"{folder}: no finished collection (no card.json); collect first"
         ) from None
     except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
-        raise ValueError(f"{path}: no card of a collection; collect again") from error
+        raise InputError(f"{path}: no card of a collection; collect again") from error
     for name in shards:
         if not (Path(folder) / name).is_file():
-            raise ValueError(f"{path}: no file {name} beside it; collect again")
+            raise InputError(f"{path}: no file {name} beside it; collect again")
     return {"shards": shards, "told": told}
 
 
@@ -363,10 +363,10 @@ def _load_shard(path: Path, robot: Robot) -> Walks:
     count, ticks = walks.trajectory.fallen.shape
     for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
         if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
-            raise ValueError(f"{path}: {name} is not of {count} walks, as trajectory.fallen is")
+            raise InputError(f"{path}: {name} is not of {count} walks, as trajectory.fallen is")
     run = walks.trajectory._replace(initial=walks.trajectory.fallen, period=walks.trajectory.fallen)
     if not count or any(leaf.shape[1] != ticks for leaf in jax.tree.leaves(run)):
-        raise ValueError(f"{path}: its walks are not of one length, that of trajectory.fallen")
+        raise InputError(f"{path}: its walks are not of one length, that of trajectory.fallen")
     return walks
 
 
@@ -375,15 +375,15 @@ def _kept_shard(path: Path, asked: Job, robot: Robot, told: dict[str, Any]) -> W
         return None
     try:
         card = read_card(path)
-    except ValueError as error:
+    except InputError as error:
         say(f"made anew: {error}")
         return None
     if card["about"].get("told") != told:
-        raise ValueError(f"{path}: collected with other settings; choose another folder")
+        raise InputError(f"{path}: collected with other settings; choose another folder")
     walks = _load_shard(path, robot)
     equal = jax.tree.map(np.array_equal, walks.job, asked)
     if not all(jax.tree.leaves(equal)):
-        raise ValueError(f"{path}: collected for other walks; choose another folder or seed")
+        raise InputError(f"{path}: collected for other walks; choose another folder or seed")
     return walks
 
 
@@ -553,11 +553,11 @@ def split_by_walk(
         seed: which ones.
 
     Raises:
-        ValueError: fewer than two walks.
+        InputError: fewer than two walks.
     """
     walks = np.unique(dataset.walk)
     if len(walks) < 2:
-        raise ValueError(f"a split by walk needs samples of at least 2 walks, got {len(walks)}")
+        raise InputError(f"a split by walk needs samples of at least 2 walks, got {len(walks)}")
     number = int(np.clip(round(held_out * len(walks)), 1, len(walks) - 1))
     chosen = np.random.default_rng(seed).permutation(walks)[:number]
     held = np.isin(dataset.walk, chosen)

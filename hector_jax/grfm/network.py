@@ -43,7 +43,7 @@ from hector_jax.grfm.gated import (
     seen_labels,
     views,
 )
-from hector_jax.inputs import Interval, problem, shown
+from hector_jax.inputs import InputError, Interval, problem, shown
 from hector_jax.model.effect import HISTORY, Effect, Window, sure
 from hector_jax.robot import Robot
 from hector_jax.storage import load_tree, read_card, save_tree
@@ -152,10 +152,10 @@ def init_params(
         hidden: widths of the layers; None takes the variant's own.
 
     Raises:
-        ValueError: no such variant.
+        InputError: no such variant.
     """
     if variant not in VARIANTS:
-        raise ValueError(
+        raise InputError(
             f"unknown variant {variant!r} of the net; there are: {', '.join(VARIANTS)}"
         )
     inputs, outputs = _sizes(variant)
@@ -330,7 +330,7 @@ def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any])
     """Write a GRFM-Net for one robot; `about` goes on its card.
 
     Raises:
-        OSError: where the file cannot be written.
+        WriteError: where the file cannot be written.
     """
     variant = "paper" if isinstance(params, NetParams) else "residual"
     facts = {
@@ -345,17 +345,17 @@ def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str
     """Variant and card of the GRFM-Net in a file; see `load_net`.
 
     Raises:
-        ValueError: one line naming the file: damaged, no net, or a net of another variant.
+        InputError: one line naming the file: damaged, no net, or a net of another variant.
     """
     card = read_card(path)
     kinds = {f"grfm-{name}": name for name in ([variant] if variant else VARIANTS)}
     if card["kind"] not in kinds:
         held = shown(card["kind"])[1:-1]
-        raise ValueError(f"{path}: holds {held}, expected {' or '.join(kinds)}")
+        raise InputError(f"{path}: holds {held}, expected {' or '.join(kinds)}")
     hidden = card["about"].get("hidden")
     sizes = hidden if isinstance(hidden, list) and 1 <= len(hidden) <= _DEEPEST else [None]
     if any(problem(size, int, Interval(1, _WIDEST)) for size in sizes):
-        raise ValueError(
+        raise InputError(
             f"{path}: about.hidden must be 1 to {_DEEPEST} whole numbers from 1 to {_WIDEST}, "
             f"got {shown(hidden)}"
         )
@@ -373,14 +373,14 @@ def load_net(
         variant: the one that is expected; None takes any.
 
     Raises:
-        ValueError: one line naming the file: damaged, of another robot, kind, layout or variant, or
+        InputError: one line naming the file: damaged, of another robot, kind, layout or variant, or
             with a number that is not finite.
     """
     found, card = read_net_card(path, variant)
     like = layout(found, tuple(card["about"]["hidden"]))
     params, card = load_tree(path, like, kind=card["kind"], robot=robot)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
-        raise ValueError(f"{path}: a parameter of the net is not finite")
+        raise InputError(f"{path}: a parameter of the net is not finite")
     return params, found, card
 
 

@@ -35,7 +35,7 @@ from hector_jax.grfm.network import (
     residual_inputs,
     standardised,
 )
-from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SEED, SOME, check
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SEED, SOME, InputError, check
 from hector_jax.model.effect import Window
 from hector_jax.storage import Checkpoint
 from hector_jax.trajectory import Wrench
@@ -121,11 +121,11 @@ def train(
         Parameters and the course of the errors.
 
     Raises:
-        ValueError: no samples, or the training came to nothing finite.
+        InputError: no samples, or the training came to nothing finite.
     """
     for name, dataset in (("training", training), ("validation", validation)):
         if len(dataset.walk) == 0:
-            raise ValueError(f"the {name} set has no samples")
+            raise InputError(f"the {name} set has no samples")
     if config.mirror and config.variant == "paper":
         training = with_mirror(training)
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
@@ -149,7 +149,7 @@ def train(
             kept.save((carry, np.array(rows)))
         progress(epoch, History(*np.array(rows).T))
     if not all(np.isfinite(leaf).all() for leaf in carry.least):
-        raise ValueError("training diverged: no epoch has a finite validation error")
+        raise InputError("training diverged: no epoch has a finite validation error")
     best = jax.tree.map(lambda p: p[0], carry.best) if paper else carry.best
     best = params._replace(force=best.force, moment=best.moment)
     return jax.device_get(best), History(*np.array(rows).T)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from hector_jax.inputs import InputError
 from hector_jax.sim.world import TIME_STEP, World
 
 TRUNK_TOP = (0.0, 0.0, 0.124)  # [m] in the trunk's frame
@@ -45,7 +46,7 @@ def _check(change: Change) -> None:
         ("slope", np.hypot(*change.slope) <= STEEPEST, f"be at most {STEEPEST} rad in all"),
     ):
         if not good:
-            raise ValueError(f"Change.{name} must {expected}, got {getattr(change, name)}")
+            raise InputError(f"Change.{name} must {expected}, got {getattr(change, name)}")
 
 
 def _loaded(model: mujoco.MjModel, body: int, mass: float, at: Sequence[float]) -> None:
@@ -91,7 +92,7 @@ def worlds_by_step(
         end: the one after its last.
 
     Raises:
-        ValueError: a number of a change is out of its range.
+        InputError: a number of a change is out of its range.
     """
     for change in changes:
         _check(change)

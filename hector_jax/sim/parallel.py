@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import Memory, Plan, WalkConfig, init_memory
 from hector_jax.control.weights import Weights
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators
@@ -167,7 +168,7 @@ def _places(world: World) -> _Places:
         kind = mujoco.mjtGeom(world.model.geom_type[geom])
         if kind not in kinds:
             name = world.model.geom(geom).name or f"number {geom}"
-            raise ValueError(
+            raise InputError(
                 f"geom {name} may touch the floor and is a {kind.name.removeprefix('mjGEOM_')}; "
                 "in MJX all but feet are expected to be BOX or CAPSULE"
             )

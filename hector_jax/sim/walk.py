@@ -39,6 +39,7 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
@@ -206,11 +207,11 @@ def substeps(config: WalkConfig) -> int:
     """Milliseconds in a tick.
 
     Raises:
-        ValueError: a tick is no whole number of milliseconds.
+        InputError: a tick is no whole number of milliseconds.
     """
     count = round(config.gait.tick / TIME_STEP)
     if count < 1 or abs(count * TIME_STEP - config.gait.tick) > 1e-9:
-        raise ValueError(
+        raise InputError(
             f"GaitConfig.tick must be a multiple of {TIME_STEP} s, got {config.gait.tick}"
         )
     return count
@@ -225,13 +226,13 @@ def walk_ticks(config: WalkConfig, seconds: float, start_tick: int) -> int:
     """Ticks of a walk from t = 0 on.
 
     Raises:
-        ValueError: there are none, or t = 0 is not after the walk's first tick.
+        InputError: there are none, or t = 0 is not after the walk's first tick.
     """
     ticks = round(seconds / config.gait.tick)
     if ticks < 1:
-        raise ValueError(f"a walk needs at least one tick of {config.gait.tick} s, got {seconds} s")
+        raise InputError(f"a walk needs at least one tick of {config.gait.tick} s, got {seconds} s")
     if start_tick <= first_tick(config):
-        raise ValueError(
+        raise InputError(
             f"a walk stands from tick {first_tick(config)} on; start_tick {start_tick} is not later"
         )
     return ticks
@@ -321,7 +322,7 @@ def walk(
         Samples of 1 ms from t = 0 (numpy). After a fall they are held and `fallen`.
 
     Raises:
-        ValueError: the plant's file or numbers are wrong, or the length is no positive
+        InputError: the plant's file or numbers are wrong, or the length is no positive
             number of ticks.
     """
     count, begin = substeps(config), first_tick(config)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hector_jax.description import Description
-from hector_jax.inputs import did_you_mean, shown
+from hector_jax.inputs import InputError, did_you_mean, shown
 from hector_jax.robot import compile_model
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples
@@ -170,10 +170,10 @@ def named_world(name: str, seed: int = 0) -> Imperfections:
     """Imperfections of a world with a name; the seed chooses the plant where there are several.
 
     Raises:
-        ValueError: the name is none of WORLDS.
+        InputError: the name is none of WORLDS.
     """
     if name not in WORLDS:
-        raise ValueError(
+        raise InputError(
             f"unknown world {shown(name)}{did_you_mean(name, WORLDS)}; "
             f"there are: {', '.join(WORLDS)}"
         )
@@ -201,12 +201,12 @@ def _check(imperfections: Imperfections) -> None:
     for name, value in flat.items():
         signed = name == "trunk_com"
         if not np.all(np.isfinite(value)) or (not signed and np.any(np.asarray(value) < 0.0)):
-            raise ValueError(f"Imperfections.{name} must be finite and >= 0, got {value}")
+            raise InputError(f"Imperfections.{name} must be finite and >= 0, got {value}")
     for name in ("armature", "contact_time", "mass", "torque_gain"):
         if np.any(np.asarray(flat[name]) <= 0.0):
-            raise ValueError(f"Imperfections.{name} must be positive, got {flat[name]}")
+            raise InputError(f"Imperfections.{name} must be positive, got {flat[name]}")
     if imperfections.delay > MAX_DELAY:
-        raise ValueError(f"Imperfections.delay is at most {MAX_DELAY} s, got {imperfections.delay}")
+        raise InputError(f"Imperfections.delay is at most {MAX_DELAY} s, got {imperfections.delay}")
 
 
 def _model(description: Description, slack: bool) -> mujoco.MjModel:
@@ -245,7 +245,7 @@ def _compile(description: Description, slack: bool) -> World:
     model, names = _model(description, slack), description.joints
     floors = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
     if len(floors) != 1:
-        raise ValueError(
+        raise InputError(
             f"{description.model}: expected one floor that collides, got {len(floors)}"
         )
     joints = [model.joint(name) for name in names]
@@ -296,7 +296,7 @@ def build_worlds(
         description: of the robot, HECTOR by default.
 
     Raises:
-        ValueError: the file is not the robot, or a number is out of its range.
+        InputError: the file is not the robot, or a number is out of its range.
     """
     for plant in imperfections:
         _check(plant)

@@ -49,7 +49,7 @@ def save_tuning(kept: Checkpoint, tuning: Tuning) -> None:
     """Keep a tuning with its history, finished or not.
 
     Raises:
-        OSError: where the file cannot be written.
+        WriteError: where the file cannot be written.
     """
     stack = lambda trees: jax.tree.map(lambda *x: np.stack(x), *trees)  # noqa: E731
     course = _Course(

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds
-from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, check
+from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, InputError, check
 from hector_jax.robot import Robot
 from hector_jax.tuning.loss import Alpha, LossConfig, Losses, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -333,7 +333,7 @@ def tune(
         past, keep: see `descend`.
 
     Raises:
-        ValueError: the starting weights fall or cannot be solved on the model.
+        InputError: the starting weights fall or cannot be solved on the model.
 
     Source: problem P and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
     """
@@ -368,7 +368,7 @@ def descend(
         keep: given the tuning so far, before `on_iteration` and likewise.
 
     Raises:
-        ValueError: the evaluation of the starting weights is not to be believed; `on_iteration` has
+        InputError: the evaluation of the starting weights is not to be believed; `on_iteration` has
             been told of it.
     """
     history: list[Iteration] = []
@@ -385,7 +385,7 @@ def descend(
         stop = Stop(int(progress.stop))
         if stop == Stop.BAD_START:
             on_iteration(history[-1])
-            raise ValueError(f"the starting weights cannot be tuned from: {reason}")
+            raise InputError(f"the starting weights cannot be tuned from: {reason}")
         told = stopped(config, stop)
         if stop == Stop.SMALL_STEP and refusal(config, found):
             told = f"{told}, the last refused: {reason}"

@@ -102,7 +102,7 @@ def tune_measured(
         past, keep: see `descend`.
 
     Raises:
-        ValueError: a walk with the starting weights falls or cannot be believed.
+        InputError: a walk with the starting weights falls or cannot be believed.
     """
 
     def mean(weights: Weights) -> Evaluation:

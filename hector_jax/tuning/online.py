@@ -25,7 +25,7 @@ from jaxtyping import Array, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.walking import Feet, Measurement, measured_feet
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import NOT_NEGATIVE, SHARE, Interval, check
+from hector_jax.inputs import NOT_NEGATIVE, SHARE, InputError, Interval, check
 from hector_jax.model.effect import HISTORY
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
@@ -56,7 +56,7 @@ class OnlineConfig:
     def __post_init__(self) -> None:
         check(self, window=Interval(2), late=NOT_NEGATIVE, step=SHARE, estimator=ESTIMATORS)
         if self.late >= self.window:
-            raise ValueError(f"OnlineConfig.late must be below window, got {self.late}")
+            raise InputError(f"OnlineConfig.late must be below window, got {self.late}")
 
 
 class Told(NamedTuple):

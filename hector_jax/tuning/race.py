@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.weights import DIRECTION_NAMES, Weights
+from hector_jax.inputs import InputError
 from hector_jax.storage import append_file, as_json, write_file
 from hector_jax.tuning.rivals import Rival, Steps
 from hector_jax.tuning.search import Generation, Walk, placed, read_record
@@ -66,12 +67,12 @@ def race(
         on_round: called once the record is read and after each round.
 
     Raises:
-        ValueError: a rollout too few, a start without a loss, a record of another race or a damaged
+        InputError: a rollout too few, a start without a loss, a record of another race or a damaged
             one, or what a rival raises.
-        OSError: the record cannot be written.
+        WriteError: the record cannot be written.
     """
     if rollouts < 1:
-        raise ValueError(f"a race needs at least one rollout, got {rollouts}")
+        raise InputError(f"a race needs at least one rollout, got {rollouts}")
     head = {"format": FORMAT, "rollouts": rollouts, "rivals": sorted(rivals), **about}
     lines = _read(path, head)
     if lines is None:
@@ -80,7 +81,7 @@ def race(
     if not lines:
         loss = float(walk({START: [start]})[START][0])
         if not np.isfinite(loss):
-            raise ValueError(f"the start cannot be raced from: its loss is {loss}")
+            raise InputError(f"the start cannot be raced from: its loss is {loss}")
         lines = [{START: loss}]
         _append(path, lines[0])
     here = Generation(np.zeros((1, len(DIRECTION_NAMES))), np.array([lines[0][START]]))
@@ -139,4 +140,4 @@ def _read(path: Path, head: Mapping[str, Any]) -> list[dict[str, Any]] | None:
     try:
         return None if lines is None else [json.loads(line) for line in lines]
     except ValueError as error:
-        raise ValueError(f"{path}: no record of a race: {error}") from error
+        raise InputError(f"{path}: no record of a race: {error}") from error

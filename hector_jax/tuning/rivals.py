@@ -28,6 +28,7 @@ from hector_jax.control.weights import (
     vector_to_weights,
     weights_to_vector,
 )
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.tuning.difftune import Iteration, TuneConfig, refusal, step_weights, tune_step
 from hector_jax.tuning.search import Generation, SearchConfig, next_generation, placed, room
@@ -104,10 +105,10 @@ class Bayes:
         """The next round.
 
         Raises:
-            ValueError: scikit-learn, of the extra `race`, is not installed.
+            InputError: scikit-learn, of the extra `race`, is not installed.
         """
         if find_spec("sklearn") is None:
-            raise ValueError(
+            raise InputError(
                 'Bayesian optimisation needs scikit-learn: pip install "hector-jax[race]"'
             )
         from threadpoolctl import threadpool_limits
@@ -253,7 +254,7 @@ def adam(
         on_iteration: called after each iteration, the start being iteration 0.
 
     Raises:
-        ValueError: the starting weights fall or cannot be solved on the model.
+        InputError: the starting weights fall or cannot be solved on the model.
     """
     optimiser, box = optax.adam(1.0), room(weights)
     history: list[Iteration] = []
@@ -270,7 +271,7 @@ def adam(
     at = np.zeros(DIM)
     best, state, share = look(at, 0.0), optimiser.init(at), 1.0
     if not best.accepted:
-        raise ValueError(f"the starting weights cannot be tuned from: {best.reason}")
+        raise InputError(f"the starting weights cannot be tuned from: {best.reason}")
     for _ in range(config.iterations):
         flat = jax.tree.map(np.multiply, best.evaluation.gradient, best.weights)
         gradient = directions() @ np.asarray(weights_to_vector(flat))

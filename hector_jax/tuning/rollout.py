@@ -22,7 +22,7 @@ from hector_jax.control.reference import Anchor, Command, anchor_at, reference_a
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
 from hector_jax.geometry import rotation_from_euler
-from hector_jax.inputs import NOT_NEGATIVE, SOME, Interval, check
+from hector_jax.inputs import NOT_NEGATIVE, SOME, InputError, Interval, check
 from hector_jax.model import srbm
 from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.model.kinematics import foot_poses
@@ -42,7 +42,7 @@ class RolloutConfig:
     def __post_init__(self) -> None:
         check(self, ticks=Interval(2), lead=NOT_NEGATIVE, block=SOME)
         if self.lead > -self.walk.gait.first_tick:
-            raise ValueError(
+            raise InputError(
                 "RolloutConfig.lead must not reach back before the gait starts "
                 f"({-self.walk.gait.first_tick} ticks), got {self.lead}"
             )

@@ -33,7 +33,7 @@ from hector_jax.control.weights import (
     moved,
     weights_to_vector,
 )
-from hector_jax.inputs import POSITIVE, SEED, SOME, Interval, check
+from hector_jax.inputs import POSITIVE, SEED, SOME, InputError, Interval, check
 from hector_jax.storage import append_file, write_file
 
 FORMAT = 1
@@ -51,7 +51,7 @@ class SearchConfig:
     def __post_init__(self) -> None:
         check(self, budget=SOME, population=Interval(4), seed=SEED, spread=POSITIVE)
         if self.budget < self.population:
-            raise ValueError(
+            raise InputError(
                 f"SearchConfig.budget must be at least the population, {self.population} walks, "
                 f"got {self.budget}"
             )
@@ -103,9 +103,9 @@ def search(
             generation.
 
     Raises:
-        ValueError: a start outside the box or with feet that differ, a record of another search
+        InputError: a start outside the box or with feet that differ, a record of another search
             or a damaged one, or cmaes, of the extra `search`, is not installed.
-        OSError: a record cannot be written.
+        WriteError: a record cannot be written.
     """
     searches = {
         name: _Search(config, start, Path(folder) / f"{name}.jsonl", about)
@@ -139,7 +139,7 @@ class _Course:
         self, config: SearchConfig, start: Weights, history: Sequence[Generation] = ()
     ) -> None:
         if find_spec("cmaes") is None:
-            raise ValueError('a search needs the package cmaes: pip install "hector-jax[search]"')
+            raise InputError('a search needs the package cmaes: pip install "hector-jax[search]"')
         from cmaes import CMA
 
         self.config, self.start = config, start
@@ -223,7 +223,7 @@ def next_generation(
     """What a search walks after `history`; nothing once it has ended.
 
     Raises:
-        ValueError: as `search`.
+        InputError: as `search`.
     """
     course = _Course(config, start, history)
     return np.zeros((0, len(DIRECTION_NAMES))) if course.stop else course.ask()
@@ -238,14 +238,14 @@ def room(start: Weights) -> Float[np.ndarray, "18 2"]:
     """Steps from a start to the box, down and up.
 
     Raises:
-        ValueError: it lies outside the box, or its feet differ.
+        InputError: it lies outside the box, or its feet differ.
     """
     tied = directions().argmax(axis=1)  # of the left foot, where there are two
     at, low, high = (np.asarray(weights_to_vector(w), float) for w in (start, *bounds()))
     if any(np.any(part[0] != part[1]) for part in start.R):
-        raise ValueError("a search needs a start whose feet share one R; these differ")
+        raise InputError("a search needs a start whose feet share one R; these differ")
     if not ((low <= at) & (at <= high)).all():
-        raise ValueError("the start lies outside the box of weights: Q 0.01..1e4, R 1e-7..1")
+        raise InputError("the start lies outside the box of weights: Q 0.01..1e4, R 1e-7..1")
     return np.log(np.stack([low, high], axis=1) / at[:, None])[tied]
 
 
@@ -260,7 +260,7 @@ def read_record(path: Path, head: Mapping[str, Any], what: str) -> list[bytes] |
         what: it is a record of, for who reads the error.
 
     Raises:
-        ValueError: it is no record, or one of other settings.
+        InputError: it is no record, or one of other settings.
     """
     try:
         data = path.read_bytes()
@@ -272,10 +272,10 @@ def read_record(path: Path, head: Mapping[str, Any], what: str) -> list[bytes] |
         kept = json.loads(first)
         differs = [name for name in head | kept if kept.get(name) != head.get(name)]
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: no record of a {what}: {error}") from error
+        raise InputError(f"{path}: no record of a {what}: {error}") from error
     if differs:
         name = differs[0]
-        raise ValueError(
+        raise InputError(
             f"{path}: record of another {what}, its {name} is {str(kept.get(name))[:80]}, asked "
             f"for is {str(head.get(name))[:80]}; choose another folder"
         )
@@ -295,10 +295,10 @@ def _read(path: Path, head: Mapping[str, Any]) -> list[Generation] | None:
             steps = np.array(told["steps"], float)
             losses = np.array([np.inf if x is None else x for x in told["losses"]], float)
         except (ValueError, TypeError, KeyError) as error:
-            raise ValueError(f"{path}: line {number} is damaged: {error}") from error
+            raise InputError(f"{path}: line {number} is damaged: {error}") from error
         shape = (head["population"], len(DIRECTION_NAMES))
         if steps.shape != shape or losses.shape != shape[:1]:
-            raise ValueError(
+            raise InputError(
                 f"{path}: line {number} is damaged: steps {steps.shape} and losses "
                 f"{losses.shape}, expected {shape} and {shape[:1]}"
             )
