@@ -48,7 +48,7 @@ def cache_folder() -> Path:
             raise InputError(
                 f"{own} is open to others or of another user, so no programs are loaded from it; "
                 "remove it, or set XDG_CACHE_HOME to a folder that can be written"
-            )
+            ) from None
         folder = own / "jax"
         folder.mkdir(exist_ok=True)
     return folder
