@@ -18,7 +18,6 @@ kernel (`control.qp`) has no stable custom call, and the plain guess leads to th
 
 import hashlib
 import io
-import json
 import textwrap
 import time
 from collections.abc import Callable
@@ -47,7 +46,7 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, read_json
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.walk import first_tick, substeps, walk
@@ -92,11 +91,9 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
         hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(sets) or 'none'}"
         raise InputError(f"{run}: no weight set {name!r}; {hint}")
     path = run / "config.json"
+    kept = read_json(path, "the settings of a run")
     try:
-        kept = json.loads(path.read_text())
         config = _restored(WalkConfig(), kept["tune"]["rollout"]["walk"])
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: no settings of a walking controller: {error}") from error
     return run / "weights" / f"{name}.json", config

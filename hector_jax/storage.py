@@ -33,7 +33,7 @@ from filelock import FileLock, Timeout
 
 from hector_jax.console import Broken, say
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import InputError, one_line, problem, read_text, shown
+from hector_jax.inputs import InputError, one_line, problem, read_json, shown
 from hector_jax.robot import MODEL_PATH, Robot
 from hector_jax.trajectory import State, Wrench
 
@@ -467,13 +467,7 @@ def load_weights(path: Path) -> Weights:
             shape, or not a positive number.
     """
     path = Path(path)
-    text = read_text(path, "weights", _MOST_WEIGHTS)
-    try:
-        tree = json.loads(text, object_pairs_hook=_no_twins)
-    except ValueError as error:  # JSONDecodeError is one too
-        raise InputError(f"{path}: no valid JSON: {error}") from error
-    except RecursionError as error:
-        raise InputError(f"{path}: no valid JSON: nested too deeply") from error
+    tree = read_json(path, "weights", _MOST_WEIGHTS, object_pairs_hook=_no_twins)
     if isinstance(tree, dict):
         tree.pop("$schema", None)  # for editors; what is in a file is checked here
     shapes: dict[str, dict[str, tuple[int, ...]]] = {

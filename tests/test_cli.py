@@ -46,16 +46,6 @@ def refused(monkeypatch, capsys, *arguments):
     return lines[0]
 
 
-def refused_flag(monkeypatch, capsys, *arguments):
-    """Runs a command with a flag that does not parse; what is said, without its box."""
-    with pytest.raises(SystemExit) as left:
-        call(monkeypatch, *arguments)
-    assert left.value.code == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    return " ".join(re.sub("[╭╮╰╯│─]", " ", err).split())
-
-
 def test_help_names_the_commands():
     shown = subprocess.run(
         [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
@@ -96,13 +86,7 @@ def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
 @pytest.mark.parametrize("command", ["walk", "evaluate"])
 def test_a_walk_of_no_length_is_refused(monkeypatch, capsys, command):
     line = refused(monkeypatch, capsys, command, "--traj", "eight", "--seconds", "0")
-    assert "--seconds must be a number above 0 and at most 600, got 0.0" in line
-
-
-def test_unknown_world(monkeypatch, capsys):
-    said = refused_flag(monkeypatch, capsys, "walk", "--world", "moon")
-    assert "moon" in said
-    assert "standin" in said
+    assert "--seconds must be a number from 0.01 to 600, got 0.0" in line
 
 
 @pytest.mark.parametrize(
@@ -132,7 +116,7 @@ def test_missing_weights_file(monkeypatch, capsys, tmp_path):
 
 def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, capsys):
     line = refused(monkeypatch, capsys, "walk", "--weights", "exprt")
-    assert "no weights 'exprt'; did you mean 'expert'?; there are: nominal, expert, or" in line
+    assert "nominal, expert or a weights file, got 'exprt'; did you mean 'expert'?" in line
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
@@ -238,7 +222,7 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     [
         (("--budget", "9"), "budget"),
         (("--population", "2"), "population"),
-        (("--seed", "-1"), "--seed must be a whole number of at least 0 and"),
+        (("--seed", "-1"), "--seed must be a whole number from 0 to 4294967295"),
         (("--start", "none.json"), "none.json"),
     ],
 )
@@ -391,30 +375,6 @@ def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong)
     line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)
     assert wrong[0].lstrip("-") in line
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("command", "flag", "wrong", "known"),
-    [
-        ("tune", "--alpha", "both", "auto"),
-        ("tune", "--variant", "papier", "residual"),
-        ("search", "--engine", "warp", "mjx"),
-        ("collect", "--engine", "warp", "mjx"),
-        ("evaluate", "--world", "srbm", "hfs-varied"),
-        ("walk", "--seconds", "long", "float"),
-        ("tune", "--sedes", "3", "--seeds"),
-        ("completion", "cmd.exe", "", "fish"),
-    ],
-)
-def test_flags_that_do_not_parse_name_what_is_known(
-    monkeypatch, capsys, tmp_path, command, flag, wrong, known
-):
-    monkeypatch.chdir(tmp_path)
-    said = refused_flag(monkeypatch, capsys, *filter(None, (command, flag, wrong)))
-    assert flag in said
-    assert wrong in said
-    assert known in said
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", [command_name(kind) for kind in get_args(Command)])

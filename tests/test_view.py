@@ -168,9 +168,11 @@ def refused(monkeypatch, capsys, *arguments):
 
 def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
     line = refused(monkeypatch, capsys, tmp_path, "--headless")
-    assert line.startswith(f"hector: {tmp_path} is no run of `hector tune`")
+    assert line.startswith(f"hector: {tmp_path}/config.json: cannot read a file of a run of")
     (tmp_path / "config.json").write_text("[]")
-    assert "config.json was expected" in refused(monkeypatch, capsys, tmp_path, "--headless")
+    assert "config.json: expected a JSON object" in refused(
+        monkeypatch, capsys, tmp_path, "--headless"
+    )
 
 
 def test_a_run_is_not_filmed_into_its_own_folder(monkeypatch, capsys, tmp_path):
@@ -181,7 +183,7 @@ def test_a_run_is_not_filmed_into_its_own_folder(monkeypatch, capsys, tmp_path):
 def test_two_different_sets_are_asked_for(monkeypatch, capsys, tmp_path):
     run = pretend_run(tmp_path)
     line = refused(monkeypatch, capsys, run, "--headless", "--sets", "with", "with")
-    assert "two different weight sets" in line
+    assert "--sets names 'with' twice" in line
 
 
 def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys, tmp_path):

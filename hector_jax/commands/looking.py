@@ -27,10 +27,6 @@ def view_run(args: View) -> None:
     folder = args.out or (beside if args.headless else None)
     if folder is None:
         view.check_viser()
-    if args.seconds < 0.1:
-        raise InputError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
-    if args.sets[0] == args.sets[1]:
-        raise InputError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
     begun = runs.read_asked(args.run)
     robot = asked.robot_of(args.run, begun)
     wanted = asked.course(begun.trajectory, robot)

@@ -33,7 +33,7 @@ from hector_jax.evaluation.report import (
     tuning_section,
     verdict_table,
 )
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, read_json
 from hector_jax.storage import write_file, write_json
 from hector_jax.tuning.difftune import Tuning
 
@@ -239,14 +239,12 @@ def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
 
 
 def _load_earlier(path: Path) -> Earlier:
+    told = read_json(path, "a table.json", 100_000_000)
     try:
-        told = json.loads(path.read_text())
         rankings = {name: list(one["ranking"]) for name, one in told["trajectories"].items()}
         return Earlier(str(told["seeds"]), rankings)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: no table.json of `hector table`: {error}") from error
+    except (TypeError, KeyError, AttributeError) as error:
+        raise InputError(f"{path}: not a table.json of `hector table`: {error!r}") from error
 
 
 def same_order(verdicts: Mapping[str, Verdict], earlier: Earlier) -> list[Bar]:
