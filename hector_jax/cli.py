@@ -6,6 +6,8 @@ program with its traceback; 2 bad input: one line says what came, where, and wha
 interrupted; 141 nobody reads standard output any more; 143 terminated.
 """
 
+import json
+import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,17 +17,20 @@ from typing import Annotated, Any, Union, get_args
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.console import exit_code
+from hector_jax.console import Broken, exit_code, say, say_if_slow
 from hector_jax.flags import (
     Command,
     Completion,
+    Doctor,
+    Export,
     check,
     command,
     command_name,
     from_line,
     resolve_latest,
 )
-from hector_jax.runtime import setup_jax
+from hector_jax.inputs import InputError
+from hector_jax.runtime import cache_folder, check_jax, home_cache, setup_jax, without_renderer
 
 _ABOUT = (
     "Gradient tuning of a walking biped's model predictive controller. "
@@ -45,9 +50,21 @@ def _run(words: Sequence[str]) -> None:
     check(args)
     if isinstance(args, Completion):
         _tyro(["--tyro-print-completion", args.shell])
-    setup_jax()
-    from hector_jax import commands  # after the flags: `hector --help` answers at once
-
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of its own cache
+    try:
+        if (cache := cache_folder()) != (usual := home_cache()):
+            say(f"{usual} cannot be written: compiled programs are kept in {cache}")
+        with say_if_slow("loading JAX and MuJoCo"):
+            check_jax(on_cpu=isinstance(args, Export))  # see hector_jax.export
+            setup_jax()
+            with without_renderer():
+                from hector_jax import commands  # after the flags: `hector --help` answers at once
+    except InputError as error:
+        if not isinstance(args, Doctor):
+            raise
+        if args.json:
+            print(json.dumps({"faults": [str(error)]}))
+        raise Broken(str(error)) from None
     commands.run(args)
 
 

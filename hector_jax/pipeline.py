@@ -4,8 +4,10 @@ Everything that is walked or tuned runs in worker processes, one core each, beca
 one long chain of small operations. A step that finds its result on disk takes it.
 """
 
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import repeat
@@ -30,7 +32,6 @@ from hector_jax.inputs import POSITIVE, SEED, SOME, InputError, check, choose, f
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.runtime import letters
-from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.storage import Checkpoint, as_json, digest, fingerprint, locked
@@ -56,6 +57,14 @@ def choose_engine(asked: str) -> str:
     if choose("engine", asked, ENGINES) == "auto":
         return "c" if jax.default_backend() == "cpu" else "mjx"
     return asked
+
+
+def _mjx_walks(*args: Any, **options: Any) -> Iterator[Trajectory]:
+    """`sim.parallel.walk_batch`; MJX takes a second to import and prints what it does not find."""
+    with redirect_stdout(sys.stderr):
+        from hector_jax.sim.parallel import walk_batch
+
+    return walk_batch(*args, **options)
 
 
 @dataclass(frozen=True)
@@ -339,7 +348,7 @@ def _keep_walks(
     def walk_jobs(jobs: list[Job]) -> Iterator[Trajectory]:
         if engine == "c":
             return walk_many(pool, walking, robot, jobs)
-        return walk_batch(walking, robot, jobs, single=single)
+        return _mjx_walks(walking, robot, jobs, single=single)
 
     title = f"collecting {len(jobs)} walks on the high-fidelity simulator, engine {engine}"
     with bar(title) as tell:
@@ -570,7 +579,7 @@ def losses_on_hfs(
         walks = walk_many(pool, walk, robot, jobs)
     else:
         filled = jobs + jobs[-1:] * (at_once - len(jobs))
-        walks = walk_batch(walk, robot, filled, fine=True)
+        walks = _mjx_walks(walk, robot, filled, fine=True)
     told = iter(
         [float(loss_of(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)]
     )

@@ -10,7 +10,8 @@ joint that moves it, parallel to the trunk's when all joints are zero.
 """
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -35,9 +36,19 @@ JOINT_NAMES, FOOT_POINTS = Description.joints, Description.foot_points
 _AXES = dict(zip("xyz", np.eye(3), strict=True))
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
 
-# MuJoCo writes its warnings into a file of the working directory; the counters in MjData, which
-# every walk reads, tell the same.
-mujoco.set_mju_user_warning(lambda message: None)
+
+@contextmanager
+def quiet_mujoco() -> Iterator[None]:
+    """Keep MuJoCo from writing its warnings into a file of the working directory.
+
+    The counters in MjData, which every walk reads, tell the same.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 class Robot(NamedTuple):
@@ -83,6 +94,7 @@ def describe(path: Path | None = None) -> Description:
     return replace(read_description(DESCRIPTION_PATH), model=path)
 
 
+@quiet_mujoco()
 def load_robot(path: Path | None = None) -> Robot:
     """The robot of a file, see `describe`.
 
@@ -131,6 +143,7 @@ def load_model(path: Path | None = None) -> mujoco.MjModel:
     return compile_model(describe(path))
 
 
+@quiet_mujoco()
 def compile_model(description: Description) -> mujoco.MjModel:
     """The compiled and checked model of a description.
 

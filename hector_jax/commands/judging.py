@@ -12,6 +12,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation import metrics, pictures, runs
 from hector_jax.evaluation.metrics import Score, Verdict
 from hector_jax.evaluation.report import print_table
+from hector_jax.evaluation.video import check_back_end
 from hector_jax.flags import Compare, Evaluate, Table, Walk, settings
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.robot import load_robot
@@ -55,6 +56,8 @@ def verdict_of(
 
 def walk(args: Walk) -> None:
     """Walk once, and tell how it went."""
+    if args.video is not None:
+        check_back_end()
     robot = load_robot(args.robot)
     weights, wanted = asked.weights(args.weights, robot), asked.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")

@@ -13,6 +13,7 @@ from hector_jax.control.walking import walk_config
 from hector_jax.evaluation import fidelity, metrics, pictures, runs, view
 from hector_jax.evaluation.report import WORLDS
 from hector_jax.evaluation.tensorboard import write_events
+from hector_jax.evaluation.video import check_back_end
 from hector_jax.flags import Replay, Tensorboard, View
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
@@ -27,6 +28,8 @@ def view_run(args: View) -> None:
     folder = args.out or (beside if args.headless else None)
     if folder is None:
         view.check_viser()
+    else:
+        check_back_end()
     begun = runs.read_asked(args.run)
     robot = asked.robot_of(args.run, begun)
     wanted = asked.course(begun.trajectory, robot)

@@ -1,7 +1,5 @@
 """A tuned controller for other machines, and how this one is."""
 
-import jax
-
 from hector_jax import doctor, export
 from hector_jax.commands import asked
 from hector_jax.console import Broken, say
@@ -15,8 +13,6 @@ from hector_jax.storage import as_json, load_weights, locked
 
 def export_controller(args: Export) -> None:
     """Export the controller of a run, checked against the live one."""
-    # before the first array: see hector_jax.export
-    jax.config.update("jax_platforms", "cpu")
     is_run = args.run.is_dir()
     if is_run and args.robot:
         raise InputError(f"--robot is for a weights file; {args.run} tells its own")

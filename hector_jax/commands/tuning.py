@@ -23,6 +23,7 @@ from hector_jax.evaluation import fidelity, metrics, pictures
 from hector_jax.evaluation.metrics import Score
 from hector_jax.evaluation.report import Picture, Report, environment, print_table, write_report
 from hector_jax.evaluation.runs import read_json
+from hector_jax.evaluation.video import check_back_end
 from hector_jax.flags import Search, Tune, Walk, as_command, from_file, settings
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
@@ -52,6 +53,8 @@ def tune(args: Tune) -> None:
     """Tune on the trajectories asked for, anew or where a run was left."""
     if args.run and args.resume:
         raise InputError(f"--run {args.run} and --resume {args.resume}: only one can be given")
+    if args.video:
+        check_back_end()
     texts = COMMANDS if args.traj == "all" else (args.traj,)
     base = args.resume or args.run
     if base is None:

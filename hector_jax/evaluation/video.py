@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from hector_jax.geometry import rotation_from_euler
-from hector_jax.inputs import POSITIVE, SOME, InputError, Interval, check
+from hector_jax.inputs import POSITIVE, SOME, InputError, Interval, check, choose
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory
 
@@ -89,6 +89,16 @@ def poses(
     return np.concatenate([trunk, quaternion, joints], axis=1)
 
 
+def check_back_end() -> None:
+    """Find out, before anything is walked for a film, whether MUJOCO_GL names a back end.
+
+    Raises:
+        InputError: it does not.
+    """
+    if asked := os.environ.get("MUJOCO_GL"):
+        choose("MUJOCO_GL", asked.lower(), (*BACK_ENDS, "disable"))
+
+
 def write_video(
     path: Path,
     robot: Robot,
@@ -112,7 +122,7 @@ def write_video(
 
     Raises:
         VideoUnavailable: no back end works here, or there is no encoder.
-        InputError: not two walks.
+        ValueError: not two walks.
     """
     config = config or VideoConfig()
     if len(walks) != 2:

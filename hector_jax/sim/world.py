@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.description import Description
 from hector_jax.inputs import InputError, did_you_mean, shown
-from hector_jax.robot import compile_model
+from hector_jax.robot import compile_model, quiet_mujoco
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
@@ -286,6 +286,7 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
     return replace(world, model=model)
 
 
+@quiet_mujoco()
 def build_worlds(
     imperfections: Sequence[Imperfections], description: Description | None = None
 ) -> list[World]:
