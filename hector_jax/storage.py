@@ -17,10 +17,11 @@ import io
 import json
 import os
 import platform
+import secrets
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -125,29 +126,26 @@ def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
     Args:
         path: the file, replaced if it is there.
         data: all of it.
-        before: name that the file which is replaced goes to.
+        before: file for what is replaced.
 
     Raises:
         WriteError: one line with the path, where the folder or the disk refuses.
     """
     path = Path(path)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(_PART, f".{path.name}.", path.parent)
-    except OSError as error:
-        raise _cannot_write(path, error) from error
-    try:
-        with os.fdopen(handle, "wb") as file:
+        with part.open("xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)
         if before is not None and path.exists():
-            os.replace(path, before)
-        os.replace(name, path)
+            write_file(before, path.read_bytes())
+        os.replace(part, path)
         _sync(path.parent)
     except BaseException as error:
-        Path(name).unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise _cannot_write(path, error) from error
         raise
@@ -330,7 +328,7 @@ def _check_card(path: Path, card: Any) -> None:
         raise InputError(
             f"{path}: file format {shown(card.get('format'))}, this version reads {FORMAT}"
         )
-    kinds = {"kind": str, "robot": str | None, "about": dict}
+    kinds = {"kind": str, "robot": str | None, "about": dict, "versions": dict}
     for name, kind in kinds.items():
         if told := problem(card.get(name), kind):
             raise InputError(f"{path}: card.{name} {told}")

@@ -1,6 +1,7 @@
 """Files: what is written comes back, and what was tampered with does not."""
 
 import json
+import os
 import pickle
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import pytest
 
 from hector_jax import storage
 from hector_jax.control.weights import expert, nominal
+from hector_jax.inputs import InputError
 from hector_jax.storage import (
     WriteError,
     load_tree,
@@ -145,6 +147,41 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
         save_tree(saved, TREE, kind="other")
     assert saved.read_bytes() == before
     assert [p.name for p in saved.parent.iterdir()] == ["tree.npz"]
+
+
+def test_the_newest_state_is_there_under_its_name_at_any_moment(tmp_path, monkeypatch):
+    state = storage.Checkpoint(tmp_path / "state.npz", "thing")
+    replace, there = storage.os.replace, []
+
+    def watched(*paths):
+        there.append(state.path.exists())
+        replace(*paths)
+        there.append(state.path.exists())
+
+    state.save({"x": np.zeros(3)})
+    monkeypatch.setattr(storage.os, "replace", watched)
+    state.save({"x": np.ones(3)})
+    assert len(there) == 4
+    assert all(there)
+    assert load_tree(state.before, {"x": np.zeros(3)}, kind="thing")[0]["x"].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        storage.write_file(tmp_path / "file", b"data")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+def test_a_card_without_versions_is_refused_by_name(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "versions", lambda: None)
+        save_tree(tmp_path / "tree.npz", TREE, kind="thing")
+    with pytest.raises(InputError, match="tree.npz: card.versions must be a dict, got None"):
+        load_tree(tmp_path / "tree.npz", TREE, kind="thing")
 
 
 def test_a_robot_is_known_by_its_numbers():
