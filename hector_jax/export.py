@@ -52,6 +52,7 @@ from hector_jax.sim import sensing
 from hector_jax.sim.walk import first_tick, substeps, walk
 from hector_jax.sim.world import build_world, ideal, standing_qpos
 from hector_jax.storage import (
+    WEIGHTS,
     fingerprint,
     make_folder,
     save_weights,
@@ -130,7 +131,7 @@ def weights_schema() -> dict[str, Any]:
 
     row = {
         "type": "array",
-        "items": {"type": "number", "exclusiveMinimum": 0},
+        "items": {"type": "number", "minimum": WEIGHTS.low, "maximum": WEIGHTS.high},
         "minItems": 3,
         "maxItems": 3,
     }

@@ -34,11 +34,12 @@ from filelock import FileLock, Timeout
 
 from hector_jax.console import Broken, say
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import InputError, one_line, problem, read_json, shown
+from hector_jax.inputs import InputError, Interval, one_line, problem, read_json, shown
 from hector_jax.robot import MODEL_PATH, Robot
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
+WEIGHTS = Interval(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
 _MOST_WEIGHTS = 1_000_000  # bytes
 _PART = ".hector_jax-part"  # ends the name of a file that is being written, and of no other
 _DIGEST = 64  # hexadecimal digits of a sha256
@@ -458,11 +459,11 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
 
 
 def load_weights(path: Path) -> Weights:
-    """Read weights that `save_weights` or a person wrote; positive, but not held to the box.
+    """Read weights that `save_weights` or a person wrote; in `WEIGHTS`, not held to the box.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, unknown, of the wrong
-            shape, or not a positive number.
+            shape, or not a number of that range.
     """
     path = Path(path)
     tree = read_json(path, "weights", _MOST_WEIGHTS, object_pairs_hook=_no_twins)
@@ -510,14 +511,13 @@ def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
 def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.ndarray:
     wanted = " x ".join(str(s) for s in shape)
     try:
-        array = np.array(entry)
-    except (ValueError, OverflowError):
+        array = np.array(entry, object)
+    except ValueError:  # rows of different lengths
         array = np.array(None)
-    if array.shape != shape or array.dtype.kind not in "if":
+    if array.shape != shape:
         raise InputError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
-    array = array.astype(float)
-    bad = ~(np.isfinite(array) & (array > 0))
-    if bad.any():
-        place = "".join(f"[{i}]" for i in np.argwhere(bad)[0])
-        raise InputError(f"{path}: {name}{place} must be positive, got {array[bad][0]:g}")
-    return array
+    for index, value in np.ndenumerate(array):
+        if told := problem(value, float, WEIGHTS):
+            place = "".join(f"[{i}]" for i in index)
+            raise InputError(f"{path}: {name}{place} {told}")
+    return array.astype(float)

@@ -73,6 +73,33 @@ def test_walking_on_the_rigid_body_prints_json(monkeypatch, capsys):
     assert not found["fell"]
 
 
+def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, capsys):
+    walk = synthetic_walk(0, 30)
+    fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
+    residual = np.where(fallen, np.inf, 0.0)
+    wrong = walk._replace(fallen=fallen, residual=residual)
+    monkeypatch.setattr(asked, "walked", lambda *args: wrong)
+    assert call(monkeypatch, "walk") == 1
+    out, err = capsys.readouterr()
+    assert "nominal weights: ended after 0.20 s" in out
+    assert "10 of 30 QPs were not solved (largest relative residual inf, expected at most" in err
+    assert call(monkeypatch, "walk", "--json") == 1
+    found = json.loads(capsys.readouterr().out)
+    assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
+    assert found["residual"] is None
+    monkeypatch.setattr(asked, "walked", lambda *args: walk._replace(fallen=fallen))
+    assert call(monkeypatch, "walk") == 0
+    assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
+
+
+def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "two\nlines.json"
+    save_weights(path, expert())
+    monkeypatch.setattr(asked, "walked", lambda *args: synthetic_walk(0, 30))
+    assert call(monkeypatch, "walk", "--weights", path) == 0
+    assert "two lines.json weights: walked" in capsys.readouterr().out.splitlines()[0]
+
+
 @pytest.mark.parametrize("command", ["walk", "tune", "search", "evaluate"])
 def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
     monkeypatch.chdir(tmp_path)

@@ -224,13 +224,19 @@ def _edit(change):
         (lambda t: t.pop("R"), 'missing weight "R"'),
         (lambda t: t["Q"].update(eular=[1, 1, 1]), 'unknown weight "Q.eular"; did you mean "Q.eul'),
         (lambda t: t.update(note="x"), 'unknown weight "note"; expected Q, R'),
-        (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be positive, got -1"),
-        (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\] must be positive, got 0"),
+        (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be a number from 1e-12"),
+        (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\].* to 1e\+12, got 0"),
+        (lambda t: t["Q"].update(euler=[1, 1, True]), r"Q.euler\[2\] must be a number.*got True"),
+        (lambda t: t["Q"].update(euler=[1e308, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1e\+308"),
+        (
+            lambda t: t["R"].update(force=[[1, 1, 1], [1, 1, 5e-324]]),
+            r"R.force\[1\]\[2\].*from 1e-12",
+        ),
         (lambda t: t["Q"].update(euler=[1, float("nan"), 1]), r"Q.euler\[1\].*got nan"),
         (lambda t: t["Q"].update(euler=[1, 1, float("inf")]), r"Q.euler\[2\].*got inf"),
         (lambda t: t["Q"].update(euler=[1, 1]), "Q.euler must be 3 numbers, got"),
-        (lambda t: t["Q"].update(euler=["a", 1, 1]), "Q.euler must be 3 numbers, got"),
-        (lambda t: t["Q"].update(euler=[10**400, 1, 1]), "Q.euler must be 3 numbers, got"),
+        (lambda t: t["Q"].update(euler=["a", 1, 1]), r"Q.euler\[0\] must be a number.*got 'a'"),
+        (lambda t: t["Q"].update(euler=[10**400, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1000"),
         (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
         (lambda t: t["R"].update(moment=None), "R.moment must be 2 x 3 numbers, got null"),
         (lambda t: t.update(Q=[1, 2]), "Q must be an object"),
@@ -243,6 +249,20 @@ def test_bad_weights_are_one_line_with_file_and_entry(tmp_path, change, message)
         load_weights(path)
     assert "weights.json" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_byte_order_mark_is_taken(tmp_path):
+    path = tmp_path / "weights.json"
+    save_weights(path, expert())
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    jax.tree.map(np.testing.assert_array_equal, load_weights(path), expert())
+
+
+def test_a_huge_number_is_told_without_advice_to_a_programmer(tmp_path):
+    path = tmp_path / "weights.json"
+    path.write_text('{"Q": 1' + 5000 * "0" + "}")
+    with pytest.raises(InputError, match="not valid JSON: a number has too many digits$"):
+        load_weights(path)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\udc80", '{"Q": 1, "Q": 2}', "[" * 100_000])

@@ -7,7 +7,8 @@ import numpy as np
 
 from hector_jax import pipeline, study
 from hector_jax.commands import asked
-from hector_jax.console import say
+from hector_jax.console import Broken, say
+from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation import metrics, pictures, runs
 from hector_jax.evaluation.metrics import Score, Verdict
@@ -15,6 +16,7 @@ from hector_jax.evaluation.report import print_table
 from hector_jax.evaluation.video import check_back_end
 from hector_jax.flags import Compare, Evaluate, Table, Walk, settings
 from hector_jax.grfm.dataset import SOLVED
+from hector_jax.inputs import plural, printable
 from hector_jax.robot import load_robot
 from hector_jax.runtime import workers
 from hector_jax.storage import as_json, save_tree
@@ -64,23 +66,33 @@ def walk(args: Walk) -> None:
     trajectory = asked.walked(args, robot, wanted, weights)
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
+    samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
+    plans = np.asarray(trajectory.residual)[::samples]
+    unsolved = int(np.sum(~(plans <= SOLVED)))
+    fell = bool(found.fallen) and not unsolved  # without a plan it is no fall of these weights
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=settings(args))
     if args.json:
         losses = {part: float(getattr(found, part)) for part in metrics.PARTS}
         errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}
-        told = {"seconds": upright, "fell": bool(found.fallen), **losses, **errors}
-        print(as_json(told))  # a walk that falls at once has no errors
+        solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(found.residual)}
+        # a walk that falls at once has no errors
+        print(as_json({"seconds": upright, "fell": fell, **losses, **errors, **solved}))
     else:
+        end = "fell after" if fell else "ended after" if found.fallen else "walked"
         print(
-            f"{wanted.name} in {args.world}, {args.weights} weights: "
-            + (f"fell after {upright:.2f} s" if found.fallen else f"walked {upright:.2f} s")
-            + f"; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
+            f"{wanted.name} in {args.world}, {printable(args.weights)} weights: {end} "
+            f"{upright:.2f} s; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
             f"L_pos {found.L_pos:.2f} m^2, L_ctrl {found.L_ctrl / 1e6:.3f}e6)"
         )
         cm, degrees = 100 * found.rms_position, np.degrees(found.rms_euler)
         print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
         print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
+    if unsolved:
+        raise Broken(
+            f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
+            f"{float(found.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
+        )
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
         pictures.film(
