@@ -28,7 +28,17 @@ from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
-from hector_jax.inputs import POSITIVE, SEED, SOME, InputError, check, choose, from_table, shown
+from hector_jax.inputs import (
+    POSITIVE,
+    SEED,
+    SOME,
+    InputError,
+    check,
+    choose,
+    from_table,
+    plural,
+    shown,
+)
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.runtime import letters
@@ -350,7 +360,9 @@ def _keep_walks(
             return walk_many(pool, walking, robot, jobs)
         return _mjx_walks(walking, robot, jobs, single=single)
 
-    title = f"collecting {len(jobs)} walks on the high-fidelity simulator, engine {engine}"
+    title = (
+        f"collecting {plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine}"
+    )
     with bar(title) as tell:
         dataset.collect(
             folder,
@@ -458,7 +470,9 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
     made_of = [dataset.walked_with(each) for each in folders]
     ending = digest(config, robot, made_of)
     kept = Checkpoint(path.with_name(f"training-{ending}.npz"), training.KIND, robot)
-    with bar(f"training GRFM-Net ({config.variant}) on {len(parts.training.walk)} samples") as tell:
+    with bar(
+        f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
+    ) as tell:
         tell(0, config.epochs, "compiling")
         params, course = training.train(
             config,

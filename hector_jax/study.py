@@ -21,7 +21,7 @@ from hector_jax.evaluation.report import Picture, environment
 from hector_jax.evaluation.table import PAPER, Earlier, Fall, Search, Table
 from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_video
 from hector_jax.grfm.network import Params
-from hector_jax.inputs import InputError, read_json
+from hector_jax.inputs import InputError, plural, read_json
 from hector_jax.kept import Judged, Tuned
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -258,7 +258,7 @@ def _walk_sets(
         **{which: one.tuning.converged for which, one in tuned.items()},
         **plan.extra[name],
     }
-    title = f"judging {name} on {len(plan.seeds)} stand-in plants"
+    title = f"evaluating {name} on {plural(len(plan.seeds), 'stand-in plant')}"
     command, seeds = plan.commands[name], plan.seeds
     known = (sets, command, plants, seeds, folder, commit, title)
     return kept.judge(pool, plan.tune, robot, *known)

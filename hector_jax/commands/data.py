@@ -20,6 +20,7 @@ from hector_jax.grfm.dataset import Walks, make_dataset
 from hector_jax.grfm.gated import gated_effect
 from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.inputs import plural
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -105,5 +106,5 @@ def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -
         for seed, plant in enumerate(asked.plants("standin", range(count)))
     ]
     return pipeline.walk_all(
-        pool, config, robot, jobs, f"walking on {count} stand-in plants, for information"
+        pool, config, robot, jobs, f"walking on {plural(count, 'stand-in plant')}, for information"
     )

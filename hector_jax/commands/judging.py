@@ -34,7 +34,7 @@ def evaluate(args: Evaluate) -> None:
     sets = {text: asked.weights(text, robot) for text in args.weights}
     plants = asked.plants(args.world, seeds)
     with workers(args.processes) as pool:
-        title = f"judging on {args.world}, {count} plants"
+        title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         known = (pool, asked.tune_config(robot), robot)
         walks = pipeline.judge(*known, sets, wanted.command, plants, seeds, title, seconds)
     scores = {n: [metrics.score(LossConfig(), walk) for walk in each] for n, each in walks.items()}
@@ -42,7 +42,7 @@ def evaluate(args: Evaluate) -> None:
     if args.json:
         print(as_json(metrics.as_result(verdict, args.world)))
     else:
-        print_table(verdict, f"{wanted.name}, {count} plants", args.world)
+        print_table(verdict, f"{wanted.name}, {plural(count, 'plant')}", args.world)
 
 
 def verdict_of(
@@ -110,7 +110,7 @@ def table(args: Table) -> None:
         print(as_json({"report": str(told), "trajectories": results}))
     else:
         for name, verdict in verdicts.items():
-            print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
+            print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
     say(f"the whole story, with pictures: {told}")
 
 

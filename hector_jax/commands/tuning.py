@@ -27,7 +27,7 @@ from hector_jax.evaluation.video import check_back_end
 from hector_jax.flags import Search, Tune, Walk, as_command, from_file, settings
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, plural
 from hector_jax.kept import Journal, Judged
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -221,7 +221,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             seeds,
             shelf / "standin",
             commit,
-            f"judging on {args.seeds} stand-in plants",
+            f"evaluating on {plural(args.seeds, 'stand-in plant')}",
             lasts,
         )
         title = "walking on the simulator of the data"
@@ -268,7 +268,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     if args.json:
         print(as_json({"run": str(folder), "traj": wanted.name, **result}))
     else:
-        print_table(verdict, f"{wanted.name}, {args.seeds} stand-in plants")
+        print_table(verdict, f"{wanted.name}, {plural(args.seeds, 'plant')}")
     say(f"the whole story, with pictures: {told}")
 
 

@@ -356,7 +356,9 @@ def _rows(name: str, sets: Sequence[Mapping[str, Any] | None]) -> dict[str, list
         if baseline not in one["change"]:
             return ""
         found = one["change"][baseline]
-        interval = Interval(*(found[key] for key in ("median", "low", "high")))
+        # null where there is no interval
+        ends = (np.nan if found[key] is None else found[key] for key in ("low", "high"))
+        interval = Interval(found["median"], *ends)
         return change_text(interval) + ("" if found["counts"] else VOID)
 
     rows = {
