@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax import replay
-from hector_jax.console import bar
+from hector_jax.console import bar, say_if_slow
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig, walk_config
@@ -466,7 +466,8 @@ def train(
 
 
 def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> Learned:
-    parts = samples(robot, *folders)
+    with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
+        parts = samples(robot, *folders)
     made_of = [dataset.walked_with(each) for each in folders]
     ending = digest(config, robot, made_of)
     kept = Checkpoint(path.with_name(f"training-{ending}.npz"), training.KIND, robot)
@@ -481,19 +482,21 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
             lambda epoch, _: tell(epoch, config.epochs, ""),
             kept,
         )
-    linear = network.fit_linear(parts.training)
-    effects = {
-        "raw": last_command,
-        "linear": network.linear_effect(linear),
-        "net": network.as_effect(params),
-    }
+    with say_if_slow("computing the errors on held-out walks"):
+        linear = network.fit_linear(parts.training)
+        effects = {
+            "raw": last_command,
+            "linear": network.linear_effect(linear),
+            "net": network.as_effect(params),
+        }
+        errors = training.report(effects, parts.held_out)
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
         "made_of": made_of[0],
         **({"and_of": made_of[1:]} if made_of[1:] else {}),
         "settings": asdict(config),
         "samples": {**sizes, "dropped": parts.dropped},
-        "errors": training.report(effects, parts.held_out),
+        "errors": errors,
         "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
@@ -555,7 +558,8 @@ def ground(
         collect(pool, CollectConfig(), config, robot, walks)
     if dataset.walked_with(walks).get("controller") != repr(config.rollout.walk):
         raise InputError(f"{walks}: walked by another controller; choose another folder")
-    return learned(train_config, robot, walks, net_path(data, train_config.variant))
+    with say_if_slow(f"reading the walks and the net in {data}"):
+        return learned(train_config, robot, walks, net_path(data, train_config.variant))
 
 
 def _command(name: str, own: Mapping[str, Command] | None) -> Command:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hector_jax import pipeline
 from hector_jax.commands import asked
-from hector_jax.console import say
+from hector_jax.console import bar, say, say_if_slow
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation import fidelity, pictures
@@ -67,24 +67,28 @@ def grfm(args: Grfm) -> None:
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, config, robot, args.data)
         paper = pipeline.ground(pool, config, robot, args.data, "paper")
-        worlds = {"hfs": pipeline.held_out(robot, args.data / "walks")}
+        with say_if_slow("reading the walks that no training saw"):
+            worlds = {"hfs": pipeline.held_out(robot, args.data / "walks")}
         if args.seeds:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": linear_effect(net.linear)}
     effects["paper"] = as_effect(paper.params)
     effects["residual"] = as_effect(net.params)
     effects["gated"] = gated_effect(net.params.linear)
-    say("predicting")
     found, drifts = {}, {}
-    for world, walks in worlds.items():
-        samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
-        # a push from outside is in no model
-        calm = ~np.any(walks.job.push.force, axis=(1, 2))
-        quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
-        drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
-        found[world] = fidelity.as_result(
-            training.report(effects, samples), fidelity.by_phase(effects, samples), drifts[world]
-        )
+    with bar("predicting the ground forces of the walks") as tell:
+        for done, (world, walks) in enumerate(worlds.items()):
+            tell(3 * done, 3 * len(worlds), f"{world}: errors")
+            samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
+            errors = training.report(effects, samples)
+            tell(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
+            phases = fidelity.by_phase(effects, samples)
+            tell(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
+            # a push from outside is in no model
+            calm = ~np.any(walks.job.push.force, axis=(1, 2))
+            quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
+            drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
+            found[world] = fidelity.as_result(errors, phases, drifts[world])
     curves = fidelity.curves(robot, worlds["hfs"].trajectory, effects)
     trainings = {"training": net.course, "training_paper": paper.course}
     tick = config.rollout.walk.gait.tick

@@ -95,11 +95,9 @@ def walk(args: Walk) -> None:
         )
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
-        pictures.film(
-            args.video,
-            robot,
-            {beside: asked.walked(args, robot, wanted, other(robot)), args.weights: trajectory},
-        )
+        say(f"walking with {beside} weights, to be filmed beside")
+        walks = {beside: asked.walked(args, robot, wanted, other(robot)), args.weights: trajectory}
+        pictures.film(args.video, robot, walks)
 
 
 def table(args: Table) -> None:

@@ -40,34 +40,32 @@ def view_run(args: View) -> None:
     sets = {name: runs.weights_of(args.run, name, robot) for name in args.sets}
     data = asked.folder_of(args.data or begun.data, begun.robot, robot)
     effect = _phi_of(data, begun.variant, robot)
-    story = [f"**{begun.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
-    shown: dict[str, view.Shown] = {}
-    say(f"walking anew in {args.world}, seed {args.seed}")
-    for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
-        walked = asked.walked(args, robot, wanted, weights)
-        loss = metrics.score(begun.loss, walked).L / 1e6
-        story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
-        say(f"  {story[-1]}")
-        walked = at_interval(walked, walk_config(robot).gait.tick)
-        stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
-        effects = {} if effect is None else {"residual": effect}
-        curves = fidelity.curves(robot, stacked, effects)
-        shown[name] = view.Shown(walked, curves)
     model = compile_model(robot.description)
-    motions = [view.motion(robot, model, one) for one in shown.values()]
-    if folder is not None:
-        pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown, motions)
-        say(f"film and pictures are in {folder}")
+    shown: dict[str, view.Shown] = {}
+
+    def walk() -> tuple[dict[str, view.Motion], str]:
+        place = WORLDS.get(args.world, args.world)
+        story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
+        say(f"walking in {args.world}, seed {args.seed}")
+        for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
+            walked = asked.walked(args, robot, wanted, weights)
+            loss = metrics.score(begun.loss, walked).L / 1e6
+            story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
+            say(f"  {story[-1]}")
+            walked = at_interval(walked, walk_config(robot).gait.tick)
+            stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
+            effects = {} if effect is None else {"residual": effect}
+            shown[name] = view.Shown(walked, fidelity.curves(robot, stacked, effects))
+        motions = [view.motion(robot, model, one) for one in shown.values()]
+        return dict(zip(view.titles(shown), motions, strict=True)), "\n\n".join(story)
+
+    if folder is None:
+        on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
+        view.serve(walk, model, args.run, on_open, args.host, args.port)
         return
-    view.serve(
-        dict(zip(view.titles(shown), motions, strict=True)),
-        model,
-        args.run,
-        "\n\n".join(story),
-        lambda address: say(f"open {address} in a browser; Ctrl-C ends it"),
-        args.host,
-        args.port,
-    )
+    motions = list(walk()[0].values())
+    pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown, motions)
+    say(f"the film and the pictures are in {folder}")
 
 
 def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:

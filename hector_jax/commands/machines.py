@@ -44,6 +44,7 @@ def examine(args: Doctor) -> None:
     Raises:
         Broken: something does not.
     """
+    say("testing this machine: two short walks and a film")
     told, faults = doctor.examine()
     if args.json:
         print(as_json({**told, "faults": faults}))

@@ -120,7 +120,7 @@ def of_view(
     tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
     if tuned:
         plots.losses(folder / "losses.png", loss, tuned)
-    say("drawing the film")
+    say("making the film")
     titled = dict(zip(view.titles(walks), walks.values(), strict=True))
     arrows = view.film_arrows(motions)
     try:
@@ -133,9 +133,11 @@ def film(
     path: Path, robot: Robot, walks: Mapping[str, Trajectory], strip: Path | None = None
 ) -> str:
     """Film two walks. A missing back end costs one line, not the run; returns why there is none."""
+    say("making the film")
     try:
         write_video(path, robot, walks, strip)
     except VideoUnavailable as error:
         say(str(error))
         return str(error)
+    say(f"the film is in {path}")
     return ""
