@@ -30,10 +30,11 @@ LATEST = Path("latest")  # stands for the newest run
 
 
 class Source(Enum):
-    """What a flag names that has to be there; it is looked for before the slow imports."""
+    """What a flag names; it is looked for before the slow imports."""
 
     FILE = "a file"
     RUN = "the folder of a run of `hector tune`"
+    FOLDER = "a folder"  # which may be missing
     EXPORTABLE = "a run folder or a weights file"
     WEIGHTS = "nominal, expert or a weights file"
     TRAJECTORY = "a name or a TOML file"
@@ -52,6 +53,7 @@ Robot = Annotated[Path | None, Source.FILE]
 Weights = Annotated[str, Source.WEIGHTS]
 Trajectory = Annotated[str, Source.TRAJECTORY]
 Run = Annotated[Path, Source.RUN]
+Folder = Annotated[Path, Source.FOLDER]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +70,7 @@ class Collect(Configured):
     Example: hector collect --walks 128 --out data/more
     """
 
-    out: Path = Path("data/walks")  # folder for the walks; those already in it are kept
+    out: Folder = Path("data/walks")  # folder for the walks; those already in it are kept
     walks: Annotated[int, Interval(1, 100_000)] = 64  # number of walks
     seconds: float = 4.0  # length of each walk [s]
     seed: Seed = 0  # seed of all random numbers: commands, weights, plants, pushes
@@ -84,7 +86,7 @@ class Train(Configured):
     Example: hector train --data data/more --out data/more.npz
     """
 
-    data: Path = Path("data/walks")  # folder of the walks
+    data: Folder = Path("data/walks")  # folder of the walks
     out: Path | None = None  # file for the net; by default grfm.npz or grfm-paper.npz beside DATA
     variant: Variant = "residual"  # architecture of the net
     epochs: Annotated[int, Interval(1, 100_000)] = 200  # passes over the samples
@@ -100,8 +102,8 @@ class Grfm(Configured):
     Example: hector grfm --seeds 0
     """
 
-    data: Path = Path("data")  # folder of the walks and nets, which are made if they are missing
-    out: Path = Path("runs/grfm")  # folder for the report
+    data: Folder = Path("data")  # folder of the walks and nets, which are made if they are missing
+    out: Folder = Path("runs/grfm")  # folder for the report
     seeds: Annotated[int, Interval(0, 10_000)] = 2  # stand-in plants, for information; 0: none
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of text
@@ -120,8 +122,8 @@ class Tune(Configured):
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
     refresh: Annotated[int, Interval(0, 100)] = 0  # times to collect at the new weights and repeat
-    data: Path = Path("data")  # folder of the walks and the net, which are made if missing
-    runs: Path = Path("runs")  # the run folder is RUNS/TRAJ/TIME
+    data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
+    runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
     run: Path | None = None  # the run folder itself, which must not exist (with all: RUN/TRAJ)
     resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
     video: bool = True  # make a film of the nominal and the tuned weights
@@ -144,7 +146,7 @@ class Search(Configured):
     spread: float = 1.0  # initial standard deviation of each log-weight
     start: Weights = "nominal"  # nominal, expert or a weights file
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
-    out: Path = Path("runs/search")  # folder for the best weights, each with a card
+    out: Folder = Path("runs/search")  # folder for the best weights, each with a card
     record: Path | None = None  # folder of the record that a search resumes from; by default OUT
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of text
@@ -168,8 +170,8 @@ class Table(Configured):
     extra: tuple[str, ...] = ()  # more rows, NAME=FOLDER of straight.json, c.json and s.json
     ceiling: Path = Path("docs/results/ceiling")  # folder of row `ceiling`, if it exists
     earlier: Path | None = None  # table.json of other plants, to compare the order of the sets
-    data: Path = Path("data")  # folder of the walks and the net, which are made if missing
-    out: Path = Path("runs/table")  # folder for the report
+    data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
+    out: Folder = Path("runs/table")  # folder for the report
     kept: Path | None = None  # folder of results to reuse; by default OUT/kept
     quick: bool = False  # a trial with 4 plants and short tunings, into OUT/quick
     processes: Processes = 2  # worker processes, one core each
@@ -376,6 +378,9 @@ def _look(label: str, value: Path | str, source: Source) -> None:
     """Raises InputError where what a flag names is not there."""
     path, named = Path(value), value in NAMED_WEIGHTS
     if source is Source.RUN and not path.is_dir():
+        raise InputError(f"{label} must be {source.value}, got {shown(str(value))}")
+    nearest = next(place for place in (path, *path.parents) if place.exists())
+    if source is Source.FOLDER and not nearest.is_dir():
         raise InputError(f"{label} must be {source.value}, got {shown(str(value))}")
     is_word = not (path.suffix or path.exists() or path.is_symlink())
     if source is Source.WEIGHTS and is_word and not named:

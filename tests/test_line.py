@@ -137,6 +137,18 @@ def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
     assert shown.stderr == f"hector: {tmp_path / name}: cannot read the file: {fault}\n"
 
 
+@pytest.mark.parametrize("words", ["tune --data", "tune --runs", "grfm --out", "collect --out"])
+def test_a_folder_that_cannot_be_one_is_told_before_anything_is_made(
+    monkeypatch, capsys, tmp_path, words
+):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("")
+    for name in ("/dev/null", "file", "file/below"):
+        line = refused(monkeypatch, capsys, *words.split(), name)
+        assert line == f"hector: {words.split()[1]} must be a folder, got {name!r}"
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_latest_is_the_newest_run(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     for age, name in ((9, "c/1"), (5, "strider/s/2"), (7, "s/3")):

@@ -159,6 +159,26 @@ def test_the_line_that_asks_again_names_what_is_not_default():
     assert as_command("tune", flags.Tune(video=False)) == "hector tune --no-video"
 
 
+def test_runs_of_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    """Also those that look at the same moment and find nothing there."""
+
+    class Clock(tuning.datetime):
+        @classmethod
+        def now(cls):
+            return cls(2026, 11, 21, 9, 34, 59)
+
+    begun = []
+    monkeypatch.setattr(tuning, "datetime", Clock)
+    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: begun.append(folder))
+    for _ in range(3):
+        tuning.tune(flags.Tune(traj="s", runs=tmp_path))
+    assert [folder.name for folder in begun] == [
+        "20261121-093459",
+        "20261121-093500",
+        "20261121-093501",
+    ]
+
+
 def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: asked.append((folder, args)))

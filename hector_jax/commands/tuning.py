@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,7 @@ from hector_jax.tuning.difftune import aligned
 from hector_jax.tuning.search import SearchConfig
 
 _FREE = ("config", "json", "processes", "resume", "run", "runs", "video")  # change no number
+_TIME = "%Y%m%d-%H%M%S"  # names a run
 
 
 def tune(args: Tune) -> None:
@@ -58,7 +59,7 @@ def tune(args: Tune) -> None:
     texts = COMMANDS if args.traj == "all" else (args.traj,)
     base = args.resume or args.run
     if base is None:
-        robot, now = load_robot(args.robot), f"{datetime.now():%Y%m%d-%H%M%S}"
+        robot, now = load_robot(args.robot), f"{datetime.now():{_TIME}}"
         runs = asked.folder_of(args.runs, args.robot, robot)
         folders = {text: runs / asked.course(text, robot).name / now for text in texts}
     else:
@@ -69,10 +70,9 @@ def tune(args: Tune) -> None:
     else:
         for folder, one in several.items():
             _asked_for(one, load_robot(args.robot))
-            if folder.exists():
+            if args.run and folder.exists():
                 raise InputError(_taken(folder))
-        for folder, one in several.items():
-            _begin(folder, one)
+        several = {_begin(folder, one): one for folder, one in several.items()}
     for folder, one in several.items():
         with locked(folder):
             _tune_in(folder, one)
@@ -82,8 +82,12 @@ def _taken(folder: Path) -> str:
     return f"run folder {folder} exists; take it up by --resume or name another by --run"
 
 
-def _begin(folder: Path, args: Tune) -> None:
-    """Make the folder of a new run, at once with its flags: one that is there can be resumed."""
+def _begin(folder: Path, args: Tune) -> Path:
+    """Make the folder of a new run, at once with its flags: one that is there can be resumed.
+
+    Returns:
+        The folder; if nobody named it and it is there, that of the next free second.
+    """
     make_folder(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
         new = Path(part) / "run"
@@ -92,10 +96,14 @@ def _begin(folder: Path, args: Tune) -> None:
         flags = settings(replace(args, run=None, resume=None))
         body = identity(load_robot(args.robot))
         write_json(new / "config.json", {"flags": flags, "robot": body})
-        try:
-            new.rename(folder)
-        except OSError:
-            raise InputError(_taken(folder)) from None
+        while True:
+            try:
+                return new.rename(folder)
+            except OSError:
+                if args.run or not folder.exists():
+                    raise InputError(_taken(folder)) from None
+            later = datetime.strptime(folder.name, _TIME) + timedelta(seconds=1)
+            folder = folder.with_name(f"{later:{_TIME}}")
 
 
 def _as_begun(folder: Path, args: Tune) -> Tune:
