@@ -4,6 +4,7 @@ What is allowed stands beside the type. Flags come from a command line (`from_li
 (`from_file`), and go out again as JSON (`settings`) or as a command line (`as_command`).
 """
 
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -38,6 +39,7 @@ class Source(Enum):
     EXPORTABLE = "a run folder or a weights file"
     WEIGHTS = "nominal, expert or a weights file"
     TRAJECTORY = "a name or a TOML file"
+    ROBOT = "a TOML file that names an MJCF (docs/howto/robot.md)"
 
 
 Processes = Annotated[int, Interval(1, 1024)]
@@ -49,7 +51,7 @@ Iterations = Annotated[
 Seconds = Annotated[float, Interval(0.01, 600)]  # at least one tick
 Variant = Literal["residual", "paper"]
 Engine = Literal["auto", "c", "mjx"]
-Robot = Annotated[Path | None, Source.FILE]
+Robot = Annotated[Path | None, Source.ROBOT]
 Weights = Annotated[str, Source.WEIGHTS]
 Trajectory = Annotated[str, Source.TRAJECTORY]
 Run = Annotated[Path, Source.RUN]
@@ -376,20 +378,26 @@ def _source(hint: Any) -> Source | None:
 
 def _look(label: str, value: Path | str, source: Source) -> None:
     """Raises InputError where what a flag names is not there."""
-    path, named = Path(value), value in NAMED_WEIGHTS
-    if source is Source.RUN and not path.is_dir():
-        raise InputError(f"{label} must be {source.value}, got {shown(str(value))}")
-    nearest = next(place for place in (path, *path.parents) if place.exists())
-    if source is Source.FOLDER and not nearest.is_dir():
-        raise InputError(f"{label} must be {source.value}, got {shown(str(value))}")
-    is_word = not (path.suffix or path.exists() or path.is_symlink())
-    if source is Source.WEIGHTS and is_word and not named:
-        hint = did_you_mean(str(value), NAMED_WEIGHTS)
+    path, hint = Path(value), ""
+    named, is_dir = value in NAMED_WEIGHTS, os.path.isdir(path)
+    match source:
+        case Source.RUN:
+            fine = is_dir
+        case Source.FOLDER:
+            fine = os.path.isdir(next(x for x in (path, *path.parents) if os.path.exists(x)))
+        case Source.ROBOT:
+            fine = path.suffix == ".toml"
+        case Source.WEIGHTS:
+            fine = named or path.suffix or os.path.lexists(path)
+            hint = did_you_mean(str(value), NAMED_WEIGHTS)
+        case _:
+            fine = True
+    if not fine:
         raise InputError(f"{label} must be {source.value}, got {shown(str(value))}{hint}")
     if (
-        source is Source.FILE
+        source in (Source.FILE, Source.ROBOT)
         or (source is Source.WEIGHTS and not named)
-        or (source is Source.EXPORTABLE and not path.is_dir())
+        or (source is Source.EXPORTABLE and not is_dir)
         or (source is Source.TRAJECTORY and path.suffix == ".toml")
     ):
         check_file(path, "the file")

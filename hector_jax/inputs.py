@@ -183,8 +183,9 @@ def check_file(path: Path, what: str) -> int:
     """
     try:
         size = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"{path}: cannot read {what}: {error.strerror}") from None
+    except (OSError, ValueError) as error:  # such as a null byte in the name
+        told = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot read {what}: {told}") from None
     if not path.is_file():  # a pipe or a device might never end
         raise InputError(f"{path}: cannot read {what}: not a plain file")
     return size

@@ -20,9 +20,9 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.description import Description
 from hector_jax.inputs import InputError, did_you_mean, shown
+from hector_jax.mjcf import TIME_STEP
 from hector_jax.robot import compile_model, quiet_mujoco
 
-TIME_STEP = 0.001  # [s] of plant, joint control and samples
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold
 SLACK = "_backlash"  # ending of the names of backlash joints
