@@ -166,7 +166,7 @@ def _known(path: Path, table: Mapping[str, Any], names: tuple[str, ...], prefix:
         if key not in names:
             raise InputError(
                 f"{path}: unknown key {shown(prefix + key)}{did_you_mean(key, names)}; "
-                f"there are: {', '.join(names)}"
+                f"known: {', '.join(names)}"
             )
 
 

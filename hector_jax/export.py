@@ -35,6 +35,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from hector_jax.console import Broken
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import (
     Feet,
@@ -89,14 +90,14 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
     sets = sorted(path.stem for path in (run / "weights").glob("*.json"))
     if name not in sets:
         near = get_close_matches(name, sets, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(sets) or 'none'}"
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sets) or 'none'}"
         raise InputError(f"{run}: no weight set {name!r}; {hint}")
     path = run / "config.json"
     kept = read_json(path, "the settings of a run")
     try:
         config = _restored(WalkConfig(), kept["tune"]["rollout"]["walk"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: no settings of a walking controller: {error}") from error
+        raise InputError(f"{path}: not the settings of a walking controller: {error!r}") from error
     return run / "weights" / f"{name}.json", config
 
 
@@ -403,7 +404,8 @@ def record(
     walked = walk(config, robot, weights, command, plant, seconds, on_sample=keep)
     if np.asarray(walked.fallen).any():
         raise InputError(
-            f"these weights fall within {seconds:g} s in the ideal world: no walk to check by"
+            f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "
+            "no walk to check the export on"
         )
 
     @jax.jit
@@ -531,9 +533,9 @@ def export(
         units, what the robot's own code needs to know, weights, settings, and the check.
 
     Raises:
-        InputError: as `record` and `export_controller`; or the exported controller differs from the
-            live one by more than TOLERANCE, and then nothing is written.
-        InputError: the folder cannot be written.
+        InputError: as `record` and `export_controller`; or the folder cannot be written.
+        Broken: the exported controller differs from the live one by more than TOLERANCE; nothing
+            is written.
     """
     make_folder(folder)
     blobs = {place: export_controller(config, robot, weights, place) for place in PLATFORMS}
@@ -541,7 +543,7 @@ def export(
     _, example = controller(config, robot, weights)
     found = check(config, load_controller(blobs["cpu"]), example, walked)
     if not max(found.force, found.moment, found.torque) <= TOLERANCE:
-        raise InputError(
+        raise Broken(
             f"the exported controller differs from the live one by {found.force:.1e} N, "
             f"{found.moment:.1e} N m and {found.torque:.1e} N m at the joints, at most "
             f"{TOLERANCE:g} was expected; nothing was written"

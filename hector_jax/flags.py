@@ -19,6 +19,7 @@ from hector_jax.inputs import (
     Interval,
     check_file,
     did_you_mean,
+    one_line,
     plural,
     problem,
     read_json,
@@ -393,7 +394,7 @@ def _look(label: str, value: Path | str, source: Source) -> None:
         case _:
             fine = True
     if not fine:
-        raise InputError(f"{label} must be {source.value}, got {shown(str(value))}{hint}")
+        raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
     if (
         source in (Source.FILE, Source.ROBOT)
         or (source is Source.WEIGHTS and not named)
@@ -571,7 +572,7 @@ def _table(path: Path) -> dict[str, Any]:
     found = read_json(path, "flags as JSON", 1_000_000)
     found = found.get("flags") if isinstance(found, dict) else None
     if not isinstance(found, dict):
-        raise InputError(f"{path}: no `flags` inside; expected the config.json of a run")
+        raise InputError(f"{path}: no `flags` in it; expected the config.json of a run")
     return found
 
 

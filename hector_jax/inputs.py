@@ -263,11 +263,11 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         if name not in fields:
             raise InputError(
                 f"{where}: unknown field {shown(name)}{did_you_mean(name, fields)}; "
-                f"there are: {', '.join(fields)}"
+                f"known: {', '.join(fields)}"
             )
     for name, field in fields.items():
         if name not in table and field.default is dataclasses.MISSING:
-            raise InputError(f"{where}: missing field {name!r}; there are: {', '.join(fields)}")
+            raise InputError(f"{where}: missing field {name!r}; known: {', '.join(fields)}")
     values = {name: _as_float(fields[name].type, value) for name, value in table.items()}
     rules = getattr(kind, "RULES", {})
     for name, value in values.items():

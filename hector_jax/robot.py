@@ -188,7 +188,7 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
         joint = model.joint(name)
         which = index % 5
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise InputError(f"{path}: joint {name!r} is no hinge, expected a hinge")
+            raise InputError(f"{path}: joint {name!r} is not a hinge")
         axis = _AXES[description.axes[which]]
         if not np.allclose(joint.axis, axis, atol=_SAME):
             raise InputError(f"{path}: axis of joint {name!r} is {joint.axis}, expected {axis}")
@@ -199,7 +199,7 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
         expected = _trunk(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
         if parent != expected:
             raise InputError(
-                f"{path}: joint {name!r} hangs on body {model.body(parent).name!r}, "
+                f"{path}: joint {name!r} is on body {model.body(parent).name!r}, "
                 f"expected {model.body(expected).name!r}"
             )
         if np.abs(joint.pos).max() > _SAME or abs(model.body_quat[body][0]) < 1 - _SAME:
@@ -254,7 +254,7 @@ def _check_feet(description: Description, model: mujoco.MjModel) -> None:
             geom = model.geom(name)
             if geom.bodyid[0] != body or geom.type[0] != mujoco.mjtGeom.mjGEOM_SPHERE:
                 raise InputError(
-                    f"{path}: geom {name!r} is no sphere on body {model.body(body).name!r}"
+                    f"{path}: geom {name!r} is not a sphere on body {model.body(body).name!r}"
                 )
             reach = geom.pos - [0, 0, geom.size[0]] - point
             if ahead * reach[0] <= 0 or np.abs(reach[1:]).max() > 1e-3:

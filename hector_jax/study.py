@@ -294,7 +294,7 @@ def _draw(
     out: Path, robot: Robot, verdicts: Mapping[str, Verdict], judged: Mapping[str, Judged]
 ) -> list[Picture]:
     """All pictures, in the order of the report."""
-    say("drawing")
+    say("drawing the pictures")
     paper = {
         (trajectory, name, baseline): table.paper_change(trajectory, name, baseline)
         for trajectory in verdicts

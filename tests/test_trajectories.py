@@ -67,9 +67,9 @@ HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["missing field 'name'", "there are: name, segment"]),
+        ("", ["missing field 'name'", "known: name, segment"]),
         ('name = "mine"', ["missing field 'segment'"]),
-        ('name = "mine"\nsegment = []', ["[[segment]] must be there 1 to 100 times, got 0"]),
+        ('name = "mine"\nsegment = []', ["[[segment]] must be given 1 to 100 times, got 0"]),
         ('name = "mine"\nsegment = 3', ["segment must be a list, got 3"]),
         ('name = "mine"\nsegment = [3]', ["segment 1 must be a table of seconds, v_x"]),
         ("name = 3\nsegment = [{seconds = 1}]", ["name must be words, got 3"]),

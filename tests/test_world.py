@@ -247,7 +247,7 @@ def test_a_wrong_number_is_refused_by_name():
 
 
 def test_an_unknown_world_is_refused():
-    with pytest.raises(ValueError, match="unknown world 'mars'; there are: ideal, hfs, hfs-varied"):
+    with pytest.raises(ValueError, match="unknown world 'mars'; known: ideal, hfs, hfs-varied"):
         named_world("mars")
 
 

@@ -52,7 +52,7 @@ def robot_of(run: Path, begun: Asked) -> Robot:
     robot = load_robot(begun.robot)
     if begun.body not in (None, identity(robot)):
         path = robot.description.path
-        raise InputError(f"{run} was tuned for another robot than {path} and its MJCF are now")
+        raise InputError(f"{run} was tuned for another robot: {path} or its MJCF has changed")
     return robot
 
 

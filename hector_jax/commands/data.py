@@ -37,7 +37,7 @@ def collect(args: Collect) -> None:
     with workers(args.processes) as pool:
         out = asked.default_of(args.out, Collect.out, args.robot, robot)
         pipeline.collect(pool, config, tune, robot, out)
-    say(f"walks are in {out}")
+    say(f"the walks are in {out}")
 
 
 def train(args: Train) -> None:
@@ -61,7 +61,7 @@ def _print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def grfm(args: Grfm) -> None:
-    """Tell and draw what each net is worth."""
+    """Report on the predictions of each net, with pictures."""
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
     with workers(args.processes) as pool:
@@ -98,7 +98,7 @@ def grfm(args: Grfm) -> None:
         print(as_json({"report": str(told), "worlds": found}))
     else:
         _print_errors(found["hfs"]["errors"])
-    say(f"the whole story, with pictures: {told}")
+    say(f"the report is {told}")
 
 
 def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -> Walks:

@@ -1,4 +1,4 @@
-"""Weight sets, walks and runs judged."""
+"""Evaluation of weight sets, walks and runs."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -24,7 +24,7 @@ from hector_jax.tuning.loss import LossConfig
 
 
 def evaluate(args: Evaluate) -> None:
-    """Judge weight sets on the plants of a world."""
+    """Evaluate weight sets on the plants of a world."""
     robot = load_robot(args.robot)
     wanted = asked.course(args.traj, robot)
     seconds = asked.seconds(args.seconds, wanted)
@@ -52,12 +52,17 @@ def verdict_of(
     verdict = metrics.judge(loss, seeds, scores)
     for name, score in verdict.scores.items():
         if score.residual.max() > SOLVED:
-            say(f"{name}: a QP of its walks was not solved (residual {score.residual.max():.0e})")
+            worst = f"{score.residual.max():.0e}"
+            say(f"{name}: at least one QP of its walks was not solved (residual {worst})")
     return verdict
 
 
 def walk(args: Walk) -> None:
-    """Walk once, and tell how it went."""
+    """Walk once and report on it.
+
+    Raises:
+        Broken: QPs of the walk were not solved.
+    """
     if args.video is not None:
         check_back_end()
     robot = load_robot(args.robot)
@@ -95,7 +100,7 @@ def walk(args: Walk) -> None:
         )
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
-        say(f"walking with {beside} weights, to be filmed beside")
+        say(f"walking with {beside} weights for the other half of the film")
         walks = {beside: asked.walked(args, robot, wanted, other(robot)), args.weights: trajectory}
         pictures.film(args.video, robot, walks)
 
@@ -109,7 +114,7 @@ def table(args: Table) -> None:
     else:
         for name, verdict in verdicts.items():
             print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
-    say(f"the whole story, with pictures: {told}")
+    say(f"the report is {told}")
 
 
 def compare(args: Compare) -> None:
@@ -117,7 +122,7 @@ def compare(args: Compare) -> None:
     finished = [folder for folder in args.runs if (folder / runs.RESULT).exists()]
     for folder in args.runs:
         if finished and folder not in finished:
-            say(f"{folder}: left out, no finished run")
+            say(f"{folder} is left out: it is not a finished run")
     told = runs.compare_runs([runs.load_run(folder) for folder in finished or args.runs])
     if args.json:
         print(as_json(told))

@@ -72,7 +72,7 @@ def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | N
     """Phi of the net that is kept under `data`; where there is none, a line says so."""
     path = pipeline.net_path(data, variant)
     if not path.exists():
-        say(f"no net at {path}, so none of its predictions; --data names another folder")
+        say(f"no net at {path}, so its predictions are not shown; --data names another folder")
         return None
     return as_effect(load_net(path, robot, variant)[0])
 

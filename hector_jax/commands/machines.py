@@ -15,14 +15,14 @@ def export_controller(args: Export) -> None:
     """Export the controller of a run, checked against the live one."""
     is_run = args.run.is_dir()
     if is_run and args.robot:
-        raise InputError(f"--robot is for a weights file; {args.run} tells its own")
+        raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
     path, config = export.find_weights(args.run, args.set)
     begun = runs.read_asked(args.run) if is_run else None
     robot = asked.robot_of(args.run, begun) if begun else load_robot(args.robot)
     wanted = asked.course(args.traj or (begun.trajectory if begun else "straight"), robot)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
-    say("exporting, walking once and asking both controllers")
+    say("exporting the controller and comparing it with the live one on a walk")
     known = (config or walk_config(robot), robot, weights, wanted.command, folder)
     with locked(folder):
         card = export.export(*known, name=name, seconds=args.seconds)
@@ -35,7 +35,7 @@ def export_controller(args: Export) -> None:
     for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
         times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
         print(f"a call {text} [ms]: {times.format(**found[what])}")
-    say(f"all of it is in {folder}")
+    say(f"the export is in {folder}")
 
 
 def examine(args: Doctor) -> None:

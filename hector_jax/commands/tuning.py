@@ -79,7 +79,7 @@ def tune(args: Tune) -> None:
 
 
 def _taken(folder: Path) -> str:
-    return f"run folder {folder} exists; take it up by --resume or name another by --run"
+    return f"run folder {folder} exists; continue it with --resume or name another with --run"
 
 
 def _begin(folder: Path, args: Tune) -> Path:
@@ -170,7 +170,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config, data = asked.lasting(shared, wanted), asked.folder_of(args.data, args.robot, robot)
     made_with = environment()
     commit = made_with.get("commit", "")
-    say(f"results go to {folder}")
+    say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, shared, robot, data, args.variant)
         problems = {"without": (command, None), "with": (command, net.params)}
@@ -232,7 +232,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             f"evaluating on {plural(args.seeds, 'stand-in plant')}",
             lasts,
         )
-        title = "walking on the simulator of the data"
+        title = "walking on the high-fidelity simulator"
         there = (command, [hfs()], [0], shelf / "hfs")
         on_hfs = kept.judge(*known, sets, *there, commit, title, lasts)
     verdict = judging.verdict_of(config.loss, seeds, _scores(judged))
@@ -276,7 +276,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         print(as_json({"run": str(folder), "traj": wanted.name, **result}))
     else:
         print_table(verdict, f"{wanted.name}, {plural(args.seeds, 'plant')}")
-    say(f"the whole story, with pictures: {told}")
+    say(f"the report is {told}")
 
 
 def _scores(judged: Judged) -> dict[str, list[Score]]:
@@ -309,7 +309,7 @@ def search(args: Search) -> None:
             args.record or out,
             own,
         )
-        say("walking start, expert and the best once more")
+        say("walking with the start, expert and best weights")
         sets = {name: [start, expert(robot), found[name].weights] for name in own}
         at_once = config.population * len(own)
         compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once, own)
@@ -341,4 +341,4 @@ def search(args: Search) -> None:
         for name, card in cards.items():
             shown = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
             print(f"{name:10s}{shown}{card['walks']:8d}{card['best_at']:9d}")
-    say(f"weights are in {out}")
+    say(f"the weights are in {out}")

@@ -78,7 +78,7 @@ class _File:
             raise InputError(f"name must not be that of a built-in trajectory, got {self.name!r}")
         if not 1 <= len(self.segment) <= _MOST_SEGMENTS:
             raise InputError(
-                f"[[segment]] must be there 1 to {_MOST_SEGMENTS} times, got {len(self.segment)}"
+                f"[[segment]] must be given 1 to {_MOST_SEGMENTS} times, got {len(self.segment)}"
             )
 
 

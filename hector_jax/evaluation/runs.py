@@ -51,7 +51,7 @@ def load_run(folder: Path) -> Run:
         read_json(folder / name) for name in (RESULT, "config.json", "versions.json")
     )
     if not isinstance(result.get("sets"), dict):
-        raise InputError(f"{folder / RESULT}: no `sets` inside; expected that of a tuning")
+        raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
     return Run(str(folder), result, read_metrics(folder), _flat(config), made_with)
 
 

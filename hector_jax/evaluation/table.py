@@ -233,8 +233,8 @@ def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
     earlier = _load_earlier(path)
     if earlier.seeds == seeds_text(seeds):
         raise InputError(
-            f"{path}: a table of seeds {earlier.seeds} too; the order is to be held against that "
-            "on other plants"
+            f"{path}: a table of the same plants, seeds {earlier.seeds}; expected others, to "
+            "compare the order of the sets"
         )
     return earlier
 

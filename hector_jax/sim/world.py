@@ -174,8 +174,7 @@ def named_world(name: str, seed: int = 0) -> Imperfections:
     """
     if name not in WORLDS:
         raise InputError(
-            f"unknown world {shown(name)}{did_you_mean(name, WORLDS)}; "
-            f"there are: {', '.join(WORLDS)}"
+            f"unknown world {shown(name)}{did_you_mean(name, WORLDS)}; known: {', '.join(WORLDS)}"
         )
     return {"ideal": ideal, "hfs": hfs, "hfs-varied": lambda: hfs_varied(seed)}[name]()
 
