@@ -75,7 +75,7 @@ class Collect(Configured):
 
     out: Folder = Path("data/walks")  # folder for the walks; those already in it are kept
     walks: Annotated[int, Interval(1, 100_000)] = 64  # number of walks
-    seconds: float = 4.0  # length of each walk [s]
+    seconds: Annotated[float, Interval(0, 600, above=True)] = 4.0  # length of each walk [s]
     seed: Seed = 0  # seed of all random numbers: commands, weights, plants, pushes
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     processes: Processes = 2  # worker processes, one core each
@@ -146,7 +146,8 @@ class Search(Configured):
     budget: Annotated[int, Interval(1, 1_000_000)] = 200  # most walks per trajectory
     population: Annotated[int, Interval(1, 10_000)] = 10  # walks in a generation
     seed: Seed = 0  # seed of the search
-    spread: float = 1.0  # initial standard deviation of each log-weight
+    # initial standard deviation of each log-weight
+    spread: Annotated[float, Interval(0, 10, above=True)] = 1.0
     start: Weights = "nominal"  # nominal, expert or a weights file
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     out: Folder = Path("runs/search")  # folder for the best weights, each with a card
@@ -212,7 +213,7 @@ class Walk(Configured):
     weights: Weights = "nominal"  # nominal, expert or a weights file
     seconds: Seconds = 4.0  # length of the walk [s]
     out: Path | None = None  # file for the trajectory (.npz)
-    video: Path | None = None  # file for a film (.mp4), with nominal weights beside them
+    video: Path | None = None  # file for a film (.mp4) beside a walk with nominal weights
     json: bool = False  # print JSON instead of text
     robot: Robot = None  # TOML file of another biped; HECTOR by default
 
@@ -237,7 +238,8 @@ class Export:
     run: Annotated[Path, Source.EXPORTABLE]  # run folder, `latest`, or a weights file
     set: str = "with"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
-    traj: Annotated[str | None, Source.TRAJECTORY] = None  # to check on; the run's or straight
+    # trajectory to check on; by default that of the run, or straight
+    traj: Annotated[str | None, Source.TRAJECTORY] = None
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
     robot: Robot = None  # TOML file of the biped of a weights file; HECTOR by default
     json: bool = False  # print JSON instead of text

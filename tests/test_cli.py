@@ -157,7 +157,7 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     ("wrong", "expected"),
     [
         (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        (("--seconds", "nan"), "--seconds must be a number that is finite, got nan"),
+        (("--seconds", "nan"), "--seconds must be a number above 0 and at most 600, got nan"),
         (("--walks", "2"), "at least 3"),
     ],
 )

@@ -150,8 +150,8 @@ def test_choices_and_ranges_hold_in_a_file(tmp_path, key, fault):
         ("run.toml", b"\xff\xfe", "not a text file"),
         ("run.toml", b"seeds = 1" + b"0" * 5000, "not valid TOML"),
         ("run.json", b"{", "not valid JSON"),
-        ("run.json", b"[]", "no `flags` inside"),
-        ("run.json", b'{"tune": {}}', "no `flags` inside"),
+        ("run.json", b"[]", "no `flags` in it"),
+        ("run.json", b'{"tune": {}}', "no `flags` in it"),
         (
             "run.json",
             b'{"flags": {"seeds": null}}',
