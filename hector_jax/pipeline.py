@@ -69,7 +69,7 @@ def choose_engine(asked: str) -> str:
     return asked
 
 
-def _mjx_walks(*args: Any, **options: Any) -> Iterator[Trajectory]:
+def mjx_walks(*args: Any, **options: Any) -> Iterator[Trajectory]:
     """`sim.parallel.walk_batch`; MJX takes a second to import and prints what it does not find."""
     with redirect_stdout(sys.stderr):
         from hector_jax.sim.parallel import walk_batch
@@ -358,7 +358,7 @@ def _keep_walks(
     def walk_jobs(jobs: list[Job]) -> Iterator[Trajectory]:
         if engine == "c":
             return walk_many(pool, walking, robot, jobs)
-        return _mjx_walks(walking, robot, jobs, single=single)
+        return mjx_walks(walking, robot, jobs, single=single)
 
     title = (
         f"collecting {plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine}"
@@ -597,7 +597,7 @@ def losses_on_hfs(
         walks = walk_many(pool, walk, robot, jobs)
     else:
         filled = jobs + jobs[-1:] * (at_once - len(jobs))
-        walks = _mjx_walks(walk, robot, filled, fine=True)
+        walks = mjx_walks(walk, robot, filled, fine=True)
     told = iter(
         [float(loss_of(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)]
     )
