@@ -192,7 +192,7 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     else:
         return 0
     try:
-        print(f"{name}: {printable(text)}", file=sys.stderr, flush=True)
+        print(f"{name}: {printable(' '.join(text.split()))}", file=sys.stderr, flush=True)
     except OSError:
         _drop(sys.stderr)
     return code

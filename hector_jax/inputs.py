@@ -80,12 +80,12 @@ def shown(value: Any) -> str:
 
 def one_line(error: BaseException | str) -> str:
     """What an error or a text says, on one line of at most 300 characters."""
-    return printable(str(error))[:300]
+    return printable(" ".join(str(error).split()))[:300]
 
 
 def printable(text: str) -> str:
     """A text on one line; what would control a terminal, as in a file's name, becomes `?`."""
-    return "".join(x if x.isprintable() else "?" for x in " ".join(text.split()))
+    return "".join(x if x.isprintable() else " " if x.isspace() else "?" for x in text)
 
 
 def plural(number: int, noun: str) -> str:
