@@ -342,7 +342,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         assert standin["seeds"] == [0, 1]
         assert standin["falls"] == 0
         for part in ("L", "L_Eul", "L_pos", "L_ctrl"):
-            assert standin[part]["low"] <= standin[part]["mean"] <= standin[part]["high"]
+            assert standin[part]["mean"] > 0.0
+            assert standin[part]["low"] is None  # two plants have no interval
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert {line["set"] for line in lines} == {"without", "with", "with_refreshed"}
     assert result["refresh"][0].keys() == {"old", "new"}
