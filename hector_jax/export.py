@@ -195,8 +195,8 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, name: str) -
         " and feet, frozen, there",
         "the reference is integrated from the start here; it starts anew at the robot, is one step"
         " late and 0.55 m high there",
-        f"|F_x|, |F_y| <= {mpc.friction:g} F_z <= {mpc.friction * mpc.max_force:g} N here; 0.5 F_z"
-        " <= 125 N there (mu = 2.0 is 1 / 0.5; 2 F_z <= 500)",
+        f"|F_x| + |F_y| <= {mpc.friction:g} F_z <= {mpc.friction * mpc.max_force:g} N here; each of"
+        " |F_x|, |F_y| <= 0.5 F_z <= 125 N there (mu = 2.0 is 1 / 0.5; 2 F_z <= 500)",
         f"-{toe:.3g} F_z (toe) <= M_y <= {heel:.3g} F_z (heel) here; toe and heel swapped there,"
         " and no lower bound on foot 1",
         "M_x = 0 here; 0 to 0.01 N m there",

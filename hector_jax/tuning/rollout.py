@@ -54,7 +54,7 @@ class Variation(NamedTuple):
     mass: Float[Array, "*batch"]  # times the robot's
     inertia: Float[Array, "*batch"]  # likewise, all of it
     com: Float[Array, "*batch 3"]  # true centre of mass from the believed one, trunk axes [m]
-    friction: Float[Array, "*batch"]  # of the ground: most horizontal by vertical force
+    friction: Float[Array, "*batch"]  # of the ground: most |F_x| + |F_y| by F_z, as in the plants
     delay: Float[Array, "*batch"]  # by which effects come late [s], at most a tick
     noise: State  # standard deviations of what the controller sees, white from tick to tick
     seed: Int[Array, "*batch"]  # of the noise
@@ -109,11 +109,11 @@ def _estimate_error(variation: Variation, state: State, tick: Int[Array, ""]) ->
 
 
 def _within_friction(wrench: Wrench, friction: Float[Array, ""]) -> Wrench:
-    """A foot slips: its horizontal force is cut to what the ground can hold."""
-    across, load = wrench.force[:, :2], jnp.maximum(wrench.force[:, 2], 0.0)
-    square = jnp.sum(across**2, axis=-1)
-    slips = square > (friction * load) ** 2
-    share = jnp.where(slips, friction * load / jnp.sqrt(jnp.where(slips, square, 1.0)), 1.0)
+    """A foot slips: its horizontal force is cut to what the friction pyramid can hold."""
+    across = jnp.sum(jnp.abs(wrench.force[:, :2]), axis=-1)
+    held = friction * jnp.maximum(wrench.force[:, 2], 0.0)
+    slips = across > held
+    share = jnp.where(slips, held / jnp.where(slips, across, 1.0), 1.0)
     return wrench._replace(force=wrench.force.at[:, :2].multiply(share[:, None]))
 
 
