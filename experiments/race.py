@@ -33,10 +33,9 @@ from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.evaluation import plots
 from hector_jax.evaluation.report import environment, markdown_table
-from hector_jax.grfm.network import Params, as_effect, load_net
+from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.inputs import InputError
-from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.walk import Job, walk_job
@@ -108,7 +107,7 @@ class Prices(NamedTuple):
 def _course_job(
     method: str, config: TuneConfig, robot: Robot, command: Command, params: Params | None
 ) -> Course:
-    effect = last_command if params is None else as_effect(params)
+    effect = effect_of(params, config.rollout.walk.gait)
     start, anchor, begin = nominal(), standing_anchor(robot), time.monotonic()
     first = difftune.tune_step(config, robot, start, command, anchor, effect)
     jax.block_until_ready(first)

@@ -97,11 +97,6 @@ class Learned(NamedTuple):
     folders: tuple[Path, ...]  # of the walks
 
 
-def _effect(params: Params | None) -> jax.tree_util.Partial:
-    """Phi of a net, or of the plain rigid body."""
-    return last_command if params is None else network.as_effect(params)
-
-
 def _tune_job(
     config: TuneConfig,
     robot: Robot,
@@ -118,7 +113,7 @@ def _tune_job(
         nominal(robot),
         command,
         standing_anchor(robot),
-        _effect(params),
+        network.effect_of(params, config.rollout.walk.gait),
         lambda iteration: tell.put((name, iteration)),
         **_kept_in(record),
     )
@@ -203,7 +198,8 @@ def _measured_job(
 ) -> Evaluation:
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     walked = walk(config.rollout.walk, robot, weights, command, plant, seconds)
-    return evaluate_walk(config, robot, weights, command, _effect(params), walked)
+    effect = network.effect_of(params, config.rollout.walk.gait)
+    return evaluate_walk(config, robot, weights, command, effect, walked)
 
 
 def tune_measured(
@@ -248,9 +244,9 @@ def tune_measured(
 
 
 def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
-    anchor = standing_anchor(robot)
-    norms = difftune.gradient_norms(config, robot, nominal(robot), command, anchor, _effect(params))
-    return jax.device_get(norms)
+    effect = network.effect_of(params, config.rollout.walk.gait)
+    model = command, standing_anchor(robot), effect
+    return jax.device_get(difftune.gradient_norms(config, robot, nominal(robot), *model))
 
 
 def gradient_norms(

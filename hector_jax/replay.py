@@ -19,9 +19,8 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.description import as_table, from_card
 from hector_jax.evaluation.report import environment
-from hector_jax.grfm.network import NetParams, Params, as_effect, layout, widths
+from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
 from hector_jax.inputs import InputError
-from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.storage import WriteError, load_tree, read_card, save_tree
 from hector_jax.trajectory import Trajectory
@@ -173,7 +172,7 @@ def again(path: Path) -> Replayed:
         InputError: see `load`.
     """
     dump, config, about = load(path)
-    effect = last_command if dump.params is None else as_effect(dump.params)
+    effect = effect_of(dump.params, config.rollout.walk.gait)
     problem = dump.robot, dump.weights, dump.command, dump.anchor, effect
     with _on_cpu():
         found = jax.device_get(tune_step(config, *problem))

@@ -16,12 +16,14 @@ from hector_jax.control.weights import (
 )
 from hector_jax.model.effect import last_command
 from hector_jax.robot import load_robot
+from hector_jax.trajectory import Wrench
 from hector_jax.tuning import difftune, sensitivity
 from hector_jax.tuning.difftune import (
     Evaluation,
     TuneConfig,
     aligned,
     gradient_norms,
+    init,
     refusal,
     relative_step,
     step_weights,
@@ -273,6 +275,14 @@ def test_impossible_settings_are_refused(wrong):
 # On the rigid body
 
 SHORT = TuneConfig(rollout=RolloutConfig(ticks=50))  # as in test_rollout, compiled once
+
+
+def test_a_start_whose_feet_differ_is_tied_and_stays_tied():
+    start = nominal()._replace(R=Wrench(*(w * np.array([[2.0], [0.5]]) for w in nominal().R)))
+    progress = init(TuneConfig(), start)
+    np.testing.assert_allclose(vector(progress.trial), vector(nominal()), rtol=1e-12)
+    free = init(TuneConfig(tie_feet=False), start)
+    np.testing.assert_array_equal(vector(free.trial), vector(start))
 
 
 @pytest.mark.slow  # half a minute of compilation

@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 from synthetic import synthetic_walk
 
+from hector_jax.control.gait import GaitConfig
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
 from hector_jax.grfm.gated import fit_gated, gated_effect, hats
 from hector_jax.grfm.network import (
     BOUND,
     ResidualParams,
     as_effect,
+    effect_of,
     fit_linear,
     fit_scaling,
     init_params,
     linear_effect,
     load_net,
     member_effects,
+    plain_net,
     save_net,
 )
-from hector_jax.model.effect import HISTORY, Window
+from hector_jax.model.effect import HISTORY, Window, last_command
 from hector_jax.robot import load_robot
 from hector_jax.trajectory import Wrench
 
@@ -296,3 +299,19 @@ def test_hats_are_one_at_their_knot_and_sum_to_one():
     np.testing.assert_allclose(hats(knots, knots), np.eye(3))
     between = hats(jnp.linspace(-0.01, 0.1, 23), knots)
     np.testing.assert_allclose(between.sum(axis=1), 1.0)
+
+
+def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one(data):
+    windows = jax.tree.map(jnp.asarray, data.window)
+    told = windows.commands._replace(
+        force=windows.commands.force * windows.contact[:, None, :, None],
+        moment=windows.commands.moment * windows.contact[:, None, :, None],
+    )
+    windows = windows._replace(commands=told)  # a foot in the air is commanded nothing
+    gait = GaitConfig()
+    plain, same = (jax.vmap(phi)(windows) for phi in (effect_of(None, gait), last_command))
+    jax.tree.map(np.testing.assert_array_equal, plain.wrench, same.wrench)
+    assert not any(np.any(load) for load in plain.legs)
+    trained = init_params(jax.random.key(0), data)
+    shape = partial(jax.tree.map, lambda x: (x.shape, x.dtype))
+    assert shape(plain_net(gait)) == shape(trained)

@@ -37,7 +37,7 @@ class RolloutConfig:
     walk: WalkConfig = WalkConfig()
     ticks: int = 400  # T; 4 s
     lead: int = 0  # ticks in place before t = 0, outside the loss
-    block: int = 500  # ticks whose solves are kept for the gradient; longer walks are walked twice
+    block: int = 500  # most ticks whose solves are stored; longer rollouts are computed twice
 
     def __post_init__(self) -> None:
         check(self, ticks=Interval(2), lead=NOT_NEGATIVE, block=SOME)
@@ -276,17 +276,14 @@ def rollout(
     if variation is not None:
         standing = jax.tree.map(lambda w: w[0], start.commands)
         start = start._replace(late=Late(standing, Load(jnp.zeros(3), jnp.zeros(3))))
-    blocks = _blocks(config)
+    blocks = -(-len(ticks) // config.block)
     if blocks == 1:
         _, samples = walk(start, ticks)
     else:
-        _, samples = jax.lax.scan(jax.checkpoint(walk), start, ticks.reshape(blocks, -1))
-        samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+        # equal blocks compile to one loop: the last one walks on for a few ticks that are dropped
+        size = -(-len(ticks) // blocks)
+        more = ticks[0] + jnp.arange(blocks * size).reshape(blocks, size)
+        _, samples = jax.lax.scan(jax.checkpoint(walk), start, more)
+        flat = lambda x: x.reshape(-1, *x.shape[2:])[: len(ticks)]  # noqa: E731
+        samples = jax.tree.map(flat, samples)
     return from_start(config, samples)
-
-
-def _blocks(config: RolloutConfig) -> int:
-    """Equal parts, of at most `block` ticks, that a rollout is kept in."""
-    ticks = config.lead + config.ticks
-    fewest = -(-ticks // config.block)
-    return next(count for count in range(fewest, ticks + 1) if ticks % count == 0)
