@@ -64,6 +64,7 @@ ARMS = {
     "model": "the model's own walk from each window's first state",
     "plain": "no net: the plain rigid body",
 }
+CODE = ("tuning.online", "grfm.network", "sim.walk")  # that decides the numbers
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] by which losses are told
 
@@ -234,7 +235,7 @@ def walk_cases(
     def path(case: Case) -> Path:
         how, _, job, effect, moment, arm = cases[case]
         name = "-".join(case).replace(" ", "")
-        ending = digest(how, robot, job, (effect,), moment, arm)
+        ending = digest(how, robot, job, (effect,), moment, arm, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
     def walked(missing: Sequence[Case]) -> Iterator[Walked]:
@@ -256,7 +257,7 @@ def main() -> None:
     robot = jax.tree.map(np.asarray, load_robot())
     flags.out.mkdir(parents=True, exist_ok=True)
     with workers(flags.processes) as pool:
-        net = pipeline.ground(pool, TuneConfig(), robot, flags.data)
+        net = pipeline.ground(pool, robot, flags.data)
         effects = {"command": last_command, "net": as_effect(net.params)}
         effects = {name: jax.tree.map(np.asarray, effect) for name, effect in effects.items()}
         found = walk_cases(pool, flags, robot, effects, starts)

@@ -40,7 +40,7 @@ from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.walk import Job, walk_job
 from hector_jax.sim.world import hfs
-from hector_jax.storage import digest, fingerprint, make_folder, versions, write_file, write_json
+from hector_jax.storage import digest, fingerprint, make_folder, write_file, write_json
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.race import Raced, Turn, lowest, race, walks
@@ -62,6 +62,7 @@ MARKS = (25, 50, 100, 200)  # walks after which the table tells the lowest loss
 ON_MODEL = ("without", "with", "adam")
 WITH_NET = ("with", "adam")
 NEAR = 3.0  # log-weights: a factor of 20 either way
+CODE = ("tuning.rivals", "grfm.network", "sim.walk")  # that decides the numbers
 RATE = 0.05  # of Adam, in log-weights: DiffTune's step in Q
 
 
@@ -153,7 +154,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
         shutil.rmtree(part, ignore_errors=True)  # a cut would leave its seconds unknown
         begin = time.monotonic()
         collection = pipeline.CollectConfig(engine=flags.engine)
-        pipeline.collect(pool, collection, TuneConfig(), robot, part / "walks")
+        pipeline.collect(pool, collection, robot, part / "walks")
         collected = time.monotonic()
         path = pipeline.net_path(part, TrainConfig().variant)
         pipeline.train(TrainConfig(), robot, part / "walks", path)
@@ -161,7 +162,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
         write_json(part / "seconds.json", took)
         part.rename(folder)
     took = json.loads((folder / "seconds.json").read_text())
-    return pipeline.ground(pool, TuneConfig(), robot, folder).params, took
+    return pipeline.ground(pool, robot, folder).params, took
 
 
 def on_model(
@@ -175,7 +176,7 @@ def on_model(
     """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
     # seconds are kept too: they are of this code and so many at once
     made = flags.processes, environment().get("commit")
-    key = digest(config, RATE, command, params, robot, repr(made))
+    key = digest(config, RATE, command, params, robot, repr(made), code=CODE)
     path = flags.out / f"model-{key}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
@@ -234,8 +235,7 @@ def run(
         "plant": fingerprint(hfs()),
         "command": fingerprint(command),
         "start": fingerprint(nominal()),
-        "versions": versions(),
-        "settings": digest(sorted(rivals.items())),
+        "settings": digest(sorted(rivals.items()), code=CODE),
     }
 
     def think(

@@ -98,6 +98,7 @@ class Tune(Configured):
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto aligns the gradient norms
     refresh: Natural = 0  # times to collect again at the tuned weights, train anew and tune again
     data: Path = Path("data")  # walks and net; made where missing
+    net: Path | None = None  # a net of `hector train` to tune through, instead of that of DATA
     runs: Path = Path("runs")  # results go to RUNS/TRAJ/TIME
     run: Path | None = None  # or to this folder, which must not exist (all: to RUN/TRAJ)
     resume: Path | None = None  # take up the run in this folder where it was cut

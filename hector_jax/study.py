@@ -159,7 +159,7 @@ def _make_table(
         make_folder(folder)
     made_with = environment()
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, plan.tune, robot, args.data)
+        net = pipeline.ground(pool, robot, args.data)
         searches = _search(pool, plan, robot, shelf)
         commit = made_with.get("commit", "")
         tunings = {
@@ -204,7 +204,9 @@ def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str,
     """The derivative-free baseline of all trajectories, in lock-step."""
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
     engine, model = pipeline.choose_engine("auto"), plan.tune.rollout
-    key = digest(engine, model, plan.tune.loss, settings, robot, hfs(), nominal())
+    key = digest(
+        engine, model, plan.tune.loss, settings, robot, hfs(), nominal(), code=pipeline.SEARCH_CODE
+    )
     starts = dict.fromkeys(plan.commands, nominal())
     folder = shelf / f"search-{key}"
     return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)

@@ -40,7 +40,8 @@ def view_run(args: View) -> None:
         make_folder(folder)
     sets = {name: runs.weights_of(args.run, name, robot) for name in args.sets}
     data = asked.folder_of(args.data or begun.data, begun.robot, robot)
-    effect = _phi_of(data, begun.variant, robot)
+    net = begun.net if args.data is None and begun.net else pipeline.net_path(data, begun.variant)
+    effect = _phi_of(net, begun.variant, robot)
     story = [f"**{begun.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
     shown: dict[str, view.Shown] = {}
     say(f"walking anew in {args.world}, seed {args.seed}")
@@ -71,9 +72,8 @@ def view_run(args: View) -> None:
     )
 
 
-def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
-    """Phi of the net that is kept under `data`; where there is none, a line says so."""
-    path = pipeline.net_path(data, variant)
+def _phi_of(path: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
+    """Phi of the net in a file; where there is none, a line says so."""
     if not path.exists():
         say(f"no net at {path}, so none of its predictions; --data names another folder")
         return None

@@ -105,6 +105,9 @@ class LinearMap(NamedTuple):
     outputs: Scaling
 
 
+LINEAR = jax.tree.structure(LinearMap(0, 0, *[Scaling(Wrench(0, 0), Wrench(0, 0))] * 2))  # pyright: ignore
+
+
 class Net(nn.Module):
     """Layers of linear, layer normalisation and softsign, then a linear one."""
 
