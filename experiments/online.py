@@ -23,7 +23,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -54,7 +54,7 @@ from hector_jax.storage import digest, load_weights, write_file, write_json
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
-from hector_jax.tuning.online import OnlineConfig, retuner
+from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner
 
 ARMS = {
     "fixed": "weights stay",
@@ -149,21 +149,20 @@ def _walk_case(
     """One walk of an arm; in a worker."""
     steps: list[Iteration] = []
     took: list[float] = []
-    step = retuner(config, robot, job.weights, job.command, effect, steps.append)
+    online = retuner(config, robot, job.weights, job.command, effect, steps.append)
     last_tick = round(moment / config.tune.rollout.walk.gait.tick)
-    kept: Weights = job.weights
 
-    def retune(tick, anchor, measurement, last):
-        nonlocal kept
+    def step(carry: Adaptation, tick: int, *measured: Any) -> tuple[Adaptation, Weights]:
         if arm == "until" and tick >= last_tick:
-            return kept
+            return carry, carry.weights
         count, start = len(steps), time.process_time()
-        kept = step(tick, anchor, measurement, last)
+        carry, weights = online.step(carry, tick, *measured)
         if len(steps) > count:
             took.append(time.process_time() - start)
-        return kept
+        return carry, weights
 
-    told = walk(config.tune.rollout.walk, robot, *job, retune=None if arm == "fixed" else retune)
+    retune = None if arm == "fixed" else online._replace(step=step)
+    told = walk(config.tune.rollout.walk, robot, *job, retune=retune)
     middle, end = round(1e3 * moment), len(told.fallen)
     found = [_loss(_cut(told, *span)) for span in ((0, middle), (middle, end))]
     spans = [(i, i + round(1e3 * WINDOW)) for i in range(0, end, round(1e3 * WINDOW))]

@@ -5,8 +5,9 @@ along; the MuJoCo worlds call `step_plan` and `actuate` with what they measure. 
 the nominal robot only, never the plant's own numbers.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,6 +100,14 @@ class Plan(NamedTuple):
     swing_ticks: Int[Array, "*batch 2"]  # since lift-off
     residual: Float[Array, "*batch"]  # worst relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see control.qp
+
+
+class Retune(NamedTuple):
+    """Weights that change while they walk: a carry, and what gives those of the next tick."""
+
+    init: Any  # carry before t = 0
+    # carry, gait tick, anchor, what is measured, wrench commanded over the tick before
+    step: Callable[[Any, int, Anchor, Measurement, Wrench], tuple[Any, Weights]]
 
 
 def slots_needed(config: WalkConfig, tick: int) -> int:
