@@ -38,6 +38,7 @@ from hector_jax.export import (
     weights_cpp,
     weights_schema,
 )
+from hector_jax.inputs import InputError
 from hector_jax.robot import load_robot
 from hector_jax.storage import load_weights, save_weights, weights_tree
 from hector_jax.trajectory import State, pack_wrench
@@ -390,6 +391,14 @@ def test_a_run_is_exported_with_its_own_controller(run):
     hash(find_weights(run, "with")[1])
     path = run / "weights" / "with.json"
     assert find_weights(path, "with") == (path, None)
+
+
+def test_a_setting_that_this_version_does_not_know_is_not_dropped(run):
+    kept = asdict(CONFIG)
+    kept["mpc"]["mu"] = kept["mpc"].pop("friction")
+    (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
+    with pytest.raises(InputError, match="tune.rollout.walk: mpc: unknown field 'mu'"):
+        find_weights(run, "with")
 
 
 @pytest.mark.parametrize(

@@ -61,13 +61,8 @@ def walk_config(robot: Robot) -> WalkConfig:
     Raises:
         InputError: one line naming the file, the key and what was expected.
     """
-    path, given = robot.description.path, dict(robot.description.control)
-    kinds = {"gait": GaitConfig, "mpc": MpcConfig, "footstep": FootstepConfig, "legs": LegConfig}
-    parts = {
-        name: from_table(f"{path}: {name}", kind, dict(given.get(name, ())))
-        for name, kind in kinds.items()
-    }
-    return from_table(str(path), WalkConfig, parts)
+    given = {name: dict(section) for name, section in robot.description.control}
+    return from_table(str(robot.description.path), WalkConfig, given)
 
 
 class Feet(NamedTuple):
