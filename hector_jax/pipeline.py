@@ -183,9 +183,11 @@ def tune_many(
         }
         tell(done, config.iterations * len(problems), "compiling")
         while not all(future.done() for future in running.values()) or not heard.empty():
+            failed = [future for future in running.values() if future.done() and future.exception()]
             if heard.empty():
-                for future in wait(running.values(), timeout=0.1).done:
-                    future.result()  # one that failed is told now, not when the others have ended
+                for future in failed:
+                    future.result()  # raises now, not when the others have ended
+                wait(running.values(), timeout=0.1)
                 continue
             name, iteration = heard.get()
             done += iteration.iteration > 0

@@ -131,7 +131,6 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         description = from_card(about.get("description", {}))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: settings that this version does not know: {error}") from error
-    config = from_table(f"{path}: config", TuneConfig, about.get("config"))
     like = Dump(
         load_robot()._replace(description=description),
         nominal(),
@@ -141,7 +140,7 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         Evaluation(none, Losses(none, none, none), nominal(), none, none),
     )
     dump, _ = load_tree(path, like, kind=_KIND)
-    return dump, config, about
+    return dump, from_table(f"{path}: config", TuneConfig, about.get("config")), about
 
 
 _walk = jax.jit(rollout, static_argnums=0)

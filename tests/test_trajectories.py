@@ -19,6 +19,7 @@ from hector_jax.control.reference import (
 from hector_jax.control.trajectories import beyond, course, limits, load_course
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
+from hector_jax.inputs import InputError
 from hector_jax.robot import load_robot
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
@@ -151,7 +152,7 @@ def walked(monkeypatch):
 
     def pretend(config, robot, weights, command, plant, seconds, seed):
         walks.append((command, seconds))
-        raise ValueError("walked")
+        raise InputError("walked")
 
     monkeypatch.setattr(asked, "walk", pretend)
     return walks
