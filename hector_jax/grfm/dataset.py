@@ -452,17 +452,20 @@ def make_dataset(
     """
     config = config or walk_config(robot).gait
     count = len(walks.fallen)
-    starts = jnp.broadcast_to(jnp.asarray(start_tick, jnp.int32), (count,))
+    starts = np.broadcast_to(np.asarray(start_tick, np.int32), (count,))
     pushes = jax.tree.map(
-        lambda given, one: jnp.broadcast_to(given, (count, *jnp.shape(given)[-one.ndim :])),
+        lambda given, one: np.broadcast_to(given, (count, *np.shape(given)[-one.ndim :])),
         push,
         NO_PUSH,
     )
-    samples, usable = jax.vmap(lambda *walk: _samples(config, robot, *walk))(
-        jnp.arange(count), starts, pushes, jax.tree.map(jnp.asarray, walks)
-    )
+    samples, usable = _all_samples(config, robot, np.arange(count), starts, pushes, walks)
     usable = np.asarray(usable)
     return jax.tree.map(lambda x: np.asarray(x)[usable], samples), int((~usable).sum())
+
+
+@partial(jax.jit, static_argnums=0)
+def _all_samples(config, robot, numbers, starts, pushes, walks):
+    return jax.vmap(partial(_samples, config, robot))(numbers, starts, pushes, walks)
 
 
 def _samples(

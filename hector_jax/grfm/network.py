@@ -164,10 +164,8 @@ def init_params(
         )
     inputs, outputs = _sizes(variant)
     net, x = Net(hidden or HIDDEN[variant], outputs), jnp.zeros(inputs)
-    force, moment = (
-        jax.vmap(lambda k: net.init(k, x)["params"])(jax.random.split(k, MEMBERS[variant]))
-        for k in jax.random.split(key)
-    )
+    draw = jax.jit(jax.vmap(lambda k: net.init(k, x)["params"]))
+    force, moment = (draw(jax.random.split(k, MEMBERS[variant])) for k in jax.random.split(key))
     if variant == "paper":
         first = partial(jax.tree.map, lambda p: p[0])
         scalings = fit_scaling(dataset.window.commands), fit_scaling(dataset.label)
