@@ -44,7 +44,7 @@ def test_nothing_is_compiled_after_the_first_iteration(work):
     nets = [jax.tree.map(np.asarray, small_net(seed)) for seed in range(2)]
     # steps that are too long, so that some are refused
     config = TuneConfig(
-        rollout=SHORT, iterations=13, beta_q=0.9, beta_r=0.9, gain=0.0, smallest_step=1e-300
+        rollout=SHORT, iterations=13, beta_q=0.9, beta_r=0.9, patience=50, smallest_step=1e-300
     )
     seen = []
 
