@@ -248,8 +248,9 @@ def front(
         panels[0].set_ylabel(r"$L_\mathrm{ctrl}$ [10$^6$]")
         legend(figure, panels[-1])
     return (
-        "Each point is a tuning with tracking priced higher by one factor from point to point; the "
-        "ends and the paper's price (x1) have labels. Left and down is better."
+        "Each point is a tuning. Along the line the price of tracking grows by one factor from "
+        "point to point; labels stand at its ends and at the paper's price (x1). Left and down is "
+        "better."
     )
 
 
