@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.console import Broken
 from hector_jax.evaluation.plots import distances, named
 from hector_jax.geometry import rotation_from_euler
-from hector_jax.inputs import POSITIVE, SOME, InputError, Interval, check
+from hector_jax.inputs import SOME, InputError, Interval, check
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, from_start
 
@@ -58,12 +58,11 @@ class VideoConfig:
     width: int = 800  # [pixel], both halves together
     height: int = 540  # a quarter of it is the plot below
     rate: int = 20  # frames per second
-    speed: float = 1.0  # of the film over that of the walk
     tiles: int = 6  # pictures in a row of the strip
 
     def __post_init__(self) -> None:
         size = Interval(64, 8192)
-        check(self, width=size, height=size, rate=SOME, speed=POSITIVE, tiles=SOME)
+        check(self, width=size, height=size, rate=SOME, tiles=SOME)
         for name in ("width", "height"):
             if getattr(self, name) % 4:
                 raise InputError(
@@ -113,7 +112,7 @@ def write_film(
             imageio_ffmpeg.get_ffmpeg_exe()
         except RuntimeError as error:
             raise VideoUnavailable(f"no film: no video encoder ({_one_line(str(error))})") from None
-    times = np.arange(0.0, _seconds(walks) + 1e-9, config.speed / config.rate)
+    times = np.arange(0.0, _seconds(walks) + 1e-9, 1.0 / config.rate)
     return _write(path, config, robot, walks, times, strip=False)
 
 

@@ -23,6 +23,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.evaluation.plots import named
 from hector_jax.evaluation.runs import METRICS, RESULT, as_sentence, curves, read_histories
 from hector_jax.evaluation.video import COLOURS, poses
 from hector_jax.geometry import rot_z
@@ -131,7 +132,7 @@ def motion(robot: Robot, model: mujoco.MjModel, shown: Shown) -> Motion:
 
 def titles(names: Iterable[str]) -> list[str]:
     """What stands above two walks."""
-    return [f"{when}: {name}" for when, name in zip(("before", "after"), names, strict=True)]
+    return [f"{when}: {named(name)}" for when, name in zip(("before", "after"), names, strict=True)]
 
 
 def _body_frames(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

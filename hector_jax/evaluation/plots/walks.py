@@ -119,7 +119,7 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
     """
     walks = {name: from_start(walk) for name, walk in walks.items()}
     span, width = _span(walks), 7.0
-    with drawing(path, width, float(np.clip(width * span[1] / span[0], 1.4, 5.0)) + 0.9) as figure:
+    with drawing(path, width, float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9) as figure:
         axes = figure.subplots()
         _draw_path(axes, walks)
         legend(figure, axes, columns=4)
@@ -145,7 +145,7 @@ def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
         spots = last.feet[landed[:, foot] & ~last.fallen, foot]
         look = {"linestyle": "none", "marker": marker, "color": "0.6", "markersize": 6, "zorder": 1}
         axes.plot(*spots[:, :2].T, **look, label=f"{side} foot set down")
-    axes.set(xlabel="x [m], ahead at t = 0", ylabel="y [m], to the left", aspect="equal")
+    axes.set(xlabel="x, ahead [m]", ylabel="y, left [m]", aspect="equal")
     axes.margins(0.05, 0.1)
 
 
