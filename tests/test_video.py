@@ -1,5 +1,7 @@
 """Films: poses are those that were walked, and no machine's missing back end ends a run."""
 
+import subprocess
+
 import imageio_ffmpeg
 import mujoco
 import numpy as np
@@ -126,6 +128,31 @@ def test_no_back_end_costs_one_line(robot, tmp_path, monkeypatch):
         write_film(tmp_path / "film.mp4", robot, walks)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_the_plot_of_a_frame_is_pale_where_time_has_not_come_yet(robot, count):
+    walks = {"a": pretend_walk(seconds=1.0), "b": pretend_walk(seconds=1.0)}
+    request = request_of(robot, walks, np.linspace(0.0, 1.0, 5)[:count])
+    request["box"] = (20, 10, 120, 40)
+    black = np.zeros((60, 140, 3), np.uint8)
+    half = np.zeros((100, 70, 3), np.uint8)
+    for k in range(count):
+        below = np.asarray(video._frame(request, black, [half, half], k))[100:, :, 0]
+        assert below.shape == (60, 140)
+        past = below[10:40, 20:121].max(axis=0) == 0
+        assert past.tolist() == [True] * (25 * k) + [False] * (101 - 25 * k)
+        assert not np.delete(below, np.s_[10:40], axis=0).any()
+
+
+def test_a_back_end_that_fails_is_told_by_its_first_fault(tmp_path, monkeypatch):
+    text = (
+        "warning\nTraceback (most recent call last):\n  File a\nKeyError: 'sky'\n"
+        "Exception ignored in: x\nTraceback (most recent call last):\n  File b\nEGLError: (\n)\n"
+    )
+    done = subprocess.CompletedProcess([], 1, "", text)
+    monkeypatch.setattr(video.subprocess, "run", lambda *args, **rest: done)
+    assert video._draw_in_child(tmp_path, "egl") == "KeyError: 'sky'"
 
 
 def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatch):

@@ -198,8 +198,10 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
         return f"not done after {_PATIENCE:.0f} s"
     if done.returncode == 0:
         return ""
-    said = [line for line in done.stderr.splitlines() if line.strip() and line[0] != " "]
-    return _one_line(said[-1]) if said else f"ended with code {done.returncode}"
+    # what ends the first traceback; those that follow are of what it left open
+    first = done.stderr.split("Traceback (most recent call last):")[:2][-1]
+    said = [line for line in first.splitlines() if line.strip() and line[0] != " "]
+    return _one_line(said[0]) if said else f"ended with code {done.returncode}"
 
 
 def _request(
@@ -212,6 +214,7 @@ def _request(
     request: dict[str, Any] = {
         "size": np.array([config.width, config.height, config.rate]),
         "times": times,
+        "seconds": max(float(walk.period) * len(walk.fallen) for walk in walks.values()),
         "top": _TOP * robot.standing_height,
         "model": np.array(str(robot.description.model.resolve())),
         "labels": np.array([named(name) for name in walks]),
@@ -360,7 +363,7 @@ def _frame(
 ) -> Image.Image:
     """Both halves with their words, and below the plot, pale where time has not come yet."""
     left, top, right, bottom = request["box"]
-    now = round(left + (right - left) * request["times"][k] / request["times"][-1])
+    now = round(left + (right - left) * request["times"][k] / request["seconds"])
     plot = plot.copy()
     ahead = plot[top:bottom, now : right + 1]
     ahead[:] = 255 - (255 - ahead) // 5
@@ -379,7 +382,7 @@ def _frame(
 
 def _words(
     draw: ImageDraw.ImageDraw,
-    place: tuple[float, float],
+    place: tuple[int, int],
     text: str,
     colour: tuple[int, int, int] | None,
     size: int = 16,

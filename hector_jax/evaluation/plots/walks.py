@@ -103,7 +103,11 @@ def distances(
             label = f"{named(name)}: {mean:.1f} cm RMS"
             axes.plot(_times(walk), away, color=np.divide(colour, 255), ls=style, label=label)
         axes.set_title("distance from the reference [cm]", loc="left")
-        axes.set(xlabel="time [s]", xlim=(0.0, axes.dataLim.x1), ylim=(0.0, None))
+        axes.set(
+            xlabel="time [s]",
+            xlim=(0.0, max(_times(walk)[-1] for walk in walks.values())),
+            ylim=(0.0, None),
+        )
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderaxespad=0.1)
         figure.draw_without_rendering()
         box = axes.get_window_extent()
