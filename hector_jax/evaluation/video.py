@@ -374,7 +374,7 @@ def _frame(
         _words(draw, (i * half + 12, 12), str(label), COLOURS[i])
         if request["times"][k] >= request[f"fall_{i}"]:
             _words(draw, (i * half + 12, 40), f"fell at {request[f'fall_{i}']:.2f} s", COLOURS[0])
-    draw.rectangle((half - 1, 0, half, height), fill="white")
+    draw.rectangle((half - 1, 0, half, height - 1), fill="white")
     _words(draw, (picture.width - 12, height - 12), f"{request['times'][k]:.1f} s", None, 14, "rb")
     _words(draw, (picture.width - 12, 12), "dashed: reference", None, 14, "rt")
     return picture
