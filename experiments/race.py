@@ -380,7 +380,8 @@ def report(
         "rollouts.png": plots.race(
             flags.out / "rollouts.png", count, "walks on the high-fidelity simulator"
         ),
-        "seconds.png": plots.race(flags.out / "seconds.png", spent, "seconds of one core"),
+        "seconds.png": plots.race(flags.out / "seconds.png", spent, "seconds of one core")
+        + " The methods with the net begin after its walks and its training.",
     }
     about = environment()
     write_json(

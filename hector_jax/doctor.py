@@ -12,7 +12,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
 from hector_jax.evaluation.report import environment
-from hector_jax.evaluation.video import VideoUnavailable, write_video
+from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.pipeline import walk_rigid_body
 from hector_jax.robot import MODEL_PATH, Robot, load_robot
@@ -81,6 +81,7 @@ def _video(robot: Robot, walked: Trajectory) -> str:
     with tempfile.TemporaryDirectory() as folder:
         pair = {"one": walked, "other": walked}
         try:
-            return f"works ({write_video(Path(folder) / 'film.mp4', robot, pair)})"
+            film = Path(folder) / "film.mp4"
+            return f"works ({write_film(film, robot, pair, VideoConfig(rate=2))})"
         except VideoUnavailable as error:
             return str(error)

@@ -185,7 +185,7 @@ class Walk(Configured):
     weights: str = "nominal"  # nominal, expert or a weights file
     seconds: Seconds = 4.0  # of the walk [s]
     out: Path | None = None  # keep the trajectory (.npz)
-    video: Path | None = None  # film it (.mp4), nominal weights beside it
+    video: Path | None = None  # film it beside the nominal weights (.mp4; .webp for a page)
     json: bool = False  # print JSON instead of words
     robot: Path | None = None  # TOML of another biped; HECTOR by default
 

@@ -20,7 +20,7 @@ from hector_jax.evaluation import metrics, plots, table
 from hector_jax.evaluation.metrics import BASELINES, Verdict
 from hector_jax.evaluation.report import Picture, environment
 from hector_jax.evaluation.table import PAPER, Earlier, Fall, Search, Table
-from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_video
+from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.grfm.network import Params
 from hector_jax.inputs import InputError
 from hector_jax.kept import Judged, Tuned
@@ -48,7 +48,7 @@ CEILING = "ceiling"
 # what `quick` cuts down to, so that all is done in under five minutes on two cores
 _QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "steps": 2}
 
-_SNAPSHOTS = VideoConfig(width=640, height=214, rate=8)  # no film of it is kept
+_SNAPSHOTS = VideoConfig(height=360)
 
 
 @dataclass(frozen=True)
@@ -324,9 +324,9 @@ def _draw(
 
 def _snapshots(folder: Path, robot: Robot, shown: Mapping[str, Trajectory]) -> Path | None:
     """A strip of both walks; None, with one line, where nothing can be drawn here."""
-    pair = {"nominal": shown["nominal"], "tuned with net": shown["with"]}
+    pair = {name: shown[name] for name in ("nominal", "with")}
     try:
-        write_video(folder / "film.mp4", robot, pair, folder / "strip.png", _SNAPSHOTS)
+        write_strip(folder / "strip.png", robot, pair, _SNAPSHOTS)
     except VideoUnavailable as error:
         say(f"no snapshots: {error}")
         return None

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -83,7 +84,10 @@ def walk(args: Walk) -> None:
         pictures.film(
             args.video,
             robot,
-            {beside: asked.walked(args, robot, wanted, other(robot)), args.weights: trajectory},
+            {
+                beside: asked.walked(args, robot, wanted, other(robot)),
+                Path(args.weights).stem: trajectory,
+            },
         )
 
 

@@ -55,12 +55,12 @@ def view_run(args: View) -> None:
         effects = {} if effect is None else {"residual": effect}
         curves = fidelity.curves(robot, stacked, effects)
         shown[name] = view.Shown(walked, curves)
-    model = compile_model(robot.description)
-    motions = [view.motion(robot, model, one) for one in shown.values()]
     if folder is not None:
-        pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown, motions)
+        pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown)
         say(f"film and pictures are in {folder}")
         return
+    model = compile_model(robot.description)
+    motions = [view.motion(robot, model, one) for one in shown.values()]
     view.serve(
         dict(zip(view.titles(shown), motions, strict=True)),
         model,

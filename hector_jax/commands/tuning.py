@@ -261,8 +261,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     drawn = pictures.of_run(folder, config, sets, histories, walks, curves, net.course)
     film: Picture | str = "left out (--no-video)"
     if args.video:
-        say("drawing the film")
-        pair = {"nominal": walks["nominal"], "tuned with net": walks["with"]}
+        pair = {name: walks[name] for name in ("nominal", "with")}
         caption = "Nominal and tuned weights on the first stand-in plant."
         film = pictures.film(folder / "film.mp4", robot, pair, folder / "film.png") or Picture(
             "film.mp4", caption
