@@ -30,7 +30,6 @@ from hector_jax.robot import load_robot
 from hector_jax.runtime import all_devices, setup_jax
 from hector_jax.tuning.batch import Problem, Scenario, lanes_of, stack, tune_batch
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Stop, TuneConfig, tune
-from hector_jax.tuning.loss import Alpha
 from hector_jax.tuning.rollout import RolloutConfig
 
 NAME = "straight"
@@ -77,7 +76,7 @@ def measure(
     anchor = standing_anchor(robot)
     effect = last_command if net is None else as_effect(load_net(net, robot)[0])
     starts = disturbed(nominal(), 1.5, min(DRAWN, max(singles, many, 1)))
-    alpha = Alpha(np.asarray(config.loss.euler), np.asarray(config.loss.position))
+    alpha = config.loss.as_arrays()
     scenario = Scenario(command, anchor, np.asarray(0), alpha, np.asarray(1.0))
 
     def start(i: int) -> Weights:

@@ -48,7 +48,7 @@ from hector_jax.tuning.batch import (
     tune_batch,
 )
 from hector_jax.tuning.difftune import Reason, Stop, TuneConfig, stopped
-from hector_jax.tuning.loss import Alpha, LossConfig, Losses
+from hector_jax.tuning.loss import LossConfig, Losses
 from hector_jax.tuning.rollout import Variation, no_variation
 
 HELD_BACK = Command(  # ahead, aside and into turns of another rate: no tuning walks it
@@ -142,9 +142,9 @@ def scenario(
     variation: Variation | None = None,
 ) -> Scenario:
     """A walk from standing, its tracking priced `tracking` times as in the paper."""
-    alpha = Alpha(*(np.asarray(tracking * a) for a in (LossConfig.euler, LossConfig.position)))
+    prices = LossConfig(tracking * LossConfig.euler, tracking * LossConfig.position)
     anchor, which = standing_anchor(robot), np.asarray(effect)
-    return Scenario(command, anchor, which, alpha, np.asarray(scale), variation)
+    return Scenario(command, anchor, which, prices.as_arrays(), np.asarray(scale), variation)
 
 
 def problem(start: Weights, scenarios: Sequence[Scenario], tail: float = 1.0) -> Problem:

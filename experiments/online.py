@@ -23,7 +23,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -54,7 +54,7 @@ from hector_jax.storage import digest, load_weights, write_file, write_json
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
-from hector_jax.tuning.online import OnlineConfig, retuner
+from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner
 
 ARMS = {
     "fixed": "weights stay",
@@ -64,6 +64,7 @@ ARMS = {
     "model": "the model's own walk from each window's first state",
     "plain": "no net: the plain rigid body",
 }
+CODE = ("tuning.online", "grfm.network", "sim.walk")  # that decides the numbers
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] by which losses are told
 
@@ -148,21 +149,20 @@ def _walk_case(
     """One walk of an arm; in a worker."""
     steps: list[Iteration] = []
     took: list[float] = []
-    step = retuner(config, robot, job.weights, job.command, effect, steps.append)
+    online = retuner(config, robot, job.weights, job.command, effect, steps.append)
     last_tick = round(moment / config.tune.rollout.walk.gait.tick)
-    kept: Weights = job.weights
 
-    def retune(tick, anchor, measurement, last):
-        nonlocal kept
+    def step(carry: Adaptation, tick: int, *measured: Any) -> tuple[Adaptation, Weights]:
         if arm == "until" and tick >= last_tick:
-            return kept
+            return carry, carry.weights
         count, start = len(steps), time.process_time()
-        kept = step(tick, anchor, measurement, last)
+        carry, weights = online.step(carry, tick, *measured)
         if len(steps) > count:
             took.append(time.process_time() - start)
-        return kept
+        return carry, weights
 
-    told = walk(config.tune.rollout.walk, robot, *job, retune=None if arm == "fixed" else retune)
+    retune = None if arm == "fixed" else online._replace(step=step)
+    told = walk(config.tune.rollout.walk, robot, *job, retune=retune)
     middle, end = round(1e3 * moment), len(told.fallen)
     found = [_loss(_cut(told, *span)) for span in ((0, middle), (middle, end))]
     spans = [(i, i + round(1e3 * WINDOW)) for i in range(0, end, round(1e3 * WINDOW))]
@@ -234,7 +234,7 @@ def walk_cases(
     def path(case: Case) -> Path:
         how, _, job, effect, moment, arm = cases[case]
         name = "-".join(case).replace(" ", "")
-        ending = digest(how, robot, job, (effect,), moment, arm)
+        ending = digest(how, robot, job, (effect,), moment, arm, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
     def walked(missing: Sequence[Case]) -> Iterator[Walked]:
@@ -256,7 +256,7 @@ def main() -> None:
     robot = jax.tree.map(np.asarray, load_robot())
     flags.out.mkdir(parents=True, exist_ok=True)
     with workers(flags.processes) as pool:
-        net = pipeline.ground(pool, TuneConfig(), robot, flags.data)
+        net = pipeline.ground(pool, robot, flags.data)
         effects = {"command": last_command, "net": as_effect(net.params)}
         effects = {name: jax.tree.map(np.asarray, effect) for name, effect in effects.items()}
         found = walk_cases(pool, flags, robot, effects, starts)

@@ -33,15 +33,14 @@ from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.evaluation import plots
 from hector_jax.evaluation.report import environment, markdown_table
-from hector_jax.grfm.network import Params, as_effect, load_net
+from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.inputs import InputError
-from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
 from hector_jax.sim.walk import Job, walk_job
 from hector_jax.sim.world import hfs
-from hector_jax.storage import digest, fingerprint, make_folder, versions, write_file, write_json
+from hector_jax.storage import digest, fingerprint, make_folder, write_file, write_json
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.race import Raced, Turn, lowest, race, walks
@@ -63,6 +62,7 @@ MARKS = (25, 50, 100, 200)  # walks after which the table tells the lowest loss
 ON_MODEL = ("without", "with", "adam")
 WITH_NET = ("with", "adam")
 NEAR = 3.0  # log-weights: a factor of 20 either way
+CODE = ("tuning.rivals", "grfm.network", "sim.walk")  # that decides the numbers
 RATE = 0.05  # of Adam, in log-weights: DiffTune's step in Q
 
 
@@ -108,7 +108,7 @@ class Prices(NamedTuple):
 def _course_job(
     method: str, config: TuneConfig, robot: Robot, command: Command, params: Params | None
 ) -> Course:
-    effect = last_command if params is None else as_effect(params)
+    effect = effect_of(params, config.rollout.walk.gait)
     start, anchor, begin = nominal(), standing_anchor(robot), time.monotonic()
     first = difftune.tune_step(config, robot, start, command, anchor, effect)
     jax.block_until_ready(first)
@@ -154,7 +154,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
         shutil.rmtree(part, ignore_errors=True)  # a cut would leave its seconds unknown
         begin = time.monotonic()
         collection = pipeline.CollectConfig(engine=flags.engine)
-        pipeline.collect(pool, collection, TuneConfig(), robot, part / "walks")
+        pipeline.collect(pool, collection, robot, part / "walks")
         collected = time.monotonic()
         path = pipeline.net_path(part, TrainConfig().variant)
         pipeline.train(TrainConfig(), robot, part / "walks", path)
@@ -162,7 +162,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
         write_json(part / "seconds.json", took)
         part.rename(folder)
     took = json.loads((folder / "seconds.json").read_text())
-    return pipeline.ground(pool, TuneConfig(), robot, folder).params, took
+    return pipeline.ground(pool, robot, folder).params, took
 
 
 def on_model(
@@ -176,7 +176,7 @@ def on_model(
     """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
     # seconds are kept too: they are of this code and so many at once
     made = flags.processes, environment().get("commit")
-    key = digest(config, RATE, command, params, robot, repr(made))
+    key = digest(config, RATE, command, params, robot, repr(made), code=CODE)
     path = flags.out / f"model-{key}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
@@ -235,8 +235,7 @@ def run(
         "plant": fingerprint(hfs()),
         "command": fingerprint(command),
         "start": fingerprint(nominal()),
-        "versions": versions(),
-        "settings": digest(sorted(rivals.items())),
+        "settings": digest(sorted(rivals.items()), code=CODE),
     }
 
     def think(
@@ -381,7 +380,8 @@ def report(
         "rollouts.png": plots.race(
             flags.out / "rollouts.png", count, "walks on the high-fidelity simulator"
         ),
-        "seconds.png": plots.race(flags.out / "seconds.png", spent, "seconds of one core"),
+        "seconds.png": plots.race(flags.out / "seconds.png", spent, "seconds of one core")
+        + " The methods with the net begin after its walks and its training.",
     }
     about = environment()
     write_json(

@@ -51,7 +51,6 @@ from hector_jax.storage import fingerprint, load_weights, write_file, write_json
 from hector_jax.tuning.loss import LossConfig
 
 BASELINE = "nominal"
-HEADLINE = {"push": 50.0, "friction": 0.4}  # of the kinds that are drawn as curves
 
 
 @dataclass(frozen=True)
@@ -172,18 +171,9 @@ def report(flags: Flags, found: Found, folder: Path) -> Path:
     """Write the report with its pictures and its numbers as JSON; returns its path."""
     folder.mkdir(parents=True, exist_ok=True)
     world, count = WORLDS.get(flags.world, flags.world), flags.scenes.phases
-    curves = {
-        kind: {level.size: row for level, row in found.cells.items() if level.kind == kind}
-        for kind in HEADLINE
-    }
-    rows = {
-        level.name: row
-        for level, row in found.cells.items()
-        if level.size == HEADLINE.get(level.kind, level.size)
-    }
+    rows = {level.name: row for level, row in found.cells.items()}
     captions = {
-        "curves.png": plots.survival(folder / "curves.png", curves),
-        "scenes.png": plots.scene_ratios(folder / "scenes.png", rows),
+        "levels.png": plots.survival(folder / "levels.png", rows),
         "directions.png": plots.push_directions(folder / "directions.png", found.endured),
     }
     last = flags.first_seed + flags.seeds - 1

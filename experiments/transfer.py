@@ -118,8 +118,7 @@ def phis(
                 "A --data folder of its own gives this one nets"
             )
             return effects, None
-    shared = TuneConfig(rollout=RolloutConfig(walk=config.rollout.walk))  # data know no lead
-    net, paper = (pipeline.ground(pool, shared, robot, data, name) for name in (None, "paper"))
+    net, paper = (pipeline.ground(pool, robot, data, name) for name in (None, "paper"))
     default = as_effect(net.params)
     effects |= {
         "linear": linear_effect(net.linear),

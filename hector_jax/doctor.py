@@ -13,7 +13,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
 from hector_jax.evaluation.report import environment
-from hector_jax.evaluation.video import VideoUnavailable, write_video
+from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.inputs import one_line
 from hector_jax.pipeline import walk_rigid_body
@@ -86,4 +86,5 @@ def _walks(robot: Robot) -> dict[str, Trajectory]:
 def _film(robot: Robot, walked: Trajectory) -> str:
     """Draw a film; the back end that drew it."""
     with tempfile.TemporaryDirectory() as folder:
-        return write_video(Path(folder) / "film.mp4", robot, {"one": walked, "other": walked})
+        film, pair = Path(folder) / "film.mp4", {"one": walked, "other": walked}
+        return write_film(film, robot, pair, VideoConfig(rate=2))

@@ -126,6 +126,7 @@ class Tune(Configured):
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
     refresh: Annotated[int, Interval(0, 100)] = 0  # times to collect at the new weights and repeat
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
+    net: Annotated[Path | None, Source.FILE] = None  # file of another net, instead of that in DATA
     runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
     run: Path | None = None  # the run folder itself, which must not exist (with all: RUN/TRAJ)
     resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
@@ -213,7 +214,7 @@ class Walk(Configured):
     weights: Weights = "nominal"  # nominal, expert or a weights file
     seconds: Seconds = 4.0  # length of the walk [s]
     out: Path | None = None  # file for the trajectory (.npz)
-    video: Path | None = None  # file for a film (.mp4) beside a walk with nominal weights
+    video: Path | None = None  # file for a film beside nominal weights (.mp4; .webp for a page)
     json: bool = False  # print JSON instead of text
     robot: Robot = None  # TOML file of another biped; HECTOR by default
 

@@ -245,7 +245,7 @@ def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
 
 
 def from_table(where: str, kind: type[T], table: Any) -> T:
-    """A dataclass from a table of a file.
+    """A dataclass from a table of a file; dataclasses inside it from tables inside that.
 
     Args:
         where: the file and the place in it, for the message.
@@ -266,9 +266,9 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
                 f"known: {', '.join(fields)}"
             )
     for name, field in fields.items():
-        if name not in table and field.default is dataclasses.MISSING:
+        if name not in table and field.default is field.default_factory is dataclasses.MISSING:
             raise InputError(f"{where}: missing field {name!r}; known: {', '.join(fields)}")
-    values = {name: _as_float(fields[name].type, value) for name, value in table.items()}
+    values = {name: _value(f"{where}: {name}", fields[name].type, x) for name, x in table.items()}
     rules = getattr(kind, "RULES", {})
     for name, value in values.items():
         if told := problem(value, fields[name].type, rules.get(name)):
@@ -280,8 +280,10 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         raise InputError(f"{where}: {told}") from None
 
 
-def _as_float(kind: Any, value: Any) -> Any:
-    """What a person writes as 1 where 1.0 is meant, and a list where a tuple is."""
+def _value(where: str, kind: Any, value: Any) -> Any:
+    """A value of a file as its type: 1 where 1.0 is meant, a tuple of a list, a dataclass."""
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        return from_table(where, kind, value)
     if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
-        return tuple(_as_float(typing.get_args(kind)[0], one) for one in value)
+        return tuple(_value(where, typing.get_args(kind)[0], one) for one in value)
     return float(value) if kind is float and type(value) is int and abs(value) < 2**53 else value

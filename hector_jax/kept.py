@@ -1,10 +1,9 @@
 """Results on disk, taken up again where the same is asked: tunings and the scores of walks.
 
 The name of a file ends in a digest of all that its content follows from: settings, body, command,
-net, weights, plant, seed, loss, versions of the packages. Other inputs make another file, so that
-nothing is taken for something else and nothing is overwritten. The program's own lines are not in
-the digest: every result tells the commit it was made at, and a report names them. A damaged file
-is named and made anew; of a tuning, from the iteration before.
+net, weights, plant, seed, loss, and the code and packages that compute it (`storage.code_hash`).
+Other inputs make another file, so that nothing is taken for something else and nothing is
+overwritten. A damaged file is named and made anew; of a tuning, from the iteration before.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -151,7 +150,8 @@ def tune_measured(
         InputError: a walk with the starting weights falls or cannot be believed.
         InputError: the folder cannot be written.
     """
-    key = digest(config, robot, weights, command, params, *plants)
+    code = (*pipeline.TUNING_CODE, "tuning.measured", "sim.walk")
+    key = digest(config, robot, weights, command, params, *plants, code=code)
     with locked(folder):
         path = folder / f"tuning-walks-{key}.npz"
         record = load_tuning(Checkpoint(path, KIND, robot, {"commit": commit}))
@@ -248,8 +248,9 @@ def _scored(
 ) -> tuple[dict[tuple[str, int], Walked], dict[str, Trajectory]]:
     """What is kept of jobs by set and seed, and of those of the first seed the walks."""
     walk_config = config.rollout.walk
+    code = ("sim.walk", "evaluation.metrics")
     endings = {
-        (name, seed): f"{name}-{seed}-{digest(walk_config, config.loss, robot, job)}.npz"
+        (name, seed): f"{name}-{seed}-{digest(walk_config, config.loss, robot, job, code=code)}.npz"
         for (name, seed), job in jobs.items()
     }
     scored: dict[tuple[str, int], Walked] = {}
@@ -338,8 +339,9 @@ def walk_groups(
         key: what the walks follow from beside the jobs, as `digest` takes it; noted in the files.
         title: for the person who waits, after the number of walks.
     """
+    code = ("sim.walk", "sim.parallel", "evaluation.metrics")
     paths = {
-        name: folder / f"{name}-{digest(*key, robot, tuple(jobs))}.npz"
+        name: folder / f"{name}-{digest(*key, robot, tuple(jobs), code=code)}.npz"
         for name, jobs in groups.items()
     }
 

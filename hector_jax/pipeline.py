@@ -44,7 +44,16 @@ from hector_jax.robot import Robot
 from hector_jax.runtime import letters
 from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.storage import Checkpoint, as_json, digest, fingerprint, locked
+from hector_jax.storage import (
+    Checkpoint,
+    as_json,
+    check_settings,
+    code_hash,
+    digest,
+    fingerprint,
+    identity,
+    locked,
+)
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning import difftune, measured
 from hector_jax.tuning import search as searching
@@ -56,6 +65,11 @@ from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.tuning.search import Found, Generation, SearchConfig, best
 
 ENGINES = ("auto", "c", "mjx")
+# modules that decide the numbers, for `storage.digest`
+TUNING_CODE = ("tuning.difftune", "grfm.network")
+TRAINING_CODE = ("grfm.training",)
+COLLECTION_CODE = (*TUNING_CODE, "grfm.dataset", "sim.parallel")
+SEARCH_CODE = ("tuning.search", "tuning.loss", "sim.parallel")
 
 
 def choose_engine(asked: str) -> str:
@@ -113,12 +127,8 @@ class Learned(NamedTuple):
     errors: dict[str, Any]  # of raw command, linear map and net on walks that no training saw
     course: History
     config: TrainConfig
-    folders: tuple[Path, ...]  # of the walks
-
-
-def _effect(params: Params | None) -> jax.tree_util.Partial:
-    """Phi of a net, or of the plain rigid body."""
-    return last_command if params is None else network.as_effect(params)
+    folders: tuple[Path, ...]  # of the walks; none for a net that came alone
+    held_out: list[int]  # numbers of the walks that no training saw
 
 
 def _tune_job(
@@ -137,7 +147,7 @@ def _tune_job(
         nominal(robot),
         command,
         standing_anchor(robot),
-        _effect(params),
+        network.effect_of(params, config.rollout.walk.gait),
         lambda iteration: tell.put((name, iteration)),
         **_kept_in(record),
     )
@@ -192,7 +202,10 @@ def tune_many(
         }
         tell(done, config.iterations * len(problems), "compiling")
         while not all(future.done() for future in running.values()) or not heard.empty():
+            failed = [future for future in running.values() if future.done() and future.exception()]
             if heard.empty():
+                for future in failed:
+                    future.result()  # raises now, not when the others have ended
                 wait(running.values(), timeout=0.1)
                 continue
             name, iteration = heard.get()
@@ -222,7 +235,8 @@ def _measured_job(
 ) -> Evaluation:
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     walked = walk(config.rollout.walk, robot, weights, command, plant, seconds)
-    return evaluate_walk(config, robot, weights, command, _effect(params), walked)
+    effect = network.effect_of(params, config.rollout.walk.gait)
+    return evaluate_walk(config, robot, weights, command, effect, walked)
 
 
 def tune_measured(
@@ -267,9 +281,9 @@ def tune_measured(
 
 
 def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
-    anchor = standing_anchor(robot)
-    norms = difftune.gradient_norms(config, robot, nominal(robot), command, anchor, _effect(params))
-    return jax.device_get(norms)
+    effect = network.effect_of(params, config.rollout.walk.gait)
+    model = command, standing_anchor(robot), effect
+    return jax.device_get(difftune.gradient_norms(config, robot, nominal(robot), *model))
 
 
 def gradient_norms(
@@ -302,7 +316,10 @@ def records_in(
         config, robot, problems: see `tune_many`; others have other records.
         about: JSON values to note with what is made now.
     """
-    endings = {n: digest(config, robot, nominal(robot), *each) for n, each in problems.items()}
+    endings = {
+        n: digest(config, robot, nominal(robot), *each, code=TUNING_CODE)
+        for n, each in problems.items()
+    }
     return {
         name: load_tuning(
             Checkpoint(folder / f"tuning-{name}-{ending}.npz", KIND, robot, about or {})
@@ -311,11 +328,17 @@ def records_in(
     }
 
 
-def tuning_paths(pool: Executor, config: TuneConfig, robot: Robot, folder: Path) -> list[Weights]:
+def path_config(robot: Robot) -> TuneConfig:
+    """Settings of the tunings whose weights the data cover: the same whatever is tuned later."""
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)))
+
+
+def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     """Weights that plain tunings of the trajectories pass through, stacked: data covers them.
 
     The tunings are kept in `folder`.
     """
+    config = path_config(robot)
     problems = {name: (named_command(name), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
     records = records_in(folder, config, robot, problems)
@@ -327,31 +350,65 @@ def tuning_paths(pool: Executor, config: TuneConfig, robot: Robot, folder: Path)
     return stacked
 
 
-def collect(
-    pool: Executor, config: CollectConfig, tune: TuneConfig, robot: Robot, folder: Path
-) -> None:
+def _compile_tuning(config: TuneConfig, robot: Robot) -> None:
+    command, effect = named_command("straight"), network.effect_of(None, config.rollout.walk.gait)
+    difftune.tune_step(config, robot, nominal(robot), command, standing_anchor(robot), effect)
+
+
+def _compile_walking(config: WalkConfig, robot: Robot) -> None:
+    walk(config, robot, nominal(robot), named_command("straight"), hfs(), config.gait.tick)
+
+
+def compile_programs(pool: Executor, robot: Robot) -> None:
+    """Compile what tunings and walks run, each program in one process; the others load it."""
+    config = path_config(robot)
+    with bar("compiling, once on a machine") as tell:
+        jobs = [
+            pool.submit(_compile_tuning, config, robot),
+            pool.submit(_compile_walking, config.rollout.walk, robot),
+        ]
+        for done, job in enumerate(jobs):
+            tell(done, len(jobs), "")
+            job.result()
+        tell(len(jobs), len(jobs), "")
+
+
+def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
+    """All that the walks of a collection follow from, as JSON values for their card."""
+    paths = path_config(robot)
+    return {
+        **asdict(config),
+        "controller": repr(paths.rollout.walk),
+        "paths": digest(paths, robot, nominal(robot), code=()),
+        "robot": identity(robot),
+        "code": code_hash(*COLLECTION_CODE),
+    }
+
+
+def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -> None:
     """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there.
 
     Raises:
-        InputError: the folder cannot be written; told before
-            anything is walked.
-        InputError: it holds walks of other jobs, another robot, controller or engine.
+        InputError: the folder cannot be written, told before anything is walked; or it holds walks
+            of other settings.
     """
     with locked(folder):
-        paths = tuning_paths(pool, tune, robot, folder / "paths")
+        compile_programs(pool, robot)
+        paths = tuning_paths(pool, robot, folder / "paths")
         jobs = dataset.draw_jobs(config.seed, config.walks, paths, config.seconds, robot)
-        _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, folder)
+        settings = collection_settings(config, robot)
+        _keep_walks(pool, config.engine, robot, jobs, folder, settings)
 
 
 def _keep_walks(
     pool: Executor,
     engine: str,
-    walking: WalkConfig,
     robot: Robot,
     jobs: Sequence[Job],
     folder: Path,
+    settings: Mapping[str, Any],
 ) -> None:
-    engine = choose_engine(engine)
+    engine, walking = choose_engine(engine), walk_config(robot)
     # On a GPU the physics is walked in 32 bits; on a CPU that gains nothing.
     single = engine == "mjx" and jax.default_backend() != "cpu"
 
@@ -369,11 +426,8 @@ def _keep_walks(
             jobs,
             walk_jobs,
             robot=robot,
-            about={
-                "controller": repr(walking),
-                "engine": engine,
-                "physics_bits": 32 if single else 64,
-            },
+            settings=settings,
+            about={"engine": engine, "physics_bits": 32 if single else 64},
             progress=lambda done, of: tell(done, of, "" if done else "compiling"),
         )
 
@@ -421,11 +475,10 @@ def _samples(robot: Robot, folder: Path) -> Samples:
     return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
 
 
-def held_out(robot: Robot, folder: Path) -> Walks:
-    """The walks under `folder` that no training sees."""
-    walks = dataset.load_walks(folder, robot)
-    chosen = np.unique(samples(robot, folder).held_out.walk)
-    return jax.tree.map(lambda x: x[chosen], walks)
+def held_out(robot: Robot, net: Learned) -> Walks:
+    """The walks that no training of a net saw, of the folder that it was trained on."""
+    walks = dataset.load_walks(net.folders[0], robot)
+    return jax.tree.map(lambda x: x[net.held_out], walks)
 
 
 def walks_of(
@@ -458,8 +511,7 @@ def train(
     up from the epoch that it kept beside `path`.
 
     Raises:
-        InputError: the folder cannot be written.
-        InputError: no walks, or damaged ones.
+        InputError: the folder cannot be written; there are no walks, or damaged ones.
     """
     with locked(path.parent):
         return _train(config, robot, (folder, *more), path)
@@ -469,7 +521,7 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
     with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
         parts = samples(robot, *folders)
     made_of = [dataset.walked_with(each) for each in folders]
-    ending = digest(config, robot, made_of)
+    ending = digest(config, robot, made_of, code=TRAINING_CODE)
     kept = Checkpoint(path.with_name(f"training-{ending}.npz"), training.KIND, robot)
     with bar(
         f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
@@ -490,18 +542,21 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
             "net": network.as_effect(params),
         }
         errors = training.report(effects, parts.held_out)
+    held_out = np.unique(parts.held_out.walk).tolist()
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
         "made_of": made_of[0],
         **({"and_of": made_of[1:]} if made_of[1:] else {}),
-        "settings": asdict(config),
+        "settings": training_settings(config),
         "samples": {**sizes, "dropped": parts.dropped},
+        "held_out": held_out,
         "errors": errors,
+        "linear": [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(linear)],
         "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
     kept.remove()
-    return Learned(params, linear, about["errors"], course, config, folders)
+    return Learned(params, linear, about["errors"], course, config, folders, held_out)
 
 
 def net_path(data: Path, variant: str) -> Path:
@@ -510,56 +565,63 @@ def net_path(data: Path, variant: str) -> Path:
     return data / ("grfm.npz" if default else f"grfm-{variant}.npz")
 
 
-def learned(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> Learned:
-    """The net kept at `path`, trained anew where it is stale or missing.
+def load_learned(path: Path, robot: Robot, variant: str) -> tuple[Learned, dict[str, Any]]:
+    """A net from a file with what its card says of its training.
 
-    Stale is a net of other walks or of another controller than those under `folder`.
+    Returns:
+        The net, and `settings` and `made_of` of its card: how it was trained, and on which walks.
 
     Raises:
         InputError: one line naming the file that is damaged, of another robot or another variant.
     """
-    made_of = dataset.walked_with(folder)
-    if not path.exists():
-        return train(config, robot, folder, path)
-    _, card = network.read_net_card(path, config.variant)
-    if card["about"].get("made_of") != made_of:
-        return train(config, robot, folder, path)
-    params, _, card = network.load_net(path, robot, config.variant)
+    params, _, card = network.load_net(path, robot, variant)
     about = card["about"]
-    config = from_table(f"{path}: about.settings", TrainConfig, about.get("settings"))
     try:
+        linear = jax.tree.unflatten(network.LINEAR, map(np.array, about["linear"]))
+        held_out = list(about["held_out"])
+        settings, made_of = dict(about["settings"]), dict(about["made_of"])
+        trained = {k: v for k, v in settings.items() if k != "code"}
+        config = from_table(f"{path}: about.settings", TrainConfig, trained)
         course = History(**{n: np.array(about["course"][n], float) for n in History._fields})
         errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: its card does not tell its training: {error!r}") from None
-    linear = network.fit_linear(samples(robot, folder).training)
-    return Learned(params, linear, errors, course, config, (folder,))
+    made = {"settings": settings, "made_of": made_of}
+    return Learned(params, linear, errors, course, config, (), held_out), made
 
 
-def ground(
-    pool: Executor, config: TuneConfig, robot: Robot, data: Path, variant: str | None = None
-) -> Learned:
-    """A GRFM-Net with its walks under `data`, from disk or made now.
+def training_settings(config: TrainConfig) -> dict[str, Any]:
+    """All that a net follows from beside its walks, as JSON values for its card."""
+    return {**asdict(config), "code": code_hash(*TRAINING_CODE)}
+
+
+def ground(pool: Executor, robot: Robot, data: Path, variant: str | None = None) -> Learned:
+    """A GRFM-Net with its walks under `data`: made now, or from disk where it would be made so.
 
     Args:
         pool: worker processes.
-        config: the controller that has to have walked.
         robot: the body.
         data: folder of `walks/` and of the net, see `net_path`.
         variant: of the net; None takes the default one.
 
     Raises:
-        InputError: the walks are of another controller or robot, the net's file is of another
-            variant, or a file is damaged.
+        InputError: walks or net in the folder were made with other settings or by other code, the
+            net on other walks, or a file is damaged or of another robot or variant.
     """
-    train_config = TrainConfig() if variant is None else TrainConfig(variant=variant)
-    walks = data / "walks"
+    config = TrainConfig() if variant is None else TrainConfig(variant=variant)
+    walks, path = data / "walks", net_path(data, config.variant)
+    settings = collection_settings(CollectConfig(), robot)
     if not (walks / "card.json").exists():
-        collect(pool, CollectConfig(), config, robot, walks)
-    if dataset.walked_with(walks).get("controller") != repr(config.rollout.walk):
-        raise InputError(f"{walks}: walked by another controller; choose another folder")
-    with say_if_slow(f"reading the walks and the net in {data}"):
-        return learned(train_config, robot, walks, net_path(data, train_config.variant))
+        collect(pool, CollectConfig(), robot, walks)
+    made_of = dataset.walked_with(walks)
+    check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
+    with locked(data):  # a second process that begins now waits, and finds the net
+        if not path.exists():
+            return _train(config, robot, (walks,), path)
+    found, about = load_learned(path, robot, config.variant)
+    check_settings(path, about["settings"], training_settings(config))
+    check_settings(path, about["made_of"], made_of)
+    return found._replace(folders=(walks,))
 
 
 def _command(name: str, own: Mapping[str, Command] | None) -> Command:
@@ -697,7 +759,9 @@ def refresh(
     path = jax.tree.map(lambda *w: np.stack(w), tuning.ten, *late)
     jobs = dataset.draw_jobs_near(config.seed, config.walks, command, path, config.seconds)
     with locked(walks):
-        _keep_walks(pool, config.engine, tune.rollout.walk, robot, jobs, walks)
+        # the jobs say the rest
+        settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}
+        _keep_walks(pool, config.engine, robot, jobs, walks, settings)
     oldest, *newer = (*before.folders, walks)
     after = train(before.config, robot, oldest, folder / "refreshed.npz", newer)
     effects = {

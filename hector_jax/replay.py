@@ -6,7 +6,7 @@ settings) and what it came to; `again` does it once more and says whether the sa
 """
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,9 +19,8 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.description import as_table, from_card
 from hector_jax.evaluation.report import environment
-from hector_jax.grfm.network import NetParams, Params, as_effect, layout, widths
-from hector_jax.inputs import InputError
-from hector_jax.model.effect import last_command
+from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
+from hector_jax.inputs import InputError, from_table
 from hector_jax.robot import Robot, load_robot
 from hector_jax.storage import WriteError, load_tree, read_card, save_tree
 from hector_jax.trajectory import Trajectory
@@ -129,7 +128,6 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
     net, none = about.get("net"), np.zeros(())
     try:
         params = None if net is None else layout(net["variant"], tuple(net["hidden"]))
-        config = _made(TuneConfig, about.get("config", {}))
         description = from_card(about.get("description", {}))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: settings that this version does not know: {error}") from error
@@ -142,19 +140,7 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         Evaluation(none, Losses(none, none, none), nominal(), none, none),
     )
     dump, _ = load_tree(path, like, kind=_KIND)
-    return dump, config, about
-
-
-def _made(kind: type, tree: dict[str, Any]) -> Any:
-    """A settings dataclass from its JSON."""
-    types = {field.name: field.type for field in fields(kind)}
-
-    def value(name: str, value: Any) -> Any:
-        if is_dataclass(types[name]):
-            return _made(types[name], value)  # pyright: ignore
-        return tuple(value) if isinstance(value, list) else value
-
-    return kind(**{name: value(name, each) for name, each in tree.items()})
+    return dump, from_table(f"{path}: config", TuneConfig, about.get("config")), about
 
 
 _walk = jax.jit(rollout, static_argnums=0)
@@ -173,7 +159,7 @@ def again(path: Path) -> Replayed:
         InputError: see `load`.
     """
     dump, config, about = load(path)
-    effect = last_command if dump.params is None else as_effect(dump.params)
+    effect = effect_of(dump.params, config.rollout.walk.gait)
     problem = dump.robot, dump.weights, dump.command, dump.anchor, effect
     with _on_cpu():
         found = jax.device_get(tune_step(config, *problem))

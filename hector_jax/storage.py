@@ -11,6 +11,7 @@ Whatever is computed for longer than a moment keeps how far it came as a `Checkp
 in a folder that `locked` gives to one process.
 """
 
+import ast
 import difflib
 import hashlib
 import io
@@ -20,7 +21,7 @@ import platform
 import secrets
 import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -35,7 +36,7 @@ from filelock import FileLock, Timeout
 from hector_jax.console import Broken, say
 from hector_jax.control.weights import Weights
 from hector_jax.inputs import InputError, Interval, one_line, problem, read_json, shown
-from hector_jax.robot import MODEL_PATH, Robot
+from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
@@ -43,6 +44,8 @@ WEIGHTS = Interval(1e-12, 1e12)  # of weights in a file; far beyond, no QP is so
 _MOST_WEIGHTS = 1_000_000  # bytes
 _PART = ".hector_jax-part"  # ends the name of a file that is being written, and of no other
 _DIGEST = 64  # hexadecimal digits of a sha256
+_NUMERIC = ("jax", "jaxlib", "mujoco", "numpy")  # packages that decide the numbers of a result
+_NO_NUMBERS = ("console", "inputs", "runtime", "storage")  # modules that decide none
 _PACKAGES = (
     "hector-jax",
     "jax",
@@ -101,16 +104,71 @@ def identity(robot: Robot) -> str:
     return hashlib.sha256(told).hexdigest()[:16]
 
 
-def digest(*parts: Any) -> str:
-    """Twelve digits for settings (by their repr), robots and trees of numbers, to the last bit."""
+def digest(*parts: Any, code: Sequence[str]) -> str:
+    """Content hash (12 hexadecimal digits) of all that a result follows from, exact in every bit.
 
-    def told(part: Any) -> str:
+    Args:
+        parts: settings (by their repr), robots and trees of numbers.
+        code: modules that compute the result, see `code_hash`.
+    """
+
+    def text(part: Any) -> str:
         if isinstance(part, Robot):
             return identity(part)
         return _bits(part) if isinstance(part, tuple) or part is None else repr(part)
 
-    key = "\n".join([*map(told, parts), repr(versions())]).encode() + MODEL_PATH.read_bytes()
-    return hashlib.sha256(key).hexdigest()[:12]
+    key = "\n".join([*map(text, parts), code_hash(*code)])
+    return hashlib.sha256(key.encode()).hexdigest()[:12]
+
+
+@cache
+def code_hash(*modules: str) -> str:
+    """Hash (12 hexadecimal digits) of the code and the packages that decide a result's numbers.
+
+    Hashed are the syntax trees of the modules and of all of this package that they import, without
+    docstrings, and the versions of JAX, MuJoCo and NumPy. Comments, layout and what only reads,
+    writes and prints void nothing.
+
+    Args:
+        modules: names such as `sim.walk`, relative to this package.
+    """
+    trees: dict[str, str] = {}
+    waiting = list(modules)
+    while waiting:
+        name = waiting.pop()
+        if name in trees or name in _NO_NUMBERS:
+            continue
+        tree = ast.parse(_source(name).read_bytes())
+        waiting += _imported(tree)
+        for node in ast.walk(tree):
+            body = getattr(node, "body", None)
+            if isinstance(body, list) and body and _is_text(body[0]):
+                body.pop(0)
+        trees[name] = ast.dump(tree)
+    numeric = {name: version(name) for name in _NUMERIC}
+    return hashlib.sha256(repr((sorted(trees.items()), numeric)).encode()).hexdigest()[:12]
+
+
+def _source(module: str) -> Path:
+    path = Path(__file__).parent.joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _imported(tree: ast.Module) -> list[str]:
+    """Modules of this package that a module imports, relative to it."""
+    package, found = f"{__package__}.", []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(package):
+            module = f"{node.module}."[len(package) :]
+            names = [f"{module}{alias.name}" for alias in node.names]
+            found += [name for name in names if _source(name).exists()] + [module[:-1]] * bool(
+                module
+            )
+    return found
+
+
+def _is_text(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str)
 
 
 def _bits(tree: Any) -> str:
@@ -349,13 +407,29 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
+def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Hold the settings that a file was made with against those that it would be made with now.
+
+    Raises:
+        InputError: one line naming the file and the first setting that differs.
+    """
+    for name in {**expected, **made}:
+        before, now = made.get(name), expected.get(name)
+        if before == now:
+            continue
+        what = f"with {name} {shown(before)}, this command expects {shown(now)}"
+        if name == "code":
+            what = f"by other code or other versions of {', '.join(_NUMERIC)}"
+        raise InputError(f"{path}: made {what}; remove it, or name another folder")
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """How far something came, on disk: the newest state and the one before it.
 
-    A file that is cut, changed, of another robot, layout or of other versions, under which the same
-    bytes cannot be promised, is named, not taken up, and put aside as `.refused`. Of what else a
-    state follows from, the file's name is to hold a `digest`.
+    A file that is cut, changed, of another robot or layout is named, not taken up, and put aside as
+    `.refused`. Of what else a state follows from, the code included, the file's name is to hold a
+    `digest`.
     """
 
     path: Path  # of the newest state
@@ -387,7 +461,6 @@ class Checkpoint:
                 continue
             try:
                 tree, card = load_tree(path, like, kind=self.kind, robot=self.robot)
-                check_versions(path, card["versions"])
             except InputError as error:
                 say(f"not taken up: {error}")
                 if path == self.path:
@@ -401,17 +474,6 @@ class Checkpoint:
         """Forget both states."""
         for path in (self.path, self.before):
             path.unlink(missing_ok=True)
-
-
-def check_versions(path: Path, made_with: Mapping[str, str]) -> None:
-    """Hold what a file was made with against what is installed.
-
-    Raises:
-        InputError: one line naming the file and the first package that differs.
-    """
-    for name, here in versions().items():
-        if (made := made_with.get(name)) != here:
-            raise InputError(f"{path}: made with {name} {made}, here is {name} {here}")
 
 
 def as_json(value: Any, indent: int | None = None) -> str:

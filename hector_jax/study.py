@@ -19,7 +19,7 @@ from hector_jax.evaluation import metrics, plots, table
 from hector_jax.evaluation.metrics import BASELINES, Verdict
 from hector_jax.evaluation.report import Picture, environment
 from hector_jax.evaluation.table import PAPER, Earlier, Fall, Search, Table
-from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_video
+from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.grfm.network import Params
 from hector_jax.inputs import InputError, plural, read_json
 from hector_jax.kept import Judged, Tuned
@@ -47,7 +47,7 @@ CEILING = "ceiling"
 # what `quick` cuts down to, so that all is done in under five minutes on two cores
 _QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "steps": 2}
 
-_SNAPSHOTS = VideoConfig(width=640, height=214, rate=8)  # no film of it is kept
+_SNAPSHOTS = VideoConfig(height=360)
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def _make_table(
         make_folder(folder)
     made_with = environment()
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, plan.tune, robot, args.data)
+        net = pipeline.ground(pool, robot, args.data)
         searches = _search(pool, plan, robot, shelf)
         commit = made_with.get("commit", "")
         tunings = {
@@ -199,7 +199,9 @@ def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str,
     """The derivative-free baseline of all trajectories, in lock-step."""
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
     engine, model = pipeline.choose_engine("auto"), plan.tune.rollout
-    key = digest(engine, model, plan.tune.loss, settings, robot, hfs(), nominal())
+    key = digest(
+        engine, model, plan.tune.loss, settings, robot, hfs(), nominal(), code=pipeline.SEARCH_CODE
+    )
     starts = dict.fromkeys(plan.commands, nominal())
     folder = shelf / f"search-{key}"
     return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)
@@ -317,9 +319,9 @@ def _draw(
 
 def _snapshots(folder: Path, robot: Robot, shown: Mapping[str, Trajectory]) -> Path | None:
     """A strip of both walks; None, with one line, where nothing can be drawn here."""
-    pair = {"nominal": shown["nominal"], "tuned with net": shown["with"]}
+    pair = {name: shown[name] for name in ("nominal", "with")}
     try:
-        write_video(folder / "film.mp4", robot, pair, folder / "strip.png", _SNAPSHOTS)
+        write_strip(folder / "strip.png", robot, pair, _SNAPSHOTS)
     except VideoUnavailable as error:
         say(f"no snapshots: {error}")
         return None

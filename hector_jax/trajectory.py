@@ -7,8 +7,12 @@ Frames: everything is in the world frame. A wrench is that of the ground on the 
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from hector_jax.geometry import rot_z
 
 LEFT, RIGHT = 0, 1
 MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen
@@ -58,6 +62,32 @@ class Trajectory(NamedTuple):
     fallen: Bool[Array, "*batch T"]  # true from the sample of the fall on
     legs_touch: Bool[Array, "*batch T"]  # one leg touched the other, which is no fall
     residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
+
+
+def from_start(walk: Trajectory) -> Trajectory:
+    """The same walk in the frame of its start: at the origin, facing along x (numpy, no batch).
+
+    A reference begins where its robot stood at t = 0, and each set of weights leaves the robot
+    elsewhere by then. In this frame all walks of a command have one reference.
+    """
+    walk = jax.tree.map(np.asarray, walk)
+    yaw, origin = np.zeros(3), np.zeros(3)
+    yaw[2], origin[:2] = walk.initial.euler[2], walk.initial.position[:2]
+    R = np.asarray(rot_z(jnp.asarray(yaw[2])))  # v @ R turns v back by the yaw
+
+    def turned(state: State) -> State:
+        position = (state.position - origin) @ R
+        rates = state.ang_velocity @ R, state.velocity @ R
+        return State(state.euler - yaw, position, *rates)
+
+    return walk._replace(
+        initial=turned(walk.initial),
+        state=turned(walk.state),
+        reference=turned(walk.reference),
+        command=Wrench(*(part @ R for part in walk.command)),
+        effect=Wrench(*(part @ R for part in walk.effect)),
+        feet=(walk.feet - origin) @ R,
+    )
 
 
 def has_fallen(

@@ -28,3 +28,32 @@ def _forget_programs():
         return
     if crowded:
         jax.clear_caches()
+
+
+def has_name(axes, which):
+    """Whether a reader can tell what an axis is: from its label, title or ticks that are words."""
+    siblings = getattr(axes, f"get_shared_{which}_axes")().get_siblings(axes)
+    words = [getattr(one, f"get_{which}label")() for one in siblings]
+    for one in siblings:
+        words += [label.get_text() for label in getattr(one, f"get_{which}ticklabels")()]
+    if which == "y":
+        words += [axes.get_title(), axes.get_title("left")]
+    return any(letter.isalpha() for letter in "".join(words))
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures as they were written, in order; all of their axes have names."""
+    from matplotlib.figure import Figure  # loads much that few tests need
+
+    figures, save = [], Figure.savefig
+
+    def savefig(figure, path, **kwargs):
+        save(figure, path, **kwargs)
+        figures.append(figure)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    yield figures
+    assert figures
+    every = [axes for figure in figures for axes in figure.axes if axes.axison]
+    assert all(has_name(axes, which) for axes in every for which in "xy")

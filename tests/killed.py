@@ -80,14 +80,14 @@ def walk_jobs(folder: Path, jobs):
 def collection(folder: Path) -> None:
     with locked(folder):
         jobs = dataset.draw_jobs(0, WALKS)
-        dataset.collect(folder, jobs, partial(walk_jobs, folder), robot=ROBOT, about={})
+        dataset.collect(folder, jobs, partial(walk_jobs, folder), robot=ROBOT)
 
 
 def training(folder: Path) -> None:
     walks = folder.parent / "walks"
     with locked(walks):
         jobs = dataset.draw_jobs(0, 5)
-        dataset.collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT, about={})
+        dataset.collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT)
     config = TrainConfig(os.environ.get("VARIANT", "paper"), epochs=60, batch=16)
     if not (folder / "net.npz").exists():
         pipeline.train(config, ROBOT, walks, folder / "net.npz")

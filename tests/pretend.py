@@ -1,6 +1,7 @@
 """Walks, scores and verdicts that no simulator made, for what is only drawn, judged or written."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hector_jax.control.weights import nominal
 from hector_jax.evaluation.metrics import Score, Verdict
@@ -67,6 +68,24 @@ def pretend_walk(seed=0, error=0.03, seconds=4.0, period=0.01, fall_at=None, tur
         fallen=fallen,
         legs_touch=np.zeros(count, bool),
         residual=np.zeros(count),
+    )
+
+
+def elsewhere(walk, place, yaw):
+    """The same walk, begun at another place (x, y) and heading."""
+    R, place = Rotation.from_euler("z", yaw).as_matrix(), np.array([*place, 0.0])
+
+    def moved(state):
+        rates = state.ang_velocity @ R.T, state.velocity @ R.T
+        return State(state.euler + [0.0, 0.0, yaw], state.position @ R.T + place, *rates)
+
+    return walk._replace(
+        initial=moved(walk.initial),
+        state=moved(walk.state),
+        reference=moved(walk.reference),
+        command=Wrench(*(part @ R.T for part in walk.command)),
+        effect=Wrench(*(part @ R.T for part in walk.effect)),
+        feet=walk.feet @ R.T + place,
     )
 
 

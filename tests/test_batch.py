@@ -27,7 +27,7 @@ from hector_jax.tuning.batch import (
     tune_batch,
 )
 from hector_jax.tuning.difftune import Evaluation, Reason, Stop, TuneConfig, tune
-from hector_jax.tuning.loss import Alpha, Losses
+from hector_jax.tuning.loss import LossConfig, Losses
 from hector_jax.tuning.rollout import RolloutConfig, no_variation
 
 ROBOT = load_robot()
@@ -35,18 +35,18 @@ ANCHOR = standing_anchor(ROBOT)
 STARTS = [disturbed(nominal(), factor, 1)[0] for factor in (1.05, 1.2, 1.5, 2.0, 3.0)]
 TOY = TuneConfig(iterations=40, patience=5)
 NOMINAL = np.asarray(weights_to_vector(nominal()))
-PAPER = Alpha(np.asarray(1e5), np.asarray(2e5))
+PAPER = LossConfig().as_arrays()
 
 
 def vector(weights):
     return np.asarray(weights_to_vector(weights))
 
 
-def toy(config, robot, weights, command, anchor, effect, alpha=None, variation=None):
+def toy(config, robot, weights, command, anchor, effect, alpha, variation=None):
     """A bowl in log-weights about a point that the command moves; with a floor under it."""
     middle = np.log(NOMINAL) + 0.3 * jnp.asarray(command.yaw_rate)[0]
     away = jnp.log(weights_to_vector(weights)) - middle
-    scale = 1e5 if alpha is None else alpha.euler
+    scale = alpha.euler
     gradient = vector_to_weights(2.0 * scale * away / weights_to_vector(weights))
     loss = scale * (1.0 + away @ away)
     falls = 1.0 * (weights_to_vector(weights)[0] > 1e3)
@@ -56,7 +56,7 @@ def toy(config, robot, weights, command, anchor, effect, alpha=None, variation=N
 @pytest.fixture
 def on_toy(monkeypatch):
     monkeypatch.setattr(difftune, "evaluate", toy)
-    monkeypatch.setattr(difftune, "tune_step", jax.jit(toy, static_argnums=0))
+    monkeypatch.setattr(difftune, "_evaluate", jax.jit(toy, static_argnums=0))
 
 
 def scenario(name="straight", alpha=PAPER, scale=1.0, effect=0, variation=None):
@@ -107,7 +107,7 @@ def test_a_start_that_falls_keeps_itself_and_says_so(on_toy):
 
 
 def test_a_batch_has_loss_weights_of_its_own_and_scales_its_losses(on_toy):
-    heavy = Alpha(np.asarray(3e5), np.asarray(0.0))
+    heavy = LossConfig(3e5, 0.0).as_arrays()
     asked = [
         problem(STARTS[0], [scenario(alpha=a, scale=k)]) for a, k in ((PAPER, 1.0), (heavy, 2.0))
     ]

@@ -299,16 +299,16 @@ def test_collection_takes_up_where_it_stopped(tmp_path, robot):
 
 
 def test_a_collection_of_something_else_is_not_overwritten(tmp_path, robot):
-    collect(tmp_path, draw_jobs(0, 2), walker(), robot=robot, about={"ticks": 4})
+    collect(tmp_path, draw_jobs(0, 2), walker(), robot=robot, settings={"ticks": 4})
     before = (tmp_path / "shard-000.npz").read_bytes()
     heavier = robot._replace(mass=np.asarray(robot.mass) + 1.0)
     for jobs, body, ticks, message in (
         (draw_jobs(1, 2), robot, 4, "shard-000.npz: collected for other walks"),
-        (draw_jobs(0, 2), robot, 5, "shard-000.npz: collected with other settings"),
+        (draw_jobs(0, 2), robot, 5, "shard-000.npz: made with ticks 4, this command expects 5"),
         (draw_jobs(0, 2), heavier, 4, "shard-000.npz: made for robot"),
     ):
         with pytest.raises(ValueError, match=message):
-            collect(tmp_path, jobs, walker(), robot=body, about={"ticks": ticks})
+            collect(tmp_path, jobs, walker(), robot=body, settings={"ticks": ticks})
     assert (tmp_path / "shard-000.npz").read_bytes() == before
     with pytest.raises(ValueError, match="shard-000.npz: made for robot"):
         load_walks(tmp_path, heavier)
@@ -321,14 +321,14 @@ def test_a_walk_that_did_not_come_is_told(tmp_path, robot):
         )
 
 
-def test_a_collection_is_known_by_its_walks_and_by_what_it_was_told(tmp_path, robot):
+def test_a_collection_is_identified_by_its_walks_and_settings(tmp_path, robot):
     known = []
     for i, (seed, ticks) in enumerate([(0, 4), (0, 4), (1, 4), (0, 5)]):
         folder = tmp_path / str(i)
-        collect(folder, draw_jobs(seed, 2), walker(), robot=robot, about={"ticks": ticks})
+        collect(folder, draw_jobs(seed, 2), walker(), robot=robot, settings={"ticks": ticks})
         known.append(walked_with(folder))
     assert known[0] == known[1]
-    assert known[0]["walks"] != known[2]["walks"]
+    assert known[0]["content"] != known[2]["content"]
     assert (known[0]["ticks"], known[3]["ticks"]) == (4, 5)
     with pytest.raises(ValueError, match="no finished collection"):
         walked_with(tmp_path / "none")

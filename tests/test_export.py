@@ -39,6 +39,7 @@ from hector_jax.export import (
     weights_cpp,
     weights_schema,
 )
+from hector_jax.inputs import InputError
 from hector_jax.robot import load_robot
 from hector_jax.storage import load_weights, save_weights, weights_tree
 from hector_jax.trajectory import State, pack_wrench
@@ -103,8 +104,8 @@ def their_qp(Q, Alpha, state, lever, foot_yaw, reference, contact, dt, mass, ine
 
     States rpy, p, omega, v, 9.81; inputs F_0, F_1, M_0, M_1; A and B frozen, powers of A, H and g
     with their 2; rows friction (mu 2.0), M_x, two of the line foot, 2 F_z <= 1000; a foot in the
-    air has no variables. Two slips of it are mended, and header and test say so: M_x may be up to
-    0.01 N m there, and foot 1 has one line row twice.
+    air has no variables. Three things are as here, and the header says so: M_x may be up to
+    0.01 N m there, foot 1 has one line row twice, and F_x and F_y are bounded each by itself.
     """
     N = len(contact)
     roll, pitch, yaw = state.euler
@@ -138,7 +139,7 @@ def their_qp(Q, Alpha, state, lever, foot_yaw, reference, contact, dt, mass, ine
         ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         left = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
         F[row : row + 4, f + 2] = 1.0
-        F[row : row + 4, f : f + 2] = [[-mu, 0], [mu, 0], [0, -mu], [0, mu]]
+        F[row : row + 4, f : f + 2] = [[-mu, -mu], [mu, mu], [mu, -mu], [-mu, mu]]
         F[row + 4, m : m + 3] = ahead
         F[row + 5, f + 2], F[row + 5, m : m + 3] = -lt, left
         F[row + 6, f + 2], F[row + 6, m : m + 3] = -lh, -left
@@ -181,7 +182,7 @@ def same_problem(seed):
 
 
 # toe and heel have changed places in their rows, and theirs hold by no friction each
-THEIRS = replace(CONFIG.mpc, line_friction=False)
+THEIRS = replace(CONFIG.mpc, line_friction=False, friction=0.5)
 SWAPPED = ROBOT._replace(toe=np.array(0.06), heel=np.array(0.09), gravity=np.array([0, 0, 9.81]))
 solve = jax.jit(solve_mpc, static_argnums=(0, 5, 6))
 
@@ -406,6 +407,14 @@ def test_a_run_is_exported_with_its_own_controller(run):
     hash(find_weights(run, "with")[1])
     path = run / "weights" / "with.json"
     assert find_weights(path, "with") == (path, None)
+
+
+def test_a_setting_that_this_version_does_not_know_is_not_dropped(run):
+    kept = asdict(CONFIG)
+    kept["mpc"]["mu"] = kept["mpc"].pop("friction")
+    (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
+    with pytest.raises(InputError, match="tune.rollout.walk: mpc: unknown field 'mu'"):
+        find_weights(run, "with")
 
 
 @pytest.mark.parametrize(

@@ -149,13 +149,16 @@ def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
         assert np.isfinite(np.concatenate(walk.last)).all()
 
 
+CODE = ("tuning.difftune",)
+
+
 def test_the_digest_tells_settings_trees_and_seeds_apart():
     found = {
-        digest(CONFIG, ROBOT, nominal()),
-        digest(CONFIG, ROBOT, expert()),
-        digest(TuneConfig(iterations=20), ROBOT, nominal()),
-        digest(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal()),
-        digest(CONFIG, ROBOT, nominal(), None),
+        digest(CONFIG, ROBOT, nominal(), code=CODE),
+        digest(CONFIG, ROBOT, expert(), code=CODE),
+        digest(TuneConfig(iterations=20), ROBOT, nominal(), code=CODE),
+        digest(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal(), code=CODE),
+        digest(CONFIG, ROBOT, nominal(), None, code=CODE),
     }
     assert len(found) == 5
 

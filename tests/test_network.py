@@ -8,23 +8,28 @@ import numpy as np
 import pytest
 from synthetic import synthetic_walk
 
+from hector_jax.control.gait import GaitConfig
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
 from hector_jax.grfm.gated import fit_gated, gated_effect, hats
 from hector_jax.grfm.network import (
     BOUND,
     ResidualParams,
     as_effect,
+    effect_of,
     fit_linear,
     fit_scaling,
     init_params,
     linear_effect,
     load_net,
     member_effects,
+    plain_net,
     save_net,
 )
-from hector_jax.model.effect import HISTORY, Window
+from hector_jax.model.effect import HISTORY, Window, last_command
 from hector_jax.robot import load_robot
 from hector_jax.trajectory import Wrench
+
+apply = jax.jit(lambda effect, window: effect(window))
 
 
 @pytest.fixture(scope="module")
@@ -64,16 +69,15 @@ def test_each_net_reads_its_own_kind_only(params, window):
     effect = as_effect(params)
     commands = window.commands
     pushed = window._replace(commands=commands._replace(force=commands.force + 10.0))
-    before, after = effect(window).wrench, effect(pushed).wrench
+    before, after = apply(effect, window).wrench, apply(effect, pushed).wrench
     np.testing.assert_array_equal(before.moment, after.moment)
     assert np.all(np.abs(before.force - after.force) > 0)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_the_effect_follows_the_dtype_of_the_window(either, window, dtype):
-    effect = as_effect(either)(
-        window._replace(commands=jax.tree.map(lambda w: jnp.asarray(w, dtype), window.commands))
-    )
+    commands = jax.tree.map(lambda w: jnp.asarray(w, dtype), window.commands)
+    effect = apply(as_effect(either), window._replace(commands=commands))
     assert {leaf.dtype for leaf in jax.tree.leaves(effect)} == {jnp.dtype(dtype)}
     assert effect.wrench.force.shape == (2, 3)
     assert bool(np.any(effect.spread.force)) == isinstance(either, ResidualParams)
@@ -81,8 +85,8 @@ def test_the_effect_follows_the_dtype_of_the_window(either, window, dtype):
 
 def test_the_members_alone_are_on_average_the_ensemble(data, window):
     params = init_params(jax.random.key(0), data, "residual")
-    members = jax.vmap(lambda effect: effect(window).wrench)(member_effects(params))
-    whole = as_effect(params)(window).wrench
+    members = jax.jit(jax.vmap(lambda effect: effect(window).wrench))(member_effects(params))
+    whole = apply(as_effect(params), window).wrench
     for each, mean in zip(members, whole, strict=True):
         assert len(each) == 4
         assert np.ptp(each, axis=0).max() > 0
@@ -92,16 +96,16 @@ def test_the_members_alone_are_on_average_the_ensemble(data, window):
 def test_vmap_over_windows_equals_a_loop(either, data):
     some = jax.tree.map(lambda x: jnp.asarray(x[:4]), data.window)
     effect = as_effect(either)
-    batch = jax.vmap(effect)(some).wrench
+    batch = jax.jit(jax.vmap(effect))(some).wrench
     for i in range(4):
-        one = effect(jax.tree.map(lambda x, i=i: x[i], some)).wrench
+        one = apply(effect, jax.tree.map(lambda x, i=i: x[i], some)).wrench
         np.testing.assert_allclose(batch.force[i], one.force, rtol=1e-12, atol=1e-12)
 
 
 def test_a_net_from_a_file_can_be_a_constant_of_a_program(either, window):
     effect = as_effect(jax.tree.map(np.asarray, either))
     inside = jax.jit(lambda w: effect(w).wrench.force)(window)
-    np.testing.assert_allclose(inside, as_effect(either)(window).wrench.force, rtol=1e-9)
+    np.testing.assert_allclose(inside, apply(as_effect(either), window).wrench.force, rtol=1e-9)
 
 
 def test_new_parameters_need_no_new_compilation(params, data, window):
@@ -126,6 +130,7 @@ def test_the_derivative_in_64_bits_agrees_with_differences_and_both_modes(either
         jax.random.normal(key_moment, (HISTORY, 2, 3)) * 0.1,
     )
 
+    @jax.jit
     def value(commands):
         wrench = effect(window._replace(commands=commands)).wrench
         return jnp.sum(jnp.tanh(wrench.force / 50.0)) + jnp.sum(wrench.moment**2)
@@ -145,7 +150,8 @@ def test_the_derivative_in_64_bits_agrees_with_differences_and_both_modes(either
 
 def test_the_gradient_is_finite_where_nothing_is_commanded(either, window):
     silent = window._replace(commands=jax.tree.map(jnp.zeros_like, window.commands))
-    gradient = jax.grad(lambda w: as_effect(either)(w).wrench.force.sum(), allow_int=True)(silent)
+    total = jax.jit(jax.grad(lambda w: as_effect(either)(w).wrench.force.sum(), allow_int=True))
+    gradient = total(silent)
     assert all(np.isfinite(g).all() for g in gradient.commands)
 
 
@@ -166,7 +172,7 @@ def test_the_linear_map_finds_a_ground_that_is_linear(data):
     force = data.window.commands.force.reshape(-1, 18) @ A + b
     known = data._replace(label=data.label._replace(force=force.reshape(-1, 2, 3)))
     effect = linear_effect(fit_linear(known))
-    guess = jax.vmap(effect)(jax.tree.map(jnp.asarray, data.window)).wrench
+    guess = jax.jit(jax.vmap(effect))(jax.tree.map(jnp.asarray, data.window)).wrench
     np.testing.assert_allclose(guess.force, known.label.force, atol=1e-6)
 
 
@@ -224,7 +230,8 @@ def test_a_mirrored_window_has_the_mirrored_effect(data):
     count = len(data.walk)
     for i in (0, 17, 18, 40):
         here, there = (
-            phi(jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), both.window)) for k in (i, count + i)
+            apply(phi, jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), both.window))
+            for k in (i, count + i)
         )
         jax.tree.map(
             partial(np.testing.assert_allclose, atol=1e-9), _flip(here.wrench), there.wrench
@@ -238,7 +245,7 @@ def test_a_command_that_stays_is_returned_as_it_is(data, window):
     held = jax.tree.map(lambda w: jnp.broadcast_to(w[:1], w.shape), window.commands)
     more = jax.tree.map(lambda w: w.at[:, 0].add(3.0), held)
     phi = gated_effect(gated)
-    before, after = (phi(window._replace(commands=c)).wrench for c in (held, more))
+    before, after = (apply(phi, window._replace(commands=c)).wrench for c in (held, more))
     stands = np.asarray(window.contact)
     assert stands[0]
     np.testing.assert_allclose(after.force - before.force, [[3.0] * 3, [0.0] * 3], atol=1e-9)
@@ -257,7 +264,8 @@ def test_what_the_nets_add_is_bounded_and_fades_far_from_the_data(data, window):
         far = window._replace(
             commands=jax.tree.map(lambda w, s=size: w.at[0].multiply(s), window.commands)
         )
-        difference = as_effect(loud)(far).wrench.force - linear(far).wrench.force
+        nets, gated = (apply(phi, far).wrench.force for phi in (as_effect(loud), linear))
+        difference = nets - gated
         added.append(np.abs(difference / params.left[:3]))
     assert added[0].max() <= BOUND + 1e-6
     assert added[0].max() > 0.1 * BOUND
@@ -273,11 +281,13 @@ def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data):
         legs_bias=jnp.asarray(rng.normal(size=true.legs_bias.shape)),
         legs=jnp.asarray(0.0 * true.legs),
     )
-    told = jax.vmap(gated_effect(true))(jax.tree.map(jnp.asarray, data.window))
+    told = jax.jit(jax.vmap(gated_effect(true)))(jax.tree.map(jnp.asarray, data.window))
     known = data._replace(
         label=jax.tree.map(np.asarray, told.wrench), legs=jax.tree.map(np.asarray, told.legs)
     )
-    found = jax.vmap(gated_effect(fit_gated(known)))(jax.tree.map(jnp.asarray, data.window))
+    found = jax.jit(jax.vmap(gated_effect(fit_gated(known))))(
+        jax.tree.map(jnp.asarray, data.window)
+    )
     for part in ("force", "moment"):
         error = getattr(found.wrench, part) - getattr(told.wrench, part)
         assert np.mean(error**2) < 0.05 * np.var(getattr(told.wrench, part))
@@ -287,8 +297,8 @@ def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data):
 def test_a_leg_pushes_only_while_it_swings(data, window):
     phi = gated_effect(fit_gated(data))
     standing = window._replace(contact=jnp.array([True, True]))
-    assert np.any(phi(window).legs.force != 0.0)
-    assert not np.any(phi(standing).legs.force)
+    assert np.any(apply(phi, window).legs.force != 0.0)
+    assert not np.any(apply(phi, standing).legs.force)
 
 
 def test_hats_are_one_at_their_knot_and_sum_to_one():
@@ -296,3 +306,19 @@ def test_hats_are_one_at_their_knot_and_sum_to_one():
     np.testing.assert_allclose(hats(knots, knots), np.eye(3))
     between = hats(jnp.linspace(-0.01, 0.1, 23), knots)
     np.testing.assert_allclose(between.sum(axis=1), 1.0)
+
+
+def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one(data):
+    windows = jax.tree.map(jnp.asarray, data.window)
+    told = windows.commands._replace(
+        force=windows.commands.force * windows.contact[:, None, :, None],
+        moment=windows.commands.moment * windows.contact[:, None, :, None],
+    )
+    windows = windows._replace(commands=told)  # a foot in the air is commanded nothing
+    gait = GaitConfig()
+    plain, same = (jax.jit(jax.vmap(p))(windows) for p in (effect_of(None, gait), last_command))
+    jax.tree.map(np.testing.assert_array_equal, plain.wrench, same.wrench)
+    assert not any(np.any(load) for load in plain.legs)
+    trained = init_params(jax.random.key(0), data)
+    shape = partial(jax.tree.map, lambda x: (x.shape, x.dtype))
+    assert shape(plain_net(gait)) == shape(trained)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.walking import Measurement, WalkConfig
+from hector_jax.control.walking import Measurement, Retune, WalkConfig
 from hector_jax.control.weights import bounds, nominal, vector_to_weights, weights_to_vector
 from hector_jax.model.effect import last_command
 from hector_jax.robot import load_robot
@@ -16,7 +16,7 @@ from hector_jax.trajectory import State, zero_wrench
 from hector_jax.tuning import online
 from hector_jax.tuning.difftune import Evaluation, TuneConfig
 from hector_jax.tuning.loss import Losses, losses, total
-from hector_jax.tuning.online import OnlineConfig, Told, follow, init_trace, retuner
+from hector_jax.tuning.online import MeasuredState, OnlineConfig, follow, init_trace, retuner
 from hector_jax.tuning.rollout import init_carry, step_carry
 
 ROBOT, TUNE, S = load_robot(), TuneConfig(), named_command("s")
@@ -48,14 +48,14 @@ def carries():
 
 
 def gradient(carries, trace, first, last, **how):
-    told = stack([Told(carry.state, carry.feet) for carry in carries[first : last + 1]])
+    told = stack([MeasuredState(carry.state, carry.feet) for carry in carries[first : last + 1]])
     weights = stack([nominal()] * (last - first))
     tick = jnp.asarray(START + first)
     return follow(TUNE, ROBOT, S, ANCHOR, last_command, trace, weights, tick, told, **how)
 
 
 def begun(carry):
-    trace = init_trace(ANCHOR, Told(carry.state, carry.feet), zero_wrench())
+    trace = init_trace(ANCHOR, MeasuredState(carry.state, carry.feet), zero_wrench())
     return trace._replace(commands=carry.commands)
 
 
@@ -132,8 +132,11 @@ def course(monkeypatch, config, follows, windows, start=None):
     start, steps, turn = start or nominal(), [], iter(follows)
     monkeypatch.setattr(online, "follow", lambda *a, **how: next(turn)(*a, **how))
     retune = retuner(config, ROBOT, start, S, last_command, steps.append)
-    ticks = range(config.window * windows + 2)
-    return [retune(t, ANCHOR, MEASURED, zero_wrench()) for t in ticks], steps
+    carry, weights = retune.init, []
+    for tick in range(config.window * windows + 2):
+        carry, now = retune.step(carry, tick, ANCHOR, MEASURED, zero_wrench())
+        weights.append(now)
+    return weights, steps
 
 
 def test_weights_change_once_a_window_by_at_most_beta(monkeypatch):
@@ -219,14 +222,15 @@ def test_the_model_commands_along_the_measured_states_what_the_walk_commanded():
     """What is differentiated is the controller that walked: its commands are found again."""
     seen, told = [], []
 
-    def watch(tick, anchor, measurement, last):
+    def watch(carry, tick, anchor, measurement, last):
         seen.append((anchor, measurement, last))
-        return nominal()
+        return carry, nominal()
 
-    walk(WalkConfig(), ROBOT, nominal(), S, ideal(), 0.45, retune=watch)
+    walk(WalkConfig(), ROBOT, nominal(), S, ideal(), 0.45, retune=Retune(None, watch))
     retune = retuner(OnlineConfig(), ROBOT, nominal(), S, last_command, told.append)
+    carry = retune.init
     for tick, row in enumerate(seen):
-        retune(tick, *row)
+        carry, _ = retune.step(carry, tick, *row)
     commands = stack([last for _, _, last in seen[1:42]])
     change = jax.tree.map(lambda w: jnp.sum(jnp.diff(w, axis=0) ** 2), commands)
     assert float(told[0].evaluation.parts.control) == pytest.approx(float(sum(change)), rel=1e-6)

@@ -1,6 +1,8 @@
 """A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
+import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import jax
 import numpy as np
@@ -8,14 +10,16 @@ import pytest
 from pretend import pretend_history
 from synthetic import synthetic_walk
 
-from hector_jax import pipeline
+from hector_jax import commands, flags, pipeline
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation.metrics import score
+from hector_jax.grfm import dataset
 from hector_jax.grfm.dataset import collect, draw_jobs, draw_jobs_near
 from hector_jax.grfm.network import NetParams
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.inputs import InputError
 from hector_jax.pipeline import CollectConfig
 from hector_jax.robot import load_robot
 from hector_jax.sim.walk import walk
@@ -24,22 +28,39 @@ from hector_jax.storage import read_card
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.rollout import RolloutConfig
 
-QUICK = TrainConfig(epochs=1)
-
 
 @pytest.fixture(scope="module")
 def robot():
     return load_robot()
 
 
-def gather(folder, robot, seed=0, controller=None):
+def gather(folder, robot, draw=0, **others):
+    """Toy walks with the card of those that a command would collect, but for `others`."""
     collect(
         folder,
-        draw_jobs(seed, 5),
-        lambda jobs: (synthetic_walk(10 * seed + job.seed, 12) for job in jobs),
+        draw_jobs(draw, 5),
+        lambda jobs: (synthetic_walk(10 * draw + job.seed, 12) for job in jobs),
         robot=robot,
-        about={"controller": controller or repr(WalkConfig())},
+        settings=pipeline.collection_settings(CollectConfig(), robot) | others,
+        about={},
     )
+
+
+def ground(folder, robot, variant=None):
+    return pipeline.ground(ThreadPoolExecutor(1), robot, folder, variant)
+
+
+@dataclass(frozen=True)
+class Quick(TrainConfig):
+    """A training of one epoch."""
+
+    epochs: int = 1
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Nets are trained for one epoch, by every command."""
+    monkeypatch.setattr(pipeline, "TrainConfig", Quick)
 
 
 def test_no_walk_is_in_two_parts(tmp_path, robot):
@@ -48,31 +69,82 @@ def test_no_walk_is_in_two_parts(tmp_path, robot):
     walks = [set(np.unique(part.walk)) for part in parts[:3]]
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 5
-    held = pipeline.held_out(robot, tmp_path)
+    net = pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
+    held = pipeline.held_out(robot, net)
     assert set(np.asarray(held.job.seed)) == walks[2]
 
 
-def test_a_net_is_trained_once_and_again_for_other_walks(tmp_path, robot):
-    path = tmp_path / "grfm.npz"
-    gather(tmp_path / "one", robot)
-    first = pipeline.learned(QUICK, robot, tmp_path / "one", path)
-    written = path.read_bytes()
-    again = pipeline.learned(QUICK, robot, tmp_path / "one", path)
-    assert path.read_bytes() == written
-    jax.tree.map(np.testing.assert_array_equal, first.params, again.params)
-    assert again.errors.keys() == {"raw", "linear", "net"}
-    card = read_card(path)["about"]
+def test_a_net_is_trained_once(tmp_path, robot, quick, monkeypatch):
+    gather(tmp_path / "walks", robot)
+    first = ground(tmp_path, robot)
+    written = (tmp_path / "grfm.npz").read_bytes()
+    monkeypatch.setattr(dataset, "make_dataset", None)  # nor are the walks made samples again
+    again = ground(tmp_path, robot)
+    assert (tmp_path / "grfm.npz").read_bytes() == written
+    for one, other in ((first.params, again.params), (first.linear, again.linear)):
+        jax.tree.map(np.testing.assert_array_equal, one, other)
+    assert again.errors == first.errors
+    assert again.held_out == first.held_out
+    card = read_card(tmp_path / "grfm.npz")["about"]
     assert card["settings"]["variant"] == "residual"
     assert card["made_of"]["controller"] == repr(WalkConfig())
-    gather(tmp_path / "two", robot, seed=1)
-    pipeline.learned(QUICK, robot, tmp_path / "two", path)
-    assert read_card(path)["about"]["made_of"] != card["made_of"]
+
+
+def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_path, monkeypatch):
+    made, cut = [], InterruptedError
+
+    def collect(pool, config, robot, folder):
+        made.append((config, folder))
+        raise cut
+
+    monkeypatch.setattr(pipeline, "collect", collect)
+    for command in (
+        flags.Tune(iterations=10, data=tmp_path / "data", run=tmp_path / "run"),
+        flags.Table(quick=True, data=tmp_path / "data", out=tmp_path / "table"),
+        flags.Grfm(data=tmp_path / "data", out=tmp_path / "grfm"),
+    ):
+        with pytest.raises(cut):
+            commands.run(command)
+    assert made == 3 * [(CollectConfig(), tmp_path / "data" / "walks")]
+
+
+@pytest.mark.parametrize(
+    ("others", "message"),
+    [
+        (
+            {"seed": 5},
+            "walks: made with seed 5, this command expects 0; remove it, or name another",
+        ),
+        ({"walks": 128}, "walks: made with walks 128, this command expects 64"),
+        ({"paths": "short"}, "walks: made with paths 'short', this command expects"),
+        ({"controller": "another"}, "walks: made with controller 'another'"),
+        ({"code": "older"}, "walks: made by other code or other versions of jax, jaxlib, mujoco"),
+    ],
+)
+def test_walks_of_other_settings_are_refused(tmp_path, robot, others, message):
+    gather(tmp_path / "walks", robot, **others)
+    with pytest.raises(InputError, match=message):
+        ground(tmp_path, robot)
+
+
+def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, robot, quick):
+    path = tmp_path / "grfm.npz"
+    gather(tmp_path / "walks", robot)
+    pipeline.train(TrainConfig(epochs=2), robot, tmp_path / "walks", path)
+    written = path.read_bytes()
+    with pytest.raises(InputError, match="grfm.npz: made with epochs 2, this command expects 1;"):
+        ground(tmp_path, robot)
+    assert path.read_bytes() == written
+    gather(tmp_path / "others", robot, draw=1)
+    pipeline.train(TrainConfig(epochs=1), robot, tmp_path / "others", path)
+    with pytest.raises(InputError, match="grfm.npz: made with content"):
+        ground(tmp_path, robot)
 
 
 def test_what_was_held_out_stays_held_out_beside_other_walks(tmp_path, robot):
     one, two = tmp_path / "one", tmp_path / "two"
     gather(one, robot)
-    gather(two, robot, seed=1)
+    gather(two, robot, draw=1)
     alone = [pipeline.samples(robot, folder) for folder in (one, two)]
     both = pipeline.samples(robot, one, two)
     joined = jax.tree.map(lambda *x: np.concatenate(x), *(part[:3] for part in alone))
@@ -126,32 +198,34 @@ def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):
     path = tmp_path / "grfm.npz"
     pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
     written = path.read_bytes()
-    gather(tmp_path / "others", robot, seed=1)
-    pool = ThreadPoolExecutor(1)
-    expected = "grfm.npz: holds grfm-paper, expected grfm-residual"
-    with pytest.raises(ValueError, match=expected):
-        pipeline.ground(pool, TuneConfig(), robot, tmp_path)
-    with pytest.raises(ValueError, match=expected):  # though it is stale too
-        pipeline.learned(QUICK, robot, tmp_path / "others", path)
+    with pytest.raises(InputError, match="grfm.npz: holds grfm-paper, expected grfm-residual"):
+        ground(tmp_path, robot)
     assert path.read_bytes() == written
 
 
-def test_a_net_is_kept_and_found_by_its_variant(tmp_path, robot, monkeypatch):
+def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
     assert pipeline.net_path(tmp_path, "residual") == tmp_path / "grfm.npz"
     path = pipeline.net_path(tmp_path, "paper")
     assert path == tmp_path / "grfm-paper.npz"
     gather(tmp_path / "walks", robot)
     pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
-    monkeypatch.setattr(pipeline, "train", None)  # nothing is to be trained again
-    found = pipeline.ground(ThreadPoolExecutor(1), TuneConfig(), robot, tmp_path, "paper")
-    assert isinstance(found.params, NetParams)
+    monkeypatch.setattr(pipeline, "_train", None)  # nothing is to be trained again
+    assert isinstance(ground(tmp_path, robot, "paper").params, NetParams)
 
 
-def test_walks_of_another_controller_are_refused(tmp_path, robot):
-    gather(tmp_path / "walks", robot, controller="another")
-    pool = ThreadPoolExecutor(1)
-    with pytest.raises(ValueError, match="walks: walked by another controller"):
-        pipeline.ground(pool, TuneConfig(), robot, tmp_path)
+def test_a_tuning_that_fails_is_told_while_others_go_on(monkeypatch, robot):
+    def job(config, robot, command, params, name, tell, record):
+        if name == "with":
+            raise InputError("the starting weights fall")
+        time.sleep(30.0)
+
+    monkeypatch.setattr(pipeline, "_tune_job", job)
+    problems = dict.fromkeys(("without", "with"), (named_command("s"), None))
+    begin, pool = time.monotonic(), ThreadPoolExecutor(2)
+    with pytest.raises(InputError, match="the starting weights fall"):
+        pipeline.tune_many(pool, TuneConfig(), robot, problems, "tuning")
+    assert time.monotonic() - begin < 15.0
+    pool.shutdown(wait=False)
 
 
 @pytest.mark.slow

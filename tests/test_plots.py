@@ -1,61 +1,113 @@
-"""Pictures: each is written, says what it shows, and survives what a run can bring."""
+"""Pictures: what is drawn is what was measured, with names and units, whatever a run can bring."""
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from PIL import Image
-from pretend import pretend_history, pretend_verdict, pretend_walk
+from pretend import elsewhere, pretend_history, pretend_verdict, pretend_walk
 
 from hector_jax.control.weights import WEIGHT_NAMES
 from hector_jax.evaluation import plots
 from hector_jax.evaluation.fidelity import Drift
 from hector_jax.evaluation.plots.style import looks_of
 from hector_jax.grfm.training import History
+from hector_jax.trajectory import State
 from hector_jax.tuning.loss import LossConfig
+
+FOUR = ("nominal", "expert", "without", "with")
 
 
 @pytest.fixture(scope="module")
 def walks():
     return {
-        name: pretend_walk(i, 0.02 + 0.01 * i, seconds=1.0, turn=0.5)
-        for i, name in enumerate(("nominal", "expert", "without", "with"))
+        name: pretend_walk(i, 0.02 + 0.01 * i, seconds=1.0, turn=0.5) for i, name in enumerate(FOUR)
     }
 
 
-def _has_ink(path):
-    with Image.open(path) as picture:
-        grey = np.asarray(picture.convert("L"))
-    return picture.width > 700 and 0.01 < np.mean(grey < 200) < 0.5
+def lines(axes):
+    """Data of an axes' lines by their label."""
+    return {line.get_label(): np.asarray(line.get_xydata()) for line in axes.lines}
 
 
-def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path):
-    path = tmp_path / "loss.png"
-    histories = {"without": pretend_history(12), "with": pretend_history(8, refused=(3, 5))}
-    assert "refused" in plots.losses(path, LossConfig(), histories)
-    assert _has_ink(path)
+def legend_of(figure):
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
-def test_tracking_and_path_are_drawn_up_to_a_fall(tmp_path, walks):
+def test_errors_and_paths_do_not_depend_on_where_a_walk_began(tmp_path, drawn, walks):
+    one = walks["with"]
+    pair = {"with": one, "nominal": elsewhere(one, (0.4, -1.0), 2.0)}
+    plots.tracking(tmp_path / "a.png", pair)
+    caption = plots.path_from_above(tmp_path / "b.png", pair)
+    assert "one reference" in caption
+    for axes in [*drawn[0].axes, *drawn[1].axes]:
+        found = lines(axes)
+        np.testing.assert_allclose(found["with (tuned, net)"], found["nominal"], atol=1e-9)
+    reference = lines(drawn[1].axes[0])["reference"]
+    np.testing.assert_allclose(reference[0], one.reference.position[0, :2], atol=1e-9)
+
+
+def test_the_errors_are_along_and_across_the_heading_in_centimetres_and_degrees(tmp_path, drawn):
+    walk = pretend_walk(error=0.0, seconds=1.0, turn=1.0)
+    yaw = walk.reference.euler[:, 2]
+    left = 0.02 * np.stack([-np.sin(yaw), np.cos(yaw), 0 * yaw], axis=1)
+    state = State(walk.state.euler + [0.0, 0.1, 0.0], walk.state.position + left, *walk.state[2:])
+    plots.tracking(tmp_path / "a.png", {"with": walk._replace(state=state)})
+    found = {axes.get_ylabel(): axes.lines[0].get_ydata() for axes in drawn[0].axes}
+    assert [label.split(" [")[1] for label in found] == ["cm]"] * 3 + ["deg]"] * 3
+    expected = [0.0, 2.0, 0.0, 0.0, np.rad2deg(0.1), 0.0]
+    for values, level in zip(found.values(), expected, strict=True):
+        np.testing.assert_allclose(values, level, atol=1e-9)
+
+
+def test_lines_end_at_a_fall(tmp_path, drawn, walks):
     fallen = walks | {"without": pretend_walk(2, seconds=1.0, fall_at=0.6)}
-    assert plots.tracking(tmp_path / "tracking.png", fallen)
-    assert plots.path_from_above(tmp_path / "path.png", fallen)
-    assert _has_ink(tmp_path / "tracking.png")
-    assert _has_ink(tmp_path / "path.png")
+    plots.tracking(tmp_path / "tracking.png", fallen)
+    plots.path_from_above(tmp_path / "path.png", fallen)
+    for axes in [*drawn[0].axes, *drawn[1].axes]:
+        up = np.isfinite(lines(axes)["without (tuned, no net)"][:, 1])
+        assert up.tolist() == [True] * 60 + [False] * 40
+
+
+def test_below_a_film_stand_the_distances_and_where_the_axes_are(tmp_path, drawn, walks):
+    pair = {name: walks[name] for name in ("nominal", "with")}
+    red, green = (255, 0, 0), (0, 255, 0)
+    box = plots.distances(tmp_path / "a.png", pair, (red, green), 800, 132)
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.size == (800, 132)
+        inside = np.asarray(picture.convert("RGB"))[box[1] : box[3], box[0] : box[2]]
+    for colour in (red, green):
+        assert (np.abs(inside.astype(int) - colour).sum(axis=-1) < 30).any()
+    away = (walks["with"].state.position - walks["with"].reference.position)[:, :2]
+    found = lines(drawn[0].axes[0])
+    rms = 100 * np.sqrt(np.mean(np.sum(away**2, axis=1)))
+    np.testing.assert_allclose(
+        found[f"with (tuned, net): {rms:.1f} cm RMS"][:, 1], 100 * np.linalg.norm(away, axis=1)
+    )
 
 
 def test_the_four_sets_of_most_pictures_stay_apart_in_grey():
-    names = ("with", "expert", "without", "nominal")
-    looks = looks_of(names)
+    looks = looks_of(FOUR)
+    names = ("with", "expert", "without", "nominal")  # from dark to light
     greys = [np.dot(to_rgb(looks[name].color), (0.299, 0.587, 0.114)) for name in names]
     assert np.diff(greys).min() > 0.12
-    assert len({look.marker for look in looks.values()}) == len(names)
+    assert len({look.marker for look in looks.values()}) == len(FOUR)
 
 
-def test_the_collective_figure_names_the_few_sets_that_its_panels_show(tmp_path, walks):
+def test_a_legend_begins_with_the_names_of_the_tables():
+    for name in (*FOUR, "with_ten", "shared_mean", "ceiling", "mine"):
+        assert plots.named(name).split(" (")[0] == name
+
+
+def test_the_collective_figure_has_the_four_sets_and_the_ceiling(tmp_path, drawn, walks):
     more = {name: walks["expert"] for name in ("searched", "shared_mean", "ceiling")} | walks
     caption = plots.collective(tmp_path / "more.png", more, None)
-    assert caption == plots.collective(tmp_path / "few.png", walks, None)
-    assert "nominal, expert, tuned without net, tuned with net" in caption
+    assert "of nominal, expert, without, with," in caption
+    path, *panels = drawn[0].axes
+    drawn_lines = {label for label in lines(path) if not label.endswith("set down")}
+    assert drawn_lines == {plots.named(name) for name in (*FOUR, "ceiling")} | {"reference"}
+    for panel in panels:
+        assert {label for label in lines(panel) if label[0] != "_"} == set(map(plots.named, FOUR))
 
 
 def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):
@@ -65,102 +117,160 @@ def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.8])
-def test_the_collective_figure_goes_with_and_without_snapshots(tmp_path, turn):
+def test_the_collective_figure_goes_with_and_without_snapshots(tmp_path, drawn, turn):
     """A straight path lies across, a bent one stands beside the panels."""
-    names = ("nominal", "searched", "mine", "with")
-    walks = {name: pretend_walk(i, seconds=2.0, turn=turn) for i, name in enumerate(names)}
-    strip = tmp_path / "strip.png"
-    Image.new("RGB", (600, 200), "grey").save(strip)
-    heights = {}
-    for name, snapshots in {"with.png": strip, "without.png": None}.items():
-        caption = plots.collective(tmp_path / name, walks, snapshots)
-        assert caption.startswith("Snapshots; ") is (snapshots is not None)
-        assert _has_ink(tmp_path / name)
-        with Image.open(tmp_path / name) as picture:
-            heights[name] = picture.height
-    assert heights["with.png"] > heights["without.png"]
+    walks = {name: pretend_walk(seconds=2.0, turn=turn) for name in ("nominal", "with")}
+    Image.new("RGB", (600, 200), "grey").save(tmp_path / "strip.png")
+    plots.collective(tmp_path / "without.png", walks, None)
+    caption = plots.collective(tmp_path / "with.png", walks, tmp_path / "strip.png")
+    assert caption.startswith("Snapshots; ")
+    without, with_ = drawn
+    assert with_.axes[0].images
+    assert with_.get_figheight() > without.get_figheight() + 3.0
+    path, first, *_ = (axes.get_window_extent() for axes in without.axes)
+    assert (path.y0 > first.y1) if turn == 0.0 else (path.x1 < first.x0)
 
 
-def test_changes_are_drawn_for_sets_that_only_one_trajectory_has_and_with_falls(tmp_path):
-    one, other = pretend_verdict(8), pretend_verdict(8, fallen={("with", 1)})
-    other.scores["mine"] = other.scores["with"]
+def test_falls_stand_at_the_edge_of_changes_and_do_not_squeeze_the_axis(tmp_path, drawn):
+    one, other = pretend_verdict(8), pretend_verdict(8, fallen={("with", 1), ("with", 3)})
+    for verdict in (one, other):
+        verdict.scores["with"].L[[1, 3]] *= 1 + 200 * verdict.scores["with"].fallen[[1, 3]]
+    other.scores["mine"] = other.scores["with_ten"]
     paper = {("c", "with_ten", "nominal"): -68.7}
-    path = tmp_path / "changes.png"
-    assert "cross" in plots.changes(path, {"c": one, "s": other}, paper)
-    assert _has_ink(path)
+    plots.changes(tmp_path / "changes.png", {"c": one, "s": other}, paper)
+    c, s, *_ = drawn[0].axes
+    assert [text.get_text() for text in s.texts] == ["2 fell"]
+    assert not c.texts
+    assert s.get_xlim()[1] < 2.0
+    rows = [label.get_text() for label in c.get_yticklabels()]
+    assert rows[-2:] == ["with (tuned, net)", "mine"]
+    dots = [line.get_xdata() for line in s.lines if line.get_marker() == "o"]
+    ratio = other.scores["with"].L / other.scores["nominal"].L
+    assert any(np.array_equal(x, ratio[~other.scores["with"].fallen]) for x in dots)
+    diamonds = next(line for line in c.lines if line.get_marker() == "D")
+    np.testing.assert_allclose(diamonds.get_xydata(), [[0.313, rows.index("with_ten")]])
+    assert c.get_xlabel() == "change of L against nominal [%]"
 
 
-def test_weights_are_drawn_with_and_without_the_expert(tmp_path):
+def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path, drawn):
+    histories = {"without": pretend_history(12), "with": pretend_history(8, refused=(3, 5))}
+    plots.losses(tmp_path / "loss.png", LossConfig(), histories)
+    whole = drawn[0].axes[0]
+    kept = [0, 1, 2, 4, 6, 7, 8]
+    expected = [histories["with"][i].evaluation.loss / 1e6 for i in kept]
+    np.testing.assert_allclose(lines(whole)["with (tuned, net)"], np.c_[kept, expected])
+    crosses = [line.get_xdata().tolist() for line in whole.lines if line.get_marker() == "x"]
+    assert [3, 5] in crosses
+    assert "refused step" in legend_of(drawn[0])
+
+
+def test_bars_are_the_weights_over_the_nominal_ones(tmp_path, drawn):
     nominal = np.geomspace(1e-4, 100, len(WEIGHT_NAMES))
-    sets = {"nominal": nominal, "without": 2 * nominal, "with": nominal / 3}
-    for name, some in {"few.png": sets, "all.png": sets | {"expert": 3 * nominal}}.items():
-        assert "nominal" in plots.weights(tmp_path / name, WEIGHT_NAMES, some)
-        assert _has_ink(tmp_path / name)
+    sets = {"nominal": nominal, "without": 2 * nominal, "with": nominal / 4}
+    plots.weights(tmp_path / "few.png", WEIGHT_NAMES, sets)
+    plots.weights(tmp_path / "all.png", WEIGHT_NAMES, sets | {"expert": 3 * nominal})
+    tops = [bar.get_y() + bar.get_height() for bar in drawn[0].axes[0].patches]
+    np.testing.assert_allclose(tops, [2.0] * 24 + [0.25] * 24)
+    np.testing.assert_allclose(lines(drawn[1].axes[0])["expert"][:, 1], 3.0)
 
 
-def test_wrenches_are_drawn_for_the_foot_that_is_asked_for(tmp_path, walks):
+def test_wrenches_are_those_of_the_foot_that_is_asked_for(tmp_path, drawn, walks):
     walk = walks["with"]
-    curves = {"commanded": walk.command, "measured": walk.effect, "predicted": walk.effect}
-    left = plots.wrenches(tmp_path / "left.png", 0.01, curves)
-    right = plots.wrenches(tmp_path / "right.png", 0.01, curves, foot=1)
-    assert "left foot" in left
-    assert "right foot" in right
-    assert _has_ink(tmp_path / "left.png")
-    assert (tmp_path / "left.png").read_bytes() != (tmp_path / "right.png").read_bytes()
+    curves = {"commanded": walk.command, "measured": walk.effect}
+    for foot, side in enumerate(("left", "right")):
+        assert f"{side} foot" in plots.wrenches(tmp_path / "a.png", 0.01, curves, foot)
+        up = drawn[foot].axes[2]
+        assert up.get_ylabel() == "$F_z$ [N]"
+        found = {step.get_label(): step.get_data().values for step in up.patches}
+        np.testing.assert_array_equal(found["measured"], walk.effect.force[:40, foot, 2])
+    assert legend_of(drawn[0]) == ["measured", "commanded"]
 
 
-def test_the_training_of_a_net_is_drawn(tmp_path):
+def test_the_epoch_of_the_least_error_on_the_validation_walks_is_marked(tmp_path, drawn):
     falling = np.geomspace(300.0, 60.0, 50)
-    assert plots.training(
-        tmp_path / "net.png", History(falling, falling / 300, falling + 5, falling / 250)
-    )
-    assert _has_ink(tmp_path / "net.png")
+    held = np.r_[falling[:30] + 5, falling[29] + np.arange(5.0, 25.0)]
+    plots.training(tmp_path / "net.png", History(falling, falling / 300, held, falling / 250))
+    force, moment = drawn[0].axes
+    assert lines(force)["least"].tolist() == [[30.0, held[29]]]
+    assert "N$^2$" in force.get_ylabel()
+    assert "(N m)$^2$" in moment.get_ylabel()
 
 
-def test_open_loop_errors_are_drawn_for_each_world(tmp_path):
+def test_open_loop_errors_have_a_row_for_each_world(tmp_path, drawn):
     time = np.linspace(0.01, 0.4, 40)
     names = ("raw", "linear", "paper", "residual", "gated", "measured")
     found = {n: Drift(time, 0.1 * time**2 / i, time / i) for i, n in enumerate(names, 1)}
-    for worlds in ({"hfs": found}, {"hfs": found, "hardware stand-in": found}):
-        path = tmp_path / f"{len(worlds)}.png"
-        assert "RMS" in plots.open_loop(path, worlds)
-        assert _has_ink(path)
+    plots.open_loop(tmp_path / "a.png", {"hfs": found, "hardware stand-in": found})
+    rows = [axes.get_title() for axes in drawn[0].axes]
+    assert rows == ["hfs"] * 2 + ["hardware stand-in"] * 2
+    np.testing.assert_allclose(lines(drawn[0].axes[0])["measured"][:, 1], 10 * time**2 / 6)
+    assert len(set(legend_of(drawn[0]))) == len(names)
 
 
-def test_tuning_while_walking_is_drawn_with_walks_that_ended_early(tmp_path):
+def test_tuning_while_walking_is_drawn_with_walks_that_ended_early(tmp_path, drawn):
     times = 0.4 * np.arange(1, 21)
+    arms = {"fixed": np.array([[1.0], [3.0], [9.0]]), "carried": np.ones((3, 1))}
     curves = {
-        (name, "nominal"): {arm: 1e5 * np.ones((2, 20)) for arm in ("fixed", "until", "carried")}
+        (name, "nominal"): {arm: 1e6 * x * np.ones((3, 20)) for arm, x in arms.items()}
         for name in ("straight", "s")
     }
-    assert "median" in plots.while_walking(tmp_path / "loss.png", 4.0, times, curves)
+    plots.while_walking(tmp_path / "loss.png", 4.0, times, curves)
+    assert set(lines(drawn[0].axes[0])["weights stay"][:, 1]) == {3.0}
+    assert drawn[0].axes[0].get_ylabel() == "L of 0.4 s [10$^6$]"
     ratios = np.exp(np.linspace(0.0, 1.0, 20)[:, None] * np.linspace(-1, 1, len(WEIGHT_NAMES)))
-    courses = {"straight": ratios, "c": ratios[:7], "s": ratios}
-    assert "6 weights" in plots.weight_courses(
-        tmp_path / "weights.png", 4.0, times, WEIGHT_NAMES, courses
+    plots.weight_courses(
+        tmp_path / "weights.png", 4.0, times, WEIGHT_NAMES, {"straight": ratios, "c": ratios[:7]}
     )
-    assert _has_ink(tmp_path / "loss.png")
-    assert _has_ink(tmp_path / "weights.png")
+    straight, c = (lines(axes) for axes in drawn[1].axes)
+    np.testing.assert_allclose(straight["Q roll"][:, 1], ratios[:, 0])  # it moved most
+    assert len(c["Q roll"]) == 7
 
 
-def test_pictures_of_batches_are_drawn(tmp_path):
-    rng = np.random.default_rng(0)
-    names = ("expert", "straight alone", "c alone", "s alone", "mean of all", "worst of all")
-    columns = ("straight", "c", "s", "unseen")
-    plots.ratios(tmp_path / "a.png", columns, {n: rng.uniform(0.3, 1.4, 4) for n in names})
-    losses = {n: 1e6 * rng.gamma(4.0, 0.5, 20) for n in names[:5]}
-    losses["nominal"] = np.r_[losses.pop("expert")[:19], 4e7]  # a fall
-    plots.by_plant(tmp_path / "b.png", losses)
+def test_sets_of_batches_stand_at_their_ratio_and_in_the_order_of_their_losses(tmp_path, drawn):
+    ratios = {"expert": np.array([0.8, 0.7]), "straight alone": np.array([0.3, 0.5])}
+    plots.ratios(tmp_path / "a.png", ("straight", "c"), ratios)
+    found = lines(drawn[0].axes[0])
+    assert found["straight alone"][:, 1].tolist() == [0.3, 0.5]
+    assert found["straight alone"][0, 0] != found["expert"][0, 0]
+    plots.by_plant(tmp_path / "b.png", {"nominal": np.array([4e7, 1e6, 2e6, 3e6])})
+    assert lines(drawn[1].axes[0])["nominal"].tolist() == [
+        [12.5, 1.0],
+        [37.5, 2.0],
+        [62.5, 3.0],
+        [87.5, 40.0],
+    ]
+
+
+def test_a_front_leaves_out_what_failed_and_labels_the_ends_and_the_papers_price(tmp_path, drawn):
     prices = np.geomspace(0.01, 100, 9)
     falling = 1e6 * np.stack([3 * prices**-0.4, 0.4 + 0.05 * prices**0.3], axis=1)
-    worlds = {"rigid body": falling, "hfs": 1.3 * falling}
+    worlds = {"rigid body": falling.copy(), "hfs": 1.3 * falling}
     worlds["rigid body"][0] = np.nan
-    plots.front(tmp_path / "c.png", prices, worlds, {"nominal": (3e6, 5e5), "expert": (2e6, 6e5)})
-    curves = 1e6 * (1 + np.exp(-np.arange(30) / 8) * rng.uniform(0.5, 20, (12, 1)))
-    curves[2, 4] = curves[3, 20:] = np.nan
-    assert "in order" in plots.starts(tmp_path / "d.png", curves)
-    for name in "abcd":
-        assert _has_ink(tmp_path / f"{name}.png")
+    plots.front(tmp_path / "c.png", prices, worlds, {"expert": (2e6, 6e5)})
+    model, hfs = drawn[0].axes
+    np.testing.assert_allclose(lines(model)["tuned"], falling[1:] / 1e6)
+    assert [text.get_text() for text in model.texts] == ["x0.032", "x1", "x100"]
+    assert [text.get_text() for text in hfs.texts] == ["x0.01", "x1", "x100"]
+    assert lines(hfs)["expert"].tolist() == [[2.0, 0.6]]
+
+
+def test_starts_end_where_their_last_accepted_step_is(tmp_path, drawn):
+    curves = 1e6 * np.array([[4.0, 3.0, 2.0], [9.0, np.nan, 5.0], [8.0, 1.0, np.nan]])
+    plots.starts(tmp_path / "d.png", curves)
+    way, end = drawn[0].axes
+    assert lines(way)["from elsewhere"].tolist() == [[0.0, 9.0], [2.0, 5.0]]
+    assert end.lines[0].get_ydata().tolist() == [1.0, 2.0, 5.0]
+
+
+@pytest.mark.parametrize("span", [1.3, 3.0, 20.0, 500.0])
+def test_a_logarithmic_axis_has_a_few_numbers_whatever_it_spans(span):
+    axes = Figure(figsize=(4, 3)).subplots()
+    axes.plot([0, 1], [0.8, 0.8 * span])
+    plots.style.log_axis(axes, "y")
+    low, high = axes.get_ylim()
+    ticks = [y for y in axes.get_yticks() if low <= y <= high]
+    assert 3 <= len(ticks) <= 10
+    assert "e" not in "".join(label.get_text() for label in axes.get_yticklabels())
 
 
 @pytest.mark.parametrize("ending", ["png", "svg", "pdf"])

@@ -171,11 +171,17 @@ def test_bayes_without_its_package_says_what_to_install(monkeypatch):
         Bayes().ask(nominal(), [Generation(np.zeros((1, 18)), np.ones(1))])
 
 
-def test_a_race_is_drawn(tmp_path):
-    x = np.arange(20.0)
-    curves = {
-        name: [(x + i, 3e6 * np.exp(-x / (5 + 9 * i))) for i in range(1 + (name != "with"))]
-        for name in plots.RIVALS
-    }
-    assert "median" in plots.race(tmp_path / "race.png", curves, "walks")
-    assert (tmp_path / "race.png").stat().st_size > 10_000
+def test_a_race_shows_each_repeat_thin_and_their_median(tmp_path, drawn):
+    x, losses = np.arange(20.0), 1e6 * np.array([[3.0], [5.0], [9.0]]) * np.linspace(1.0, 0.2, 20)
+    curves = {"with": [(x, losses[0])], "random": [(x, one) for one in losses]}
+    walks = plots.race(tmp_path / "a.png", curves, "walks on the simulator")
+    seconds = plots.race(tmp_path / "b.png", curves, "seconds of one core")
+    assert walks != seconds
+    assert "by seconds of one core" in seconds
+    axes = drawn[0].axes[0]
+    thin = [line.get_ydata() for line in axes.lines if line.get_linewidth() < 1.0]
+    np.testing.assert_allclose(thin, losses / 1e6)
+    middle = next(line for line in axes.lines if line.get_label() == "random")
+    np.testing.assert_allclose(middle.get_ydata(), losses[1] / 1e6)
+    low, high = axes.get_ylim()
+    assert sum(low <= y <= high for y in axes.get_yticks()) >= 4

@@ -92,18 +92,13 @@ def spoil(path, how):
     path.write_bytes(bytes(data))
 
 
-@pytest.mark.parametrize("how", ["truncated", "bit-flipped", "version", "shape", "robot"])
-def test_a_spoilt_state_is_named_and_the_one_before_is_taken(tmp_path, capsys, monkeypatch, how):
+@pytest.mark.parametrize("how", ["truncated", "bit-flipped", "shape", "robot"])
+def test_a_spoilt_state_is_named_and_the_one_before_is_taken(tmp_path, capsys, how):
     kept = Checkpoint(tmp_path / "state.npz", "thing", ROBOT)
     kept.save({"x": np.zeros(3)})
     kept.save(STATE)
     assert kept.load(STATE)[0]["x"].tolist() == [0.0, 1.0, 2.0]
-    if how == "version":
-        others = {**storage.versions(), "jax": "0.0.1"}
-        with monkeypatch.context() as patch:
-            patch.setattr(storage, "versions", lambda: others)
-            kept.save(STATE)
-    elif how == "shape":
+    if how == "shape":
         kept.save({"x": np.zeros(4)})
     elif how == "robot":
         heavier = ROBOT._replace(mass=np.asarray(ROBOT.mass) + 1.0)
@@ -295,6 +290,29 @@ def test_a_run_is_taken_up_with_the_flags_it_was_begun_with(begun):
     assert (told[-1].traj, told[-1].seeds, told[-1].processes) == ("c", 3, 1)
 
 
+def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(tmp_path, monkeypatch):
+    resumed = []
+    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: resumed.append(args))
+    own = {"video": False, "json": True, "processes": 1, "data": tmp_path / "data"}
+    tuning.tune(flags.Tune(run=tmp_path / "run", **own))
+    tuning.tune(flags.Tune(resume=tmp_path / "run"))
+    assert {name: getattr(resumed[-1], name) for name in own} == own
+    tuning.tune(flags.Tune(resume=tmp_path / "run", processes=3, data=tmp_path / "moved"))
+    assert (resumed[-1].processes, resumed[-1].data) == (3, tmp_path / "moved")
+
+
+def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monkeypatch):
+    folder, resumed = begun
+    there = Path.cwd()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=f"^data: no data here; the run was begun in {there}: "):
+        tuning.tune(flags.Tune(resume=folder))
+    assert not (tmp_path / "data").exists()
+    (tmp_path / "mine").mkdir()
+    tuning.tune(flags.Tune(resume=folder, data=Path("mine")))
+    assert len(resumed) == 2
+
+
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
@@ -312,12 +330,12 @@ def test_another_configuration_is_not_taken_up(begun, asked, message):
     assert files(folder) == before
 
 
-def test_a_run_of_other_versions_another_robot_or_none_is_not_taken_up(begun, monkeypatch):
+def test_a_run_of_other_code_another_robot_or_none_is_not_taken_up(begun, monkeypatch):
     folder, _ = begun
     again = flags.Tune(resume=folder)
     with monkeypatch.context() as patch:
-        patch.setattr(storage, "versions", lambda: {"jax": "0.0.1"})
-        with pytest.raises(ValueError, match="versions.json: made with jax .*, here is jax 0.0.1"):
+        patch.setattr(tuning, "code_hash", lambda *modules: "another")
+        with pytest.raises(InputError, match="run: begun with other code or other versions"):
             tuning.tune(again)
     with monkeypatch.context() as patch:
         other = ROBOT._replace(mass=np.asarray(13.0))

@@ -4,20 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import synthetic_walk
+from model import PLAIN, SHORT, small_effect
 
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
-from hector_jax.grfm.dataset import at_interval, make_dataset
-from hector_jax.grfm.network import as_effect, init_params
-from hector_jax.model.effect import last_command, sure
 from hector_jax.robot import load_robot
-from hector_jax.tuning import sensitivity
+from hector_jax.tuning import difftune, sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune_step
 from hector_jax.tuning.loss import LossConfig, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-SHORT, LONG = RolloutConfig(ticks=50), RolloutConfig(ticks=400)
+LONG = RolloutConfig(ticks=400)
 walk = jax.jit(rollout, static_argnums=0)
 propagate = jax.jit(sensitivity.propagate, static_argnums=0)
 
@@ -35,21 +32,21 @@ def anchor(robot):
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("weights", [nominal, expert])
 def test_named_weights_walk_every_trajectory(robot, anchor, name, weights):
-    trajectory = walk(LONG, robot, weights(), named_command(name), anchor, last_command)
+    trajectory = walk(LONG, robot, weights(), named_command(name), anchor, PLAIN)
     assert not trajectory.fallen.any()
     assert trajectory.residual.max() < 1e-8
     assert total(LossConfig(), losses(trajectory)) < 3e6
 
 
 def test_a_foot_in_the_air_gets_no_wrench(robot, anchor):
-    trajectory = walk(SHORT, robot, expert(), named_command("s"), anchor, last_command)
+    trajectory = walk(LONG, robot, expert(), named_command("s"), anchor, PLAIN)
     swing = ~np.asarray(trajectory.contact)
     assert not np.asarray(trajectory.command.force)[swing].any()
     assert not np.asarray(trajectory.command.moment)[swing].any()
 
 
 def test_commands_respect_friction_force_and_line_foot(robot, anchor):
-    trajectory = walk(LONG, robot, nominal(), named_command("s"), anchor, last_command)
+    trajectory = walk(LONG, robot, nominal(), named_command("s"), anchor, PLAIN)
     force = np.asarray(trajectory.command.force)[np.asarray(trajectory.contact)]
     assert (np.abs(force[:, :2]) <= 0.5 * force[:, 2:] + 1e-4).all()
     assert (force[:, 2] >= -1e-6).all()
@@ -60,7 +57,7 @@ def test_falling_is_seen_and_charged(robot, anchor):
     weak = vector_to_weights(
         weights_to_vector(nominal()).at[12:].set(1.0)
     )  # effort so dear that it sinks
-    trajectory = walk(LONG, robot, weak, named_command("straight"), anchor, last_command)
+    trajectory = walk(LONG, robot, weak, named_command("straight"), anchor, PLAIN)
     assert trajectory.fallen[-1]
     fallen = float(trajectory.fallen.sum())
     assert losses(trajectory).position >= 10 * fallen * 0.5**2
@@ -73,10 +70,13 @@ def test_starting_half_a_cycle_later_mirrors_the_walk(robot):
     half = RolloutConfig().walk.gait.cycle // 2
     command = named_command("straight")
     # A robot that is its own mirror image: the products of inertia that yaw couples to vanish.
-    one = walk(SHORT, robot, nominal(), command, standing_anchor(robot), last_command)
-    other = walk(SHORT, robot, nominal(), command, standing_anchor(robot, half), last_command)
-    np.testing.assert_allclose(one.state.position, other.state.position * mirror, atol=1e-9)
-    np.testing.assert_allclose(one.command.force, other.command.force[:, ::-1] * mirror, atol=1e-6)
+    one, other = (
+        walk(LONG, robot, nominal(), command, standing_anchor(robot, tick), PLAIN)
+        for tick in (0, half)
+    )
+    position, force = other.state.position * mirror, other.command.force[:, ::-1] * mirror
+    np.testing.assert_allclose(one.state.position[:50], position[:50], atol=1e-9)
+    np.testing.assert_allclose(one.command.force[:50], force[:50], atol=1e-6)
 
 
 def random_weights(seed):
@@ -84,60 +84,40 @@ def random_weights(seed):
     return vector_to_weights(weights_to_vector(nominal()) * np.exp(draws))
 
 
-def differences(config, robot, weights, command, anchor, effect, step):
+def loss_of(config, robot, vector, *model):
+    """The loss by the program that has the gradient too, so that no other one is compiled."""
+    return float(tune_step(config, robot, vector_to_weights(jnp.asarray(vector)), *model).loss)
+
+
+def differences(config, robot, weights, *model, step):
     """Central differences of the loss in the 24 log-weights."""
-    return _differences(config, robot, weights_to_vector(weights), command, anchor, effect, step)
-
-
-@jax.jit
-def _shifted(theta, step):
-    eye = jnp.eye(theta.size)
-    return jnp.concatenate([theta * jnp.exp(step * eye), theta * jnp.exp(-step * eye)])
-
-
-def _loss(config, robot, theta, command, anchor, effect):
-    trajectory = rollout(config, robot, vector_to_weights(theta), command, anchor, effect)
-    return total(LossConfig(), losses(trajectory))
-
-
-_losses_of = jax.jit(
-    lambda config, robot, thetas, command, anchor, effect: jax.lax.map(
-        lambda theta: _loss(config, robot, theta, command, anchor, effect), thetas
-    ),
-    static_argnums=0,
-)
-
-
-def _differences(config, robot, theta, command, anchor, effect, step):
-    values = _losses_of(config, robot, _shifted(theta, step), command, anchor, effect)
-    return (values[:24] - values[24:]) / (2 * step)
+    theta, found = np.asarray(weights_to_vector(weights)), []
+    for direction in step * np.eye(24):
+        up, down = (
+            loss_of(config, robot, theta * np.exp(side * direction), *model) for side in (1, -1)
+        )
+        found.append((up - down) / (2 * step))
+    return np.array(found)
 
 
 def relative(found, expected):
     return float(jnp.linalg.norm(found - expected) / jnp.linalg.norm(expected))
 
 
-def _mixed(params, window):
-    net, command = as_effect(params)(window).wrench, last_command(window).wrench
-    wrench = jax.tree.map(lambda n, c: 0.1 * n + 0.9 * c, net, command)
-    return sure(wrench)
-
-
 @pytest.fixture(scope="module")
 def net():
-    """An untrained GRFM-Net that is part of the answer, so that the robot stays on its feet."""
-    walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
-    dataset, _ = make_dataset(load_robot(), jax.tree.map(lambda *x: np.stack(x), *walks))
-    return jax.tree_util.Partial(_mixed, init_params(jax.random.key(0), dataset))
+    """A net that is part of the answer, and of the same program as the plain rigid body."""
+    return small_effect()
 
 
 def check_gradient(config, robot, weights, command, anchor, effect, bar):
-    evaluation = tune_step(TuneConfig(rollout=config), robot, weights, command, anchor, effect)
+    tuning, model = TuneConfig(rollout=config), (command, anchor, effect)
+    evaluation = tune_step(tuning, robot, weights, *model)
     reverse = weights_to_vector(jax.tree.map(jnp.multiply, evaluation.gradient, weights))
     # Halving the step tells a change of the active set inside it from a wrong derivative.
     errors = []
     for step in (1e-5, 5e-6, 2.5e-6):
-        expected = differences(config, robot, weights, command, anchor, effect, step)
+        expected = differences(tuning, robot, weights, *model, step=step)
         errors.append(relative(reverse, expected))
         if errors[-1] <= bar:
             break
@@ -153,7 +133,7 @@ def check_gradient(config, robot, weights, command, anchor, effect, bar):
 @pytest.mark.parametrize("seed", range(5))
 def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor, seed):
     command = named_command(COMMANDS[seed % 3])
-    check_gradient(SHORT, robot, random_weights(seed), command, anchor, last_command, 1e-6)
+    check_gradient(SHORT, robot, random_weights(seed), command, anchor, PLAIN, 1e-6)
 
 
 @pytest.mark.slow
@@ -167,7 +147,7 @@ def test_gradient_over_50_ticks_with_a_net_is_that_of_differences(robot, anchor,
 @pytest.mark.parametrize("with_net", [False, True])
 @pytest.mark.parametrize("seed", range(5))
 def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, net, seed, with_net):
-    effect, weights = net if with_net else last_command, random_weights(seed)
+    effect, weights = net if with_net else PLAIN, random_weights(seed)
     command = named_command(COMMANDS[seed % 3])
     assert not walk(LONG, robot, weights, command, anchor, effect).fallen.any()
     check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4)
@@ -177,14 +157,14 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor)
     command = named_command("s")
     whole, parts = (
         tune_step(
-            TuneConfig(rollout=RolloutConfig(ticks=30, block=block)),
+            TuneConfig(rollout=RolloutConfig(ticks=50, block=block)),
             robot,
             nominal(),
             command,
             anchor,
-            last_command,
+            PLAIN,
         )
-        for block in (30, 12)
+        for block in (500, 23)  # the last block is padded
     )
     assert float(parts.loss) == pytest.approx(float(whole.loss), rel=1e-12)
     for a, b in zip(jax.tree.leaves(parts.gradient), jax.tree.leaves(whole.gradient), strict=True):
@@ -192,14 +172,13 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor)
 
 
 def test_the_way_back_solves_no_qp_again(robot, anchor):
-    step = jax.jit(tune_step, static_argnums=0)
-    lowered = step.lower(
-        TuneConfig(rollout=RolloutConfig(ticks=30)),
+    lowered = jax.jit(tune_step, static_argnums=0).lower(
+        TuneConfig(rollout=SHORT),
         robot,
         nominal(),
         named_command("s"),
         anchor,
-        last_command,
+        PLAIN,
     )
     functions = lowered.as_text().split("func.func")
     solving = [f for f in functions if "_solve_normal" in f.splitlines()[0] and ".while" in f]
@@ -213,7 +192,8 @@ def test_a_block_has_at_least_one_tick():
 
 def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
     config = TuneConfig(rollout=SHORT)
-    tune_step(config, robot, nominal(), named_command("s"), anchor, last_command)
-    before = tune_step._cache_size()
-    tune_step(config, robot, expert(), named_command("c"), anchor, last_command)
-    assert tune_step._cache_size() == before
+    tune_step(config, robot, nominal(), named_command("s"), anchor, PLAIN)
+    before = difftune._evaluate._cache_size()
+    other = TuneConfig(rollout=SHORT, loss=LossConfig(euler=1.0), beta_q=0.1, iterations=20)
+    tune_step(other, robot, expert(), named_command("c"), anchor, PLAIN)
+    assert difftune._evaluate._cache_size() == before

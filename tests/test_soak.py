@@ -10,12 +10,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from synthetic import synthetic_walk
+from model import SHORT, small_net
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
-from hector_jax.grfm.dataset import at_interval, make_dataset
-from hector_jax.grfm.network import as_effect, init_params
+from hector_jax.grfm.network import as_effect
 from hector_jax.model.effect import last_command
 from hector_jax.robot import load_robot
 from hector_jax.tuning.difftune import TuneConfig, tune
@@ -42,12 +41,11 @@ def work():
 
 def test_nothing_is_compiled_after_the_first_iteration(work):
     """Past the paper's ten iterations, to the end, on another trajectory and with another net."""
-    walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
-    data = make_dataset(ROBOT, jax.tree.map(lambda *x: np.stack(x), *walks))[0]
-    nets = [init_params(jax.random.key(i), data, "paper", hidden=(4,)) for i in range(2)]
-    nets = [jax.tree.map(np.asarray, net) for net in nets]
+    nets = [jax.tree.map(np.asarray, small_net(seed)) for seed in range(2)]
     # steps that are too long, so that some are refused
-    config = TuneConfig(rollout=RolloutConfig(ticks=10), iterations=13, beta_q=0.9, beta_r=0.9)
+    config = TuneConfig(
+        rollout=SHORT, iterations=20, beta_q=0.9, beta_r=0.9, patience=50, smallest_step=1e-300
+    )
     seen = []
 
     def on_iteration(iteration):
@@ -58,9 +56,9 @@ def test_nothing_is_compiled_after_the_first_iteration(work):
         command = named_command(name)
         tune(config, ROBOT, nominal(), command, ANCHOR, as_effect(net), on_iteration)
         work.clear()
-    assert [number for number, *_ in seen] == 2 * [*range(14)]
+    assert [number for number, *_ in seen] == 2 * [*range(21)]
     assert seen[0][2] > 0
-    assert [count for *_, count in seen[1:]] == 27 * [0]
+    assert [count for *_, count in seen[1:]] == 41 * [0]
     assert {accepted for _, accepted, _ in seen} == {True, False}
 
 

@@ -272,3 +272,49 @@ def test_weights_that_are_no_json_object_are_refused(tmp_path, text):
     with pytest.raises(ValueError, match="weights.json: ") as caught:
         load_weights(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def edited(tmp_path, monkeypatch):
+    """Changes the text of a module of the package, as far as `code_hash` can see."""
+    source = storage._source
+
+    def edit(module, before, after):
+        text = source(module).read_text()
+        assert before in text
+        (tmp_path / "edited.py").write_text(text.replace(before, after))
+        other = lambda name: tmp_path / "edited.py" if name == module else source(name)  # noqa: E731
+        monkeypatch.setattr(storage, "_source", other)
+        storage.code_hash.cache_clear()
+
+    yield edit
+    monkeypatch.undo()
+    storage.code_hash.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("module", "before", "after", "same"),
+    [
+        ("control.footstep", "stance / 2 * state.velocity", "stance / 3 * state.velocity", False),
+        ("control.footstep", "    points = (", "    # a comment\n    points = (", True),
+        ("control.footstep", "Where the feet come down next", "Another docstring", True),
+        ("console", "_QUIET = 15.0", "_QUIET = 16.0", True),
+        ("export", "TOLERANCE = 1e-6", "TOLERANCE = 1e-7", True),
+    ],
+)
+def test_a_result_holds_for_the_code_that_computes_it(edited, module, before, after, same):
+    hashes = storage.code_hash("sim.walk"), storage.code_hash("tuning.difftune", "grfm.network")
+    edited(module, before, after)
+    again = storage.code_hash("sim.walk"), storage.code_hash("tuning.difftune", "grfm.network")
+    assert [a == b for a, b in zip(hashes, again, strict=True)] == [same, same]
+
+
+@pytest.mark.parametrize(("package", "same"), [("jax", False), ("numpy", False), ("flax", True)])
+def test_a_result_holds_for_the_packages_that_compute_it(monkeypatch, package, same):
+    before = storage.code_hash("sim.walk")
+    installed = storage.version
+    others = lambda name: "0.0.1" if name == package else installed(name)  # noqa: E731
+    storage.code_hash.cache_clear()
+    monkeypatch.setattr(storage, "version", others)
+    assert (storage.code_hash("sim.walk") == before) is same
+    storage.code_hash.cache_clear()

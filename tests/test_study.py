@@ -43,7 +43,7 @@ def asked(monkeypatch):
             told["walks"] += 1
             yield pretend_walk(job.seed, 0.02, 1.0, fall_at=0.5 if job.seed == 3 else None)
 
-    def write_video(*args):
+    def write_strip(*args):
         raise VideoUnavailable("no film: none here")
 
     def tune_measured(pool, config, robot, weights, command, params, plants, title, record):
@@ -59,7 +59,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(pipeline, "tune_measured", tune_measured)
     monkeypatch.setattr(pipeline, "walks_of", walks_of)
     monkeypatch.setattr(kept, "load_tuning", Record)
-    monkeypatch.setattr(study, "write_video", write_video)
+    monkeypatch.setattr(study, "write_strip", write_strip)
     return told
 
 

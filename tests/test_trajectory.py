@@ -1,7 +1,9 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
+from pretend import elsewhere, pretend_walk
 
-from hector_jax.trajectory import State, has_fallen
+from hector_jax.trajectory import State, from_start, has_fallen
 
 
 def upright(**change):
@@ -17,3 +19,13 @@ def test_a_fall_is_a_fall():
     assert has_fallen(upright(euler=[0.0, -0.81, 0.0]))
     assert has_fallen(upright(euler=[0.81, 0.0, 0.0]))
     assert has_fallen(upright(velocity=[0.0, np.nan, 0.0]))
+
+
+def test_from_its_start_a_walk_looks_the_same_wherever_it_began():
+    walk = pretend_walk(seconds=0.5, turn=1.0)
+    found = from_start(elsewhere(walk, (0.4, -1.0), 2.0))
+    for name, value in walk._asdict().items():
+        for part, same in zip(
+            jax.tree.leaves(getattr(found, name)), jax.tree.leaves(value), strict=True
+        ):
+            np.testing.assert_allclose(part, same, atol=1e-9, err_msg=name)

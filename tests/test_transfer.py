@@ -129,10 +129,16 @@ def test_tables_hold_every_row_and_are_rectangular():
     assert "could be made" in transfer.verdict(rows, "paper")
 
 
-def test_the_pictures_are_drawn(tmp_path):
+def test_pictures_show_gradients_of_unit_length_and_the_losses_of_both(tmp_path, drawn):
     plots.gradients(tmp_path / "a.png", NAMES, TRUTH, {"command": -TRUTH, "net": TRUTH})
+    bars = {bars.get_label().split(",")[0]: bars for bars in drawn[0].axes[0].containers}
+    unit = TRUTH.mean(axis=0) / np.linalg.norm(TRUTH.mean(axis=0))
+    for name, sign in (("hfs", 1), ("command", -1), ("net", 1)):
+        np.testing.assert_allclose([bar.get_height() for bar in bars[name]], sign * unit)
     losses = np.exp(RNG.normal(size=8)) * 1e6
     key = ("straight", "1.5")
-    models, told = {key: {"net": losses}}, {key: {"net": 1.0}}
+    models, told = {key: {"net": 2 * losses}}, {key: {"net": 0.9}}
     plots.ranks(tmp_path / "b.png", {key: losses}, models, told)
-    assert all((tmp_path / name).stat().st_size > 5000 for name in ("a.png", "b.png"))
+    dots = drawn[1].axes[0].lines[0]
+    assert dots.get_label() == "net: 0.90"
+    np.testing.assert_allclose(dots.get_xydata(), np.c_[losses, 2 * losses] / 1e6)

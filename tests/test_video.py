@@ -1,15 +1,18 @@
 """Films: poses are those that were walked, and no machine's missing back end ends a run."""
 
+import subprocess
+
 import imageio_ffmpeg
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
-from pretend import pretend_walk
+from pretend import elsewhere, pretend_walk
 from scipy.spatial.transform import Rotation
 
 from hector_jax.evaluation import video
-from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_video
+from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_film, write_strip
+from hector_jax.inputs import InputError
 from hector_jax.robot import MODEL_PATH, load_robot
 from hector_jax.trajectory import State
 
@@ -31,50 +34,125 @@ def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude(robot):
     np.testing.assert_allclose(data.xmat[1].reshape(3, 3), expected, atol=1e-9)
 
 
+def request_of(robot, walks, times):
+    return video._request(VideoConfig(), robot, walks, np.asarray(times))
+
+
 def test_a_film_shows_the_state_of_its_time_whatever_the_walks_rate(robot):
     slow, fast = (pretend_walk(seconds=1.0, period=p) for p in (0.01, 0.001))
-    found = video._request(VideoConfig(), robot, {"a": slow, "b": fast})
-    assert len(found["times"]) == 26
-    np.testing.assert_allclose(found["aim_0"], found["aim_1"], atol=0.006)
-    np.testing.assert_allclose(found["aim_0"][10], slow.reference.position[39])
+    found = request_of(robot, {"a": slow, "b": fast}, 0.04 * np.arange(26))
+    np.testing.assert_allclose(found["path_0"], found["path_1"], atol=0.01)
+    assert len(found["reference"]) == 50
+    assert found["sample"][[0, 10, 25]].tolist() == [0, 19, 49]
+    trunk = video.poses(robot, State(*(x[39:40] for x in slow.state)), slow.joints[39:40])
+    np.testing.assert_allclose(found["pose_0"][10], trunk[0])
 
 
 def test_a_robot_that_fell_stays_where_it_was_last_seen(robot):
     walks = {"a": pretend_walk(seconds=1.0, fall_at=0.5), "b": pretend_walk(seconds=1.0)}
-    found = video._request(VideoConfig(), robot, walks)
+    found = request_of(robot, walks, 0.04 * np.arange(26))
     assert found["fall_0"] == pytest.approx(0.5)
     assert np.isinf(found["fall_1"])
     assert np.isfinite(found["pose_0"]).all()
     np.testing.assert_array_equal(found["pose_0"][13], found["pose_0"][-1])
 
 
+def test_before_and_after_have_one_reference_wherever_the_robots_began(robot):
+    walk = pretend_walk(seconds=1.0, turn=1.0)
+    found = request_of(robot, {"a": walk, "b": elsewhere(walk, (0.3, -0.2), 0.4)}, [0.0, 0.5])
+    np.testing.assert_allclose(found["path_1"], found["path_0"], atol=1e-9)
+    np.testing.assert_allclose(found["reference"], walk.reference.position[::2], atol=1e-9)
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.3, 1.7, 4.0])
+@pytest.mark.parametrize("tiles", [2, 6])
+def test_snapshots_show_as_many_phases_of_the_gait_as_there_are(seconds, tiles):
+    walks = {"a": pretend_walk(seconds=seconds), "b": pretend_walk(seconds=seconds)}
+    times = video._snapshots(walks, tiles)
+    assert (np.diff(times) > 0).all()
+    assert times[0] == 0.0
+    assert times[-1] <= seconds
+    cycle = min(0.4, seconds)
+    np.testing.assert_allclose(np.mod(times, cycle) / cycle, np.arange(tiles) / tiles, atol=0.01)
+
+
+def test_the_camera_of_four_seconds_stands_still_and_sees_the_whole_reference(robot):
+    walk = pretend_walk(seconds=4.0, turn=np.pi / 4)
+    request = request_of(robot, {"a": walk, "b": walk}, 0.1 * np.arange(41))
+    first, *rest = video._cameras(request, 40.0, 1.0, 4.0)
+    assert all((camera.lookat == first.lookat).all() for camera in rest)
+    turn = [90.0 - first.azimuth, -first.elevation]  # looks along y, then down
+    R = Rotation.from_euler("zx", turn, degrees=True).as_matrix()
+    for height in (0.0, float(request["top"])):
+        points = walk.reference.position * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
+        across, ahead, up = ((points - first.lookat) @ R.T).T
+        seen = np.tan(np.deg2rad(20.0)) * (ahead + first.distance)
+        assert (np.abs(across) < seen).all()
+        assert (np.abs(up) < seen).all()
+    close, *_, last = video._cameras(request, 40.0, 1.0, 0.8)
+    assert close.distance < first.distance
+    assert np.linalg.norm(last.lookat - close.lookat) > 0.5
+
+
 @pytest.mark.filterwarnings("ignore:os.fork")  # of the reader used here, not of the writer
-def test_a_film_and_a_strip_are_written_with_the_promised_size(robot, tmp_path):
-    walks = {"nominal": pretend_walk(0, 0.05, 0.2), "tuned with net": pretend_walk(1, 0.01, 0.2)}
-    film, strip = tmp_path / "film.mp4", tmp_path / "strip.png"
+def test_films_and_strips_are_written_with_the_promised_size(robot, tmp_path):
+    walks = {"nominal": pretend_walk(0, 0.05, 0.2), "with": pretend_walk(1, 0.01, 0.2)}
+    config = VideoConfig(width=640, height=432, rate=10, tiles=2)
     try:
-        write_video(film, robot, walks, strip, VideoConfig(rate=10))
+        write_film(tmp_path / "film.mp4", robot, walks, config)
     except VideoUnavailable as error:
         pytest.skip(str(error))
-    frames = imageio_ffmpeg.read_frames(film)
+    frames = imageio_ffmpeg.read_frames(tmp_path / "film.mp4")
     about = next(frames)
-    assert about["size"] == (640, 360)
+    assert about["size"] == (640, 432)
     assert about["fps"] == 10
-    pictures = [np.frombuffer(f, np.uint8).reshape(360, 640, 3).astype(int) for f in frames]
+    pictures = [np.frombuffer(f, np.uint8).reshape(432, 640, 3).astype(int) for f in frames]
     assert len(pictures) == 3
     assert np.ptp(pictures[0][60:300]) > 150
-    assert np.abs(pictures[2][:, :320] - pictures[2][:, 320:]).mean() > 1
-    with Image.open(strip) as picture:
-        assert picture.height == 720
+    assert np.abs(pictures[2][:320, :320] - pictures[2][:320, 320:]).mean() > 1
+    # the plot below is pale where time has not come yet
+    first, _, last = (np.sum(np.ptp(picture[324:], axis=-1) > 60) for picture in pictures)
+    assert last > first + 20
+    write_film(tmp_path / "film.webp", robot, walks, config)
+    with Image.open(tmp_path / "film.webp") as picture:
+        assert (picture.size, picture.n_frames, picture.info["loop"]) == ((640, 432), 3, 0)
+    write_strip(tmp_path / "strip.png", robot, walks, config)
+    with Image.open(tmp_path / "strip.png") as picture:
+        assert picture.size == (2 * 192, 2 * 324)
 
 
 def test_no_back_end_costs_one_line(robot, tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "crayon")
     walks = {"a": pretend_walk(seconds=0.1), "b": pretend_walk(seconds=0.1)}
     with pytest.raises(VideoUnavailable, match="no film: .*crayon") as caught:
-        write_video(tmp_path / "film.mp4", robot, walks)
+        write_film(tmp_path / "film.mp4", robot, walks)
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_the_plot_of_a_frame_is_pale_where_time_has_not_come_yet(robot, count):
+    walks = {"a": pretend_walk(seconds=1.0), "b": pretend_walk(seconds=1.0)}
+    request = request_of(robot, walks, np.linspace(0.0, 1.0, 5)[:count])
+    request["box"] = (20, 10, 120, 40)
+    black = np.zeros((60, 140, 3), np.uint8)
+    half = np.zeros((100, 70, 3), np.uint8)
+    for k in range(count):
+        below = np.asarray(video._frame(request, black, [half, half], k))[100:, :, 0]
+        assert below.shape == (60, 140)
+        past = below[10:40, 20:121].max(axis=0) == 0
+        assert past.tolist() == [True] * (25 * k) + [False] * (101 - 25 * k)
+        assert not np.delete(below, np.s_[10:40], axis=0).any()
+
+
+def test_a_back_end_that_fails_is_told_by_its_first_fault(tmp_path, monkeypatch):
+    text = (
+        "warning\nTraceback (most recent call last):\n  File a\nKeyError: 'sky'\n"
+        "Exception ignored in: x\nTraceback (most recent call last):\n  File b\nEGLError: (\n)\n"
+    )
+    done = subprocess.CompletedProcess([], 1, "", text)
+    monkeypatch.setattr(video.subprocess, "run", lambda *args, **rest: done)
+    assert video._draw_in_child(tmp_path, "egl") == "KeyError: 'sky'"
 
 
 def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatch):
@@ -84,23 +162,28 @@ def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatc
         tried.append(back_end)
         if back_end == "egl":
             return "no device"
-        (folder / "film.mp4").write_bytes(b"film")
+        (folder / "drawn.mp4").write_bytes(b"film")
         return ""
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(video, "_draw_in_child", draw)
     walks = {"a": pretend_walk(seconds=0.1), "b": pretend_walk(seconds=0.1)}
-    assert write_video(tmp_path / "film.mp4", robot, walks) == "osmesa"
+    assert write_film(tmp_path / "film.mp4", robot, walks) == "osmesa"
     assert tried == ["egl", "osmesa"]
     assert (tmp_path / "film.mp4").read_bytes() == b"film"
 
 
 def test_a_film_shows_two_walks(robot, tmp_path):
     with pytest.raises(ValueError, match="two walks side by side, got 1"):
-        write_video(tmp_path / "film.mp4", robot, {"a": pretend_walk(seconds=0.1)})
+        write_film(tmp_path / "film.mp4", robot, {"a": pretend_walk(seconds=0.1)})
 
 
-@pytest.mark.parametrize("wrong", [{"width": 642}, {"height": 33}, {"rate": 0}, {"speed": 0.0}])
+def test_a_film_of_another_ending_is_refused(robot, tmp_path):
+    with pytest.raises(InputError, match=r"must end in .mp4, .webp, .gif, .png, got film.avi"):
+        write_film(tmp_path / "film.avi", robot, {})
+
+
+@pytest.mark.parametrize("wrong", [{"width": 642}, {"height": 33}, {"rate": 0}])
 def test_sizes_that_cannot_be_encoded_are_refused(wrong):
     with pytest.raises(ValueError, match=f"VideoConfig.{next(iter(wrong))} must be"):
         VideoConfig(**wrong)

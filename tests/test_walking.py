@@ -19,6 +19,7 @@ from hector_jax.control.walking import (
     init_memory,
     measured_feet,
     plan,
+    plan_horizon,
     slots_needed,
     step_plan,
 )
@@ -156,6 +157,22 @@ def test_being_behind_pushes_ahead():
 
 def test_the_swing_clock_starts_at_lift_off():
     assert [at(t)[1].swing_ticks.tolist() for t in (20, 21, 39)] == [[0, 0], [1, 0], [19, 0]]
+
+
+def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
+    config = WalkConfig(gait=GaitConfig(stance=10, swing=10), mpc=MpcConfig(horizon=15))
+    assert config.touchdowns == 3
+    walking = jax.tree.map(jnp.asarray, standing())
+    state = walking.state._replace(velocity=jnp.array([0.5, 0.0, 0.0]))
+    horizon, touchdown = plan_horizon(
+        config, ROBOT, STRAIGHT, ANCHOR, jnp.array(0), state, feet_of(walking)
+    )
+    stands = np.asarray(horizon.contact)
+    assert stands.sum(axis=1).tolist() == [1] * 15
+    # a foot stands 0.1 s: at 0.5 m/s it is hardly further than 3 cm from under the body
+    assert np.abs(np.asarray(horizon.lever)[stands][:, 0]).max() < 0.035
+    ahead = np.asarray(horizon.lever[-1, 0] + 0.5 * 0.42 - touchdown.position[0])[0]
+    assert ahead == pytest.approx(0.5 * 0.2, abs=0.01)  # a cycle further on
 
 
 def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():

@@ -33,10 +33,9 @@ def collect(args: Collect) -> None:
     """Walk on the simulator with chance, and keep the walks."""
     config = pipeline.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     robot = load_robot(args.robot)
-    tune = asked.tune_config(robot)
     with workers(args.processes) as pool:
         out = asked.default_of(args.out, Collect.out, args.robot, robot)
-        pipeline.collect(pool, config, tune, robot, out)
+        pipeline.collect(pool, config, robot, out)
     say(f"the walks are in {out}")
 
 
@@ -65,10 +64,10 @@ def grfm(args: Grfm) -> None:
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, config, robot, args.data)
-        paper = pipeline.ground(pool, config, robot, args.data, "paper")
+        net = pipeline.ground(pool, robot, args.data)
+        paper = pipeline.ground(pool, robot, args.data, "paper")
         with say_if_slow("reading the walks that no training saw"):
-            worlds = {"hfs": pipeline.held_out(robot, args.data / "walks")}
+            worlds = {"hfs": pipeline.held_out(robot, net)}
         if args.seeds:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": linear_effect(net.linear)}

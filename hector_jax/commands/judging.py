@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation import metrics, pictures, runs
 from hector_jax.evaluation.metrics import Score, Verdict
 from hector_jax.evaluation.report import print_table
-from hector_jax.evaluation.video import check_back_end
+from hector_jax.evaluation.video import check_film
 from hector_jax.flags import Compare, Evaluate, Table, Walk, settings
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.inputs import plural, printable
@@ -64,7 +65,7 @@ def walk(args: Walk) -> None:
         Broken: QPs of the walk were not solved.
     """
     if args.video is not None:
-        check_back_end()
+        check_film(args.video)
     robot = load_robot(args.robot)
     weights, wanted = asked.weights(args.weights, robot), asked.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
@@ -101,7 +102,10 @@ def walk(args: Walk) -> None:
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
         say(f"walking with {beside} weights for the other half of the film")
-        walks = {beside: asked.walked(args, robot, wanted, other(robot)), args.weights: trajectory}
+        walks = {
+            beside: asked.walked(args, robot, wanted, other(robot)),
+            Path(args.weights).stem: trajectory,
+        }
         pictures.film(args.video, robot, walks)
 
 

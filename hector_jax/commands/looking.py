@@ -13,7 +13,7 @@ from hector_jax.control.walking import walk_config
 from hector_jax.evaluation import fidelity, metrics, pictures, runs, view
 from hector_jax.evaluation.report import WORLDS
 from hector_jax.evaluation.tensorboard import write_events
-from hector_jax.evaluation.video import check_back_end
+from hector_jax.evaluation.video import check_film
 from hector_jax.flags import Replay, Tensorboard, View
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
@@ -29,7 +29,7 @@ def view_run(args: View) -> None:
     if folder is None:
         view.check_viser()
     else:
-        check_back_end()
+        check_film(folder / "film.mp4")
     begun = runs.read_asked(args.run)
     robot = asked.robot_of(args.run, begun)
     wanted = asked.course(begun.trajectory, robot)
@@ -39,11 +39,11 @@ def view_run(args: View) -> None:
         make_folder(folder)
     sets = {name: runs.weights_of(args.run, name, robot) for name in args.sets}
     data = asked.folder_of(args.data or begun.data, begun.robot, robot)
-    effect = _phi_of(data, begun.variant, robot)
-    model = compile_model(robot.description)
+    net = begun.net if args.data is None and begun.net else pipeline.net_path(data, begun.variant)
+    effect = _phi_of(net, begun.variant, robot)
     shown: dict[str, view.Shown] = {}
 
-    def walk() -> tuple[dict[str, view.Motion], str]:
+    def walk() -> str:
         place = WORLDS.get(args.world, args.world)
         story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
@@ -56,21 +56,25 @@ def view_run(args: View) -> None:
             stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
             effects = {} if effect is None else {"residual": effect}
             shown[name] = view.Shown(walked, fidelity.curves(robot, stacked, effects))
-        motions = [view.motion(robot, model, one) for one in shown.values()]
-        return dict(zip(view.titles(shown), motions, strict=True)), "\n\n".join(story)
+        return "\n\n".join(story)
 
-    if folder is None:
-        on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
-        view.serve(walk, model, args.run, on_open, args.host, args.port)
+    def motions() -> tuple[dict[str, view.Motion], str]:
+        story = walk()
+        found = (view.motion(robot, model, one) for one in shown.values())
+        return dict(zip(view.titles(shown), found, strict=True)), story
+
+    if folder is not None:
+        walk()
+        pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown)
+        say(f"the film and the pictures are in {folder}")
         return
-    motions = list(walk()[0].values())
-    pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown, motions)
-    say(f"the film and the pictures are in {folder}")
+    model = compile_model(robot.description)
+    on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
+    view.serve(motions, model, args.run, on_open, args.host, args.port)
 
 
-def _phi_of(data: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
-    """Phi of the net that is kept under `data`; where there is none, a line says so."""
-    path = pipeline.net_path(data, variant)
+def _phi_of(path: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
+    """Phi of the net in a file; where there is none, a line says so."""
     if not path.exists():
         say(f"no net at {path}, so its predictions are not shown; --data names another folder")
         return None

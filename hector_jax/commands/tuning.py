@@ -23,18 +23,18 @@ from hector_jax.evaluation import fidelity, metrics, pictures
 from hector_jax.evaluation.metrics import Score
 from hector_jax.evaluation.report import Picture, Report, environment, print_table, write_report
 from hector_jax.evaluation.runs import read_json
-from hector_jax.evaluation.video import check_back_end
+from hector_jax.evaluation.video import check_film
 from hector_jax.flags import Search, Tune, Walk, as_command, from_file, settings
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
-from hector_jax.inputs import InputError, plural
+from hector_jax.inputs import InputError, plural, shown
 from hector_jax.kept import Journal, Judged
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
 from hector_jax.sim.world import hfs
 from hector_jax.storage import (
     as_json,
-    check_versions,
+    code_hash,
     fingerprint,
     identity,
     locked,
@@ -46,7 +46,9 @@ from hector_jax.storage import (
 from hector_jax.tuning.difftune import aligned
 from hector_jax.tuning.search import SearchConfig
 
-_FREE = ("config", "json", "processes", "resume", "run", "runs", "video")  # change no number
+_CODE = (*pipeline.COLLECTION_CODE, "grfm.training", "sim.standin", "evaluation.metrics")
+_NEW = ("config", "resume", "run", "runs")  # of a call, not of the run that it begins or resumes
+_FREE = ("data", "json", "processes", "video")  # may be others when a run is resumed
 _TIME = "%Y%m%d-%H%M%S"  # names a run
 
 
@@ -55,7 +57,7 @@ def tune(args: Tune) -> None:
     if args.run and args.resume:
         raise InputError(f"--run {args.run} and --resume {args.resume}: only one can be given")
     if args.video:
-        check_back_end()
+        check_film(Path("film.mp4"))
     texts = COMMANDS if args.traj == "all" else (args.traj,)
     base = args.resume or args.run
     if base is None:
@@ -94,8 +96,9 @@ def _begin(folder: Path, args: Tune) -> Path:
         write_json(new / "versions.json", environment())
         # without the folder, so that `--config` can ask for the same in another one
         flags = settings(replace(args, run=None, resume=None))
-        body = identity(load_robot(args.robot))
-        write_json(new / "config.json", {"flags": flags, "robot": body})
+        robot, here = identity(load_robot(args.robot)), str(Path.cwd())
+        config = {"flags": flags, "directory": here, "robot": robot, "code": code_hash(*_CODE)}
+        write_json(new / "config.json", config)
         while True:
             try:
                 return new.rename(folder)
@@ -109,29 +112,42 @@ def _begin(folder: Path, args: Tune) -> Path:
 def _as_begun(folder: Path, args: Tune) -> Tune:
     """The flags of the run in `folder`; those given beside --resume have to agree.
 
-    A flag at its default counts as not given.
+    A flag at its default counts as not given. Of those that change no number the given one is
+    taken.
 
     Raises:
-        InputError: one line naming the file: no run, one of other flags, versions or another robot.
+        InputError: one line naming the file: no run, one of other flags, other code, another robot,
+            or one whose data are not here.
     """
-    as_asked, made_with = (read_json(folder / f"{name}.json") for name in ("config", "versions"))
-    check_versions(folder / "versions.json", made_with)
-    begun, taken = from_file(Tune, folder / "config.json"), {}
-    if "robot" not in as_asked:
-        raise InputError(f"{folder / 'config.json'}: no robot told; expected that of a run")
-    _agree(folder, as_asked, {"robot": identity(load_robot(begun.robot))})
-    before, here = (told.get("commit", "none") for told in (made_with, environment()))
-    if before != here:
-        say(f"warning: {folder} was begun at commit {before}, here is {here}")
+    path, flags = folder / "config.json", {}
+    config, made_with = read_json(path), read_json(folder / "versions.json")
+    for name in ("robot", "code", "directory"):
+        if not isinstance(config.get(name), str):
+            raise InputError(f"{path}: {name} must be text, got {shown(config.get(name))}")
+    begun = from_file(Tune, path)
+    if config["code"] != code_hash(*_CODE):
+        commit = made_with.get("commit", "no commit is noted")
+        raise InputError(
+            f"{folder}: begun with other code or other versions of its packages ({commit}); "
+            "start a new run"
+        )
+    _agree(folder, config, {"robot": identity(load_robot(begun.robot))})
     for field in dataclasses.fields(Tune):
         name = field.name
-        if name in _FREE:
+        if name in _NEW:
             continue
         before, given = getattr(begun, name), getattr(args, name)
-        if given not in (before, field.default):
+        flags[name] = before if given == field.default else given
+        if name not in _FREE and flags[name] != before:
             raise InputError(f"{folder}: begun with --{name} {before}, got {given}")
-        taken[name] = before
-    return replace(args, **taken)
+    now = replace(args, **flags)
+    data = asked.folder_of(now.data, now.robot, load_robot(now.robot))
+    if not now.net and not data.exists() and Path(config["directory"]) != Path.cwd():
+        raise InputError(
+            f"{data}: no data here; the run was begun in {config['directory']}: resume it there, "
+            "or name the folder by --data"
+        )
+    return now
 
 
 def _agree(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -153,6 +169,8 @@ def _asked_for(args: Tune, robot: Robot) -> Course:
         InputError: there is no such trajectory, or none that --refresh can take.
     """
     wanted = asked.course(args.traj, robot)
+    if args.refresh and args.net:
+        raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
     if args.refresh and len(wanted.command.duration) > PIECES:
         raise InputError(
             f"--refresh takes trajectories of at most {PIECES} segments, {wanted.name} has "
@@ -166,13 +184,16 @@ def _tune_in(folder: Path, args: Tune) -> None:
     robot, start = load_robot(args.robot), time.monotonic()
     wanted = _asked_for(args, robot)
     command, lasts = wanted.command, wanted.seconds or Walk.seconds
-    shared, shelf = asked.tune_config(robot, iterations=args.iterations), folder / "kept"
-    config, data = asked.lasting(shared, wanted), asked.folder_of(args.data, args.robot, robot)
+    config = asked.lasting(asked.tune_config(robot, iterations=args.iterations), wanted)
+    shelf, data = folder / "kept", asked.folder_of(args.data, args.robot, robot)
     made_with = environment()
     commit = made_with.get("commit", "")
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, shared, robot, data, args.variant)
+        if args.net is None:
+            net = pipeline.ground(pool, robot, data, args.variant)
+        else:
+            net, _ = pipeline.load_learned(args.net, robot, args.variant)
         problems = {"without": (command, None), "with": (command, net.params)}
         norms = pipeline.gradient_norms(pool, config, robot, problems)
         if args.alpha == "auto":
@@ -251,7 +272,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     drawn = pictures.of_run(folder, config, sets, histories, walks, curves, net.course)
     film: Picture | str = "left out (--no-video)"
     if args.video:
-        pair = {"nominal": walks["nominal"], "tuned with net": walks["with"]}
+        pair = {name: walks[name] for name in ("nominal", "with")}
         caption = "Nominal and tuned weights on the first stand-in plant."
         film = pictures.film(folder / "film.mp4", robot, pair, folder / "film.png") or Picture(
             "film.mp4", caption

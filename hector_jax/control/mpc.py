@@ -2,9 +2,9 @@ r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stanc
 
     minimise    sum_{k=1}^{N} |x_k - x_ref,k|^2_Q + sum_{k=0}^{N-1} |u_k|^2_R
     subject to  x_{k+1} = A_k x_k + B_k u_k                                  dynamics
-                |F_x|, |F_y| <= mu F_z,   0 <= F_z <= F_max                  each stance foot
+                |F_x| + |F_y| <= mu F_z,   0 <= F_z <= F_max                 each stance foot
                 M_x = 0,   -l_t F_z <= M_y <= l_h F_z                       line foot, its yaw frame
-                |F_y| at toe and heel <= mu F_z there                       line foot, its yaw frame
+                |F_y| <= mu' F_z at toe and heel each                       line foot, its yaw frame
                 F = M = 0                                                    each foot in the air
 
 States are condensed away, a foot in the air has no variables and M_x is eliminated, so that a
@@ -15,7 +15,11 @@ unit Hessian, so that shapes stay static.
 Where this leaves the paper: x_1..x_N are priced instead of x_0..x_{N-1}, because x_0 is given; toe
 and heel of the line foot are in their physical places (pressure at the toe gives M_y = -l_t F_z;
 the paper prints them swapped); a foot in the air has no M_z; toe and heel hold by friction each, or
-the foot would turn on the spot when the pressure is all at one end.
+the foot would turn on the spot when the pressure is all at one end. Friction is the pyramid of the
+plants, MuJoCo's, whose base is a square on its corner in world axes: the paper's |F_x|, |F_y| <= mu
+F_z would ask for sqrt 2 times as much along a diagonal, more than some floors hold. mu' =
+mu max(|cos yaw|, |sin yaw|) is the most that it holds across a foot, whatever toe and heel push
+against each other along it.
 """
 
 from dataclasses import dataclass
@@ -41,7 +45,7 @@ class MpcConfig:
 
     horizon: int = 10  # steps N
     step_ticks: int = 3  # ticks per step: dt = 0.03 s
-    friction: float = 0.5  # mu; below the floor's own, or the feet slip
+    friction: float = 0.6  # mu; at most the floor's own, or the feet slip
     max_force: float = 500.0  # [N] per foot
     line_friction: bool = True  # toe and heel each hold by friction, or the foot turns on the spot
     effort_about: str = (
@@ -96,22 +100,23 @@ def _input_map(feet: Float[Array, "slots 2"], foot_yaw: Float[Array, "2"]) -> Fl
 def _rows(config: MpcConfig, robot: Robot, yaw: Float[Array, ""]) -> Float[Array, "rows 5"]:
     """Constraint rows of a stance foot that points along `yaw`; their bounds are `_bounds`."""
     mu, toe, heel = config.friction, robot.toe, robot.heel
-    zero = jnp.zeros_like(yaw)
+    zero, sin, cos = jnp.zeros_like(yaw), jnp.sin(yaw), jnp.cos(yaw)
     fx, fy, fz, my, mz = jnp.eye(5, dtype=yaw.dtype)
-    side = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw), zero, zero, zero])  # force across the foot
     rows = [
-        fx - mu * fz,
-        fx + mu * fz,
-        fy - mu * fz,
-        fy + mu * fz,
+        fx + fy - mu * fz,
+        fx + fy + mu * fz,
+        fx - fy - mu * fz,
+        fx - fy + mu * fz,
         fz,
         my + toe * fz,
         my - heel * fz,
     ]
     if config.line_friction:
-        at_toe, load = mz + heel * side, heel * fz - my
-        at_heel, rest = toe * side - mz, toe * fz + my
-        rows += [at_toe - mu * load, at_toe + mu * load, at_heel - mu * rest, at_heel + mu * rest]
+        side = jnp.stack([-sin, cos, zero, zero, zero])  # force across the foot
+        grip = mu * jnp.maximum(jnp.abs(cos), jnp.abs(sin))
+        at_toe, at_heel = mz + heel * side, toe * side - mz
+        toe_load, heel_load = grip * (heel * fz - my), grip * (toe * fz + my)
+        rows += [at_toe - toe_load, at_toe + toe_load, at_heel - heel_load, at_heel + heel_load]
     return jnp.stack(rows)
 
 

@@ -5,8 +5,9 @@ along; the MuJoCo worlds call `step_plan` and `actuate` with what they measure. 
 the nominal robot only, never the plant's own numbers.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +49,11 @@ class WalkConfig:
         """MPC step dt [s]."""
         return self.mpc.step_ticks * self.gait.tick
 
+    @property
+    def touchdowns(self) -> int:
+        """Most touchdowns of one foot within the horizon."""
+        return -(-self.mpc.horizon * self.mpc.step_ticks // self.gait.cycle)
+
 
 def walk_config(robot: Robot) -> WalkConfig:
     """The controller that a robot's description asks for.
@@ -55,13 +61,8 @@ def walk_config(robot: Robot) -> WalkConfig:
     Raises:
         InputError: one line naming the file, the key and what was expected.
     """
-    path, given = robot.description.path, dict(robot.description.control)
-    kinds = {"gait": GaitConfig, "mpc": MpcConfig, "footstep": FootstepConfig, "legs": LegConfig}
-    parts = {
-        name: from_table(f"{path}: {name}", kind, dict(given.get(name, ())))
-        for name, kind in kinds.items()
-    }
-    return from_table(str(path), WalkConfig, parts)
+    given = {name: dict(section) for name, section in robot.description.control}
+    return from_table(str(robot.description.path), WalkConfig, given)
 
 
 class Feet(NamedTuple):
@@ -96,9 +97,81 @@ class Plan(NamedTuple):
     status: Int[Array, "*batch"]  # of the QP, see control.qp
 
 
+class Retune(NamedTuple):
+    """Weights that change while they walk: a carry, and what gives those of the next tick."""
+
+    init: Any  # carry before t = 0
+    # carry, gait tick, anchor, what is measured, wrench commanded over the tick before
+    step: Callable[[Any, int, Anchor, Measurement, Wrench], tuple[Any, Weights]]
+
+
 def slots_needed(config: WalkConfig, tick: int) -> int:
     """Feet that may stand at once in a plan: 2 before the gait starts or with double support."""
     return 2 if tick < config.gait.first_tick or config.gait.double_support else 1
+
+
+def plan_horizon(
+    config: WalkConfig,
+    robot: Robot,
+    command: Command,
+    anchor: Anchor,
+    tick: Int[Array, ""],
+    state: State,
+    feet: Feet,
+) -> tuple[Horizon, Feet]:
+    """What the MPC is to plan about, and where each foot next comes down.
+
+    Args:
+        config, robot: the controller.
+        command, anchor: what to walk.
+        tick: gait tick now.
+        state: base now.
+        feet: foot points now; of a foot in the air they are not used.
+
+    Source: Eq. 6, 14-16.
+    """
+    ticks = config.gait
+    steps = tick + config.mpc.step_ticks * jnp.arange(config.mpc.horizon + 1)
+    reference = jax.vmap(lambda t: reference_at(ticks.tick, command, anchor, t))(steps)
+    now = jax.tree.map(lambda r: r[0], reference)
+
+    # The contact of step 0 is the present one, of a later step that at the middle of its interval.
+    middles = jnp.concatenate([tick[None], steps[1:-1] + config.mpc.step_ticks // 2])
+    count = gait.touchdowns(ticks, tick, middles)
+    wait = gait.ticks_to_touchdown(ticks, tick)
+    touchdowns = [
+        Feet(
+            *touchdown_points(
+                config.footstep,
+                robot,
+                state,
+                now,
+                ticks.tick * (wait + number * ticks.cycle),
+                ticks.tick * ticks.stance,
+                ticks.tick * ticks.swing,
+            )
+        )
+        for number in range(config.touchdowns)
+    ]
+    foot_points, foot_yaw = feet
+    for number, touchdown in enumerate(touchdowns):
+        landed = count > number
+        foot_points = jnp.where(landed[..., None], touchdown.position, foot_points)
+        foot_yaw = jnp.where(landed, touchdown.yaw, foot_yaw)
+
+    # Linearised about the reference's motion carried on from where the robot is: levers stay true
+    # under a tracking error.
+    start = jax.tree.map(lambda r: r[:-1], reference)
+    path = state.position + start.position - now.position
+    heading = state.euler[2] + start.euler[:, 2] - now.euler[2]
+    horizon = Horizon(
+        reference=jax.tree.map(lambda r: r[1:], reference),
+        euler=jnp.zeros_like(start.euler).at[:, 2].set(heading),
+        lever=foot_points - path[:, None],
+        foot_yaw=foot_yaw,
+        contact=gait.contact(ticks, middles),
+    )
+    return horizon, touchdowns[0]
 
 
 def plan(
@@ -113,7 +186,7 @@ def plan(
     *,
     slots: int = 1,
 ) -> Plan:
-    """The wrench to command over the tick, from the MPC, and where the feet are to land.
+    """Solve the MPC for one tick. Returns the commanded wrench and the planned touchdowns.
 
     Args:
         config, robot, weights: the controller.
@@ -125,49 +198,16 @@ def plan(
 
     Source: Eq. 3-6.
     """
-    ticks, dt = config.gait, config.mpc_step
-    steps = tick + config.mpc.step_ticks * jnp.arange(config.mpc.horizon + 1)
-    reference = jax.vmap(lambda t: reference_at(ticks.tick, command, anchor, t))(steps)
-    now = jax.tree.map(lambda r: r[0], reference)
-
-    wait = ticks.tick * gait.ticks_to_touchdown(ticks, tick)
-    points, yaws = touchdown_points(
-        config.footstep,
-        robot,
-        state,
-        now,
-        wait,
-        ticks.tick * ticks.stance,
-        ticks.tick * ticks.swing,
-    )
-    # The contact of step 0 is the present one, of a later step that at the middle of its interval.
-    middles = jnp.concatenate([tick[None], steps[1:-1] + config.mpc.step_ticks // 2])
-    landed = gait.touchdowns(ticks, tick, middles) > 0
-    foot_points = jnp.where(landed[..., None], points, feet.position)
-    foot_yaw = jnp.where(landed, yaws, feet.yaw)
-
-    # Linearised about the reference's motion carried on from where the robot is: levers stay true
-    # under a tracking error.
-    start = jax.tree.map(lambda r: r[:-1], reference)
-    path = state.position + start.position - now.position
-    heading = state.euler[2] + start.euler[:, 2] - now.euler[2]
-    target = jax.tree.map(lambda r: r[1:], reference)
-    horizon = Horizon(
-        reference=target,
-        euler=jnp.zeros_like(start.euler).at[:, 2].set(heading),
-        lever=foot_points - path[:, None],
-        foot_yaw=foot_yaw,
-        contact=gait.contact(ticks, middles),
-    )
-    wrench, solution = solve_mpc(config.mpc, robot, weights, state, horizon, dt, slots)
+    horizon, touchdown = plan_horizon(config, robot, command, anchor, tick, state, feet)
+    wrench, solution = solve_mpc(config.mpc, robot, weights, state, horizon, config.mpc_step, slots)
     residual = jnp.maximum(
         jnp.maximum(solution.primal_residual, solution.dual_residual), solution.gap
     )
     return Plan(
         wrench=wrench,
-        contact=gait.contact(ticks, tick),
-        touchdown=Feet(points, yaws),
-        swing_ticks=gait.swing_ticks(ticks, tick),
+        contact=gait.contact(config.gait, tick),
+        touchdown=touchdown,
+        swing_ticks=gait.swing_ticks(config.gait, tick),
         residual=residual,
         status=solution.status,
     )

@@ -1,6 +1,6 @@
 """The pictures and the film that a command leaves, each drawn by plots or video.py."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,8 @@ from hector_jax.evaluation import plots, view
 from hector_jax.evaluation.fidelity import Drift
 from hector_jax.evaluation.report import WORLDS, Picture
 from hector_jax.evaluation.runs import Histories
-from hector_jax.evaluation.video import VideoUnavailable, write_video
+from hector_jax.evaluation.video import VideoUnavailable, write_film, write_strip
 from hector_jax.grfm.training import History
-from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.trajectory import Trajectory, Wrench
 from hector_jax.tuning.difftune import TuneConfig, Tuning
@@ -95,7 +94,6 @@ def of_view(
     histories: Histories,
     loss: LossConfig,
     shown: Mapping[str, view.Shown],
-    motions: Sequence[view.Motion],
 ) -> None:
     """Draw what the page of `view` shows, as a film and pictures.
 
@@ -105,10 +103,9 @@ def of_view(
         histories: of the run.
         loss: that its L is of.
         shown: walks by the name of their set, before and after.
-        motions: of the same walks.
 
     Raises:
-        InputError: no film can be made here.
+        VideoUnavailable: no film can be made here.
     """
     walks = {name: one.walk for name, one in shown.items()}
     plots.tracking(folder / "tracking.png", walks)
@@ -120,22 +117,24 @@ def of_view(
     tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
     if tuned:
         plots.losses(folder / "losses.png", loss, tuned)
-    say("making the film")
     titled = dict(zip(view.titles(walks), walks.values(), strict=True))
-    arrows = view.film_arrows(motions)
-    try:
-        write_video(folder / "film.mp4", robot, titled, folder / "film.png", arrows=arrows)
-    except VideoUnavailable as error:
-        raise InputError(str(error)) from None
+    say("making the film")
+    write_film(folder / "film.mp4", robot, titled)
+    write_strip(folder / "film.png", robot, titled)
 
 
 def film(
     path: Path, robot: Robot, walks: Mapping[str, Trajectory], strip: Path | None = None
 ) -> str:
-    """Film two walks. A missing back end costs one line, not the run; returns why there is none."""
+    """Film two walks and leave a strip of snapshots where asked to.
+
+    A missing back end costs one line, not the run; returns why there is no film.
+    """
     say("making the film")
     try:
-        write_video(path, robot, walks, strip)
+        write_film(path, robot, walks)
+        if strip is not None:
+            write_strip(strip, robot, walks)
     except VideoUnavailable as error:
         say(str(error))
         return str(error)

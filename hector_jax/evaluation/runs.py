@@ -61,6 +61,7 @@ class Asked(NamedTuple):
     trajectory: str
     loss: LossConfig
     data: Path  # folder of its net
+    net: Path | None  # or the net itself
     variant: str  # of the net
     robot: Path | None  # TOML of the biped; None: HECTOR
     body: str | None  # its `storage.identity` then; None: not told
@@ -80,6 +81,7 @@ def read_asked(folder: Path) -> Asked:
             trajectory=str(flags["traj"]),
             loss=LossConfig(**loss),
             data=Path(flags["data"]),
+            net=Path(flags["net"]) if flags.get("net") else None,
             variant=str(flags.get("variant", "residual")),
             robot=Path(flags["robot"]) if flags.get("robot") else None,
             body=config.get("robot"),

@@ -1,10 +1,10 @@
-"""Before and after side by side, as a film and as a strip of pictures.
+"""Two walks of one command side by side: a film, and a strip of snapshots.
 
-MuJoCo reads which OpenGL back end to draw with when it is imported, and a broken back end may end
-its process. So the drawing is done by a child process, one per back end until one succeeds: EGL,
-OSMesa, GLFW, or only that of MUJOCO_GL where it is set. Parent and child share a file of poses. A
-film is a comfort: where none can be made, `VideoUnavailable` says why in one line, and the run goes
-on without it.
+Both halves have the same camera and, as each walk is seen from where it started, the same
+reference. MuJoCo reads which OpenGL back end to draw with when it is imported, and a broken back
+end may end its process. So the drawing is done by a child process, one per back end until one
+succeeds: EGL, OSMesa, GLFW, or only that of MUJOCO_GL where it is set. Where none can draw,
+`VideoUnavailable` says why in one line, and the run goes on without a film.
 """
 
 import os
@@ -12,8 +12,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,51 +26,47 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
+from hector_jax.console import Broken
+from hector_jax.evaluation.plots import distances, named
 from hector_jax.geometry import rotation_from_euler
-from hector_jax.inputs import POSITIVE, SOME, InputError, Interval, check, choose
+from hector_jax.inputs import SOME, InputError, Interval, check, choose
 from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Trajectory
+from hector_jax.trajectory import State, Trajectory, from_start
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
-METRES_PER_NEWTON = 0.35 / 120.0  # the robot's weight is an arrow of 35 cm
-LEAST_ARROW = 0.03  # [m]; shorter ones are not drawn
+ENDINGS = (".mp4", ".webp", ".gif", ".png")  # all but the first are pictures that move
+COLOURS = ((184, 33, 51), (0, 122, 94))  # of before and after
 
 _PATIENCE = 300.0  # [s] for a back end to draw the whole film
-_HEIGHT = 0.423  # [m] of the centre of mass of the robot that the camera is set for
-_TRAILS = ((0.72, 0.13, 0.20, 1.0), (0.0, 0.48, 0.37, 1.0))  # colours of before and after
-_REFERENCE = (0.08, 0.08, 0.10, 1.0)
-_ARROW = (237, 107, 28)
+_TOP = 1.6  # height of the robot, in heights of its centre of mass
+_WINDOW = 4.0  # [s] of the reference that a film keeps in view
+_SAMPLE = 0.02  # [s] between the points of the lines on the floor
+_DASH = 4  # of these points
+_DOWN, _ASIDE = np.deg2rad(30.0), np.deg2rad(35.0)  # how the camera looks along the way
+_LAST = 1500  # [ms] that a picture that moves stands still before it starts again
+_INK = (20, 20, 25)
 
 
-class VideoUnavailable(RuntimeError):  # noqa: N818, it is no fault of the program
+class VideoUnavailable(Broken):
     """No film can be made here; the message says why in one line."""
-
-
-class Arrows(NamedTuple):
-    """Arrows of one meaning in both walks of a film."""
-
-    words: str
-    colour: tuple[int, int, int]
-    ends: tuple[Float[np.ndarray, "T 2 2 3"], ...]  # of each walk: sample, foot, start and tip [m]
 
 
 @dataclass(frozen=True)
 class VideoConfig:
     """How a film looks."""
 
-    width: int = 640  # [pixel], both halves together
-    height: int = 360
-    rate: int = 25  # frames per second
-    speed: float = 1.0  # of the film over that of the walk
+    width: int = 800  # [pixel], both halves together
+    height: int = 540  # a quarter of it is the plot below
+    rate: int = 20  # frames per second
     tiles: int = 6  # pictures in a row of the strip
 
     def __post_init__(self) -> None:
         size = Interval(64, 8192)
-        check(self, width=size, height=size, rate=SOME, speed=POSITIVE, tiles=SOME)
-        for name, of in (("width", 4), ("height", 2)):
-            if getattr(self, name) % of:
+        check(self, width=size, height=size, rate=SOME, tiles=SOME)
+        for name in ("width", "height"):
+            if getattr(self, name) % 4:
                 raise InputError(
-                    f"VideoConfig.{name} must be a multiple of {of}, got {getattr(self, name)}"
+                    f"VideoConfig.{name} must be a multiple of 4, got {getattr(self, name)}"
                 )
 
 
@@ -89,59 +86,101 @@ def poses(
     return np.concatenate([trunk, quaternion, joints], axis=1)
 
 
-def check_back_end() -> None:
-    """Find out, before anything is walked for a film, whether MUJOCO_GL names a back end.
+def check_film(path: Path) -> None:
+    """Find out, before anything is walked for a film, whether it can be asked for.
 
     Raises:
-        InputError: it does not.
+        InputError: the ending is none of `ENDINGS`, or MUJOCO_GL names no back end.
     """
+    _check_ending(path)
     if asked := os.environ.get("MUJOCO_GL"):
         choose("MUJOCO_GL", asked.lower(), (*BACK_ENDS, "disable"))
 
 
-def write_video(
-    path: Path,
-    robot: Robot,
-    walks: Mapping[str, Trajectory],
-    strip: Path | None = None,
-    config: VideoConfig | None = None,
-    arrows: Sequence[Arrows] | None = None,
+def _check_ending(path: Path) -> None:
+    if path.suffix.lower() not in ENDINGS:
+        raise InputError(f"a film must end in {', '.join(ENDINGS)}, got {path.name}")
+
+
+def write_film(
+    path: Path, robot: Robot, walks: Mapping[str, Trajectory], config: VideoConfig | None = None
 ) -> str:
-    """Draw two walks side by side as an MP4.
+    """Draw two walks side by side, and below how far each is from the reference.
 
     Args:
-        path: film to write.
+        path: film (.mp4), or picture that moves and starts again (.webp, .gif, .png).
         robot: the body that walked.
-        walks: two, by the words that stand above them, before and after.
-        strip: PNG to write with snapshots of both.
-        config: size and rate; None takes 640 x 360 at 25 frames per second.
-        arrows: to draw at the feet; None takes the forces of the ground.
+        walks: two of one command, by the words that stand above them, before and after.
+        config: size and rate.
 
     Returns:
         The back end that drew it.
 
     Raises:
         VideoUnavailable: no back end works here, or there is no encoder.
-        ValueError: not two walks.
+        InputError: the ending is none of these.
     """
     config = config or VideoConfig()
+    _check_ending(path)
+    if path.suffix.lower() == ".mp4":
+        try:
+            imageio_ffmpeg.get_ffmpeg_exe()
+        except RuntimeError as error:
+            raise VideoUnavailable(f"no film: no video encoder ({_one_line(str(error))})") from None
+    times = np.arange(0.0, _seconds(walks) + 1e-9, 1.0 / config.rate)
+    return _write(path, config, robot, walks, times, strip=False)
+
+
+def write_strip(
+    path: Path, robot: Robot, walks: Mapping[str, Trajectory], config: VideoConfig | None = None
+) -> str:
+    """Draw snapshots of two walks, a row each, spread over the phases of a gait cycle.
+
+    Args, returns and raises as `write_film`; the path is that of a PNG.
+    """
+    config = config or VideoConfig()
+    return _write(path, config, robot, walks, _snapshots(walks, config.tiles), strip=True)
+
+
+def _seconds(walks: Mapping[str, Trajectory]) -> float:
+    return min(float(walk.period) * len(walk.fallen) for walk in walks.values())
+
+
+def _snapshots(walks: Mapping[str, Trajectory], tiles: int) -> Float[np.ndarray, " tiles"]:
+    """Times [s] of snapshots, each 1/tiles of a gait cycle later in it: no two show one pose."""
+    walk, seconds = next(iter(walks.values())), _seconds(walks)
+    stands = np.asarray(walk.contact)[:, 0]
+    lands = np.flatnonzero(stands[1:] & ~stands[:-1]) * float(walk.period)
+    cycle = min(seconds, np.median(np.diff(lands)) if len(lands) > 1 else seconds)
+    whole = np.floor(np.linspace(0.0, seconds / cycle - 1.0, tiles) + 1e-6)
+    return cycle * (whole + np.arange(tiles) / tiles)
+
+
+def _write(
+    path: Path,
+    config: VideoConfig,
+    robot: Robot,
+    walks: Mapping[str, Trajectory],
+    times: Float[np.ndarray, " K"],
+    *,
+    strip: bool,
+) -> str:
+    """Draw what is seen at these times [s] with the first back end that works; returns it."""
     if len(walks) != 2:
         raise ValueError(f"a film shows two walks side by side, got {len(walks)}: {list(walks)}")
-    try:
-        imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        raise VideoUnavailable(f"no film: no video encoder ({_one_line(str(error))})") from None
-    asked = os.environ.get("MUJOCO_GL")
+    chosen = os.environ.get("MUJOCO_GL")
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
-        folder = Path(name)
-        np.savez(folder / "request.npz", **_request(config, robot, walks, arrows))
-        failures = []
-        for back_end in (asked,) if asked else BACK_ENDS:
+        folder, failures = Path(name), []
+        drawn = folder / f"drawn{path.suffix.lower()}"
+        request = _request(config, robot, walks, times)
+        if not strip:
+            plot = folder / "plot.png"
+            request["box"] = distances(plot, walks, COLOURS, config.width, config.height // 4)
+        np.savez(folder / "request.npz", name=np.array(drawn.name), strip=strip, **request)
+        for back_end in (chosen,) if chosen else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
             if not failure:
-                shutil.move(folder / "film.mp4", path)
-                if strip is not None:
-                    shutil.move(folder / "strip.png", strip)
+                shutil.move(drawn, path)
                 return back_end
             failures.append(f"{back_end}: {failure}")
     raise VideoUnavailable(f"no film: MuJoCo cannot draw here ({'; '.join(failures)})")
@@ -174,82 +213,106 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
         return f"not done after {_PATIENCE:.0f} s"
     if done.returncode == 0:
         return ""
-    said = [line for line in done.stderr.splitlines() if line.strip() and line[0] != " "]
-    return _one_line(said[-1]) if said else f"ended with code {done.returncode}"
+    # what ends the first traceback; those that follow are of what it left open
+    first = done.stderr.split("Traceback (most recent call last):")[:2][-1]
+    said = [line for line in first.splitlines() if line.strip() and line[0] != " "]
+    return _one_line(said[0]) if said else f"ended with code {done.returncode}"
 
 
 def _request(
     config: VideoConfig,
     robot: Robot,
     walks: Mapping[str, Trajectory],
-    arrows: Sequence[Arrows] | None = None,
+    times: Float[np.ndarray, " K"],
 ) -> dict[str, Any]:
-    """Everything the child needs to know, as arrays."""
-    arrows = [_ground(walks)] if arrows is None else arrows
-    seconds = min(float(w.period) * len(w.fallen) for w in walks.values())
-    times = np.arange(0.0, seconds + 1e-9, config.speed / config.rate)
+    """Everything the child needs to know, as arrays; the walks in the frame of their start."""
     request: dict[str, Any] = {
-        "size": np.array([config.width, config.height, config.rate, config.tiles]),
+        "size": np.array([config.width, config.height, config.rate]),
         "times": times,
-        "scale": np.asarray(robot.standing_height / _HEIGHT),
+        "seconds": max(float(walk.period) * len(walk.fallen) for walk in walks.values()),
+        "top": _TOP * robot.standing_height,
         "model": np.array(str(robot.description.model.resolve())),
-        "labels": np.array(list(walks)),
-        "arrow_words": np.array([one.words for one in arrows]),
-        "arrow_colours": np.array([one.colour for one in arrows]) / 255.0,
+        "labels": np.array([named(name) for name in walks]),
     }
-    for i, walk in enumerate(walks.values()):
-        period, fallen = float(walk.period), np.asarray(walk.fallen)
+    for i, walk in enumerate(map(from_start, walks.values())):
+        period, fallen = float(walk.period), walk.fallen
         up = int(np.argmax(fallen)) if fallen.any() else len(fallen)
-        at = np.clip(np.round(times / period).astype(int) - 1, 0, max(up - 1, 0))
-        state = State(*(np.asarray(x)[at] for x in walk.state))
+        now = np.clip(np.round(times / period).astype(int) - 1, 0, len(fallen) - 1)
+        at = np.minimum(now, max(up - 1, 0))
+        each = max(1, round(_SAMPLE / period))  # samples from one point of a line to the next
+        state = State(*(x[at] for x in walk.state))
         request |= {
-            f"pose_{i}": poses(robot, state, np.asarray(walk.joints)[at]),
-            f"path_{i}": np.asarray(walk.state.position)[at],
-            f"aim_{i}": np.asarray(walk.reference.position)[at],
-            f"reference_{i}": np.asarray(walk.reference.position)[:: max(1, round(0.02 / period))],
-            f"arrows_{i}": np.stack([one.ends[i][at] for one in arrows], axis=1),
+            "reference": walk.reference.position[::each],
+            "sample": now // each,
+            f"pose_{i}": poses(robot, state, walk.joints[at]),
+            f"path_{i}": walk.state.position[:up:each],
             f"fall_{i}": np.array(period * up if fallen.any() else np.inf),
         }
     return request
 
 
-def _ground(walks: Mapping[str, Trajectory]) -> Arrows:
-    """The forces of the ground on both feet."""
-    ends = []
-    for walk in walks.values():
-        feet = np.asarray(walk.feet)
-        force = _smooth(np.asarray(walk.effect.force), float(walk.period))
-        ends.append(np.stack([feet, feet + METRES_PER_NEWTON * force], axis=2))
-    return Arrows("ground force", _ARROW, tuple(ends))
-
-
-def _smooth(force: Float[np.ndarray, "T 2 3"], period: float) -> Float[np.ndarray, "T 2 3"]:
-    """Mean over the 10 ms before each sample: an arrow that can be looked at."""
-    width = max(1, round(0.01 / period))
-    total = np.cumsum(np.concatenate([np.zeros((width, 2, 3)), force]), axis=0)
-    return (total[width:] - total[:-width]) / width
-
-
 # What follows runs in the child.
 
 
+class _Stage(NamedTuple):
+    """What both walks are drawn with."""
+
+    request: Mapping[str, Any]
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    renderer: mujoco.Renderer
+    cameras: list[mujoco.MjvCamera]  # of each frame
+
+    def view(self, walk: int, k: int) -> UInt8[np.ndarray, "height width 3"]:
+        """One walk in frame k."""
+        request, colour = self.request, np.array([*COLOURS[walk], 255]) / 255.0
+        accent = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_MATERIAL, "accent")
+        if accent >= 0:
+            self.model.mat_rgba[accent] = colour
+        self.data.qpos[:] = request[f"pose_{walk}"][k]
+        mujoco.mj_forward(self.model, self.data)
+        self.renderer.update_scene(self.data, self.cameras[k])
+        scene, sample = self.renderer.scene, request["sample"][k]
+        scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        ink = np.array([*_INK, 255]) / 255.0
+        path, reference = request[f"path_{walk}"][: sample + 1], request["reference"]
+        for start, end in pairwise(path):
+            _line(scene, start, end, 5.0, 0.003, colour)
+        for start, end in zip(reference[:: 2 * _DASH], reference[_DASH :: 2 * _DASH], strict=False):
+            _line(scene, start, end, 2.5, 0.005, ink)
+        return self.renderer.render()
+
+
 def _draw(request: Mapping[str, Any]) -> None:
-    """Write film.mp4 and strip.png into the working directory."""
-    width, height, rate, tiles = (int(x) for x in request["size"])
-    times, labels = request["times"], [str(x) for x in request["labels"]]
-    words = [str(x) for x in request["arrow_words"]]
-    meanings = dict(zip(words, request["arrow_colours"], strict=True))
+    """Write what is asked for into the working directory."""
+    width, height, rate = (int(x) for x in request["size"])
+    strip, file = bool(request["strip"]), str(request["name"])
+    across, down = (3 * width // 10, 3 * height // 4) if strip else (width // 2, 3 * height // 4)
     model = mujoco.MjModel.from_xml_path(str(request["model"]))
-    data = mujoco.MjData(model)
-    model.vis.global_.offwidth = max(model.vis.global_.offwidth, width // 2)
-    model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+    model.vis.global_.offwidth = max(model.vis.global_.offwidth, across)
+    model.vis.global_.offheight = max(model.vis.global_.offheight, down)
     model.vis.quality.shadowsize = 2048  # drawn without a GPU, shadows cost the most
-    chosen = np.linspace(0, len(times) - 1, min(tiles, len(times))).round().astype(int)
-    snapshots: list[list[np.ndarray]] = [[], []]
-    renderer = mujoco.Renderer(model, height, width // 2)
+    cameras = _cameras(request, model.vis.global_.fovy, across / down, 0.8 if strip else _WINDOW)
+    frames = range(len(request["times"]))
+    with mujoco.Renderer(model, down, across) as renderer:
+        stage = _Stage(request, model, mujoco.MjData(model), renderer, cameras)
+        if strip:
+            _strip(request, [[stage.view(i, k) for k in frames] for i in range(2)]).save(file)
+        else:
+            plot = np.asarray(Image.open("plot.png").convert("RGB"))
+            shown = (_frame(request, plot, [stage.view(i, k) for i in range(2)], k) for k in frames)
+            _encode(file, shown, (width, height), rate)
+
+
+def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rate: int) -> None:
+    if not file.endswith(".mp4"):
+        first, *rest = frames
+        lasts = [1000 // rate] * len(rest) + [_LAST]
+        first.save(file, save_all=True, append_images=rest, duration=lasts, loop=0, quality=75)
+        return
     writer = imageio_ffmpeg.write_frames(
-        "film.mp4",
-        (width, height),
+        file,
+        size,
         fps=rate,
         codec="libx264",
         macro_block_size=2,
@@ -258,108 +321,89 @@ def _draw(request: Mapping[str, Any]) -> None:
         output_params=["-crf", "19", "-preset", "fast", "-movflags", "+faststart"],
     )
     writer.send(None)
-    for k, time in enumerate(times):
-        halves = [_view(renderer, model, data, request, i, k) for i in range(2)]
-        if k in chosen:
-            for row, half in zip(snapshots, halves, strict=True):
-                row.append(half)
-        falls = [float(request[f"fall_{i}"]) for i in range(2)]
-        writer.send(np.ascontiguousarray(_frame(halves, labels, falls, float(time), meanings)))
+    for frame in frames:
+        writer.send(frame.tobytes())
     writer.close()
-    renderer.close()
-    Image.fromarray(_strip(snapshots, labels, times[chosen])).save("strip.png")
 
 
-def _view(
-    renderer: mujoco.Renderer,
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    request: Mapping[str, Any],
-    walk: int,
-    k: int,
-) -> UInt8[np.ndarray, "height width 3"]:
-    """One walk at one time, seen by a camera that goes with the reference."""
-    data.qpos[:] = request[f"pose_{walk}"][k]
-    mujoco.mj_forward(model, data)
-    reference, path = request[f"reference_{walk}"], request[f"path_{walk}"]
-    camera, scale = mujoco.MjvCamera(), float(request["scale"])
-    camera.lookat[:] = [*request[f"aim_{walk}"][k, :2], 0.37 * scale]
-    camera.distance, camera.azimuth, camera.elevation = 1.75 * scale, 125.0, -14.0
-    renderer.update_scene(data, camera)
-    renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
-    scene = renderer.scene
-    for start, end in _dashes(reference):
-        _line(scene, start, end, 0.005, _REFERENCE)
-    for start, end in zip(path[:k], path[1 : k + 1], strict=True):
-        _line(scene, start, end, 0.006, _TRAILS[walk])
-    for both, colour in zip(request[f"arrows_{walk}"][k], request["arrow_colours"], strict=True):
-        for foot, tip in both:
-            if np.linalg.norm(tip - foot) > LEAST_ARROW:
-                _between(scene, mujoco.mjtGeom.mjGEOM_ARROW, foot, tip, 0.012, (*colour, 0.9))
-    return renderer.render()
+def _cameras(
+    request: Mapping[str, Any], fovy: float, aspect: float, seconds: float
+) -> list[mujoco.MjvCamera]:
+    """Cameras from behind and above that see the robot and `seconds` of the reference around it.
 
-
-def _dashes(points: Float[np.ndarray, "T 3"], length: float = 0.06) -> list[tuple[Any, Any]]:
-    """Pieces of a path of `length` [m] with gaps of the same length between them."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    starts = np.arange(0.0, way[-1] - length, 2 * length)
-    place = lambda s: np.stack([np.interp(s, way, x) for x in points.T], axis=-1)  # noqa: E731
-    return list(zip(place(starts), place(starts + length), strict=True))
-
-
-def _line(scene: mujoco.MjvScene, start: Any, end: Any, radius: float, rgba: tuple) -> None:
-    """A line on the floor under two points."""
-    start, end = (np.array([*point[:2], 0.002]) for point in (start, end))
-    _between(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, start, end, radius, rgba)
-
-
-def _between(
-    scene: mujoco.MjvScene, kind: int, start: Any, end: Any, radius: float, rgba: tuple
-) -> None:
-    """A decoration of the scene from one point to another."""
-    geom = scene.geoms[scene.ngeom]
-    mujoco.mjv_initGeom(
-        geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.array(rgba, "f")
+    A walk that lasts no longer is seen by a camera that does not move.
+    """
+    reference, top = request["reference"] * [1.0, 1.0, 0.0], float(request["top"])
+    way = reference[-1] - reference[0]
+    heading = np.arctan2(way[1], way[0]) if np.linalg.norm(way) > top else 0.0
+    azimuth = heading + _ASIDE
+    ahead = np.array(
+        [np.cos(azimuth) * np.cos(_DOWN), np.sin(azimuth) * np.cos(_DOWN), -np.sin(_DOWN)]
     )
-    mujoco.mjv_connector(geom, kind, radius, start, end)
-    if kind == mujoco.mjtGeom.mjGEOM_ARROW:
-        geom.size[2] *= 2.0  # MuJoCo draws an arrow half as long as it was asked for
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    axes = np.stack([right, np.cross(right, ahead), ahead], axis=1)
+    half = np.tan(np.deg2rad(fovy) / 2) * np.array([aspect, 1.0])
+    count = min(len(reference), round(seconds / _SAMPLE))
+    middles, away = [], []
+    for sample in request["sample"]:
+        first = int(np.clip(sample - count // 2, 0, len(reference) - count))
+        floor = reference[first : first + count]
+        body = np.concatenate([floor, floor + [0.0, 0.0, top]]) @ axes
+        middle = (body.min(axis=0) + body.max(axis=0)) / 2
+        spread = np.abs(body[:, :2] - middle[:2]) + 0.3 * top * np.array([1.0, 0.4])
+        away.append(np.max(spread / half - (body[:, 2:] - middle[2])))
+        middles.append(axes @ middle)
+    cameras = [mujoco.MjvCamera() for _ in middles]
+    for camera, middle in zip(cameras, middles, strict=True):
+        camera.lookat[:], camera.distance = middle, max(away)
+        camera.azimuth, camera.elevation = np.rad2deg(azimuth), -np.rad2deg(_DOWN)
+    return cameras
+
+
+def _line(
+    scene: mujoco.MjvScene, start: Any, end: Any, pixels: float, height: float, rgba: np.ndarray
+) -> None:
+    """A line under two points, at a `height` [m] above the floor; the higher hides the lower."""
+    geom, kind, zero = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3)
+    start, end = (np.array([*point[:2], height]) for point in (start, end))
+    rgba = rgba * [0.6, 0.6, 0.6, 1.0]  # MuJoCo draws lines brighter than bodies
+    mujoco.mjv_initGeom(geom, kind, zero, zero, np.eye(3).ravel(), rgba.astype("f"))
+    mujoco.mjv_connector(geom, kind, pixels, start, end)
     geom.category = mujoco.mjtCatBit.mjCAT_DECOR
     scene.ngeom += 1
 
 
 def _frame(
-    halves: list[np.ndarray],
-    labels: list[str],
-    falls: list[float],
-    time: float,
-    meanings: Mapping[str, Any],
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Both halves with their words."""
-    picture = Image.fromarray(np.concatenate(halves, axis=1))
+    request: Mapping[str, Any], plot: np.ndarray, halves: list[np.ndarray], k: int
+) -> Image.Image:
+    """Both halves with their words, and below the plot, pale where time has not come yet."""
+    left, top, right, bottom = request["box"]
+    now = round(left + (right - left) * request["times"][k] / request["seconds"])
+    plot = plot.copy()
+    ahead = plot[top:bottom, now : right + 1]
+    ahead[:] = 255 - (255 - ahead) // 5
+    picture = Image.fromarray(np.concatenate([np.concatenate(halves, axis=1), plot]))
     draw = ImageDraw.Draw(picture, "RGBA")
-    half, height = picture.width // 2, picture.height
-    for i, (label, fall) in enumerate(zip(labels, falls, strict=True)):
-        _words(draw, (i * half + 10, 10), label, _TRAILS[i])
-        if time >= fall:
-            _words(draw, (i * half + 10, 36), f"fell at {fall:.2f} s", (0.7, 0.1, 0.1, 1.0))
-    draw.rectangle((half - 1, 0, half, height), fill="white")
-    _words(draw, (picture.width - 10, height - 10), f"{time:.1f} s", None, anchor="rb")
-    place = 10.0
-    for words, colour in {"dashed: reference": None, **meanings}.items():
-        place = 14.0 + _words(draw, (place, height - 10), words, colour, 11, "lb")
-    return np.asarray(picture)
+    half, height = halves[0].shape[1], halves[0].shape[0]
+    for i, label in enumerate(request["labels"]):
+        _words(draw, (i * half + 12, 12), str(label), COLOURS[i])
+        if request["times"][k] >= request[f"fall_{i}"]:
+            _words(draw, (i * half + 12, 40), f"fell at {request[f'fall_{i}']:.2f} s", COLOURS[0])
+    draw.rectangle((half - 1, 0, half, height - 1), fill="white")
+    _words(draw, (picture.width - 12, height - 12), f"{request['times'][k]:.1f} s", None, 14, "rb")
+    _words(draw, (picture.width - 12, 12), "dashed: reference", None, 14, "rt")
+    return picture
 
 
 def _words(
     draw: ImageDraw.ImageDraw,
-    place: tuple[float, float],
+    place: tuple[int, int],
     text: str,
-    colour: Sequence[float] | None,
-    size: int = 14,
+    colour: tuple[int, int, int] | None,
+    size: int = 16,
     anchor: str = "lt",
-) -> float:
-    """Words on a light plate, with a mark in the colour of what they name; its right edge."""
+) -> None:
+    """Words on a light plate, with a mark in the colour of what they name."""
     font = ImageFont.load_default(size=size)
     left, top, right, bottom = draw.textbbox(place, text, font, anchor)
     mark = 0 if colour is None else size
@@ -367,31 +411,24 @@ def _words(
         (left - 5, top - 5, right + 5 + mark, bottom + 5), 4, fill=(255, 255, 255, 205)
     )
     if colour is not None:
-        fill = tuple(int(255 * c) for c in colour)
-        draw.rounded_rectangle((left, top, left + size - 5, bottom), 2, fill=fill)
-    draw.text((place[0] + mark, place[1]), text, "#16181c", font, anchor)
-    return right + 5 + mark
+        draw.rounded_rectangle((left, top, left + size - 5, bottom), 2, fill=colour)
+    draw.text((place[0] + mark, place[1]), text, _INK, font, anchor)
 
 
-def _strip(
-    rows: list[list[np.ndarray]], labels: list[str], times: np.ndarray
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Snapshots, one row per walk, cut to the robot."""
-    cut = rows[0][0].shape[1] // 8
-    lines = [np.concatenate([tile[:, cut:-cut] for tile in row], axis=1) for row in rows]
-    picture = Image.fromarray(np.concatenate(lines, axis=0))
+def _strip(request: Mapping[str, Any], rows: list[list[np.ndarray]]) -> Image.Image:
+    """Snapshots, one row per walk."""
+    picture = Image.fromarray(np.concatenate([np.concatenate(row, axis=1) for row in rows]))
     draw = ImageDraw.Draw(picture, "RGBA")
-    wide, high = picture.width // len(times), picture.height // 2
-    for i, label in enumerate(labels):
-        _words(draw, (10, i * high + 10), label, _TRAILS[i])
-        for k, time in enumerate(times):
-            _words(
-                draw, (wide * (k + 1) - 10, high * (i + 1) - 10), f"{time:.1f} s", None, 12, "rb"
-            )
-            if k:
-                draw.rectangle((wide * k - 1, 0, wide * k, picture.height), fill="white")
+    high, wide = rows[0][0].shape[:2]
+    for i, label in enumerate(request["labels"]):
+        _words(draw, (12, i * high + 12), str(label), COLOURS[i])
+        for k, time in enumerate(request["times"]):
+            place = (wide * (k + 1) - 10, high * (i + 1) - 10)
+            _words(draw, place, f"{time:.2f} s", None, 14, "rb")
+    for k in range(1, len(rows[0])):
+        draw.rectangle((wide * k - 1, 0, wide * k, picture.height), fill="white")
     draw.rectangle((0, high - 1, picture.width, high), fill="white")
-    return np.asarray(picture)
+    return picture
 
 
 if __name__ == "__main__":

@@ -23,21 +23,23 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.evaluation.plots import named
 from hector_jax.evaluation.runs import METRICS, RESULT, as_sentence, curves, read_histories
-from hector_jax.evaluation.video import LEAST_ARROW, METRES_PER_NEWTON, Arrows, poses
+from hector_jax.evaluation.video import COLOURS, poses
 from hector_jax.geometry import rot_z
 from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
-from hector_jax.trajectory import Trajectory, Wrench
+from hector_jax.trajectory import Trajectory, Wrench, from_start
 
 HOST, PORT = "127.0.0.1", 8080
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between looks at the metrics
 _APART = 0.8  # [m] between the two walks
-_SCALES = {"force": METRES_PER_NEWTON, "moment": 0.35 / 12.0}  # [m/N], [m/(N m)] of the arrows
+# [m/N], [m/(N m)] of the arrows: that of the robot's weight has 35 cm
+_SCALES = {"force": 0.35 / 120.0, "moment": 0.35 / 12.0}
+_LEAST_ARROW = 0.03  # [m]; shorter ones are not drawn
 _RADII = {"force": 0.008, "moment": 0.014}  # [m] of their shafts
-_COLOURS = ((184, 33, 51), (0, 122, 94))  # before and after, as in the film
 _DARK = (20, 20, 25)
 # before, after and what else there is: told apart by dashes too
 _STROKES = (
@@ -86,14 +88,14 @@ class Motion(NamedTuple):
 
 
 def motion(robot: Robot, model: mujoco.MjModel, shown: Shown) -> Motion:
-    """What of a walk is drawn where.
+    """What of a walk is drawn where, in the frame of its start.
 
     Args:
         robot: the body that walked.
         model: of the same body.
         shown: the walk.
     """
-    walk = shown.walk
+    walk = from_start(shown.walk)
     fallen, period = np.asarray(walk.fallen), float(walk.period)
     up = int(np.argmax(fallen)) if fallen.any() else len(fallen)
     at = np.minimum(np.arange(len(fallen)), max(up - 1, 0))
@@ -130,20 +132,7 @@ def motion(robot: Robot, model: mujoco.MjModel, shown: Shown) -> Motion:
 
 def titles(names: Iterable[str]) -> list[str]:
     """What stands above two walks."""
-    return [f"{when}: {name}" for when, name in zip(("before", "after"), names, strict=True)]
-
-
-def film_arrows(motions: Sequence[Motion]) -> list[Arrows]:
-    """The forces of two walks by source, for a film of them."""
-    return [
-        Arrows(
-            words=_SOURCES[source].words,
-            colour=_SOURCES[source].colour,
-            ends=tuple(one.arrows["force", source] for one in motions),
-        )
-        for kind, source in motions[0].arrows
-        if kind == "force"
-    ]
+    return [f"{when}: {named(name)}" for when, name in zip(("before", "after"), names, strict=True)]
 
 
 def _body_frames(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -325,8 +314,8 @@ class Page:
             root = f"/world/{i}"
             scene.add_frame(root, show_axes=False, position=(0.5 - i) * _APART * across)
             lines = {
-                "footholds": (_on_floor(one.soles, 0.003), _pale(_COLOURS[i]), 0.03),
-                "path": (_on_floor(_pieces(one.path, 2), 0.006), _COLOURS[i], 0.008),
+                "footholds": (_on_floor(one.soles, 0.003), _pale(COLOURS[i]), 0.03),
+                "path": (_on_floor(_pieces(one.path, 2), 0.006), COLOURS[i], 0.008),
                 "reference": (_on_floor(_pieces(one.reference, 6)[::2], 0.008), _DARK, 0.01),
             }
             for line, (points, colour, thickness) in lines.items():
@@ -339,7 +328,7 @@ class Page:
                     ),
                     "bodies": {
                         body: scene.add_mesh_trimesh(f"{root}/body{body}", mesh)
-                        for body, mesh in _meshes(model, _COLOURS[i]).items()
+                        for body, mesh in _meshes(model, COLOURS[i]).items()
                     },
                     "arrows": {
                         (kind, source): scene.add_arrows(
@@ -363,7 +352,9 @@ class Page:
                 handle.position, handle.wxyz = one.position[tick, body], one.wxyz[tick, body]
             for (kind, source), handle in handles["arrows"].items():
                 arrows = one.arrows[kind, source][tick]
-                seen = np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1) > LEAST_ARROW  # NaN: not
+                seen = (
+                    np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1) > _LEAST_ARROW
+                )  # NaN: not
                 shown = self._shown[kind].value and self._shown[source].value
                 handle.visible = bool(shown and seen.any())
                 if handle.visible:

@@ -34,7 +34,7 @@ from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import Robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import NO_PUSH, Push, hfs, hfs_drawn
-from hector_jax.storage import load_tree, read_card, save_tree, write_file
+from hector_jax.storage import check_settings, load_tree, read_card, save_tree, write_file
 from hector_jax.trajectory import Load, State, Trajectory, Wrench
 
 KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
@@ -243,9 +243,10 @@ def collect(
     walk_jobs: Callable[[list[Job]], Iterable[Trajectory]],
     *,
     robot: Robot,
+    settings: Mapping[str, Any] | None = None,
+    about: Mapping[str, Any] | None = None,
     interval: float | None = None,
     shard: int = 16,
-    about: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Walk all jobs and keep them under `folder` in shards, taking up what an earlier call left.
@@ -259,22 +260,26 @@ def collect(
         walk_jobs: called once, with the jobs whose walks are missing; gives the walks in their
             order, from any world. An iterator that walks while it is asked loses least to a stop.
         robot: the body; shards of another one are refused.
+        settings: JSON values of all that the walks follow from; shards of others are refused.
+        about: JSON values for the card, such as the engine that walked.
         interval: the plan interval [s], that of the robot's gait by default.
         shard: walks in a file.
-        about: JSON values that tell how it was walked; shards that tell otherwise are refused.
         progress: called with walks done and walks in all.
 
     Raises:
-        InputError: a shard in the folder is of other jobs, another robot or another `about`, or
-            walks are missing or too short.
+        InputError: a shard in the folder is of other jobs, another robot or other settings.
+        ValueError: walks are missing or too short.
         InputError: the folder cannot be written.
     """
     interval = walk_config(robot).gait.tick if interval is None else interval
-    told = json.loads(json.dumps({"interval": interval, **(about or {})}))  # as it is read back
+    settings = json.loads(
+        json.dumps({"interval": interval, **(settings or {})})
+    )  # as it is read back
     facts = {
         "units": _UNITS,
         "frames": "world; wrench of the ground on the foot at its foot point, left then right",
-        "told": told,
+        "settings": settings,
+        **(about or {}),
     }
     single = {start: Path(folder) / f"walk-{start:05d}.npz" for start in range(len(jobs))}
     chunks = {
@@ -283,7 +288,7 @@ def collect(
     }
 
     def take(path: Path, numbers: Sequence[int]) -> Walks | None:
-        return _kept_shard(path, _stack([jobs[i] for i in numbers]), robot, told)
+        return _kept_shard(path, _stack([jobs[i] for i in numbers]), robot, settings)
 
     kept = {path: take(path, numbers) for path, numbers in chunks.items()}
     open_ = [i for path, numbers in chunks.items() if kept[path] is None for i in numbers]
@@ -327,7 +332,7 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
 
 
 def walked_with(folder: Path) -> dict[str, Any]:
-    """What tells one collection from another: a hash of its walks, and the settings it was told.
+    """What tells one collection from another: a hash of its walks, and its settings.
 
     Raises:
         InputError: nothing collected, not finished, or a card that is none.
@@ -336,14 +341,14 @@ def walked_with(folder: Path) -> dict[str, Any]:
     digest = hashlib.sha256()
     for name in card["shards"]:
         digest.update((Path(folder) / name).read_bytes())
-    return {"walks": digest.hexdigest()[:16], **card["told"]}
+    return {"content": digest.hexdigest()[:16], **card["settings"]}
 
 
 def _read_collection(folder: Path) -> dict[str, Any]:
     path = Path(folder) / "card.json"
     try:
         card = json.loads(path.read_text())
-        shards, told = card["shards"], dict(card["told"])
+        shards, settings = card["shards"], dict(card["settings"])
         if not shards or not all(re.fullmatch(r"shard-\d+\.npz", name) for name in shards):
             raise ValueError(f"shards are {shown(shards)}")
     except FileNotFoundError:
@@ -355,7 +360,7 @@ def _read_collection(folder: Path) -> dict[str, Any]:
     for name in shards:
         if not (Path(folder) / name).is_file():
             raise InputError(f"{path}: no file {name} beside it; collect again")
-    return {"shards": shards, "told": told}
+    return {"shards": shards, "settings": settings}
 
 
 def _load_shard(path: Path, robot: Robot) -> Walks:
@@ -370,7 +375,7 @@ def _load_shard(path: Path, robot: Robot) -> Walks:
     return walks
 
 
-def _kept_shard(path: Path, asked: Job, robot: Robot, told: dict[str, Any]) -> Walks | None:
+def _kept_shard(path: Path, asked: Job, robot: Robot, settings: dict[str, Any]) -> Walks | None:
     if not path.exists():
         return None
     try:
@@ -378,8 +383,7 @@ def _kept_shard(path: Path, asked: Job, robot: Robot, told: dict[str, Any]) -> W
     except InputError as error:
         say(f"made anew: {error}")
         return None
-    if card["about"].get("told") != told:
-        raise InputError(f"{path}: collected with other settings; choose another folder")
+    check_settings(path, card["about"].get("settings", {}), settings)
     walks = _load_shard(path, robot)
     equal = jax.tree.map(np.array_equal, walks.job, asked)
     if not all(jax.tree.leaves(equal)):
@@ -448,17 +452,20 @@ def make_dataset(
     """
     config = config or walk_config(robot).gait
     count = len(walks.fallen)
-    starts = jnp.broadcast_to(jnp.asarray(start_tick, jnp.int32), (count,))
+    starts = np.broadcast_to(np.asarray(start_tick, np.int32), (count,))
     pushes = jax.tree.map(
-        lambda given, one: jnp.broadcast_to(given, (count, *jnp.shape(given)[-one.ndim :])),
+        lambda given, one: np.broadcast_to(given, (count, *np.shape(given)[-one.ndim :])),
         push,
         NO_PUSH,
     )
-    samples, usable = jax.vmap(lambda *walk: _samples(config, robot, *walk))(
-        jnp.arange(count), starts, pushes, jax.tree.map(jnp.asarray, walks)
-    )
+    samples, usable = _all_samples(config, robot, np.arange(count), starts, pushes, walks)
     usable = np.asarray(usable)
     return jax.tree.map(lambda x: np.asarray(x)[usable], samples), int((~usable).sum())
+
+
+@partial(jax.jit, static_argnums=0)
+def _all_samples(config, robot, numbers, starts, pushes, walks):
+    return jax.vmap(partial(_samples, config, robot))(numbers, starts, pushes, walks)
 
 
 def _samples(

@@ -92,8 +92,11 @@ def views(window: Window) -> View:
 
 def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[Array, "... knots"]:
     """Piecewise linear functions of the time [s], one at each knot; the ends reach on."""
-    rows = jnp.eye(len(knots), dtype=jnp.result_type(time))
-    return jnp.stack([jnp.interp(time, knots, row) for row in rows], axis=-1)
+    before = jnp.concatenate([knots[:1] - 1.0, knots[:-1]])
+    after = jnp.concatenate([knots[1:], knots[-1:] + 1.0])
+    time = jnp.clip(time, knots[0], knots[-1])[..., None]
+    sides = (time - before) / (knots - before), (after - time) / (after - knots)
+    return jnp.clip(jnp.minimum(*sides), 0.0, 1.0)
 
 
 def from_views(values: Float[Array, "2 6"]) -> Wrench:
@@ -141,7 +144,7 @@ def fit_gated(dataset: Dataset) -> GatedMap:
     seen = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
     tick, gate = (
-        np.repeat(np.asarray(hats(window.since_switch, jnp.asarray(knots)))[:, None], 2, axis=1)
+        np.repeat(np.asarray(jax.jit(hats)(window.since_switch, knots))[:, None], 2, axis=1)
         for knots in (ticks, gates)
     )
     ground, legs = seen_labels(dataset)

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from hector_jax.control.gait import GaitConfig, since_switch
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.gated import (
     CHANGES,
@@ -104,6 +105,9 @@ class LinearMap(NamedTuple):
     outputs: Scaling
 
 
+LINEAR = jax.tree.structure(LinearMap(0, 0, *[Scaling(Wrench(0, 0), Wrench(0, 0))] * 2))  # pyright: ignore
+
+
 class Net(nn.Module):
     """Layers of linear, layer normalisation and softsign, then a linear one."""
 
@@ -158,10 +162,8 @@ def init_params(
         raise InputError(f"unknown variant {variant!r} of the net; known: {', '.join(VARIANTS)}")
     inputs, outputs = _sizes(variant)
     net, x = Net(hidden or HIDDEN[variant], outputs), jnp.zeros(inputs)
-    force, moment = (
-        jax.vmap(lambda k: net.init(k, x)["params"])(jax.random.split(k, MEMBERS[variant]))
-        for k in jax.random.split(key)
-    )
+    draw = jax.jit(jax.vmap(lambda k: net.init(k, x)["params"]))
+    force, moment = (draw(jax.random.split(k, MEMBERS[variant])) for k in jax.random.split(key))
     if variant == "paper":
         first = partial(jax.tree.map, lambda p: p[0])
         scalings = fit_scaling(dataset.window.commands), fit_scaling(dataset.label)
@@ -257,6 +259,24 @@ def as_effect(params: Params) -> jax.tree_util.Partial:
     """Phi of a GRFM-Net of either variant: `Window -> Effect`; the paper's has no spread."""
     paper = isinstance(params, NetParams)
     return jax.tree_util.Partial(_net_effect if paper else _residual_effect, params)
+
+
+def plain_net(gait: GaitConfig) -> ResidualParams:
+    """A net that returns every command as it is: the plain rigid body, in the program of the net.
+
+    Its parameters have the shapes of a net that was trained on walks of `gait`.
+    """
+    ticks = np.unique(np.asarray(since_switch(gait, jnp.arange(gait.cycle))))
+    zeros = lambda x: np.zeros([len(ticks) if n == 0 else n for n in x.shape], np.float32)  # noqa: E731
+    net = jax.tree.map(zeros, layout("residual", HIDDEN["residual"]))
+    knots = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
+    one = np.ones((), np.float32)
+    return net._replace(linear=knots, usual=Usual(net.usual.mean, net.usual.scale + one, one))
+
+
+def effect_of(params: Params | None, gait: GaitConfig) -> jax.tree_util.Partial:
+    """Phi of a net, or of the plain rigid body (None), which needs no program of its own."""
+    return as_effect(plain_net(gait) if params is None else params)
 
 
 def member_effects(params: ResidualParams) -> jax.tree_util.Partial:

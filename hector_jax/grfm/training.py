@@ -94,6 +94,13 @@ class _Samples(NamedTuple):
     trust: Array  # (n, 1), by foot in the residual variant
 
 
+class _Rates(NamedTuple):
+    """Numbers of a training that a program takes as they come."""
+
+    learning: float
+    l2: float
+
+
 class _Carry(NamedTuple):
     nets: Wrench  # parameters of force and moment nets, members stacked, in a wrench's places
     optimiser: Any
@@ -136,14 +143,17 @@ def train(
     infinite = jax.tree.map(
         lambda w: jnp.full(MEMBERS[config.variant], jnp.inf, jnp.float32), Wrench(0, 0)
     )
-    carry = _Carry(nets, _optimiser(config).init(nets), nets, infinite)
+    rates = _Rates(config.learning_rate, config.l2)
+    carry = _Carry(nets, _optimiser(rates).init(nets), nets, infinite)
     seen, unseen = _prepare(params, training), _prepare(params, validation)
     rows, scale = [], _output_scale(params)
     if kept and (taken := kept.load((carry, np.zeros((0, 4))))):
         carry, rows = taken[0][0], list(taken[0][1])
     keys = jax.random.split(key_shuffle, config.epochs)
     for epoch, key in enumerate(keys[len(rows) :], start=len(rows) + 1):
-        carry, row = _train_epoch(config, scale, seen, unseen, carry, key)
+        carry, row = _train_epoch(
+            config.variant, config.batch, rates, scale, seen, unseen, carry, key
+        )
         rows.append(jax.device_get(row))
         if kept:
             kept.save((carry, np.array(rows)))
@@ -155,12 +165,12 @@ def train(
     return jax.device_get(best), History(*np.array(rows).T)
 
 
-def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
+def _optimiser(rates: _Rates) -> optax.GradientTransformation:
     def kernels(nets: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", nets)
 
     return optax.chain(
-        optax.add_decayed_weights(config.l2, mask=kernels), optax.adam(config.learning_rate)
+        optax.add_decayed_weights(rates.l2, mask=kernels), optax.adam(rates.learning)
     )
 
 
@@ -203,9 +213,11 @@ def _squares(variant: str, nets: Wrench, samples: _Samples) -> Wrench:
     return Wrench(*map(by_member, nets, samples.x, samples.y))
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=(0, 1))
 def _train_epoch(
-    config: TrainConfig,
+    variant: str,
+    size: int,
+    rates: _Rates,
     scale: Wrench,
     seen: _Samples,
     unseen: _Samples,
@@ -213,12 +225,12 @@ def _train_epoch(
     key: Key[Array, ""],
 ) -> tuple[_Carry, Float[Array, "4"]]:
     count = len(seen.x.force)
-    batch = min(config.batch, count)
+    batch = min(size, count)
     order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
-    optimiser = _optimiser(config)
+    optimiser = _optimiser(rates)
 
     def loss(nets: Wrench, chosen: _Samples) -> tuple[Float[Array, ""], Wrench]:
-        squares = _squares(config.variant, nets, chosen)
+        squares = _squares(variant, nets, chosen)
         return squares.force.mean(axis=1).sum() + squares.moment.mean(axis=1).sum(), squares
 
     def step(
@@ -233,7 +245,7 @@ def _train_epoch(
     (nets, memory), squares = jax.lax.scan(step, (carry.nets, carry.optimiser), order)
     variance = jax.tree.map(jnp.square, scale)
     physical = partial(jax.tree.map, lambda square, v: jnp.mean(square * v, axis=-1))
-    error = physical(_squares(config.variant, nets, unseen), variance)
+    error = physical(_squares(variant, nets, unseen), variance)
     best = Wrench(
         *(
             jax.tree.map(partial(jax.vmap(jnp.where), now < least), new, old)

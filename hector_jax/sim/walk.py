@@ -32,6 +32,7 @@ from hector_jax.control.walking import (
     Measurement,
     Memory,
     Plan,
+    Retune,
     WalkConfig,
     actuate,
     init_memory,
@@ -69,10 +70,6 @@ class Job(NamedTuple):
     start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
     push: Push = NO_PUSH
     changes: tuple[Change, ...] = ()  # of the plant
-
-
-Retune = Callable[[int, Anchor, Measurement, Wrench], Weights]
-"""Gait tick, anchor, what is measured, wrench commanded over the tick before -> weights."""
 
 
 class Observed(NamedTuple):
@@ -317,7 +314,7 @@ def walk(
         push: on the trunk.
         changes: of the plant, while it is walked on.
         on_sample: called after each millisecond, start-up included, with the world of that moment.
-        retune: asked at each tick from t = 0 on for the weights to plan with.
+        retune: gives the weights to plan with at each tick from t = 0 on, instead of `weights`.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they are held and `fallen`.
@@ -349,6 +346,7 @@ def walk(
     contacts = sensing.empty_contacts(count)
     memory, motors, yaw = programs.begin(device_robot, rows[0]), init_actuators(), jnp.zeros(())
     told: list[tuple[Plan, Observed]] = []
+    carry = None if retune is None else retune.init
     for tick in range(begin, start_tick + ticks):
         if tick == start_tick:
             last = jax.tree.map(lambda x: x[-1], told[-1][1].state)
@@ -357,7 +355,8 @@ def walk(
         now, yaw_before = np.array(tick, np.int32), yaw
         if retune is not None and tick >= start_tick:
             measurement = programs.tell(device_robot, yaw, rows[0], error[0])
-            chosen = retune(tick, anchor, measurement, told[-1][0].wrench)
+            last = told[-1][0].wrench
+            carry, chosen = retune.step(carry, tick, anchor, measurement, last)
             device_weights = jax.device_put(chosen)
         plan_now = programs.decide[slots_needed(config, tick)]
         memory, plan = plan_now(

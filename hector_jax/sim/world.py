@@ -128,8 +128,8 @@ def hfs_drawn(seed: int, share: float = 0.2) -> Imperfections:
     """A plant around the hfs: each number drawn uniformly within +-`share` of its own.
 
     Of mass, whose number is known better, a tenth of the share; the trunk's centre of mass
-    moves by up to 2.5 cm times the share. The floor keeps a friction of at least 0.6 (the MPC
-    plans with 0.5 and no plant below that can be walked on), and no motor gives
+    moves by up to 2.5 cm times the share. The floor keeps a friction of at least 0.6 (that
+    with which the MPC plans), and no motor gives
     more than it is told to: a gain falls short of 1 by up to a quarter of the share.
 
     Args:

@@ -29,7 +29,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.robot import Robot
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Progress, Stop, TuneConfig
-from hector_jax.tuning.loss import Alpha, Losses
+from hector_jax.tuning.loss import Losses, LossWeights
 from hector_jax.tuning.rollout import Variation
 
 AXIS = "problems"
@@ -42,7 +42,7 @@ class Scenario(NamedTuple):
     command: Command
     anchor: Anchor
     effect: Int[Array, "*batch"]  # which of the batch's phis
-    alpha: Alpha
+    alpha: LossWeights
     scale: Float[Array, "*batch"]  # the loss is divided by it
     variation: Variation | None = None
 
@@ -129,7 +129,7 @@ def _evaluate(
     def walk(scenario: Scenario) -> Evaluation:
         which = 0 if single else scenario.effect
         found = difftune.evaluate(
-            config,
+            config.rollout,
             robot,
             weights,
             scenario.command,

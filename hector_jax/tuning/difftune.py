@@ -16,7 +16,6 @@ from Python, one iteration after the other; `batch` compiles them into its loop 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -29,7 +28,7 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds
 from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, InputError, check
 from hector_jax.robot import Robot
-from hector_jax.tuning.loss import Alpha, LossConfig, Losses, losses, total
+from hector_jax.tuning.loss import LossConfig, Losses, LossWeights, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 
 PAPER_ITERATIONS = 10
@@ -131,30 +130,29 @@ class Tuning(NamedTuple):
 
 
 def evaluate(
-    config: TuneConfig,
+    config: RolloutConfig,
     robot: Robot,
     weights: Weights,
     command: Command,
     anchor: Anchor,
     effect: jax.tree_util.Partial,
-    alpha: Alpha | None = None,
+    alpha: LossWeights,
     variation: Variation | None = None,
 ) -> Evaluation:
     """Loss of a weight set on the model and its gradient, in one program.
 
     Args:
-        config: how; its loss weights count where `alpha` gives none.
-        robot, weights, command, anchor, effect, variation: see `rollout`.
-        alpha: weights of the loss's parts as arrays.
+        config, robot, weights, command, anchor, effect, variation: see `rollout`.
+        alpha: weights of the parts of the loss.
 
     Source: Eq. 9, 11.
     """
 
     def objective(weights: Weights) -> tuple[Array, tuple]:
-        trajectory = rollout(config.rollout, robot, weights, command, anchor, effect, variation)
+        trajectory = rollout(config, robot, weights, command, anchor, effect, variation)
         parts = losses(trajectory)
-        loss = total(config.loss if alpha is None else alpha, parts)
-        return loss, (parts, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual))
+        seen = parts, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+        return total(alpha, parts), seen
 
     (loss, (parts, fallen, residual)), gradient = jax.value_and_grad(objective, has_aux=True)(
         weights
@@ -162,8 +160,21 @@ def evaluate(
     return Evaluation(loss, parts, gradient, fallen, residual)
 
 
-tune_step = jax.jit(evaluate, static_argnums=0)
-"""`evaluate`, compiled once per config: new weights, commands and nets need no compilation."""
+_evaluate = jax.jit(evaluate, static_argnums=0)
+# once for a rollout: new weights, commands, nets and loss weights need no compilation
+
+
+def tune_step(
+    config: TuneConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+) -> Evaluation:
+    """`evaluate` with the rollout and the loss weights of a tuning, compiled."""
+    alpha = config.loss.as_arrays()
+    return _evaluate(config.rollout, robot, weights, command, anchor, effect, alpha)
 
 
 def relative_step(beta_q: float, beta_r: float) -> optax.GradientTransformation:
@@ -194,9 +205,9 @@ def _optimiser(config: TuneConfig) -> optax.GradientTransformation:
     )
 
 
-def _tied(gradient: Weights) -> Weights:
-    both = lambda g: jnp.broadcast_to(g.mean(axis=0), g.shape)  # noqa: E731
-    return Weights(gradient.Q, jax.tree.map(both, gradient.R))
+def _mean_over_feet(tree: Weights) -> Weights:
+    both = lambda x: jnp.broadcast_to(x.mean(axis=0), x.shape)  # noqa: E731
+    return Weights(tree.Q, jax.tree.map(both, tree.R))
 
 
 def step_weights(
@@ -204,7 +215,7 @@ def step_weights(
 ) -> Weights:
     """Weights after `share` of a full step downhill, projected onto the box."""
     if config.tie_feet:
-        gradient = _tied(gradient)
+        gradient = _mean_over_feet(gradient)
     optimiser = _optimiser(config)
     updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
     moved = optax.apply_updates(weights, jax.tree.map(lambda u: share * u, updates))
@@ -223,8 +234,16 @@ def believed(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
 
 
 def init(config: TuneConfig, weights: Weights, count: int = 0) -> Progress:
-    """A tuning before its first rollout, which is iteration `count`."""
+    """A tuning before its first rollout, which is iteration `count`.
+
+    With `tie_feet` both feet start from the geometric mean of their weights in R.
+    """
     weights = jax.tree.map(jnp.asarray, weights)
+    if config.tie_feet:
+        equal = jnp.all(jnp.stack([jnp.array_equal(*w) for w in weights.R]))
+        tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights)))
+        # weights that are equal stay so to the last bit
+        weights = jax.tree.map(lambda w, t: jnp.where(equal, w, t), weights, tied)
     return Progress(
         trial=weights,
         share=jnp.asarray(1.0),
@@ -404,7 +423,6 @@ def _known(past: Sequence[Iteration], trial: Weights) -> Evaluation | None:
     return None
 
 
-@partial(jax.jit, static_argnums=0)
 def gradient_norms(
     config: TuneConfig,
     robot: Robot,
@@ -415,14 +433,12 @@ def gradient_norms(
 ) -> Losses:
     """Norms of the parts' gradients in log-weights, which the paper's footnote aligns."""
 
-    def parts(weights: Weights) -> Losses:
-        return losses(rollout(config.rollout, robot, weights, command, anchor, effect))
+    def norm(alpha: LossWeights) -> Float[Array, ""]:
+        found = _evaluate(config.rollout, robot, weights, command, anchor, effect, alpha)
+        logs = jax.tree.map(jnp.multiply, found.gradient, weights)
+        return optax.global_norm(logs)
 
-    def norm(gradient: Weights) -> Float[Array, ""]:
-        logs = jax.tree.map(lambda g, w: g * w, gradient, weights)
-        return jnp.sqrt(sum(jnp.sum(g**2) for g in jax.tree.leaves(logs)))
-
-    return Losses(*(norm(gradient) for gradient in jax.jacrev(parts)(weights)))
+    return Losses(*(norm(LossWeights(*alone)) for alone in np.eye(3)))
 
 
 def aligned(config: LossConfig, norms: Losses) -> LossConfig:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.inputs import NOT_NEGATIVE, check
@@ -22,6 +23,14 @@ from hector_jax.trajectory import Trajectory, Wrench
 SAMPLE = 1e-3  # [s] the rate at which the paper sums
 FALL_POSITION = 0.5  # [m] least error charged after a fall
 FALL_EULER = 0.8  # [rad]
+
+
+class LossWeights(NamedTuple):
+    """Weights of the three parts as arrays, so that one program serves them all."""
+
+    euler: Float[Array, "*batch"]  # alpha_1 [1/rad^2]
+    position: Float[Array, "*batch"]  # alpha_2 [1/m^2]
+    control: Float[Array, "*batch"]  # 1 in the paper
 
 
 @dataclass(frozen=True)
@@ -34,12 +43,14 @@ class LossConfig:
     def __post_init__(self) -> None:
         check(self, euler=NOT_NEGATIVE, position=NOT_NEGATIVE)
 
+    @property
+    def control(self) -> float:
+        """Weight of L_ctrl, by which the others are measured."""
+        return 1.0
 
-class Alpha(NamedTuple):
-    """The same weights as arrays, where problems with different ones share a program."""
-
-    euler: Float[Array, "*batch"]  # alpha_1 [1/rad^2]
-    position: Float[Array, "*batch"]  # alpha_2 [1/m^2]
+    def as_arrays(self) -> LossWeights:
+        """The weights as arguments of a compiled program."""
+        return LossWeights(*(np.asarray(getattr(self, name)) for name in LossWeights._fields))
 
 
 class Losses(NamedTuple):
@@ -86,13 +97,17 @@ def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
     return jnp.sum(jnp.where(switched, _squared_changes(trajectory.command, trajectory.fallen), 0))
 
 
-def total(config: LossConfig | Alpha, parts: Losses) -> Float[Array, "*batch"]:
+def total(weights: LossWeights | LossConfig, parts: Losses) -> Float[Array, "*batch"]:
     """L of its parts. Source: Eq. 11.
 
     >>> total(LossConfig(), Losses(*map(jnp.asarray, (1.0, 2.0, 3e5)))).item()
     800000.0
     """
-    return config.euler * parts.euler + config.position * parts.position + parts.control
+    return (
+        weights.euler * parts.euler
+        + weights.position * parts.position
+        + weights.control * parts.control
+    )
 
 
 @partial(jax.jit, static_argnums=0)

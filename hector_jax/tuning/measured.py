@@ -1,9 +1,11 @@
 """DiffTune along walks that were measured, on a better simulator or on the robot (Eq. 9, 10).
 
-The errors in the loss are the measured ones, and dynamics, phi and controller are differentiated at
-the measured states: the model is asked only how a state would have changed with the weights, not
-what it was. Tuning on the model's own walk ends where the model errs; from there this goes on, at
-the price of a walk for every step.
+The tracking errors in the loss are the measured ones, and dynamics, phi and controller are
+differentiated at the measured states: the model is asked only how a state would have changed with
+the weights, not what it was. The changes of the command in the loss are those of commands planned
+anew from the true states and joints; what was sent was planned from an estimate, so that on a plant
+with backlash or an estimator that errs the two differ. Tuning on the model's own walk ends where
+the model errs; from there this goes on, at the price of a walk for every step.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,13 +28,14 @@ from hector_jax.tuning.difftune import (
     Tuning,
     descend,
 )
-from hector_jax.tuning.online import Told, follow, init_trace
+from hector_jax.tuning.online import MeasuredState, follow, init_trace
 
 
 @jax.jit
-def _told(robot: Robot, state: State, joints: Array) -> Told:
-    def one(state: State, joints: Array) -> Told:
-        return Told(state, measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints))))
+def _measured_states(robot: Robot, state: State, joints: Array) -> MeasuredState:
+    def one(state: State, joints: Array) -> MeasuredState:
+        measurement = Measurement(state, joints, jnp.zeros_like(joints))
+        return MeasuredState(state, measured_feet(robot, measurement))
 
     return jax.vmap(one)(state, joints)
 
@@ -69,13 +72,13 @@ def evaluate_walk(
             f"got {samples} samples"
         )
     ends = slice(samples // ticks - 1, None, samples // ticks)
-    told = _told(robot, jax.tree.map(lambda x: x[ends], walk.state), walk.joints[ends])
+    states = _measured_states(robot, jax.tree.map(lambda x: x[ends], walk.state), walk.joints[ends])
     first = Wrench(*(w[0] for w in walk.command))
     anchor = anchor_at(robot, walk.initial, start_tick)
-    trace = init_trace(anchor, jax.tree.map(lambda x: x[0], told), first)
+    trace = init_trace(anchor, jax.tree.map(lambda x: x[0], states), first)
     used = jax.tree.map(lambda w: np.broadcast_to(w, (ticks - 1, *np.shape(w))), weights)
     tick = np.asarray(start_tick + 1, np.int32)
-    _, found = follow(config, robot, command, anchor, effect, trace, used, tick, told)
+    _, found = follow(config, robot, command, anchor, effect, trace, used, tick, states)
     fallen = jnp.maximum(found.fallen, jnp.mean(1.0 * jnp.asarray(walk.fallen)))
     worst = jnp.maximum(found.residual, jnp.max(jnp.asarray(walk.residual)))
     return jax.tree.map(np.asarray, found._replace(fallen=fallen, residual=worst))

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.walking import Feet, Measurement, measured_feet
+from hector_jax.control.walking import Feet, Measurement, Retune, measured_feet
 from hector_jax.control.weights import Weights
 from hector_jax.inputs import NOT_NEGATIVE, SHARE, InputError, Interval, check
 from hector_jax.model.effect import HISTORY
@@ -59,7 +59,7 @@ class OnlineConfig:
             raise InputError(f"OnlineConfig.late must be below window, got {self.late}")
 
 
-class Told(NamedTuple):
+class MeasuredState(NamedTuple):
     """What is measured at the start of a tick."""
 
     state: State  # of the base
@@ -73,20 +73,20 @@ class Trace(NamedTuple):
     tangents: Varied  # of the carry at its end
 
 
-def init_trace(anchor: Anchor, told: Told, last: Wrench) -> Trace:
+def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench) -> Trace:
     """No weight has a part in what was measured so far.
 
     Args:
         anchor: of the reference.
-        told: now.
+        measured: now.
         last: wrench commanded over the last tick, taken for those before it too.
     """
     commands = jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), last)
-    return Trace(commands, no_tangents(_carry(anchor, told, commands)))
+    return Trace(commands, no_tangents(_carry(anchor, measured, commands)))
 
 
-def _carry(anchor: Anchor, told: Told, commands: Wrench) -> Carry:
-    return Carry(told.state, told.feet, commands, anchor, jnp.asarray(False))
+def _carry(anchor: Anchor, measured: MeasuredState, commands: Wrench) -> Carry:
+    return Carry(measured.state, measured.feet, commands, anchor, jnp.asarray(False))
 
 
 def window_gradient(
@@ -98,7 +98,7 @@ def window_gradient(
     trace: Trace,
     weights: Weights,
     tick: Int[Array, ""],
-    told: Told,
+    states: MeasuredState,
     measured: bool = True,
 ) -> tuple[Trace, Evaluation]:
     """Loss of the ticks of a window and its gradient by the weights.
@@ -111,7 +111,7 @@ def window_gradient(
         trace: of the window before, see `init_trace`.
         weights: in force over each of the n ticks, stacked.
         tick: gait tick at the window's start, later than t = 0.
-        told: n + 1 measurements, stacked: at the start of each tick and at the end of the last.
+        states: n + 1 measurements, stacked: at the start of each tick and at the end of the last.
         measured: along what was measured; or along the model's own walk from the first measurement
             on (static).
 
@@ -135,8 +135,8 @@ def window_gradient(
             sample = sample._replace(state=after.state, fallen=fallen)
         return (then, tangents), (sample, columns)
 
-    now, after = jax.tree.map(lambda x: x[:-1], told), jax.tree.map(lambda x: x[1:], told)
-    start = _carry(anchor, jax.tree.map(lambda x: x[0], told), trace.commands)
+    now, after = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
+    start = _carry(anchor, jax.tree.map(lambda x: x[0], states), trace.commands)
     ticks = tick + jnp.arange(len(now.feet.yaw))
     (last, tangents), (samples, columns) = jax.lax.scan(
         one, (start, trace.tangents), (ticks, weights, now, after)
@@ -174,15 +174,39 @@ def _with_command_before(
 _feet = jax.jit(measured_feet)
 
 
-def retuner(
+class Adaptation(NamedTuple):
+    """Where online tuning stands between two ticks."""
+
+    weights: Weights  # in force
+    newest: Weights  # that come into force at tick `due`
+    sound: Weights  # of the last window that was not refused
+    scale: float  # of the next step, 1 for a full one
+    led: float  # scale of the step that led to `newest`
+    count: int  # windows so far
+    due: int  # gait tick
+    trace: Trace | None  # of the windows so far; None before the first
+    states: tuple[MeasuredState, ...]  # measured since the window began
+    used: tuple[Weights, ...]  # in force over its ticks
+
+
+def init_adaptation(weights: Weights) -> Adaptation:
+    """Online tuning before its first tick, from some weights."""
+    start = jax.tree.map(np.asarray, weights)
+    return Adaptation(start, start, start, 1.0, 0.0, 0, 0, None, (), ())
+
+
+def step_adaptation(
     config: OnlineConfig,
     robot: Robot,
-    weights: Weights,
     command: Command,
     effect: jax.tree_util.Partial,
-    on_step: Callable[[Iteration], None] = lambda iteration: None,
-) -> Callable[[int, Anchor, Measurement, Wrench], Weights]:
-    """What a walk asks every tick for the weights to plan with; see `sim.walk.walk`.
+    carry: Adaptation,
+    tick: int,
+    anchor: Anchor,
+    measurement: Measurement,
+    last: Wrench,
+) -> tuple[Adaptation, Iteration | None]:
+    """Weights for one tick of a walk; at the end of a window, what its step was.
 
     A window that fell, was not solved or is not finite is refused: the weights go back to those of
     the last window that was sound, the step is halved and the sensitivities begin anew.
@@ -190,52 +214,86 @@ def retuner(
     Args:
         config: how.
         robot: nominal body.
-        weights: where to start.
-        command: what is walked.
+        command, anchor: what is walked, from where.
         effect: phi.
-        on_step: called after each window, with the weights in force at its end.
-
-    Returns:
-        Function of one walk, which remembers it: gait tick from t = 0 on, anchor, what is measured
-        at the tick's start and the wrench commanded over the tick before -> weights.
+        carry: from `init_adaptation` or the tick before.
+        tick: gait tick, from t = 0 on.
+        measurement: at the tick's start.
+        last: wrench commanded over the tick before [N, N m].
     """
-    sound = newest = in_force = jax.tree.map(np.asarray, weights)
-    seen: list[Told] = []
-    used: list[Weights] = []
-    share, led, count, trace, due = 1.0, 0.0, 0, None, 0
+    if tick == anchor.tick:  # the reference is anchored in this tick
+        return carry, None
+    state = MeasuredState(measurement.state, _feet(robot, measurement))
+    states = (*carry.states, jax.tree.map(np.asarray, state))
+    carry, iteration = carry._replace(states=states), None
+    if carry.trace is None:
+        carry = carry._replace(trace=init_trace(anchor, state, last))
+    if len(carry.used) == config.window:
+        trace, evaluation = _follow_window(config, robot, command, anchor, effect, carry, tick)
+        reason = refusal(config.tune, evaluation)
+        iteration = Iteration(carry.count, carry.weights, evaluation, not reason, reason, carry.led)
+        if reason:
+            scale, led, newest, sound = carry.scale / 2.0, 0.0, carry.sound, carry.sound
+            trace = init_trace(anchor, state, last)
+        else:
+            scale, led, sound = min(1.0, 2.0 * carry.scale), config.step * carry.scale, carry.newest
+            newest = step_weights(config.tune, sound, evaluation.gradient, led)
+        due, states = tick + config.late, carry.states[-1:]
+        count = carry.count + 1
+        carry = Adaptation(carry.weights, newest, sound, scale, led, count, due, trace, states, ())
+    weights = carry.newest if tick >= carry.due else carry.weights
+    return carry._replace(weights=weights, used=(*carry.used, weights)), iteration
 
-    def stacked(rows: list) -> Any:
-        return jax.tree.map(lambda *x: np.stack(x), *rows)
 
-    def retune(tick: int, anchor: Anchor, measurement: Measurement, last: Wrench) -> Weights:
-        nonlocal sound, newest, in_force, share, led, count, trace, due
-        if tick == anchor.tick:  # the reference is anchored in this tick
-            return in_force
-        told = Told(measurement.state, _feet(robot, measurement))
-        seen.append(jax.tree.map(np.asarray, told))
-        trace = trace or init_trace(anchor, told, last)
-        if len(used) == config.window:
-            if config.estimator != "carried":
-                trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
-            start = np.asarray(tick - config.window, np.int32)
-            known = (config.tune, robot, command, anchor, effect, trace)
-            measured = config.estimator != "model"
-            found = follow(*known, stacked(used), start, stacked(seen), measured=measured)
-            trace, evaluation = jax.tree.map(np.asarray, found)
-            reason = refusal(config.tune, evaluation)
-            on_step(Iteration(count, in_force, evaluation, not reason, reason, led))
-            if reason:
-                newest, share, led = sound, share / 2.0, 0.0
-                trace = init_trace(anchor, told, last)
-            else:
-                sound, led = newest, config.step * share
-                newest = step_weights(config.tune, newest, evaluation.gradient, led)
-                share = min(1.0, 2.0 * share)
-            count, due = count + 1, tick + config.late
-            del seen[:-1], used[:]
-        if tick >= due:
-            in_force = newest
-        used.append(in_force)
-        return in_force
+def _follow_window(
+    config: OnlineConfig,
+    robot: Robot,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+    carry: Adaptation,
+    tick: int,
+) -> tuple[Trace, Evaluation]:
+    """`window_gradient` of the window that ends at `tick`."""
+    stack = lambda rows: jax.tree.map(lambda *x: np.stack(x), *rows)  # noqa: E731
+    trace = carry.trace
+    if trace is not None and config.estimator != "carried":
+        trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
+    found = follow(
+        config.tune,
+        robot,
+        command,
+        anchor,
+        effect,
+        trace,
+        stack(carry.used),
+        np.asarray(tick - config.window, np.int32),
+        stack(carry.states),
+        measured=config.estimator != "model",
+    )
+    return jax.tree.map(np.asarray, found)
 
-    return retune
+
+def retuner(
+    config: OnlineConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    on_step: Callable[[Iteration], None] = lambda iteration: None,
+) -> Retune:
+    """Online tuning for `sim.walk.walk`.
+
+    Args:
+        config, robot, command, effect: see `step_adaptation`.
+        weights: where to start.
+        on_step: called after each window, with the weights in force at its end.
+    """
+
+    def step(carry: Adaptation, *tick: Any) -> tuple[Adaptation, Weights]:
+        carry, iteration = step_adaptation(config, robot, command, effect, carry, *tick)
+        if iteration is not None:
+            on_step(iteration)
+        return carry, carry.weights
+
+    return Retune(init_adaptation(weights), step)

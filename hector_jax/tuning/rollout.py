@@ -37,7 +37,7 @@ class RolloutConfig:
     walk: WalkConfig = WalkConfig()
     ticks: int = 400  # T; 4 s
     lead: int = 0  # ticks in place before t = 0, outside the loss
-    block: int = 500  # ticks whose solves are kept for the gradient; longer walks are walked twice
+    block: int = 500  # most ticks whose solves are stored; longer rollouts are computed twice
 
     def __post_init__(self) -> None:
         check(self, ticks=Interval(2), lead=NOT_NEGATIVE, block=SOME)
@@ -54,7 +54,7 @@ class Variation(NamedTuple):
     mass: Float[Array, "*batch"]  # times the robot's
     inertia: Float[Array, "*batch"]  # likewise, all of it
     com: Float[Array, "*batch 3"]  # true centre of mass from the believed one, trunk axes [m]
-    friction: Float[Array, "*batch"]  # of the ground: most horizontal by vertical force
+    friction: Float[Array, "*batch"]  # of the ground: most |F_x| + |F_y| by F_z, as in the plants
     delay: Float[Array, "*batch"]  # by which effects come late [s], at most a tick
     noise: State  # standard deviations of what the controller sees, white from tick to tick
     seed: Int[Array, "*batch"]  # of the noise
@@ -109,11 +109,11 @@ def _estimate_error(variation: Variation, state: State, tick: Int[Array, ""]) ->
 
 
 def _within_friction(wrench: Wrench, friction: Float[Array, ""]) -> Wrench:
-    """A foot slips: its horizontal force is cut to what the ground can hold."""
-    across, load = wrench.force[:, :2], jnp.maximum(wrench.force[:, 2], 0.0)
-    square = jnp.sum(across**2, axis=-1)
-    slips = square > (friction * load) ** 2
-    share = jnp.where(slips, friction * load / jnp.sqrt(jnp.where(slips, square, 1.0)), 1.0)
+    """A foot slips: its horizontal force is cut to what the friction pyramid can hold."""
+    across = jnp.sum(jnp.abs(wrench.force[:, :2]), axis=-1)
+    held = friction * jnp.maximum(wrench.force[:, 2], 0.0)
+    slips = across > held
+    share = jnp.where(slips, held / jnp.where(slips, across, 1.0), 1.0)
     return wrench._replace(force=wrench.force.at[:, :2].multiply(share[:, None]))
 
 
@@ -276,17 +276,14 @@ def rollout(
     if variation is not None:
         standing = jax.tree.map(lambda w: w[0], start.commands)
         start = start._replace(late=Late(standing, Load(jnp.zeros(3), jnp.zeros(3))))
-    blocks = _blocks(config)
+    blocks = -(-len(ticks) // config.block)
     if blocks == 1:
         _, samples = walk(start, ticks)
     else:
-        _, samples = jax.lax.scan(jax.checkpoint(walk), start, ticks.reshape(blocks, -1))
-        samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+        # equal blocks compile to one loop: the last one walks on for a few ticks that are dropped
+        size = -(-len(ticks) // blocks)
+        more = ticks[0] + jnp.arange(blocks * size).reshape(blocks, size)
+        _, samples = jax.lax.scan(jax.checkpoint(walk), start, more)
+        flat = lambda x: x.reshape(-1, *x.shape[2:])[: len(ticks)]  # noqa: E731
+        samples = jax.tree.map(flat, samples)
     return from_start(config, samples)
-
-
-def _blocks(config: RolloutConfig) -> int:
-    """Equal parts, of at most `block` ticks, that a rollout is kept in."""
-    ticks = config.lead + config.ticks
-    fewest = -(-ticks // config.block)
-    return next(count for count in range(fewest, ticks + 1) if ticks % count == 0)

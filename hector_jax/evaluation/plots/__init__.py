@@ -11,9 +11,9 @@ from hector_jax.evaluation.plots.sets import (
     changes,
     push_directions,
     ratios,
-    scene_ratios,
     survival,
 )
+from hector_jax.evaluation.plots.style import named
 from hector_jax.evaluation.plots.tunings import (
     RIVALS,
     front,
@@ -24,23 +24,24 @@ from hector_jax.evaluation.plots.tunings import (
     weights,
     while_walking,
 )
-from hector_jax.evaluation.plots.walks import collective, path_from_above, tracking
+from hector_jax.evaluation.plots.walks import collective, distances, path_from_above, tracking
 
 __all__ = [
     "RIVALS",
     "by_plant",
     "changes",
     "collective",
+    "distances",
     "front",
     "gradients",
     "losses",
+    "named",
     "open_loop",
     "path_from_above",
     "push_directions",
     "race",
     "ranks",
     "ratios",
-    "scene_ratios",
     "starts",
     "survival",
     "tracking",

@@ -17,6 +17,7 @@ from hector_jax.evaluation.plots.style import (
     SETS,
     drawing,
     legend,
+    log_axis,
     named,
     weight_label,
     widen,
@@ -210,16 +211,12 @@ def ranks(
                     label=f"{name}: {correlations[trajectory, factor][name]:.2f}",
                 )
             panel.legend(loc="upper left", handlelength=1.0, borderaxespad=0.2)
-            panel.set(xscale="log", yscale="log", title=f"{trajectory}, within x/{factor}")
+            panel.set_title(f"{trajectory}, within x/{factor}")
+            log_axis(panel, "x")
+            panel.set_yscale("log")
             low, high = panel.get_ylim()
             panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
-            for axis in (panel.xaxis, panel.yaxis):
-                low, high = axis.get_view_interval()
-                digits = "23456789" if high < 6 * low else "25"
-                axis.set_major_formatter(lambda y, _: f"{y:g}")
-                axis.set_minor_formatter(
-                    lambda y, _, digits=digits: f"{y:g}" if f"{y:.0e}"[0] in digits else ""
-                )
+            log_axis(panel, "y")
         for panel in panels[-1]:
             panel.set_xlabel("L on the hfs [10$^6$]")
         for panel in panels[:, 0]:

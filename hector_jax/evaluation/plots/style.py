@@ -1,15 +1,15 @@
 """How all pictures look: figure and legend, axes, and what each weight set is drawn with."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullLocator
 
 _STYLE = {
     "font.size": 8.5,
@@ -27,7 +27,7 @@ _STYLE = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "legend.handlelength": 2.8,
-    "savefig.dpi": 160,
+    "savefig.dpi": "figure",
     "svg.hashsalt": "hector_jax",  # the same picture gives the same bytes
 }
 
@@ -81,15 +81,9 @@ _SPARE = tuple(
     )
 )
 _NAMES = {
-    "without": "tuned without net",
-    "with": "tuned with net",
-    "without_ten": "without net, ten iterations",
-    "with_ten": "with net, ten iterations",
-    "with_walks": "with net, then along walks",
-    "searched": "searched on the simulator",
-    "ceiling": "long search",
-    "shared_mean": "one set for all, by the mean",
-    "shared_worst": "one set for all, by the worst",
+    "without": "without (tuned, no net)",
+    "with": "with (tuned, net)",
+    "ceiling": "ceiling (long search)",
     "predicted": "predicted by the net",
     "linear": "predicted by a linear map",
     "paper": "predicted by the paper's net",
@@ -125,15 +119,15 @@ def looks_of(names: Iterable[str]) -> dict[str, Look]:
 
 
 def named(name: str) -> str:
-    """What a legend calls a weight set or a curve."""
+    """What a legend calls a weight set, by its name in the tables, or a curve."""
     return _NAMES.get(name, name)
 
 
 @contextmanager
-def drawing(path: Path, width: float, height: float) -> Iterator[Figure]:
+def drawing(path: Path, width: float, height: float, dpi: float = 160) -> Iterator[Figure]:
     """A figure [inch] that is written when its block ends."""
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
         yield figure
         # no date and no version inside: the same picture gives the same bytes
         metadata = {
@@ -163,17 +157,20 @@ def weight_label(name: str) -> str:
     return f"{matrix} {rest.replace('_', ' ')}"
 
 
-def log_axis(axis: Axis, set_scale: Callable[[str], None]) -> None:
-    """A logarithmic axis with plain numbers, and few where it spans much."""
-    set_scale("log")
+def log_axis(axes: Axes, which: str) -> None:
+    """Make the axis `which` (x or y) logarithmic, with a few plain numbers whatever it spans."""
+    axes.set(**{f"{which}scale": "log"})
+    axis = getattr(axes, f"{which}axis")
     low, high = axis.get_view_interval()
-    digits = "23456789" if high < 3 * low else "25" if high < 30 * low else ""
-    axis.set_major_formatter(lambda y, _: f"{y:g}")
-    axis.set_minor_formatter(lambda y, _: f"{y:g}" if f"{y:.0e}"[0] in digits else "")
-
-
-def plain_log(axis: Axis) -> None:
-    """Ticks of a logarithmic axis at 1, 2 and 5, written out."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    for span, digits in (
+        (2, np.arange(1, 10, 0.5)),
+        (4, (1, 1.5, *range(2, 10))),
+        (30, (1, 1.5, 2, 3, 5, 7)),
+        (1e3, (1, 2, 5)),
+        (np.inf, (1,)),
+    ):
+        if high < span * low:
+            axis.set_major_locator(LogLocator(subs=digits))
+            break
     axis.set_major_formatter(lambda value, _: f"{value:g}")
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())

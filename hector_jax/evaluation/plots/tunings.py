@@ -1,15 +1,10 @@
 """What a tuning did, iteration by iteration, and tunings beside each other."""
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.text import Annotation
-from matplotlib.ticker import NullLocator
-from matplotlib.transforms import Bbox
 
 from hector_jax.evaluation.plots.style import (
     BLUE,
@@ -23,7 +18,6 @@ from hector_jax.evaluation.plots.style import (
     log_axis,
     looks_of,
     named,
-    plain_log,
     weight_label,
 )
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
@@ -125,8 +119,7 @@ def weights(
         axes.axhline(1.0, color="black", linewidth=0.8)
         for edge in range(3, len(names), 3):  # Euler angles, position, and so on
             axes.axvline(edge - 0.5, color="0.8", linewidth=0.8, zorder=0)
-        axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
+        log_axis(axes, "y")
         axes.grid(visible=False, axis="x")
         axes.set_xticks(at, [weight_label(n) for n in names], rotation=60, ha="right", va="center")
         for label in axes.get_xticklabels():
@@ -209,9 +202,8 @@ def weight_courses(
                 panel.plot(
                     times[: len(values)], values, color=color, marker=mark, ms=2.6, label=label
                 )
-            panel.set(title=trajectory, xlabel="time [s]", yscale="log")
-            panel.yaxis.set_major_formatter(lambda y, _: f"{y:g}")
-            panel.yaxis.set_minor_formatter(lambda y, _: f"{y:g}")
+            panel.set(title=trajectory, xlabel="time [s]")
+            log_axis(panel, "y")
             panel.legend(
                 ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.18), columnspacing=1.2
             )
@@ -236,56 +228,30 @@ def front(
     with drawing(path, 4.0 * len(worlds), 3.6) as figure:
         panels = figure.subplots(1, len(worlds), squeeze=False)[0]
         for panel, (world, values) in zip(panels, worlds.items(), strict=True):
-            known = np.isfinite(values).all(axis=1)
-            panel.plot(*values[known].T / 1e6, "o-", color=GREEN, label="tuned")
+            kept = np.isfinite(values).all(axis=1)
+            points, factors = values[kept] / 1e6, prices[kept]
+            panel.plot(*points.T, "o-", color=GREEN, label="tuned")
             if world == list(worlds)[-1]:
                 for name, look in looks_of(beside).items():
-                    x, y = beside[name]
-                    panel.plot(x / 1e6, y / 1e6, label=name, **look.dot)
-            log_axis(panel.xaxis, panel.set_xscale)
+                    panel.plot(*np.divide(beside[name], 1e6), label=named(name), **look.dot)
+            paper = int(np.argmin(np.abs(np.log(factors))))
+            for i, (x, y, side) in {
+                0: (6, 0, "left"),
+                paper: (-6, -4, "right"),
+                -1: (0, 6, "center"),
+            }.items():
+                text = f"x{float(f'{factors[i]:.2g}'):g}"
+                panel.annotate(text, points[i], (x, y), textcoords="offset points", ha=side)
+            panel.margins(0.15, 0.1)
+            log_axis(panel, "x")
             panel.set(title=world, xlabel="tracking [10$^6$]")
         panels[0].set_ylabel(r"$L_\mathrm{ctrl}$ [10$^6$]")
         legend(figure, panels[-1])
-        figure.draw_without_rendering()  # where things stand is known only then
-        for panel, values in zip(panels, worlds.values(), strict=True):
-            known = np.isfinite(values).all(axis=1)
-            labels = [f"x{float(f'{price:.2g}'):g}" for price in prices[known]]
-            _label_points(panel, labels, values[known] / 1e6)
     return (
-        "Each point is a tuning, its tracking priced as the label says, where there is room for "
-        "one; the line joins them in the order of prices. Left and down is better."
+        "Each point is a tuning. Along the line the price of tracking grows by one factor from "
+        "point to point; labels stand at its ends and at the paper's price (x1). Left and down is "
+        "better."
     )
-
-
-_SIDES = ((4, 4), (5, 0), (4, -4), (-4, 4), (-5, 0), (-4, -4), (0, 6), (0, -6))  # [pt]
-
-
-def _label_points(axes: Axes, labels: Sequence[str], points: Float[np.ndarray, "n 2"]) -> None:
-    """Labels beside points of a line, away from it and from other points; without room, none."""
-    spots = axes.transData.transform(points)
-    line = [spot for ends in pairwise(spots) for spot in np.linspace(*ends, 40)]
-    taken = [Bbox.from_bounds(x - 3.0, y - 3.0, 6.0, 6.0) for x, y in line]
-    taken += [axes.spines[side].get_window_extent() for side in ("left", "bottom")]
-    for i, label in enumerate(labels):
-        text = axes.annotate(label, points[i], (0, 0), textcoords="offset points", fontsize=7)
-        others, free = np.delete(spots, i, axis=0), {}
-        for side in _SIDES:
-            box = _put(text, side)
-            if not box.count_overlaps(taken):
-                away = np.linalg.norm(others - box.get_points().mean(axis=0), axis=1)
-                free[side] = min(25.0, away.min(initial=25.0))  # further off is no better
-        if free:
-            taken.append(_put(text, max(free, key=lambda side: free[side])))
-        else:
-            text.remove()
-
-
-def _put(text: Annotation, side: tuple[int, int]) -> Bbox:
-    """Where the text stands once it is put to this side of its point."""
-    text.set_position(side)
-    text.set_ha(("center", "left", "right")[np.sign(side[0])])
-    text.set_va(("center", "bottom", "top")[np.sign(side[1])])
-    return text.get_window_extent()
 
 
 def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
@@ -308,7 +274,7 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
         share = 100 * (np.arange(len(ends)) + 0.5) / len(ends)
         right.plot(share, order, "o", color="0.5", markersize=3)
         right.plot(share[np.searchsorted(order, ends[0])], ends[0], "o", color=GREEN)
-        log_axis(left.yaxis, left.set_yscale)
+        log_axis(left, "y")
         left.set(xlabel="iteration", ylabel="L on the model [10$^6$]", title="on the way")
         left.xaxis.get_major_locator().set_params(integer=True)
         right.set(xlabel="starts [%]", title="at the end", xlim=(0, 100))
@@ -347,7 +313,7 @@ def race(
     curves: Mapping[str, Sequence[tuple[Float[np.ndarray, " walks"], Float[np.ndarray, " walks"]]]],
     abscissa: str,
 ) -> str:
-    """Lowest loss so far of each way of tuning: median over its repeats, and their range.
+    """Lowest loss so far of each way of tuning: its repeats, and their median.
 
     Args:
         path: file to write.
@@ -362,15 +328,14 @@ def race(
             losses = np.array([losses[:count] for _, losses in repeats]) / 1e6
             look = _RIVAL_LOOK[name]
             if len(losses) > 1:
-                low, high = losses.min(axis=0), losses.max(axis=0)
-                axes.fill_between(x, low, high, step="post", color=look["color"], alpha=0.1, lw=0)
+                axes.step(x, losses.T, where="post", color=look["color"], alpha=0.45, lw=0.6)
             middle = np.median(losses, axis=0)
             axes.step(x, middle, where="post", **look, label=RIVALS[name])
             axes.plot(x[-1], middle[-1], "o", color=look["color"], markersize=3)
-        axes.set(yscale="log", xlabel=abscissa, ylabel="lowest L on the simulator [10$^6$]")
-        plain_log(axes.yaxis)
-        axes.yaxis.set_minor_locator(NullLocator())
+        axes.set(xlabel=abscissa, ylabel="lowest L on the simulator so far [10$^6$]")
+        log_axis(axes, "y")
         legend(figure, axes, columns=3)
     return (
-        "Lowest loss so far on the high-fidelity simulator: median of the repeats, and their range."
+        f"Lowest loss on the high-fidelity simulator so far, by {abscissa}: median of the repeats, "
+        "each of them thin."
     )

@@ -1,0 +1,315 @@
+"""Golden results: what must not change when the code is rearranged, as named arrays of numbers.
+
+    python -m benchmarks.golden make before.npz        at one commit
+    python -m benchmarks.golden compare before.npz     at a later one, same machine and packages
+    python -m benchmarks.golden compare before.npz --only qp tick
+
+Every option that a flag or a robot's TOML can choose is in it, not the defaults alone. Two commits
+have the names and the tolerances in common; how a commit computes a number is its own business.
+`--table` adds a quick table (data, net, tunings, verdicts), some minutes on two cores.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import problems
+from hector_jax.console import say
+from hector_jax.control.footstep import FootstepConfig
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.legs import LegConfig
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.qp import QpConfig, solve_qp
+from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
+from hector_jax.control.walking import WalkConfig, walk_config
+from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.export import controller, export_controller, load_controller
+from hector_jax.grfm import dataset, training
+from hector_jax.grfm.network import as_effect, effect_of
+from hector_jax.grfm.training import TrainConfig
+from hector_jax.model.effect import last_command
+from hector_jax.robot import Robot, load_robot
+from hector_jax.runtime import setup_jax
+from hector_jax.sim.parallel import walk_batch
+from hector_jax.sim.standin import standin
+from hector_jax.sim.walk import Job, walk
+from hector_jax.sim.world import hfs, ideal
+from hector_jax.trajectory import State, Trajectory
+from hector_jax.tuning import sensitivity
+from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
+from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
+
+STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+PAPER_FOOTHOLDS = FootstepConfig(rule="paper")
+DOUBLE_SUPPORT = GaitConfig(stance=24, swing=16)
+
+Arrays = dict[str, Any]
+Section = tuple[Callable[[], Arrays], float]  # what makes its numbers, and their tolerance
+
+
+def _flat(tree: Any) -> np.ndarray:
+    return np.concatenate([np.ravel(np.asarray(x, float)) for x in jax.tree.leaves(tree)])
+
+
+def _loss(walked: Trajectory) -> float:
+    return float(total(LossConfig(), losses(walked)))
+
+
+def controllers() -> dict[str, WalkConfig]:
+    """The controller with each of its options."""
+    default = WalkConfig()
+    return {
+        "default": default,
+        "no line friction": replace(default, mpc=MpcConfig(line_friction=False)),
+        "effort about the weight": replace(default, mpc=MpcConfig(effort_about="weight")),
+        "paper's footholds": replace(default, footstep=PAPER_FOOTHOLDS),
+        "double support": replace(default, gait=DOUBLE_SUPPORT),
+        "leg weight": replace(default, legs=LegConfig(stance_weight=True)),
+        "jaxopt": replace(default, mpc=MpcConfig(qp=QpConfig(solver="jaxopt"))),
+    }
+
+
+def qp() -> Arrays:
+    """Solutions of walking QPs with both solvers."""
+    robot = load_robot()
+    write = jax.vmap(partial(problems.layer_qp, WalkConfig(), robot))
+    qps = jax.jit(write)(problems.draw_problems(WalkConfig(), robot, 24))
+    found = {}
+    for solver in ("interior_point", "jaxopt"):
+        config = QpConfig(solver=solver)
+        solution = jax.jit(jax.vmap(partial(solve_qp, config=config)))(qps)
+        found[f"{solver} x"] = solution.x
+        found[f"{solver} status"] = solution.status
+    return found
+
+
+def _tick(config: WalkConfig, robot: Robot) -> Arrays:
+    """Wrench, touchdowns and torques of a plan from a state off the reference."""
+    control, example = controller(config, robot, expert(robot))
+    carry, millisecond, measured, command, anchor = example
+    rng = np.random.default_rng(3)
+    measured = {name: x + 0.01 * rng.normal(size=np.shape(x)) for name, x in measured.items()}
+    command = named_command("s")._asdict()
+    run, found = jax.jit(control), {}
+    begin = 10 * (config.gait.stand - config.gait.first_tick)  # milliseconds before t = 0
+    for tick in (-config.gait.stand, 3, 17, 24):
+        at = np.int32(begin + 10 * tick)
+        after, out = run(carry, at, measured, command, anchor)
+        _, later = run(after, at + np.int32(4), measured, command, anchor)
+        found[f"tick {tick}"] = _flat([out["force"], out["moment"], out["torque"], later["torque"]])
+    return found
+
+
+def tick() -> Arrays:
+    """One tick of the controller with each option, and of the other robot."""
+    found = {
+        f"{name}, {key}": value
+        for name, config in controllers().items()
+        for key, value in _tick(config, load_robot()).items()
+    }
+    other = load_robot(STRIDER)
+    strider = _tick(walk_config(other), other)
+    return found | {f"strider, {key}": value for key, value in strider.items()}
+
+
+def _walks(robot: Robot) -> dataset.Walks:
+    """Walks of a second on the hfs, for phi."""
+    config = walk_config(robot)
+    jobs = dataset.draw_jobs(0, 6, seconds=1.0, robot=robot)
+    walked = [walk(config, robot, *job) for job in jobs]
+    walks = [dataset.at_interval(one, config.gait.tick) for one in walked]
+    stack = lambda trees: jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *trees)  # noqa: E731
+    return dataset.Walks(stack(jobs), stack(walks))
+
+
+def _nets(robot: Robot) -> dict[str, Any]:
+    walks = _walks(robot)
+    samples, _ = dataset.make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
+    seen, unseen = dataset.split_by_walk(samples)
+    return {
+        variant: training.train(TrainConfig(variant, epochs=3), seen, unseen)[0]
+        for variant in ("residual", "paper")
+    }
+
+
+def phi() -> Arrays:
+    """Both variants of the net, trained on given walks, and what the walks were."""
+    robot = load_robot()
+    found = {f"net {name}": _flat(params) for name, params in _nets(robot).items()}
+    return found | {"walks": _flat(_walks(robot).trajectory.state)}
+
+
+def rollouts() -> Arrays:
+    """Loss and gradient over 400 ticks, on each model, by each way."""
+    robot, found = load_robot(), {}
+    models = {name: as_effect(params) for name, params in _nets(robot).items()}
+    models["plain"] = effect_of(None, GaitConfig())
+    config = TuneConfig()
+    for model, effect in models.items():
+        for command in COMMANDS if model == "plain" else ("s",):
+            known = named_command(command), standing_anchor(robot), effect
+            seen = tune_step(config, robot, nominal(), *known)
+            found[f"{model}, {command}"] = _flat([seen.loss, seen.parts, seen.gradient])
+    short = TuneConfig(rollout=RolloutConfig(ticks=50))
+    known = robot, nominal(), named_command("s"), standing_anchor(robot), last_command
+    for name, walking in controllers().items():
+        if name not in ("default", "leg weight"):
+            optional = replace(short, rollout=RolloutConfig(walk=walking, ticks=50))
+            seen = tune_step(optional, *known)
+            found[name] = _flat([seen.loss, seen.gradient])
+    lead = replace(short, rollout=RolloutConfig(ticks=50, lead=20, block=40))
+    found["lead"] = _flat(tune_step(lead, *known).gradient)
+    walked, columns = jax.jit(sensitivity.propagate, static_argnums=0)(short.rollout, *known)
+    found["forward recursion"] = _flat(sensitivity.gradient(LossConfig(), walked, columns))
+    noise = State(*(np.full(3, 1e-3) for _ in range(4)))
+    varied = no_variation()._replace(
+        mass=np.asarray(1.1), friction=np.asarray(0.4), delay=np.asarray(0.004), noise=noise
+    )
+    varied = jax.tree.map(jnp.asarray, varied)
+    found["variation"] = _flat(
+        jax.jit(rollout, static_argnums=0)(short.rollout, *known, varied).state
+    )
+    other = load_robot(STRIDER)
+    config = TuneConfig(rollout=RolloutConfig(walk=walk_config(other), ticks=50))
+    known = other, nominal(other), named_command("s"), standing_anchor(other), last_command
+    seen = tune_step(config, *known)
+    return found | {"strider": _flat([seen.loss, seen.gradient])}
+
+
+def tunings() -> Arrays:
+    """Ten iterations with each rule."""
+    robot, found = load_robot(), {}
+    known = robot, nominal(), named_command("s"), standing_anchor(robot)
+    rules = {
+        "relative": TuneConfig(iterations=10),
+        "literal": TuneConfig(iterations=10, update="literal", beta_q=1e-5, beta_r=1e-17),
+        "untied": TuneConfig(iterations=10, tie_feet=False),
+    }
+    for name, config in rules.items():
+        ended = tune(config, *known, effect_of(None, GaitConfig()))
+        found[f"{name}, L"] = [float(one.evaluation.loss) for one in ended.history]
+        found[f"{name}, weights"] = np.asarray(weights_to_vector(ended.ten))
+    return found
+
+
+def seconds() -> Arrays:
+    """A second of walking in each world and engine."""
+    robot, found = load_robot(), {}
+    for name, plant in {"ideal": ideal(), "hfs": hfs(), "standin": standin(0)}.items():
+        walked = walk(WalkConfig(), robot, expert(), named_command("s"), plant, 1.0, 0)
+        found[name] = _flat([walked.state, walked.command, walked.effect])
+    jobs = [Job(expert(), named_command("s"), plant, 1.0) for plant in (ideal(), ideal())]
+    (batched, _) = walk_batch(WalkConfig(), robot, jobs, fine=True)
+    found["mjx"] = _flat([batched.state, batched.command, batched.effect])
+    other = load_robot(STRIDER)
+    walked = walk(walk_config(other), other, nominal(other), named_command("s"), ideal(), 1.0, 0)
+    return found | {"strider": _flat([walked.state, walked.command, walked.effect])}
+
+
+def walks() -> Arrays:
+    """L of four seconds in each world."""
+    robot, found = load_robot(), {}
+    for world, plant in {"ideal": ideal(), "hfs": hfs(), "standin": standin(0)}.items():
+        for name, weights in {"nominal": nominal(), "expert": expert()}.items():
+            for command in COMMANDS:
+                walked = walk(WalkConfig(), robot, weights, named_command(command), plant, 4.0, 0)
+                found[f"{world}, {name}, {command}"] = _loss(walked)
+    return found
+
+
+def exported() -> Arrays:
+    """One call of the exported controller, in a tick that plans."""
+    robot = load_robot()
+    call = load_controller(export_controller(WalkConfig(), robot, expert()))
+    _, example = controller(WalkConfig(), robot, expert())
+    _, out = call(*example)
+    return {"call": _flat([out["force"], out["moment"], out["torque"]])}
+
+
+def table() -> Arrays:
+    """A quick table from nothing: data, net, tunings, verdicts."""
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["table", "--quick", "--data", f"{folder}/data", "--out", f"{folder}/table"]
+        subprocess.run([sys.executable, "-m", "hector_jax.cli", *words], check=True)
+        told = json.loads((Path(folder) / "table" / "quick" / "table.json").read_text())
+    return _numbers(told["trajectories"])
+
+
+def _numbers(tree: Any, name: str = "") -> Arrays:
+    if isinstance(tree, dict):
+        rows = [_numbers(value, f"{name}.{key}") for key, value in tree.items()]
+        return {key: value for row in rows for key, value in row.items()}
+    return {} if tree is None or isinstance(tree, str | list) else {name[1:]: float(tree)}
+
+
+SECTIONS: dict[str, Section] = {
+    "qp": (qp, 1e-12),
+    "tick": (tick, 1e-12),
+    "phi": (phi, 1e-9),
+    "rollouts": (rollouts, 1e-9),
+    "tunings": (tunings, 1e-9),
+    "seconds": (seconds, 1e-9),
+    "walks": (walks, 1e-6),
+    "exported": (exported, 1e-12),
+    "table": (table, 1e-3),
+}
+
+
+def difference(before: np.ndarray, now: np.ndarray) -> float:
+    """Largest difference over the largest entry; infinite for another shape."""
+    if before.shape != now.shape:
+        return np.inf
+    largest = np.max(np.abs(before), initial=0.0)
+    return float(np.max(np.abs(before - now), initial=0.0) / (largest or 1.0))
+
+
+def main() -> int:
+    """Make or compare; 1 where something differs."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.golden", description=__doc__)
+    parser.add_argument("what", choices=("make", "compare"))
+    parser.add_argument("file", type=Path, help="golden results (.npz)")
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, help="sections; all but the table")
+    parser.add_argument("--table", action="store_true", help="the quick table too")
+    flags = parser.parse_args()
+    names = flags.only or [name for name in SECTIONS if name != "table" or flags.table]
+    setup_jax()
+    found = {}
+    for name in names:
+        say(f"{name} ...")
+        found |= {f"{name}: {key}": np.asarray(x, float) for key, x in SECTIONS[name][0]().items()}
+    if flags.what == "make":
+        np.savez(flags.file, **found)
+        print(f"{len(found)} results in {flags.file}")
+        return 0
+    differ = False
+    with np.load(flags.file) as before:
+        for name in names:
+            tolerance, worst = SECTIONS[name][1], {}
+            keys = {key for key in (*before.files, *found) if key.startswith(f"{name}: ")}
+            for key in keys:
+                there = key in found and key in before.files
+                worst[key] = difference(before[key], found[key]) if there else np.inf
+            key = max(worst, key=lambda key: worst[key])
+            told = "same" if worst[key] <= tolerance else "DIFFERS"
+            differ |= worst[key] > tolerance
+            print(f"{name:10s} {told:8s} {worst[key]:.1e} (at most {tolerance:.0e}), {key}")
+            for other in sorted(worst, key=lambda key: -worst[key])[1:]:
+                if worst[other] > tolerance:
+                    print(f"{'':20s}{worst[other]:.1e}, {other}")
+    return int(differ)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

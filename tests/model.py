@@ -1,0 +1,35 @@
+"""The model that tests of tunings share: a rollout of 50 ticks, compiled once for all of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from synthetic import synthetic_walk
+
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.reference import standing_anchor
+from hector_jax.grfm.dataset import at_interval, make_dataset
+from hector_jax.grfm.network import as_effect, effect_of, init_params
+from hector_jax.robot import load_robot
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.rollout import RolloutConfig
+
+ROBOT = load_robot()
+ANCHOR = standing_anchor(ROBOT)
+SHORT = RolloutConfig(ticks=50)
+CONFIG = TuneConfig(rollout=SHORT)
+PLAIN = effect_of(None, GaitConfig())
+
+
+def small_net(seed=0):
+    """An untrained net that adds a newton or so to what was commanded."""
+    walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
+    data = make_dataset(ROBOT, jax.tree.map(lambda *x: np.stack(x), *walks))[0]
+    made = init_params(jax.random.key(seed), data)
+    quiet = jax.tree.map(jnp.zeros_like, made.linear)
+    linear = quiet._replace(ticks=made.linear.ticks, gates=made.linear.gates)
+    return made._replace(linear=linear, left=jnp.ones_like(made.left))
+
+
+def small_effect(seed=0):
+    """Phi of `small_net`."""
+    return as_effect(small_net(seed))
