@@ -14,9 +14,9 @@ import jax
 from benchmarks.measuring import Check, Report, show
 from hector_jax.control.walking import WalkConfig
 from hector_jax.grfm.dataset import draw_jobs
+from hector_jax.pipeline import mjx_walks
 from hector_jax.robot import load_robot
 from hector_jax.runtime import setup_jax
-from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import first_tick, substeps
 
 BAR = 0.7  # million robot-steps per second of 4096 walks at once, on one H200
@@ -32,7 +32,7 @@ def measure(batches: list[int], seconds: float, single: bool) -> Report:
         jobs, spent = draw_jobs(0, batch, seconds=seconds), []
         for _ in range(2):
             start = time.perf_counter()
-            walks = walk_batch(config, robot, jobs, chunk=batch, single=single)
+            walks = mjx_walks(config, robot, jobs, chunk=batch, single=single)
             built = time.perf_counter()
             falls = sum(bool(walk.fallen.any()) for walk in walks)
             spent.append(time.perf_counter() - built)

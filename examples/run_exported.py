@@ -34,6 +34,8 @@ def load(folder: Path, card: dict):
 
 def main(folder: Path) -> None:
     """Go through the recorded walk, compare and time."""
+    if not (folder / "controller.json").exists():
+        sys.exit(f"{folder}: no controller.json; expected the folder that `hector export` wrote")
     card = json.loads((folder / "controller.json").read_text())
     control, carry = load(folder, card)
     with np.load(folder / "check.npz") as file:
@@ -65,4 +67,10 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    words = sys.argv[1:]
+    if words in (["-h"], ["--help"]):
+        print(__doc__)
+    elif len(words) != 1:
+        sys.exit("expected the FOLDER that `hector export` wrote, such as runs/s/TIME/export")
+    else:
+        main(Path(words[0]))

@@ -355,7 +355,7 @@ def plant_table(scores: Mapping[str, Score], base: str) -> str:
     """Weight sets over plants: falls, mean, tail, and the paired ratio to one of them."""
     rows = []
     for name, score in scores.items():
-        change = 100 * (metrics.bootstrap(score.L / scores[base].L, np.median).value - 1)
+        change = 100 * (np.median(score.L / scores[base].L) - 1)
         falls = f"{int(score.fallen.sum())} of {len(score.L)}"
         losses = jnp.asarray(score.L)
         worst = tail_weights(losses, jnp.asarray(TAIL)) @ losses

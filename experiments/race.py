@@ -312,7 +312,7 @@ def main() -> None:
         for method, each in methods.items()
     }
     told = report(flags, engine, raced.start, groups, courses, prices, took)
-    say(f"the whole story, with pictures: {told}")
+    say(f"the report is {told}")
 
 
 def report(

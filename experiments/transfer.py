@@ -42,7 +42,6 @@ from hector_jax.inputs import InputError
 from hector_jax.model.effect import Effect, Window, last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import setup_jax, workers
-from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import hfs
 from hector_jax.storage import load_weights, write_file, write_json
@@ -165,7 +164,7 @@ def walk_groups(
     engine = "c" if jax.default_backend() == "cpu" else "mjx"
     walk = {
         "c": partial(walk_many, pool, config, robot),
-        "mjx": partial(walk_batch, config, robot, fine=True, single=False),
+        "mjx": partial(pipeline.mjx_walks, config, robot, fine=True, single=False),
     }[engine]
     like = Walked(np.zeros(0), np.zeros(0), np.zeros(0))
     key, title = (config, LossConfig(), engine), f" on the high-fidelity simulator, engine {engine}"

@@ -1,6 +1,8 @@
 """What a person sees while waiting: one line or one bar on stderr; stdout carries results only."""
 
+import errno
 import os
+import select
 import shlex
 import signal
 import sys
@@ -10,12 +12,12 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, printable
 
 console = Console(stderr=True, highlight=False)
 
@@ -26,7 +28,19 @@ _QUIET = 15.0  # [s] between lines where there is no terminal to draw a bar on
 
 def say(text: str) -> None:
     """One line to the person who waits."""
-    console.print(text, markup=False, soft_wrap=True)
+    console.print(printable(text), markup=False, soft_wrap=True)
+
+
+@contextmanager
+def say_if_slow(text: str) -> Iterator[None]:
+    """Say what goes on within if it takes longer than a second."""
+    timer = threading.Timer(1.0, say, [text])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @contextmanager
@@ -49,6 +63,9 @@ def bar(title: str) -> Iterator[Tell]:
             yield lambda done, of, remark="": progress.update(
                 task, completed=done, total=of, remark=remark
             )
+            # what converged early is done, too
+            total = progress.tasks[0].total or 1
+            progress.update(task, completed=total, total=total)
         return
     start = last = time.monotonic()
     say(f"{title} ...")
@@ -71,6 +88,8 @@ class Broken(RuntimeError):  # noqa: N818, it is no fault of the program
 
 
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+_PATIENCE = 5.0  # [s] for compiled code, in which Python hears no signal, to come to an end
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Stopped(KeyboardInterrupt):
@@ -79,31 +98,60 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def _stoppable(name: str) -> Iterator[None]:
-    """Raise `Stopped` at the first signal, end the process on the spot at the second.
+    """Raise `Stopped` at the first signal; end the process on the spot at the second.
 
-    Nothing is lost by the second: files appear whole, and workers leave with their parent.
+    On the spot, too, if the first is not heard within `_PATIENCE`. Nothing is lost by that: files
+    appear whole, and workers leave with their parent.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may have handlers
         return
-    came: list[int] = []
+    heard = threading.Event()
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
 
     def stop(number: int, frame: Any) -> None:
-        came.append(number)
-        if len(came) == 1:
+        if not heard.is_set():
+            heard.set()
             raise Stopped(number)
-        if console.is_terminal:
-            os.write(2, b"\x1b[?25h")  # the cursor, which a bar hides
-        os.write(2, f"{name}: {_SIGNALS[signal.Signals(number)]}, at once\n".encode())
-        os._exit(128 + number)
+
+    def watch() -> None:
+        number = os.read(reading, 1)  # comes at once, whatever the main thread does
+        if number and not select.select([reading], [], [], _PATIENCE)[0] and heard.is_set():
+            number = os.read(reading, 1)
+        if number:
+            if console.is_terminal:
+                os.write(2, b"\x1b[?25h")  # the cursor, which a bar hides
+            os.write(2, f"{name}: {_SIGNALS[signal.Signals(number[0])]}, at once\n".encode())
+            os._exit(128 + number[0])
+        os.close(reading)
 
     handlers = {number: signal.signal(number, stop) for number in _SIGNALS}
+    wakeup = signal.set_wakeup_fd(writing)
+    threading.Thread(target=watch, daemon=True).start()
     try:
         yield
     finally:
-        if not came:  # else a second one may come while the program ends
+        if not heard.is_set():  # else a second one may come while the program ends
+            signal.set_wakeup_fd(wakeup)
+            os.close(writing)
             for number, handler in handlers.items():
                 signal.signal(number, handler)
+
+
+def _open_streams() -> None:
+    """Give closed standard streams /dev/null; else the next file would take their number."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w" if number else "r", closefd=False))  # noqa: SIM115
+
+
+def _drop(stream: TextIO) -> None:
+    """Let what a stream could not write go, or Python would try again as it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def exit_code(name: str, work: Callable[[], None]) -> int:
@@ -111,23 +159,29 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
 
     Args:
         name: of the program, before the line.
-        work: `InputError` is bad input (2); `Broken` and a worker process that was killed are told
-            as such (1), SIGINT (130) and SIGTERM (143) too; a second signal does not wait. Where
-            nobody reads standard output any more, it ends without a word (141). Any other exception
-            is a fault of the program: it goes on to the caller with its traceback, which for a
-            script means exit code 1.
+        work: `InputError` is bad input (2); `Broken`, a full disk and a worker process that was
+            killed are told as such (1), SIGINT (130) and SIGTERM (143) too; a second signal does
+            not wait. Where nobody reads standard output any more, it ends without a word (141). Any
+            other exception is a fault of the program: it goes on to the caller with its traceback,
+            which for a script means exit code 1.
     """
+    _open_streams()
     try:
         with _stoppable(name):
             work()
             sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
+        _drop(sys.stdout)
         return 141
     except InputError as error:
-        code, text = 2, " ".join(str(error).split())
+        code, text = 2, str(error)
     except Broken as error:
         code, text = 1, str(error)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        _drop(sys.stdout)
+        code, text = 1, f"cannot write {error.filename or 'the output'}: {error.strerror}"
     except BrokenExecutor:
         code, text = 1, "a worker process was killed, perhaps for want of memory"
     except Stopped as stopped:
@@ -137,7 +191,10 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
         code, text = 130, _SIGNALS[signal.SIGINT]
     else:
         return 0
-    print(f"{name}: {text}", file=sys.stderr)
+    try:
+        print(f"{name}: {printable(' '.join(text.split()))}", file=sys.stderr, flush=True)
+    except OSError:
+        _drop(sys.stderr)
     return code
 
 

@@ -17,7 +17,6 @@ What is left out is as in assets/hector.toml. Masses, lengths, joint and torque 
 MJCF's; a description rides on its `Robot` and is static under jit.
 """
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -29,9 +28,8 @@ from hector_jax.inputs import (
     POSITIVE,
     InputError,
     did_you_mean,
-    one_line,
     problem,
-    read_text,
+    read_toml,
     shown,
 )
 from hector_jax.trajectory import MAX_TILT, MIN_HEIGHT
@@ -109,7 +107,7 @@ def read_description(path: Path) -> Description:
         InputError: one line naming file, key, what came and what was expected.
     """
     path = Path(path)
-    told = _parse(path)
+    told = read_toml(path, "the robot description", _MAX_BYTES)
     _known(path, told, _TOP, "")
     model = _text(path, told, "model", "", MODEL_PATH.name)
     if Path(model).name != model:
@@ -163,20 +161,12 @@ def from_card(table: Mapping[str, Any]) -> Description:
     )
 
 
-def _parse(path: Path) -> dict[str, Any]:
-    text = read_text(path, "the robot description", _MAX_BYTES)
-    try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: no valid TOML: {one_line(error)}") from None
-
-
 def _known(path: Path, table: Mapping[str, Any], names: tuple[str, ...], prefix: str) -> None:
     for key in table:
         if key not in names:
             raise InputError(
                 f"{path}: unknown key {shown(prefix + key)}{did_you_mean(key, names)}; "
-                f"there are: {', '.join(names)}"
+                f"known: {', '.join(names)}"
             )
 
 

@@ -1,5 +1,6 @@
 """What this machine offers, and whether the program works on it."""
 
+import os
 import tempfile
 import time
 from importlib.util import find_spec
@@ -14,15 +15,21 @@ from hector_jax.control.weights import expert
 from hector_jax.evaluation.report import environment
 from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.grfm.dataset import SOLVED
+from hector_jax.inputs import one_line
 from hector_jax.pipeline import walk_rigid_body
 from hector_jax.robot import MODEL_PATH, Robot, load_robot
 from hector_jax.runtime import cache_folder
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
-from hector_jax.storage import versions
 from hector_jax.trajectory import Trajectory
 
-_EXTRAS = {"search": "cmaes", "tensorboard": "tensorboardX", "view": "viser"}
+_EXTRAS = {  # by name, the package that it needs and what it is for
+    "export": ("flatbuffers", "hector export"),
+    "race": ("sklearn", "experiments/race.py"),
+    "search": ("cmaes", "hector search, hector table"),
+    "tensorboard": ("tensorboardX", "hector tensorboard"),
+    "view": ("viser", "hector view"),
+}
 
 
 def examine() -> tuple[dict[str, str], list[str]]:
@@ -33,19 +40,17 @@ def examine() -> tuple[dict[str, str], list[str]]:
         extra or video back end is told but breaks nothing: runs go on without.
     """
     faults: list[str] = []
-    try:
-        devices = jax.devices()
-    except RuntimeError as error:
-        return versions(), [f"JAX finds no device: {_one_line(error)}"]
     told = {name: text for name, text in environment().items() if name != "device"}
     if told.get("mujoco") != told.get("mujoco-mjx"):
         faults.append("mujoco and mujoco-mjx are of different releases")
-    told["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in devices)
+    told["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in jax.devices())
     if jnp.asarray(0.0).dtype != jnp.float64:
         faults.append("JAX computes in 32 bits")
     told["cache"] = str(cache_folder())
-    extras = [f"{x}: {'yes' if find_spec(p) else 'no'}" for x, p in _EXTRAS.items()]
-    told["extras"] = ", ".join(extras)
+    told["extras"] = ", ".join(
+        f"{name}: {'yes' if find_spec(package) else 'no'} (for {use})"
+        for name, (package, use) in _EXTRAS.items()
+    )
     try:
         robot = load_robot()
         told["robot"] = f"{MODEL_PATH}, {float(robot.mass):.2f} kg"
@@ -53,19 +58,20 @@ def examine() -> tuple[dict[str, str], list[str]]:
         walks = _walks(robot)
         told["self-test"] = f"walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s"
     except (ValueError, OSError, RuntimeError) as error:
-        faults.append(f"self-test: {_one_line(error)}")
+        faults.append(f"self-test: {one_line(error)}")
         return told, faults
     faults += [
         f"self-test: the robot does not walk in {world}"
         for world, found in walks.items()
         if found.fallen.any() or not found.residual.max() <= SOLVED
     ]
-    told["video"] = _video(robot, walks["ideal"])
+    try:
+        told["video"] = f"works ({_film(robot, walks['ideal'])})"
+    except VideoUnavailable as error:
+        told["video"] = str(error)
+        if "MUJOCO_GL" in os.environ:  # a back end was asked for
+            faults.append(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}")
     return told, faults
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 def _walks(robot: Robot) -> dict[str, Trajectory]:
@@ -77,11 +83,8 @@ def _walks(robot: Robot) -> dict[str, Trajectory]:
     }
 
 
-def _video(robot: Robot, walked: Trajectory) -> str:
+def _film(robot: Robot, walked: Trajectory) -> str:
+    """Draw a film; the back end that drew it."""
     with tempfile.TemporaryDirectory() as folder:
-        pair = {"one": walked, "other": walked}
-        try:
-            film = Path(folder) / "film.mp4"
-            return f"works ({write_film(film, robot, pair, VideoConfig(rate=2))})"
-        except VideoUnavailable as error:
-            return str(error)
+        film, pair = Path(folder) / "film.mp4", {"one": walked, "other": walked}
+        return write_film(film, robot, pair, VideoConfig(rate=2))

@@ -18,7 +18,6 @@ kernel (`control.qp`) has no stable custom call, and the plain guess leads to th
 
 import hashlib
 import io
-import json
 import textwrap
 import time
 from collections.abc import Callable
@@ -36,6 +35,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from hector_jax.console import Broken
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import (
     Feet,
@@ -47,12 +47,13 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import InputError, from_table
+from hector_jax.inputs import InputError, from_table, read_json
 from hector_jax.robot import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.walk import first_tick, substeps, walk
 from hector_jax.sim.world import build_world, ideal, standing_qpos
 from hector_jax.storage import (
+    WEIGHTS,
     fingerprint,
     make_folder,
     save_weights,
@@ -87,15 +88,14 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
     sets = sorted(path.stem for path in (run / "weights").glob("*.json"))
     if name not in sets:
         near = get_close_matches(name, sets, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"there are: {', '.join(sets) or 'none'}"
+        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(sets) or 'none'}"
         raise InputError(f"{run}: no weight set {name!r}; {hint}")
     path = run / "config.json"
+    kept = read_json(path, "the settings of a run")
     try:
-        settings = json.loads(path.read_text())["tune"]["rollout"]["walk"]
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: no settings of a walking controller: {error!r}") from error
+        settings = kept["tune"]["rollout"]["walk"]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: not the settings of a walking controller: {error!r}") from error
     # a setting that this version does not know is refused: the file goes to a robot
     config = from_table(f"{path}: tune.rollout.walk", WalkConfig, settings)
     return run / "weights" / f"{name}.json", config
@@ -120,7 +120,7 @@ def weights_schema() -> dict[str, Any]:
 
     row = {
         "type": "array",
-        "items": {"type": "number", "exclusiveMinimum": 0},
+        "items": {"type": "number", "minimum": WEIGHTS.low, "maximum": WEIGHTS.high},
         "minItems": 3,
         "maxItems": 3,
     }
@@ -392,7 +392,8 @@ def record(
     walked = walk(config, robot, weights, command, plant, seconds, on_sample=keep)
     if np.asarray(walked.fallen).any():
         raise InputError(
-            f"these weights fall within {seconds:g} s in the ideal world: no walk to check by"
+            f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "
+            "no walk to check the export on"
         )
 
     @jax.jit
@@ -520,9 +521,9 @@ def export(
         units, what the robot's own code needs to know, weights, settings, and the check.
 
     Raises:
-        InputError: as `record` and `export_controller`; or the exported controller differs from the
-            live one by more than TOLERANCE, and then nothing is written.
-        InputError: the folder cannot be written.
+        InputError: as `record` and `export_controller`; or the folder cannot be written.
+        Broken: the exported controller differs from the live one by more than TOLERANCE; nothing
+            is written.
     """
     make_folder(folder)
     blobs = {place: export_controller(config, robot, weights, place) for place in PLATFORMS}
@@ -530,7 +531,7 @@ def export(
     _, example = controller(config, robot, weights)
     found = check(config, load_controller(blobs["cpu"]), example, walked)
     if not max(found.force, found.moment, found.torque) <= TOLERANCE:
-        raise InputError(
+        raise Broken(
             f"the exported controller differs from the live one by {found.force:.1e} N, "
             f"{found.moment:.1e} N m and {found.torque:.1e} N m at the joints, at most "
             f"{TOLERANCE:g} was expected; nothing was written"

@@ -7,11 +7,14 @@ numbers, or the words to choose from.
 
 import dataclasses
 import difflib
+import json
 import math
+import tomllib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
@@ -40,9 +43,12 @@ class Interval:
         return bool(over and number <= self.high and math.isfinite(number))
 
     def __str__(self) -> str:
-        low = f"{'above' if self.above else 'of at least'} {self.low:g}"
-        parts = [low] * math.isfinite(self.low)
-        parts += [f"{'' if parts else 'of '}at most {self.high:g}"] * math.isfinite(self.high)
+        write = lambda x: str(x) if isinstance(x, int) else f"{x:g}"  # noqa: E731
+        if math.isfinite(self.low) and math.isfinite(self.high) and not self.above:
+            return f"from {write(self.low)} to {write(self.high)}"
+        parts = [f"{'above' if self.above else 'of at least'} {write(self.low)}"]
+        parts = parts * math.isfinite(self.low)
+        parts += [f"{'' if parts else 'of '}at most {write(self.high)}"] * math.isfinite(self.high)
         return " and ".join(parts) or "that is finite"
 
 
@@ -53,8 +59,8 @@ SOME = Interval(1)  # a number of things, at least one
 SEED = Interval(0, 2**32 - 1)
 
 
-Rule = Interval | tuple[str, ...]
-"""What is allowed beyond a type: numbers, or words."""
+Rule = Interval | tuple[str, ...] | Enum
+"""What is allowed beyond a type: numbers, or words; a member of an `Enum` is for the caller."""
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
@@ -74,7 +80,21 @@ def shown(value: Any) -> str:
 
 def one_line(error: BaseException | str) -> str:
     """What an error or a text says, on one line of at most 300 characters."""
-    return " ".join(str(error).split())[:300]
+    return printable(" ".join(str(error).split()))[:300]
+
+
+def printable(text: str) -> str:
+    """A text on one line; what would control a terminal, as in a file's name, becomes `?`."""
+    return "".join(x if x.isprintable() else " " if x.isspace() else "?" for x in text)
+
+
+def plural(number: int, noun: str) -> str:
+    """A number of things.
+
+    >>> plural(1, "plant"), plural(32, "stand-in plant")
+    ('1 plant', '32 stand-in plants')
+    """
+    return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def _words(choices: Iterable[str]) -> str:
@@ -87,10 +107,14 @@ def problem(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
 
     Args:
         value: what came.
-        kind: the annotation: bool, int, float, str, a class, a tuple or a union of these; what is
-            none of them allows everything.
+        kind: the annotation: bool, int, float, str, a class, a tuple or a union of these, with the
+            rule where it is `Annotated`, or words as a `Literal`; any other allows everything.
         rule: what is allowed of numbers or words; without one, numbers have to be finite.
     """
+    if typing.get_origin(kind) is typing.Annotated:
+        return problem(value, *typing.get_args(kind)[:2])
+    if typing.get_origin(kind) is typing.Literal:
+        return problem(value, str, typing.get_args(kind))
     if isinstance(kind, types.UnionType):
         kinds = typing.get_args(kind)
         found = [problem(value, one, rule) for one in kinds if one is not types.NoneType]
@@ -147,8 +171,28 @@ def choose(name: str, word: str, choices: Iterable[str]) -> str:
     return word
 
 
+def check_file(path: Path, what: str) -> int:
+    """Size of a plain file in bytes.
+
+    Args:
+        path: the file.
+        what: it should be, in words.
+
+    Raises:
+        InputError: one line naming the file that is missing or is not a plain one.
+    """
+    try:
+        size = path.stat().st_size
+    except (OSError, ValueError) as error:  # such as a null byte in the name
+        told = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot read {what}: {told}") from None
+    if not path.is_file():  # a pipe or a device might never end
+        raise InputError(f"{path}: cannot read {what}: not a plain file")
+    return size
+
+
 def read_text(path: Path, what: str, most: int) -> str:
-    """Text of a file in UTF-8.
+    """Text of a file in UTF-8, with or without a byte order mark.
 
     Args:
         path: the file.
@@ -158,17 +202,46 @@ def read_text(path: Path, what: str, most: int) -> str:
     Raises:
         InputError: one line naming the file: missing, too large, no text.
     """
+    if (size := check_file(path, what)) > most:
+        raise InputError(f"{path}: {size / 1e6:.1f} MB, expected at most {most / 1e6:g} MB")
     try:
-        size = path.stat().st_size
-        if not path.is_file():  # a pipe or a device might never end
-            raise InputError(f"{path}: cannot read {what}: not a plain file")
-        if size > most:
-            raise InputError(f"{path}: {size / 1e6:.1f} MB, expected at most {most / 1e6:g} MB")
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # Windows writes a mark before the text
     except OSError as error:
         raise InputError(f"{path}: cannot read {what}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file, expected {what} in UTF-8") from None
+
+
+def read_json(path: Path, what: str, most: int = 10_000_000, **options: Any) -> Any:
+    """What a JSON file holds; see `read_text`, with `options` of `json.loads`.
+
+    Raises:
+        InputError: one line naming the file: as `read_text`, or not valid JSON.
+    """
+    return _decoded(path, "JSON", lambda: json.loads(read_text(path, what, most), **options))
+
+
+def read_toml(path: Path, what: str, most: int) -> dict[str, Any]:
+    """What a TOML file holds; see `read_text`.
+
+    Raises:
+        InputError: one line naming the file: as `read_text`, or not valid TOML.
+    """
+    return _decoded(path, "TOML", lambda: tomllib.loads(read_text(path, what, most)))
+
+
+def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
+    try:
+        return decode()
+    except InputError:
+        raise
+    except RecursionError:
+        told = "nested too deeply"
+    except ValueError as error:
+        told = one_line(error)
+        if "set_int_max_str_digits" in told:  # Python's advice to a programmer
+            told = "a number has too many digits"
+    raise InputError(f"{path}: not valid {language}: {told}")
 
 
 def from_table(where: str, kind: type[T], table: Any) -> T:
@@ -190,11 +263,11 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         if name not in fields:
             raise InputError(
                 f"{where}: unknown field {shown(name)}{did_you_mean(name, fields)}; "
-                f"there are: {', '.join(fields)}"
+                f"known: {', '.join(fields)}"
             )
     for name, field in fields.items():
         if name not in table and field.default is field.default_factory is dataclasses.MISSING:
-            raise InputError(f"{where}: missing field {name!r}; there are: {', '.join(fields)}")
+            raise InputError(f"{where}: missing field {name!r}; known: {', '.join(fields)}")
     values = {name: _value(f"{where}: {name}", fields[name].type, x) for name, x in table.items()}
     rules = getattr(kind, "RULES", {})
     for name, value in values.items():

@@ -23,6 +23,7 @@ from hector_jax.evaluation import metrics
 from hector_jax.evaluation.metrics import Score
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import Params
+from hector_jax.inputs import plural
 from hector_jax.pipeline import as_line
 from hector_jax.robot import Robot
 from hector_jax.sim.walk import Job
@@ -271,7 +272,9 @@ def _scored(
         scored[name, seed] = Walked(*taken[0], commit=taken[1]["commit"])
     missing = [key for key in jobs if key not in scored]
     if missing:
-        title = f"{title}, {len(scored)} of {len(jobs)} walks kept" if scored else title
+        title = (
+            f"{title}; {len(scored)} of {plural(len(jobs), 'walk')} are there" if scored else title
+        )
         walks = pipeline.walks_of(pool, config, robot, [jobs[key] for key in missing], title)
         for (name, seed), walk in zip(missing, walks, strict=True):
             found = _walked(config.loss, walk, commit)
@@ -344,7 +347,7 @@ def walk_groups(
 
     def make(missing: Sequence[str]) -> Iterator[Tree]:
         jobs = [job for name in missing for job in groups[name]]
-        with bar(f"{len(jobs)} walks{title}") as on:
+        with bar(f"{plural(len(jobs), 'walk')}{title}") as on:
             on(0, len(jobs), "compiling")
             walks, done = walk(jobs), 0
             for name in missing:

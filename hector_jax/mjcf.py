@@ -23,6 +23,7 @@ from hector_jax.inputs import (
     shown,
 )
 
+TIME_STEP = 0.001  # [s] of plant, joint control and samples, whatever the robot
 _MOST_BYTES = 1_000_000
 _MOST_MESH_BYTES = 20_000_000
 _DEEPEST = 100
@@ -50,7 +51,6 @@ _RANGES: Mapping[str, Interval] = {
     "friction": NOT_NEGATIVE,
     "margin": NOT_NEGATIVE,
     "size": NOT_NEGATIVE,
-    "timestep": Interval(0.0, 0.1, above=True),
     "iterations": Interval(1, 1000),
     "ls_iterations": Interval(1, 1000),
     "width": _PIXELS,
@@ -144,6 +144,8 @@ def _problem(tag: str, name: str, value: str) -> str | None:
     if name == "name":
         return None
     numbers = _numbers(value)
+    if name == "timestep" and numbers != [TIME_STEP]:
+        return f"{TIME_STEP}, the step of all walks [s], or nothing"
     if name == "memory":
         size = re.fullmatch(r"(\d{1,12})([KMG]?)", value)
         fine = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)

@@ -4,8 +4,10 @@ Everything that is walked or tuned runs in worker processes, one core each, beca
 one long chain of small operations. A step that finds its result on disk takes it.
 """
 
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
+from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import repeat
@@ -17,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax import replay
-from hector_jax.console import bar
+from hector_jax.console import bar, say_if_slow
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig, walk_config
@@ -26,11 +28,20 @@ from hector_jax.grfm import dataset, network, training
 from hector_jax.grfm.dataset import Dataset, Walks
 from hector_jax.grfm.network import LinearMap, Params
 from hector_jax.grfm.training import History, TrainConfig
-from hector_jax.inputs import POSITIVE, SEED, SOME, InputError, check, choose, from_table, shown
+from hector_jax.inputs import (
+    POSITIVE,
+    SEED,
+    SOME,
+    InputError,
+    check,
+    choose,
+    from_table,
+    plural,
+    shown,
+)
 from hector_jax.model.effect import HISTORY, last_command
 from hector_jax.robot import Robot
 from hector_jax.runtime import letters
-from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.storage import (
@@ -70,6 +81,14 @@ def choose_engine(asked: str) -> str:
     if choose("engine", asked, ENGINES) == "auto":
         return "c" if jax.default_backend() == "cpu" else "mjx"
     return asked
+
+
+def mjx_walks(*args: Any, **options: Any) -> Iterator[Trajectory]:
+    """`sim.parallel.walk_batch`; MJX takes a second to import and prints what it does not find."""
+    with redirect_stdout(sys.stderr):
+        from hector_jax.sim.parallel import walk_batch
+
+    return walk_batch(*args, **options)
 
 
 @dataclass(frozen=True)
@@ -396,9 +415,11 @@ def _keep_walks(
     def walk_jobs(jobs: list[Job]) -> Iterator[Trajectory]:
         if engine == "c":
             return walk_many(pool, walking, robot, jobs)
-        return walk_batch(walking, robot, jobs, single=single)
+        return mjx_walks(walking, robot, jobs, single=single)
 
-    title = f"collecting {len(jobs)} walks on the high-fidelity simulator, engine {engine}"
+    title = (
+        f"collecting {plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine}"
+    )
     with bar(title) as tell:
         dataset.collect(
             folder,
@@ -497,11 +518,14 @@ def train(
 
 
 def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> Learned:
-    parts = samples(robot, *folders)
+    with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
+        parts = samples(robot, *folders)
     made_of = [dataset.walked_with(each) for each in folders]
     ending = digest(config, robot, made_of, code=TRAINING_CODE)
     kept = Checkpoint(path.with_name(f"training-{ending}.npz"), training.KIND, robot)
-    with bar(f"training GRFM-Net ({config.variant}) on {len(parts.training.walk)} samples") as tell:
+    with bar(
+        f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
+    ) as tell:
         tell(0, config.epochs, "compiling")
         params, course = training.train(
             config,
@@ -510,12 +534,14 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
             lambda epoch, _: tell(epoch, config.epochs, ""),
             kept,
         )
-    linear = network.fit_linear(parts.training)
-    effects = {
-        "raw": last_command,
-        "linear": network.linear_effect(linear),
-        "net": network.as_effect(params),
-    }
+    with say_if_slow("computing the errors on held-out walks"):
+        linear = network.fit_linear(parts.training)
+        effects = {
+            "raw": last_command,
+            "linear": network.linear_effect(linear),
+            "net": network.as_effect(params),
+        }
+        errors = training.report(effects, parts.held_out)
     held_out = np.unique(parts.held_out.walk).tolist()
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
@@ -524,7 +550,7 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
         "settings": training_settings(config),
         "samples": {**sizes, "dropped": parts.dropped},
         "held_out": held_out,
-        "errors": training.report(effects, parts.held_out),
+        "errors": errors,
         "linear": [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(linear)],
         "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
     }
@@ -633,7 +659,7 @@ def losses_on_hfs(
         walks = walk_many(pool, walk, robot, jobs)
     else:
         filled = jobs + jobs[-1:] * (at_once - len(jobs))
-        walks = walk_batch(walk, robot, filled, fine=True)
+        walks = mjx_walks(walk, robot, filled, fine=True)
     told = iter(
         [float(loss_of(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)]
     )

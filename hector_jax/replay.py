@@ -112,9 +112,9 @@ def keep(
     try:
         save_tree(path, dump, kind=_KIND, robot=robot, about=about)
     except WriteError as error:
-        say(f"no dump of a refused step: {error}")
+        say(f"a refused step was not recorded: {error}")
         return None
-    say(f"{name}, iteration {iteration.iteration}: {iteration.reason}; hector replay {path}")
+    say(f"{name}, iteration {iteration.iteration}: {iteration.reason}; see hector replay {path}")
     return path
 
 

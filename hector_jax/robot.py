@@ -10,7 +10,8 @@ joint that moves it, parallel to the trunk's when all joints are zero.
 """
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -35,9 +36,19 @@ JOINT_NAMES, FOOT_POINTS = Description.joints, Description.foot_points
 _AXES = dict(zip("xyz", np.eye(3), strict=True))
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
 
-# MuJoCo writes its warnings into a file of the working directory; the counters in MjData, which
-# every walk reads, tell the same.
-mujoco.set_mju_user_warning(lambda message: None)
+
+@contextmanager
+def quiet_mujoco() -> Iterator[None]:
+    """Keep MuJoCo from writing its warnings into a file of the working directory.
+
+    The counters in MjData, which every walk reads, tell the same.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 class Robot(NamedTuple):
@@ -83,6 +94,7 @@ def describe(path: Path | None = None) -> Description:
     return replace(read_description(DESCRIPTION_PATH), model=path)
 
 
+@quiet_mujoco()
 def load_robot(path: Path | None = None) -> Robot:
     """The robot of a file, see `describe`.
 
@@ -131,6 +143,7 @@ def load_model(path: Path | None = None) -> mujoco.MjModel:
     return compile_model(describe(path))
 
 
+@quiet_mujoco()
 def compile_model(description: Description) -> mujoco.MjModel:
     """The compiled and checked model of a description.
 
@@ -175,7 +188,7 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
         joint = model.joint(name)
         which = index % 5
         if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise InputError(f"{path}: joint {name!r} is no hinge, expected a hinge")
+            raise InputError(f"{path}: joint {name!r} is not a hinge")
         axis = _AXES[description.axes[which]]
         if not np.allclose(joint.axis, axis, atol=_SAME):
             raise InputError(f"{path}: axis of joint {name!r} is {joint.axis}, expected {axis}")
@@ -186,7 +199,7 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
         expected = _trunk(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
         if parent != expected:
             raise InputError(
-                f"{path}: joint {name!r} hangs on body {model.body(parent).name!r}, "
+                f"{path}: joint {name!r} is on body {model.body(parent).name!r}, "
                 f"expected {model.body(expected).name!r}"
             )
         if np.abs(joint.pos).max() > _SAME or abs(model.body_quat[body][0]) < 1 - _SAME:
@@ -241,7 +254,7 @@ def _check_feet(description: Description, model: mujoco.MjModel) -> None:
             geom = model.geom(name)
             if geom.bodyid[0] != body or geom.type[0] != mujoco.mjtGeom.mjGEOM_SPHERE:
                 raise InputError(
-                    f"{path}: geom {name!r} is no sphere on body {model.body(body).name!r}"
+                    f"{path}: geom {name!r} is not a sphere on body {model.body(body).name!r}"
                 )
             reach = geom.pos - [0, 0, geom.size[0]] - point
             if ahead * reach[0] <= 0 or np.abs(reach[1:]).max() > 1e-3:

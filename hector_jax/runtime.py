@@ -6,7 +6,10 @@ processes) call `setup_jax` once, before the first array.
 
 import gc
 import os
+import resource
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -18,7 +21,16 @@ from multiprocessing.managers import SyncManager
 from pathlib import Path
 from typing import Any
 
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, one_line
+
+_LEAST_MEMORY = 3e9  # [B] of addresses: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
+
+
+def home_cache() -> Path:
+    """Folder of the compilation cache in the user's home."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    folder = Path(base) if base else Path(os.path.expanduser("~")) / ".cache"
+    return folder / "hector_jax" / "jax"
 
 
 def cache_folder() -> Path:
@@ -27,9 +39,7 @@ def cache_folder() -> Path:
     Raises:
         InputError: there is none that this user alone can write.
     """
-    base = os.environ.get("XDG_CACHE_HOME")
-    folder = Path(base) if base else Path(os.path.expanduser("~")) / ".cache"
-    folder = folder / "hector_jax" / "jax"
+    folder = home_cache()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = tempfile.TemporaryFile(dir=folder)
@@ -52,6 +62,56 @@ def cache_folder() -> Path:
         folder = own / "jax"
         folder.mkdir(exist_ok=True)
     return folder
+
+
+def check_jax(on_cpu: bool = False) -> None:
+    """Find out whether JAX can compute with what the environment asks of it.
+
+    Args:
+        on_cpu: compute on the CPU, whatever accelerators there are.
+
+    Raises:
+        InputError: one line with the limit or variable that it cannot work with.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:  # it would hang or abort
+        raise InputError(
+            f"the limit on virtual memory (ulimit -v) is {limit / 1e9:.1f} GB, expected at least "
+            f"{_LEAST_MEMORY / 1e9:g} GB"
+        )
+    if "XLA_FLAGS" in os.environ:  # one that XLA does not know ends the process
+        done = subprocess.run(
+            [sys.executable, "-c", "import jax; jax.devices()"],
+            env=os.environ | {"JAX_PLATFORMS": "cpu"},
+            capture_output=True,
+            text=True,
+            errors="replace",
+        )
+        if done.returncode:
+            said = done.stderr.strip().rpartition("\n")[2].rpartition("] ")[2]
+            raise InputError(f"XLA_FLAGS={os.environ['XLA_FLAGS']}: {one_line(said)}")
+    asked = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if name[:4] == "JAX_"]
+    try:
+        import jax
+
+        if on_cpu:
+            jax.config.update("jax_platforms", "cpu")
+        jax.devices()
+    except Exception as error:  # of several kinds, some without a word
+        told = f"JAX does not start{' with ' if asked else ''}{', '.join(asked)}"
+        raise InputError(f"{told}: {one_line(error) or 'no such device here'}") from None
+
+
+@contextmanager
+def without_renderer() -> Iterator[None]:
+    """Import MuJoCo within without OpenGL: only a film needs it, which another process draws."""
+    before = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
+        os.environ.update({} if before is None else {"MUJOCO_GL": before})
 
 
 def setup_jax() -> None:
@@ -153,6 +213,8 @@ def start_worker(cores: Any, lifeline: Connection) -> None:
 
     jax.config.update("jax_platforms", "cpu")
     setup_jax()
+    with without_renderer():
+        import mujoco  # noqa: F401
 
 
 def _cores(processes: int) -> list[int | None]:

@@ -18,10 +18,11 @@ import io
 import json
 import os
 import platform
+import secrets
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -34,11 +35,12 @@ from filelock import FileLock, Timeout
 
 from hector_jax.console import Broken, say
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import InputError, one_line, problem, read_text, shown
+from hector_jax.inputs import InputError, Interval, one_line, problem, read_json, shown
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Wrench
 
 FORMAT = 1
+WEIGHTS = Interval(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
 _MOST_WEIGHTS = 1_000_000  # bytes
 _PART = ".hector_jax-part"  # ends the name of a file that is being written, and of no other
 _DIGEST = 64  # hexadecimal digits of a sha256
@@ -183,29 +185,26 @@ def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
     Args:
         path: the file, replaced if it is there.
         data: all of it.
-        before: name that the file which is replaced goes to.
+        before: file for what is replaced.
 
     Raises:
         WriteError: one line with the path, where the folder or the disk refuses.
     """
     path = Path(path)
+    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(_PART, f".{path.name}.", path.parent)
-    except OSError as error:
-        raise _cannot_write(path, error) from error
-    try:
-        with os.fdopen(handle, "wb") as file:
+        with part.open("xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(name, 0o644)
         if before is not None and path.exists():
-            os.replace(path, before)
-        os.replace(name, path)
+            write_file(before, path.read_bytes())
+        os.replace(part, path)
         _sync(path.parent)
     except BaseException as error:
-        Path(name).unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise _cannot_write(path, error) from error
         raise
@@ -388,7 +387,7 @@ def _check_card(path: Path, card: Any) -> None:
         raise InputError(
             f"{path}: file format {shown(card.get('format'))}, this version reads {FORMAT}"
         )
-    kinds = {"kind": str, "robot": str | None, "about": dict}
+    kinds = {"kind": str, "robot": str | None, "about": dict, "versions": dict}
     for name, kind in kinds.items():
         if told := problem(card.get(name), kind):
             raise InputError(f"{path}: card.{name} {told}")
@@ -522,20 +521,14 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
 
 
 def load_weights(path: Path) -> Weights:
-    """Read weights that `save_weights` or a person wrote; positive, but not held to the box.
+    """Read weights that `save_weights` or a person wrote; in `WEIGHTS`, not held to the box.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, unknown, of the wrong
-            shape, or not a positive number.
+            shape, or not a number of that range.
     """
     path = Path(path)
-    text = read_text(path, "weights", _MOST_WEIGHTS)
-    try:
-        tree = json.loads(text, object_pairs_hook=_no_twins)
-    except ValueError as error:  # JSONDecodeError is one too
-        raise InputError(f"{path}: no valid JSON: {error}") from error
-    except RecursionError as error:
-        raise InputError(f"{path}: no valid JSON: nested too deeply") from error
+    tree = read_json(path, "weights", _MOST_WEIGHTS, object_pairs_hook=_no_twins)
     if isinstance(tree, dict):
         tree.pop("$schema", None)  # for editors; what is in a file is checked here
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
@@ -580,14 +573,13 @@ def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
 def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.ndarray:
     wanted = " x ".join(str(s) for s in shape)
     try:
-        array = np.array(entry)
-    except (ValueError, OverflowError):
+        array = np.array(entry, object)
+    except ValueError:  # rows of different lengths
         array = np.array(None)
-    if array.shape != shape or array.dtype.kind not in "if":
+    if array.shape != shape:
         raise InputError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
-    array = array.astype(float)
-    bad = ~(np.isfinite(array) & (array > 0))
-    if bad.any():
-        place = "".join(f"[{i}]" for i in np.argwhere(bad)[0])
-        raise InputError(f"{path}: {name}{place} must be positive, got {array[bad][0]:g}")
-    return array
+    for index, value in np.ndenumerate(array):
+        if told := problem(value, float, WEIGHTS):
+            place = "".join(f"[{i}]" for i in index)
+            raise InputError(f"{path}: {name}{place} {told}")
+    return array.astype(float)

@@ -4,7 +4,6 @@ Each step takes up what is kept of it (kept.py, tuning/search.py), so that a run
 on where it was, and another set or more plants cost only what is new.
 """
 
-import json
 import re
 import tempfile
 from collections.abc import Callable, Mapping
@@ -22,7 +21,7 @@ from hector_jax.evaluation.report import Picture, environment
 from hector_jax.evaluation.table import PAPER, Earlier, Fall, Search, Table
 from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.grfm.network import Params
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, plural, read_json
 from hector_jax.kept import Judged, Tuned
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -73,8 +72,6 @@ def _plan(args: flags.Table) -> _Plan:
         if name not in COMMANDS:
             raise InputError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
     commands = {name: named_command(name) for name in args.trajectories}
-    if len(commands) < len(args.trajectories) or not commands:
-        raise InputError(f"--trajectories must name each once, got {' '.join(args.trajectories)}")
     seeds = range(args.first_seed, args.first_seed + args.seeds)
     return _Plan(
         commands,
@@ -114,13 +111,11 @@ def _sets_from_files(args: flags.Table) -> dict[str, dict[str, Weights]]:
 
 def _long_search(card: Path) -> Search:
     """What the card beside the ceiling's weights tells of its search."""
+    told = read_json(card, "the card of a search")
     try:
-        told = json.loads(card.read_bytes())
         return Search(told["walks"], told["best_at"], told["L"]["best"], told["stop"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{card}: no card of a search, so its weights are of none: {error}"
-        ) from None
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{card}: not the card of a search: {error!r}") from None
 
 
 def make_table(
@@ -265,7 +260,7 @@ def _walk_sets(
         **{which: one.tuning.converged for which, one in tuned.items()},
         **plan.extra[name],
     }
-    title = f"judging {name} on {len(plan.seeds)} stand-in plants"
+    title = f"evaluating {name} on {plural(len(plan.seeds), 'stand-in plant')}"
     command, seeds = plan.commands[name], plan.seeds
     known = (sets, command, plants, seeds, folder, commit, title)
     return kept.judge(pool, plan.tune, robot, *known)
@@ -301,7 +296,7 @@ def _draw(
     out: Path, robot: Robot, verdicts: Mapping[str, Verdict], judged: Mapping[str, Judged]
 ) -> list[Picture]:
     """All pictures, in the order of the report."""
-    say("drawing")
+    say("drawing the pictures")
     paper = {
         (trajectory, name, baseline): table.paper_change(trajectory, name, baseline)
         for trajectory in verdicts

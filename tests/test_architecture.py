@@ -27,7 +27,7 @@ FLOORS = [
 ]
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
-    "mujoco": ("robot", "sim", "evaluation.video", "evaluation.view"),
+    "mujoco": ("runtime", "robot", "sim", "evaluation.video", "evaluation.view"),
     "viser": ("evaluation.view",),
     "trimesh": ("evaluation.view",),
     "flax": ("grfm.network",),

@@ -171,7 +171,7 @@ def test_mjx_takes_any_robot_and_knows_what_may_not_touch_the_floor(strider):
         ('"left_sole"', '"left_soul"', ["no site 'left_soul'", "did you mean 'left_sole'?"]),
         ('"home"', '"hom"', ["no keyframe 'hom'", "did you mean 'home'?"]),
         ("[joints]", "[joints]\naxes = 'xzyyy'", ["axis of joint 'left_yaw'", "[1. 0. 0.]"]),
-        ("[gait]", "[gait", ["no valid TOML"]),
+        ("[gait]", "[gait", ["not valid TOML"]),
     ],
 )
 def test_a_wrong_description_is_refused_in_one_line(tmp_path, old, new, words):

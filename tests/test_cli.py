@@ -1,7 +1,6 @@
 """The console script as a person meets it: plain words, exit codes, one line for bad input."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -46,16 +45,6 @@ def refused(monkeypatch, capsys, *arguments):
     return lines[0]
 
 
-def refused_flag(monkeypatch, capsys, *arguments):
-    """Runs a command with a flag that does not parse; what is said, without its box."""
-    with pytest.raises(SystemExit) as left:
-        call(monkeypatch, *arguments)
-    assert left.value.code == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    return " ".join(re.sub("[╭╮╰╯│─]", " ", err).split())
-
-
 def test_help_names_the_commands():
     shown = subprocess.run(
         [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
@@ -66,9 +55,9 @@ def test_help_names_the_commands():
     assert shown.stderr == ""
 
 
-def test_importing_everything_prints_nothing_and_leaves_no_file(tmp_path):
+def test_importing_the_commands_prints_nothing_and_leaves_no_file(tmp_path):
     shown = subprocess.run(
-        [sys.executable, "-c", "import hector_jax.commands, hector_jax.sim.parallel"],
+        [sys.executable, "-c", "import hector_jax.commands"],
         capture_output=True,
         text=True,
         cwd=tmp_path,
@@ -84,6 +73,33 @@ def test_walking_on_the_rigid_body_prints_json(monkeypatch, capsys):
     assert not found["fell"]
 
 
+def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, capsys):
+    walk = synthetic_walk(0, 30)
+    fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
+    residual = np.where(fallen, np.inf, 0.0)
+    wrong = walk._replace(fallen=fallen, residual=residual)
+    monkeypatch.setattr(asked, "walked", lambda *args: wrong)
+    assert call(monkeypatch, "walk") == 1
+    out, err = capsys.readouterr()
+    assert "nominal weights: ended after 0.20 s" in out
+    assert "10 of 30 QPs were not solved (largest relative residual inf, expected at most" in err
+    assert call(monkeypatch, "walk", "--json") == 1
+    found = json.loads(capsys.readouterr().out)
+    assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
+    assert found["residual"] is None
+    monkeypatch.setattr(asked, "walked", lambda *args: walk._replace(fallen=fallen))
+    assert call(monkeypatch, "walk") == 0
+    assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
+
+
+def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):
+    path = tmp_path / "two\nlines.json"
+    save_weights(path, expert())
+    monkeypatch.setattr(asked, "walked", lambda *args: synthetic_walk(0, 30))
+    assert call(monkeypatch, "walk", "--weights", path) == 0
+    assert "two lines.json weights: walked" in capsys.readouterr().out.splitlines()[0]
+
+
 @pytest.mark.parametrize("command", ["walk", "tune", "search", "evaluate"])
 def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
     monkeypatch.chdir(tmp_path)
@@ -96,13 +112,7 @@ def test_unknown_trajectory(monkeypatch, capsys, tmp_path, command):
 @pytest.mark.parametrize("command", ["walk", "evaluate"])
 def test_a_walk_of_no_length_is_refused(monkeypatch, capsys, command):
     line = refused(monkeypatch, capsys, command, "--traj", "eight", "--seconds", "0")
-    assert "--seconds must be a number above 0 and at most 600, got 0.0" in line
-
-
-def test_unknown_world(monkeypatch, capsys):
-    said = refused_flag(monkeypatch, capsys, "walk", "--world", "moon")
-    assert "moon" in said
-    assert "standin" in said
+    assert "--seconds must be a number from 0.01 to 600, got 0.0" in line
 
 
 @pytest.mark.parametrize(
@@ -132,7 +142,7 @@ def test_missing_weights_file(monkeypatch, capsys, tmp_path):
 
 def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, capsys):
     line = refused(monkeypatch, capsys, "walk", "--weights", "exprt")
-    assert "no weights 'exprt'; did you mean 'expert'?; there are: nominal, expert, or" in line
+    assert "nominal, expert or a weights file, got 'exprt'; did you mean 'expert'?" in line
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
@@ -147,7 +157,7 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     ("wrong", "expected"),
     [
         (("--seconds", "0.001"), "at least 0.03 s, the 3 ticks of one sample, got 0.001"),
-        (("--seconds", "nan"), "--seconds must be a number that is finite, got nan"),
+        (("--seconds", "nan"), "--seconds must be a number above 0 and at most 600, got nan"),
         (("--walks", "2"), "at least 3"),
     ],
 )
@@ -238,7 +248,7 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     [
         (("--budget", "9"), "budget"),
         (("--population", "2"), "population"),
-        (("--seed", "-1"), "--seed must be a whole number of at least 0 and"),
+        (("--seed", "-1"), "--seed must be a whole number from 0 to 4294967295"),
         (("--start", "none.json"), "none.json"),
     ],
 )
@@ -332,7 +342,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         assert standin["seeds"] == [0, 1]
         assert standin["falls"] == 0
         for part in ("L", "L_Eul", "L_pos", "L_ctrl"):
-            assert standin[part]["low"] <= standin[part]["mean"] <= standin[part]["high"]
+            assert standin[part]["mean"] > 0.0
+            assert standin[part]["low"] is None  # two plants have no interval
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert {line["set"] for line in lines} == {"without", "with", "with_refreshed"}
     assert result["refresh"][0].keys() == {"old", "new"}
@@ -393,30 +404,6 @@ def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong)
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("command", "flag", "wrong", "known"),
-    [
-        ("tune", "--alpha", "both", "auto"),
-        ("tune", "--variant", "papier", "residual"),
-        ("search", "--engine", "warp", "mjx"),
-        ("collect", "--engine", "warp", "mjx"),
-        ("evaluate", "--world", "srbm", "hfs-varied"),
-        ("walk", "--seconds", "long", "float"),
-        ("tune", "--sedes", "3", "--seeds"),
-        ("completion", "cmd.exe", "", "fish"),
-    ],
-)
-def test_flags_that_do_not_parse_name_what_is_known(
-    monkeypatch, capsys, tmp_path, command, flag, wrong, known
-):
-    monkeypatch.chdir(tmp_path)
-    said = refused_flag(monkeypatch, capsys, *filter(None, (command, flag, wrong)))
-    assert flag in said
-    assert wrong in said
-    assert known in said
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("name", [command_name(kind) for kind in get_args(Command)])
 def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, name):
     monkeypatch.setenv("COLUMNS", "200")
@@ -456,38 +443,26 @@ def test_completion_prints_a_script_that_knows_the_commands(monkeypatch, capsys,
 def test_a_doctor_that_finds_a_fault_leaves_with_one(monkeypatch, capsys):
     walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
     monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
-    monkeypatch.setattr(doctor, "_video", lambda *args: "not looked at")
+    monkeypatch.setattr(doctor, "_film", lambda *args: "egl")
     monkeypatch.setattr(doctor, "SOLVED", -1.0)
     assert call(monkeypatch, "doctor", "--json") == 1
     out, err = capsys.readouterr()
     faults = [f"self-test: the robot does not walk in {world}" for world in walks]
     assert json.loads(out)["faults"] == faults
-    assert err == f"hector: {'; '.join(faults)}\n"
-
-
-def test_a_doctor_without_a_device_says_so():
-    shown = subprocess.run(
-        [sys.executable, "-m", "hector_jax.cli", "doctor"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "JAX_PLATFORMS": "abacus"},
-    )
-    assert shown.returncode == 1
-    assert "hector: JAX finds no device: " in shown.stderr
-    assert "abacus" in shown.stderr
-    assert "Traceback" not in shown.stderr
+    assert err.splitlines()[-1] == f"hector: {'; '.join(faults)}"
 
 
 def test_a_sound_machine_passes_the_doctor(monkeypatch, capsys):
     walks = {"srbm": synthetic_walk(0, 30), "ideal": synthetic_walk(0, 30)}
     monkeypatch.setattr(doctor, "_walks", lambda robot: walks)
-    monkeypatch.setattr(doctor, "_video", lambda *args: "not looked at")
+    monkeypatch.setattr(doctor, "_film", lambda *args: "egl")
     assert call(monkeypatch, "doctor", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["faults"] == []
     assert told["precision"] == "float64"
     assert told["robot"].startswith(str(MODEL_PATH))
     assert {"python", "jax", "mujoco", "devices", "cache", "extras", "video"} <= told.keys()
+    assert "export: yes (for hector export)" in told["extras"]
     told = doctor.examine()[0]  # without --json the same lines
     assert call(monkeypatch, "doctor") == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(told)

@@ -95,7 +95,7 @@ def test_the_command_prints_json_and_nothing_else(monkeypatch, capsys, runs):
     assert cli.main() == 0
     out, err = capsys.readouterr()
     assert [one["run"] for one in json.loads(out)["runs"]] == [str(run) for run in runs]
-    assert err == ""
+    assert err in ("", "loading JAX and MuJoCo\n")
 
 
 def test_what_a_run_wrote_can_be_asked_for_again(runs):
@@ -105,13 +105,17 @@ def test_what_a_run_wrote_can_be_asked_for_again(runs):
 @pytest.mark.parametrize(
     ("name", "text", "fault"),
     [
-        ("result.json", None, "cannot read .*result.json: No such file.*expected a run folder"),
-        ("result.json", "{", "result.json: no valid JSON"),
-        ("result.json", "[]", "result.json: expected an object"),
+        (
+            "result.json",
+            None,
+            "result.json: cannot read a file of a run of `hector tune`: No such file",
+        ),
+        ("result.json", "{", "result.json: not valid JSON"),
+        ("result.json", "[]", "result.json: expected a JSON object"),
         ("result.json", "{}", "result.json: no `sets`"),
         ("result.json", '{"sets": {"with": {"hfs": {}}}}', "set with has no verdict"),
-        ("config.json", None, "cannot read .*config.json"),
-        ("versions.json", "3", "versions.json: expected an object"),
+        ("config.json", None, "config.json: cannot read"),
+        ("versions.json", "3", "versions.json: expected a JSON object"),
         ("metrics.jsonl", "{}\n", "metrics.jsonl, line 1: an iteration"),
         ("metrics.jsonl", '"a"\n', "metrics.jsonl, line 1: an iteration"),
     ],
@@ -129,7 +133,7 @@ def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
 def test_no_run_at_all_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["hector", "compare"])
     assert cli.main() == 2
-    assert "at least one run folder" in capsys.readouterr().err
+    assert "compare expects RUNS" in capsys.readouterr().err
 
 
 def test_a_line_that_is_being_written_is_not_read_yet(runs):

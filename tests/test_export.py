@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import json
 import re
+import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -361,9 +362,24 @@ def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsy
         monkeypatch.setattr(export, part, lambda *known: None)
     found = Check(2e-6, 0.0, 0.0, 0, {}, {})
     monkeypatch.setattr(export, "check", lambda *known: found)
-    assert call(monkeypatch, run) == 2
+    assert call(monkeypatch, run) == 1
     assert "2.0e-06 N" in capsys.readouterr().err
     assert list((run / "export").glob("[!.]*")) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "line"),
+    [
+        (["--help"], 0, "FOLDER is the one that `hector export` wrote"),
+        ([], 1, "expected the FOLDER that `hector export` wrote"),
+        (["nowhere"], 1, "nowhere: no controller.json; expected the folder that"),
+    ],
+)
+def test_the_example_says_what_it_expects(words, code, line):
+    done = subprocess.run([sys.executable, EXAMPLE, *words], capture_output=True, text=True)
+    assert done.returncode == code
+    assert line in done.stdout + done.stderr
+    assert len(done.stderr.splitlines()) == code
 
 
 def test_the_example_knows_nothing_of_us():
@@ -405,7 +421,7 @@ def test_a_setting_that_this_version_does_not_know_is_not_dropped(run):
     ("arguments", "part"),
     [
         (["--set", "wiht"], "did you mean 'with'"),
-        (["--set", "zzz"], "there are: with"),
+        (["--set", "zzz"], "known: with"),
         (["--traj", "circle"], "circle"),
         (["--seconds", "0"], "--seconds"),
     ],

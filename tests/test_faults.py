@@ -213,7 +213,7 @@ def test_a_start_that_cannot_be_believed_ends_the_run_and_leaves_a_dump(
         tune(tmp_path / "dumps", command, net, robot=robot)
     (path,) = (tmp_path / "dumps").iterdir()
     said = " ".join(capsys.readouterr().err.split())
-    assert f"with, iteration 0: {reason}; hector replay {path}" in said
+    assert f"with, iteration 0: {reason}; see hector replay {path}" in said
     assert call(monkeypatch, "replay", path, "--json") == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["same"] is True
@@ -320,7 +320,7 @@ def test_a_folder_that_cannot_be_written_does_not_end_the_tuning(tmp_path, capsy
     (tmp_path / "wall").write_text("a file, where a folder is wanted")
     _, lines = tune(tmp_path / "wall", told(Fault.FALL), params)
     assert len(lines) > 3
-    assert "no dump of a refused step" in capsys.readouterr().err
+    assert "a refused step was not recorded" in capsys.readouterr().err
 
 
 # Numbers that no rollout gives

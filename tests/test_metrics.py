@@ -7,7 +7,13 @@ import pytest
 from pretend import SETS, pretend_score, pretend_verdict, pretend_walk
 
 from hector_jax.evaluation import metrics
+from hector_jax.storage import as_json
 from hector_jax.tuning.loss import LossConfig
+
+
+def mean_of(x):
+    """Mean over the samples."""
+    return x.mean(axis=-1)
 
 
 def _judge(**losses):
@@ -43,7 +49,7 @@ def test_a_fall_is_charged_and_told_and_its_missing_samples_stay_out_of_the_rms(
 
 def test_a_bootstrap_interval_holds_its_value_and_is_the_same_each_time():
     samples = np.random.default_rng(3).lognormal(size=32)
-    first, second = metrics.bootstrap(samples), metrics.bootstrap(samples)
+    first, second = (metrics.bootstrap(mean_of, samples) for _ in range(2))
     assert first == second
     assert first.low < first.value < first.high
     assert first.value == pytest.approx(samples.mean())
@@ -51,16 +57,27 @@ def test_a_bootstrap_interval_holds_its_value_and_is_the_same_each_time():
 
 def test_bootstrap_intervals_cover_the_mean_about_as_often_as_they_say():
     draws = np.random.default_rng(5).normal(size=(100, 32))
-    inside = [i.low < 0 < i.high for i in map(metrics.bootstrap, draws)]
+    inside = [i.low < 0 < i.high for i in (metrics.bootstrap(mean_of, x) for x in draws)]
     assert 0.86 <= np.mean(inside) <= 1.0
 
 
-def test_one_seed_has_an_interval_without_width():
-    assert metrics.bootstrap(np.array([2.0])) == (2.0, 2.0, 2.0)
+def test_fewer_than_four_samples_have_no_interval():
+    for count in (1, 2, 3):
+        found = metrics.bootstrap(mean_of, np.arange(1.0, count + 1))
+        assert found.value == (count + 1) / 2
+        assert np.isnan([found.low, found.high]).all()
+        assert found.text("{:.1f}".format) == f"{found.value:.1f}"
+    four = metrics.bootstrap(mean_of, np.arange(4.0))
+    assert four.text("{:.2f}".format) == f"1.50 [{four.low:.2f}, {four.high:.2f}]"
+    verdict = _judge(nominal=[1.0], tuned=[0.5])
+    found = json.loads(as_json(metrics.as_result(verdict)))["sets"]["tuned"]["standin"]
+    assert found["L"] == {"mean": 0.5, "low": None, "high": None}
+    change = found["change"]["nominal"]
+    assert (change["median"], change["low"], change["high"]) == (pytest.approx(-50.0), None, None)
 
 
 def test_the_change_is_the_median_of_paired_ratios_not_the_ratio_of_means():
-    verdict = _judge(nominal=[1.0, 10.0, 100.0], tuned=[0.5, 8.0, 99.0])
+    verdict = _judge(nominal=[1.0, 10.0, 10.0, 100.0], tuned=[0.5, 8.0, 8.0, 99.0])
     change = metrics.compare(verdict, "tuned", "nominal").change["L"]
     assert change.value == pytest.approx(-20.0)
     assert change.low == pytest.approx(-50.0)
@@ -109,7 +126,7 @@ def test_the_result_of_a_set_that_falls_at_once_is_still_json():
     walk = metrics.score(LossConfig(), pretend_walk(fall_at=-1.0))
     verdict = metrics.judge(LossConfig(), [0, 1], {"nominal": [walk] * 2, "with": [walk] * 2})
     found = metrics.as_result(verdict)["sets"]["with"]["standin"]
-    json.dumps(found, allow_nan=False)
+    as_json(found)
     assert found["falls"] == 2
     assert found["rms"]["position"] == [None] * 3
     assert found["change"]["nominal"]["median"] == pytest.approx(0.0)

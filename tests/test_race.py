@@ -119,10 +119,10 @@ def test_a_race_that_was_cut_ends_as_if_it_had_not_been(raced, tmp_path, cut):
 def test_a_record_of_another_race_is_refused(tmp_path):
     rivals = {"random": Random(1)}
     run(tmp_path, rivals, 10)
-    with pytest.raises(ValueError, match="its rollouts is 10, asked for is 20"):
+    with pytest.raises(ValueError, match="its rollouts is 10, expected 20"):
         run(tmp_path, rivals, 20)
     (tmp_path / "race.jsonl").write_text("mine\n")
-    with pytest.raises(ValueError, match="no record of a race"):
+    with pytest.raises(ValueError, match="not the record of a race"):
         run(tmp_path, rivals, 10)
 
 

@@ -90,7 +90,5 @@ def test_stop_and_go_stands_in_every_other_second():
 
 
 def test_unknown_trajectory_is_named():
-    with pytest.raises(
-        ValueError, match="unknown trajectory 'circle'; there are: straight, c, s, "
-    ):
+    with pytest.raises(ValueError, match="unknown trajectory 'circle'; known: straight, c, s, "):
         named_command("circle")

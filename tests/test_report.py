@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 
 import numpy as np
 import pytest
@@ -95,8 +96,22 @@ def test_legs_that_touch_are_told_where_they_do(tmp_path):
 def test_the_table_goes_without_baselines_that_were_not_walked():
     whole = pretend_verdict(2)
     text = _printed(Verdict(whole.seeds, {"mine.json": whole.scores["with"]}, LossConfig()))
-    row = next(line for line in text.splitlines() if line.startswith("mine.json"))
-    assert row.split()[-2:] == ["-", "-"]
+    assert "against" not in text
+    assert "Change of L" not in text
+    both = _printed(whole._replace(scores={n: whole.scores[n] for n in ("nominal", "with")}))
+    assert "against nominal" in both
+    assert "against expert" not in both
+
+
+def test_one_plant_is_told_in_the_singular_and_without_an_interval():
+    one = pretend_verdict(1)
+    for text in (_printed(one), report.verdict_table(one), " ".join(report.legend(one))):
+        assert "1 plants" not in text
+        assert "seeds 0" not in text
+        assert "[9" not in text
+        assert re.search(r"[+-]\d+ \[", text) is None
+    assert "means over 1 plant (seed 0)." in report.legend(one)[0]
+    assert "interval" not in report.legend(one)[1]
 
 
 @pytest.mark.parametrize(

@@ -62,10 +62,10 @@ def whole(tmp_path_factory):
 
 
 def test_a_tuning_cut_at_any_step_of_a_save_ends_in_the_same_bytes(tmp_path, whole, monkeypatch):
-    """Cut before and after the file is brought to the disk and between the two renamings."""
+    """Cut before and after a file is brought to the disk and before it gets its name."""
     folder, rng, cuts = tmp_path / "run", np.random.default_rng(0), 12
     for number in range(cuts):
-        step = ("fsync", "replace", "chmod")[number % 3]
+        step = ("fsync", "replace")[number % 2]
         left = iter(range(int(rng.integers(0, 3)), -1, -1))
 
         def cut(*args, step=step, left=left):
@@ -257,7 +257,7 @@ def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
     told = (
         "import sys, tempfile\n"
         f"tempfile.gettempdir = lambda: {str(wall)!r}\n"
-        "sys.argv = ['hector', 'doctor']\n"
+        "sys.argv = ['hector', 'walk']\n"
         "from hector_jax.cli import main\n"
         "sys.exit(main())"
     )
@@ -342,9 +342,7 @@ def test_a_run_of_other_code_another_robot_or_none_is_not_taken_up(begun, monkey
         patch.setattr(tuning, "load_robot", lambda path=None: other)
         with pytest.raises(ValueError, match="run: begun with robot"):
             tuning.tune(again)
-    with pytest.raises(
-        ValueError, match="cannot read .*none/config.json: No such file.* expected a run folder"
-    ):
+    with pytest.raises(ValueError, match="none/config.json: cannot read a file of a run of"):
         tuning.tune(flags.Tune(resume=folder / "none"))
 
 

@@ -153,7 +153,7 @@ def test_a_loss_without_a_number_is_the_worst_and_leaves_valid_json(tmp_path):
 def test_a_record_of_another_search_is_refused(tmp_path):
     run(tmp_path)
     kept = (tmp_path / "s.jsonl").read_bytes()
-    with pytest.raises(ValueError, match=r"s\.jsonl: .* its seed is 3, asked for is 5"):
+    with pytest.raises(ValueError, match=r"s\.jsonl: .* its seed is 3, expected 5"):
         run(tmp_path, SearchConfig(60, 10, seed=5))
     with pytest.raises(ValueError, match="its start is"):
         run(tmp_path, start=expert())
@@ -182,7 +182,7 @@ def test_a_damaged_record_is_refused(tmp_path, line, says):
 
 def test_another_file_is_no_record(tmp_path):
     (tmp_path / "s.jsonl").write_text("[1]\nmine\n")
-    with pytest.raises(ValueError, match="no record of a search"):
+    with pytest.raises(ValueError, match="not the record of a search"):
         run(tmp_path)
 
 

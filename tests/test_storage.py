@@ -1,6 +1,7 @@
 """Files: what is written comes back, and what was tampered with does not."""
 
 import json
+import os
 import pickle
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import pytest
 
 from hector_jax import storage
 from hector_jax.control.weights import expert, nominal
+from hector_jax.inputs import InputError
 from hector_jax.storage import (
     WriteError,
     load_tree,
@@ -147,6 +149,41 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
     assert [p.name for p in saved.parent.iterdir()] == ["tree.npz"]
 
 
+def test_the_newest_state_is_there_under_its_name_at_any_moment(tmp_path, monkeypatch):
+    state = storage.Checkpoint(tmp_path / "state.npz", "thing")
+    replace, there = storage.os.replace, []
+
+    def watched(*paths):
+        there.append(state.path.exists())
+        replace(*paths)
+        there.append(state.path.exists())
+
+    state.save({"x": np.zeros(3)})
+    monkeypatch.setattr(storage.os, "replace", watched)
+    state.save({"x": np.ones(3)})
+    assert len(there) == 4
+    assert all(there)
+    assert load_tree(state.before, {"x": np.zeros(3)}, kind="thing")[0]["x"].tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        storage.write_file(tmp_path / "file", b"data")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+def test_a_card_without_versions_is_refused_by_name(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(storage, "versions", lambda: None)
+        save_tree(tmp_path / "tree.npz", TREE, kind="thing")
+    with pytest.raises(InputError, match="tree.npz: card.versions must be a dict, got None"):
+        load_tree(tmp_path / "tree.npz", TREE, kind="thing")
+
+
 def test_a_robot_is_known_by_its_numbers():
     same = jax.tree.map(lambda x: np.array(x, copy=True), ROBOT)
     other = ROBOT._replace(flag=np.array(0.2501))
@@ -187,13 +224,19 @@ def _edit(change):
         (lambda t: t.pop("R"), 'missing weight "R"'),
         (lambda t: t["Q"].update(eular=[1, 1, 1]), 'unknown weight "Q.eular"; did you mean "Q.eul'),
         (lambda t: t.update(note="x"), 'unknown weight "note"; expected Q, R'),
-        (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be positive, got -1"),
-        (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\] must be positive, got 0"),
+        (lambda t: t["Q"].update(euler=[1, -1, 1]), r"Q.euler\[1\] must be a number from 1e-12"),
+        (lambda t: t["Q"].update(euler=[1, 1, 0]), r"Q.euler\[2\].* to 1e\+12, got 0"),
+        (lambda t: t["Q"].update(euler=[1, 1, True]), r"Q.euler\[2\] must be a number.*got True"),
+        (lambda t: t["Q"].update(euler=[1e308, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1e\+308"),
+        (
+            lambda t: t["R"].update(force=[[1, 1, 1], [1, 1, 5e-324]]),
+            r"R.force\[1\]\[2\].*from 1e-12",
+        ),
         (lambda t: t["Q"].update(euler=[1, float("nan"), 1]), r"Q.euler\[1\].*got nan"),
         (lambda t: t["Q"].update(euler=[1, 1, float("inf")]), r"Q.euler\[2\].*got inf"),
         (lambda t: t["Q"].update(euler=[1, 1]), "Q.euler must be 3 numbers, got"),
-        (lambda t: t["Q"].update(euler=["a", 1, 1]), "Q.euler must be 3 numbers, got"),
-        (lambda t: t["Q"].update(euler=[10**400, 1, 1]), "Q.euler must be 3 numbers, got"),
+        (lambda t: t["Q"].update(euler=["a", 1, 1]), r"Q.euler\[0\] must be a number.*got 'a'"),
+        (lambda t: t["Q"].update(euler=[10**400, 1, 1]), r"Q.euler\[0\].* to 1e\+12, got 1000"),
         (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
         (lambda t: t["R"].update(moment=None), "R.moment must be 2 x 3 numbers, got null"),
         (lambda t: t.update(Q=[1, 2]), "Q must be an object"),
@@ -206,6 +249,20 @@ def test_bad_weights_are_one_line_with_file_and_entry(tmp_path, change, message)
         load_weights(path)
     assert "weights.json" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_byte_order_mark_is_taken(tmp_path):
+    path = tmp_path / "weights.json"
+    save_weights(path, expert())
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    jax.tree.map(np.testing.assert_array_equal, load_weights(path), expert())
+
+
+def test_a_huge_number_is_told_without_advice_to_a_programmer(tmp_path):
+    path = tmp_path / "weights.json"
+    path.write_text('{"Q": 1' + 5000 * "0" + "}")
+    with pytest.raises(InputError, match="not valid JSON: a number has too many digits$"):
+        load_weights(path)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\udc80", '{"Q": 1, "Q": 2}', "[" * 100_000])

@@ -113,7 +113,7 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     assert asked["walks"] == 16
     for folder in ("ceiling", "other"):
         save_weights(tmp_path / folder / "s.json", nominal())
-    with pytest.raises(ValueError, match=r"s-card.json: no card of a search"):
+    with pytest.raises(ValueError, match=r"s-card.json: cannot read the card of a search"):
         study.make_table(table(tmp_path, **small), plants)
     card = {"walks": 2000, "best_at": 1234, "L": {"best": 1e6}, "stop": "50 generations"}
     (tmp_path / "ceiling" / "s-card.json").write_text(json.dumps(card))
@@ -129,21 +129,22 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"seeds": 0}, "--seeds must be a whole number of at least 1, got 0"),
-        ({"first_seed": -1}, "--first-seed must be a whole number of at least 0 and .*got -1"),
-        ({"steps": -1}, "--steps must be a whole number of at least 0, got -1"),
+        ({"seeds": 0}, "--seeds must be a whole number from 1 to 10000, got 0"),
+        ({"first_seed": -1}, "--first-seed must be a whole number from 0 to 4294967295, got -1"),
+        ({"steps": -1}, "--steps must be a whole number from 0 to 10000, got -1"),
         ({"trajectories": ("turn",)}, "--trajectories must be of straight, c, s, got turn"),
-        ({"iterations": 3}, "--iterations must be a whole number of at least 10, got 3"),
+        ({"iterations": 3}, "--iterations must be a whole number from 10 to 10000, got 3"),
         ({"rollouts": 3}, "budget must be at least the population"),
         ({"trajectories": ("moon",)}, "--trajectories must be of straight, c, s, got moon"),
-        ({"trajectories": ("s", "s")}, "--trajectories must name each once, got s s"),
+        ({"trajectories": ("s", "s")}, "--trajectories names 's' twice"),
+        ({"trajectories": ()}, "--trajectories expects a value, got none"),
         ({"extra": ("mine",)}, "--extra must be NAME=FOLDER.*got mine"),
         ({"extra": ("my set=x",)}, "--extra must be NAME=FOLDER.*got my set=x"),
         ({"extra": ("with=x",)}, "--extra with=x: there is a set 'with' already"),
         ({"extra": ("a=x", "a=y")}, "--extra a=y: there is a set 'a' already"),
         ({"extra": ("a=nowhere",)}, "nowhere/straight.json: cannot read weights"),
-        ({"earlier": Path("nowhere.json")}, "cannot read nowhere.json"),
-        ({"processes": 0}, "--processes must be a whole number of at least 1, got 0"),
+        ({"earlier": Path("nowhere.json")}, "nowhere.json: cannot read a table.json"),
+        ({"processes": 0}, "--processes must be a whole number from 1 to 1024, got 0"),
     ],
 )
 def test_wrong_flags_are_told_before_anything_is_computed(tmp_path, changes, words):
@@ -156,6 +157,26 @@ def test_the_line_that_asks_again_names_what_is_not_default():
     asked = Table(seeds=4, extra=("a=x", "b=y"), quick=True)
     assert as_command("table", asked) == "hector table --seeds 4 --extra a=x b=y --quick"
     assert as_command("tune", flags.Tune(video=False)) == "hector tune --no-video"
+
+
+def test_runs_of_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    """Also those that look at the same moment and find nothing there."""
+
+    class Clock(tuning.datetime):
+        @classmethod
+        def now(cls):
+            return cls(2026, 11, 21, 9, 34, 59)
+
+    begun = []
+    monkeypatch.setattr(tuning, "datetime", Clock)
+    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: begun.append(folder))
+    for _ in range(3):
+        tuning.tune(flags.Tune(traj="s", runs=tmp_path))
+    assert [folder.name for folder in begun] == [
+        "20261121-093459",
+        "20261121-093500",
+        "20261121-093501",
+    ]
 
 
 def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):

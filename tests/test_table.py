@@ -107,7 +107,7 @@ def test_the_order_is_held_against_that_of_an_earlier_table(tmp_path):
     write_table(tmp_path, whole(s=judged(**GOOD, mine=1e6)))
     earlier = table.load_earlier(tmp_path / "table.json", range(4, 8))
     assert earlier.seeds == "0-3"
-    with pytest.raises(ValueError, match=r"table.json: a table of seeds 0-3 too"):
+    with pytest.raises(ValueError, match=r"table.json: a table of the same plants, seeds 0-3"):
         table.load_earlier(tmp_path / "table.json", range(4))
     (same,) = table.same_order({"s": judged(**GOOD)}, earlier)
     assert (same.holds, same.measured) == (True, "all 5")

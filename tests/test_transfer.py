@@ -94,7 +94,7 @@ def test_a_phase_with_a_fall_is_left_out_for_all():
     assert transfer.compare(TRUTH, None, np.full_like(TRUTH, np.nan)) is None
 
 
-def test_a_single_phase_has_no_interval():
+def test_few_phases_have_no_interval():
     row = transfer.compare(TRUTH[:1], -TRUTH[:1], TRUTH[:1])
     assert row is not None
     assert row.gain is not None

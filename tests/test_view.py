@@ -17,6 +17,7 @@ from hector_jax.commands import asked
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.evaluation import pictures, runs, view
 from hector_jax.evaluation.view import Shown, motion
+from hector_jax.inputs import InputError
 from hector_jax.robot import load_model, load_robot
 from hector_jax.storage import save_weights, write_json
 
@@ -171,9 +172,11 @@ def refused(monkeypatch, capsys, *arguments):
 
 def test_what_is_no_run_is_refused_in_one_line(monkeypatch, capsys, tmp_path):
     line = refused(monkeypatch, capsys, tmp_path, "--headless")
-    assert line.startswith(f"hector: {tmp_path} is no run of `hector tune`")
+    assert line.startswith(f"hector: {tmp_path}/config.json: cannot read a file of a run of")
     (tmp_path / "config.json").write_text("[]")
-    assert "config.json was expected" in refused(monkeypatch, capsys, tmp_path, "--headless")
+    assert "config.json: expected a JSON object" in refused(
+        monkeypatch, capsys, tmp_path, "--headless"
+    )
 
 
 def test_a_run_is_not_filmed_into_its_own_folder(monkeypatch, capsys, tmp_path):
@@ -184,7 +187,7 @@ def test_a_run_is_not_filmed_into_its_own_folder(monkeypatch, capsys, tmp_path):
 def test_two_different_sets_are_asked_for(monkeypatch, capsys, tmp_path):
     run = pretend_run(tmp_path)
     line = refused(monkeypatch, capsys, run, "--headless", "--sets", "with", "with")
-    assert "two different weight sets" in line
+    assert "--sets names 'with' twice" in line
 
 
 def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys, tmp_path):
@@ -283,10 +286,23 @@ def test_a_taken_port_is_passed_by():
         assert view._free_port("127.0.0.1", port) not in (0, port)
 
 
-@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 70000), ("203.0.113.7", 8080)])
-def test_an_address_that_cannot_be_listened_on_is_refused(host, port):
-    with pytest.raises((ValueError, OSError), match=r"--port must be|cannot listen on 203"):
-        view._free_port(host, port)
+def test_an_address_that_cannot_be_listened_on_is_refused():
+    with pytest.raises(InputError, match=r"cannot listen on 203"):
+        view._free_port("203.0.113.7", 8080)
+
+
+def test_the_address_is_told_before_anything_is_walked(model, tmp_path):
+    pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
+    told = []
+
+    def walk():
+        told.append("walking")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        view.serve(walk, model, tmp_path, told.append, port=0)
+    assert told[0].startswith("http://127.0.0.1:")
+    assert told[1:] == ["walking"]
 
 
 def _until(seconds, look):

@@ -12,7 +12,7 @@ from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.evaluation.runs import Asked
 from hector_jax.flags import View, Walk
-from hector_jax.inputs import InputError, did_you_mean, shown
+from hector_jax.inputs import InputError
 from hector_jax.robot import Robot, load_robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
@@ -27,14 +27,9 @@ def weights(text: str, robot: Robot) -> Weights:
     """A weight set by its name, or from a file.
 
     Raises:
-        InputError: there is no such set, or the file holds none.
+        InputError: the file holds none.
     """
     named = {"nominal": nominal, "expert": expert}
-    if text not in named and not Path(text).suffix and not Path(text).exists():
-        raise InputError(
-            f"no weights {shown(text)}{did_you_mean(text, named)}; there are: "
-            f"{', '.join(named)}, or a file"
-        )
     return named[text](robot) if text in named else load_weights(Path(text))
 
 
@@ -57,7 +52,7 @@ def robot_of(run: Path, begun: Asked) -> Robot:
     robot = load_robot(begun.robot)
     if begun.body not in (None, identity(robot)):
         path = robot.description.path
-        raise InputError(f"{run} was tuned for another robot than {path} and its MJCF are now")
+        raise InputError(f"{run} was tuned for another robot: {path} or its MJCF has changed")
     return robot
 
 

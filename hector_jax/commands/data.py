@@ -9,7 +9,7 @@ import numpy as np
 
 from hector_jax import pipeline
 from hector_jax.commands import asked
-from hector_jax.console import say
+from hector_jax.console import bar, say, say_if_slow
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation import fidelity, pictures
@@ -20,6 +20,7 @@ from hector_jax.grfm.dataset import Walks, make_dataset
 from hector_jax.grfm.gated import gated_effect
 from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.grfm.training import TrainConfig
+from hector_jax.inputs import plural
 from hector_jax.model.effect import last_command
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -35,7 +36,7 @@ def collect(args: Collect) -> None:
     with workers(args.processes) as pool:
         out = asked.default_of(args.out, Collect.out, args.robot, robot)
         pipeline.collect(pool, config, robot, out)
-    say(f"walks are in {out}")
+    say(f"the walks are in {out}")
 
 
 def train(args: Train) -> None:
@@ -59,30 +60,34 @@ def _print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
 
 
 def grfm(args: Grfm) -> None:
-    """Tell and draw what each net is worth."""
+    """Report on the predictions of each net, with pictures."""
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
     with workers(args.processes) as pool:
         net = pipeline.ground(pool, robot, args.data)
         paper = pipeline.ground(pool, robot, args.data, "paper")
-        worlds = {"hfs": pipeline.held_out(robot, net)}
+        with say_if_slow("reading the walks that no training saw"):
+            worlds = {"hfs": pipeline.held_out(robot, net)}
         if args.seeds:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": linear_effect(net.linear)}
     effects["paper"] = as_effect(paper.params)
     effects["residual"] = as_effect(net.params)
     effects["gated"] = gated_effect(net.params.linear)
-    say("predicting")
     found, drifts = {}, {}
-    for world, walks in worlds.items():
-        samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
-        # a push from outside is in no model
-        calm = ~np.any(walks.job.push.force, axis=(1, 2))
-        quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
-        drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
-        found[world] = fidelity.as_result(
-            training.report(effects, samples), fidelity.by_phase(effects, samples), drifts[world]
-        )
+    with bar("predicting the ground forces of the walks") as tell:
+        for done, (world, walks) in enumerate(worlds.items()):
+            tell(3 * done, 3 * len(worlds), f"{world}: errors")
+            samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
+            errors = training.report(effects, samples)
+            tell(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
+            phases = fidelity.by_phase(effects, samples)
+            tell(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
+            # a push from outside is in no model
+            calm = ~np.any(walks.job.push.force, axis=(1, 2))
+            quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
+            drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
+            found[world] = fidelity.as_result(errors, phases, drifts[world])
     curves = fidelity.curves(robot, worlds["hfs"].trajectory, effects)
     trainings = {"training": net.course, "training_paper": paper.course}
     tick = config.rollout.walk.gait.tick
@@ -92,7 +97,7 @@ def grfm(args: Grfm) -> None:
         print(as_json({"report": str(told), "worlds": found}))
     else:
         _print_errors(found["hfs"]["errors"])
-    say(f"the whole story, with pictures: {told}")
+    say(f"the report is {told}")
 
 
 def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -> Walks:
@@ -104,5 +109,5 @@ def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -
         for seed, plant in enumerate(asked.plants("standin", range(count)))
     ]
     return pipeline.walk_all(
-        pool, config, robot, jobs, f"walking on {count} stand-in plants, for information"
+        pool, config, robot, jobs, f"walking on {plural(count, 'stand-in plant')}, for information"
     )

@@ -1,4 +1,4 @@
-"""Weight sets, walks and runs judged."""
+"""Evaluation of weight sets, walks and runs."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -8,13 +8,16 @@ import numpy as np
 
 from hector_jax import pipeline, study
 from hector_jax.commands import asked
-from hector_jax.console import say
+from hector_jax.console import Broken, say
+from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.evaluation import metrics, pictures, runs
 from hector_jax.evaluation.metrics import Score, Verdict
 from hector_jax.evaluation.report import print_table
+from hector_jax.evaluation.video import check_film
 from hector_jax.flags import Compare, Evaluate, Table, Walk, settings
 from hector_jax.grfm.dataset import SOLVED
+from hector_jax.inputs import plural, printable
 from hector_jax.robot import load_robot
 from hector_jax.runtime import workers
 from hector_jax.storage import as_json, save_tree
@@ -22,7 +25,7 @@ from hector_jax.tuning.loss import LossConfig
 
 
 def evaluate(args: Evaluate) -> None:
-    """Judge weight sets on the plants of a world."""
+    """Evaluate weight sets on the plants of a world."""
     robot = load_robot(args.robot)
     wanted = asked.course(args.traj, robot)
     seconds = asked.seconds(args.seconds, wanted)
@@ -32,7 +35,7 @@ def evaluate(args: Evaluate) -> None:
     sets = {text: asked.weights(text, robot) for text in args.weights}
     plants = asked.plants(args.world, seeds)
     with workers(args.processes) as pool:
-        title = f"judging on {args.world}, {count} plants"
+        title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         known = (pool, asked.tune_config(robot), robot)
         walks = pipeline.judge(*known, sets, wanted.command, plants, seeds, title, seconds)
     scores = {n: [metrics.score(LossConfig(), walk) for walk in each] for n, each in walks.items()}
@@ -40,7 +43,7 @@ def evaluate(args: Evaluate) -> None:
     if args.json:
         print(as_json(metrics.as_result(verdict, args.world)))
     else:
-        print_table(verdict, f"{wanted.name}, {count} plants", args.world)
+        print_table(verdict, f"{wanted.name}, {plural(count, 'plant')}", args.world)
 
 
 def verdict_of(
@@ -50,45 +53,60 @@ def verdict_of(
     verdict = metrics.judge(loss, seeds, scores)
     for name, score in verdict.scores.items():
         if score.residual.max() > SOLVED:
-            say(f"{name}: a QP of its walks was not solved (residual {score.residual.max():.0e})")
+            worst = f"{score.residual.max():.0e}"
+            say(f"{name}: at least one QP of its walks was not solved (residual {worst})")
     return verdict
 
 
 def walk(args: Walk) -> None:
-    """Walk once, and tell how it went."""
+    """Walk once and report on it.
+
+    Raises:
+        Broken: QPs of the walk were not solved.
+    """
+    if args.video is not None:
+        check_film(args.video)
     robot = load_robot(args.robot)
     weights, wanted = asked.weights(args.weights, robot), asked.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
     trajectory = asked.walked(args, robot, wanted, weights)
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
+    samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
+    plans = np.asarray(trajectory.residual)[::samples]
+    unsolved = int(np.sum(~(plans <= SOLVED)))
+    fell = bool(found.fallen) and not unsolved  # without a plan it is no fall of these weights
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=settings(args))
     if args.json:
         losses = {part: float(getattr(found, part)) for part in metrics.PARTS}
         errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}
-        told = {"seconds": upright, "fell": bool(found.fallen), **losses, **errors}
-        print(as_json(told))  # a walk that falls at once has no errors
+        solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(found.residual)}
+        # a walk that falls at once has no errors
+        print(as_json({"seconds": upright, "fell": fell, **losses, **errors, **solved}))
     else:
+        end = "fell after" if fell else "ended after" if found.fallen else "walked"
         print(
-            f"{wanted.name} in {args.world}, {args.weights} weights: "
-            + (f"fell after {upright:.2f} s" if found.fallen else f"walked {upright:.2f} s")
-            + f"; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
+            f"{wanted.name} in {args.world}, {printable(args.weights)} weights: {end} "
+            f"{upright:.2f} s; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
             f"L_pos {found.L_pos:.2f} m^2, L_ctrl {found.L_ctrl / 1e6:.3f}e6)"
         )
         cm, degrees = 100 * found.rms_position, np.degrees(found.rms_euler)
         print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
         print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
+    if unsolved:
+        raise Broken(
+            f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
+            f"{float(found.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
+        )
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
-        pictures.film(
-            args.video,
-            robot,
-            {
-                beside: asked.walked(args, robot, wanted, other(robot)),
-                Path(args.weights).stem: trajectory,
-            },
-        )
+        say(f"walking with {beside} weights for the other half of the film")
+        walks = {
+            beside: asked.walked(args, robot, wanted, other(robot)),
+            Path(args.weights).stem: trajectory,
+        }
+        pictures.film(args.video, robot, walks)
 
 
 def table(args: Table) -> None:
@@ -99,8 +117,8 @@ def table(args: Table) -> None:
         print(as_json({"report": str(told), "trajectories": results}))
     else:
         for name, verdict in verdicts.items():
-            print_table(verdict, f"{name}, {len(verdict.seeds)} plants")
-    say(f"the whole story, with pictures: {told}")
+            print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
+    say(f"the report is {told}")
 
 
 def compare(args: Compare) -> None:
@@ -108,7 +126,7 @@ def compare(args: Compare) -> None:
     finished = [folder for folder in args.runs if (folder / runs.RESULT).exists()]
     for folder in args.runs:
         if finished and folder not in finished:
-            say(f"{folder}: left out, no finished run")
+            say(f"{folder} is left out: it is not a finished run")
     told = runs.compare_runs([runs.load_run(folder) for folder in finished or args.runs])
     if args.json:
         print(as_json(told))

@@ -13,6 +13,7 @@ from hector_jax.control.walking import walk_config
 from hector_jax.evaluation import fidelity, metrics, pictures, runs, view
 from hector_jax.evaluation.report import WORLDS
 from hector_jax.evaluation.tensorboard import write_events
+from hector_jax.evaluation.video import check_film
 from hector_jax.flags import Replay, Tensorboard, View
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
@@ -27,10 +28,8 @@ def view_run(args: View) -> None:
     folder = args.out or (beside if args.headless else None)
     if folder is None:
         view.check_viser()
-    if args.seconds < 0.1:
-        raise InputError(f"--seconds must be at least 0.1 to be looked at, got {args.seconds}")
-    if args.sets[0] == args.sets[1]:
-        raise InputError(f"--sets must name two different weight sets, got {args.sets[0]} twice")
+    else:
+        check_film(folder / "film.mp4")
     begun = runs.read_asked(args.run)
     robot = asked.robot_of(args.run, begun)
     wanted = asked.course(begun.trajectory, robot)
@@ -42,40 +41,42 @@ def view_run(args: View) -> None:
     data = asked.folder_of(args.data or begun.data, begun.robot, robot)
     net = begun.net if args.data is None and begun.net else pipeline.net_path(data, begun.variant)
     effect = _phi_of(net, begun.variant, robot)
-    story = [f"**{begun.trajectory}** in {WORLDS.get(args.world, args.world)}, seed {args.seed}"]
     shown: dict[str, view.Shown] = {}
-    say(f"walking anew in {args.world}, seed {args.seed}")
-    for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
-        walked = asked.walked(args, robot, wanted, weights)
-        loss = metrics.score(begun.loss, walked).L / 1e6
-        story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
-        say(f"  {story[-1]}")
-        walked = at_interval(walked, walk_config(robot).gait.tick)
-        stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
-        effects = {} if effect is None else {"residual": effect}
-        curves = fidelity.curves(robot, stacked, effects)
-        shown[name] = view.Shown(walked, curves)
+
+    def walk() -> str:
+        place = WORLDS.get(args.world, args.world)
+        story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
+        say(f"walking in {args.world}, seed {args.seed}")
+        for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
+            walked = asked.walked(args, robot, wanted, weights)
+            loss = metrics.score(begun.loss, walked).L / 1e6
+            story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
+            say(f"  {story[-1]}")
+            walked = at_interval(walked, walk_config(robot).gait.tick)
+            stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
+            effects = {} if effect is None else {"residual": effect}
+            shown[name] = view.Shown(walked, fidelity.curves(robot, stacked, effects))
+        return "\n\n".join(story)
+
+    def motions() -> tuple[dict[str, view.Motion], str]:
+        story = walk()
+        found = (view.motion(robot, model, one) for one in shown.values())
+        return dict(zip(view.titles(shown), found, strict=True)), story
+
     if folder is not None:
+        walk()
         pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown)
-        say(f"film and pictures are in {folder}")
+        say(f"the film and the pictures are in {folder}")
         return
     model = compile_model(robot.description)
-    motions = [view.motion(robot, model, one) for one in shown.values()]
-    view.serve(
-        dict(zip(view.titles(shown), motions, strict=True)),
-        model,
-        args.run,
-        "\n\n".join(story),
-        lambda address: say(f"open {address} in a browser; Ctrl-C ends it"),
-        args.host,
-        args.port,
-    )
+    on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
+    view.serve(motions, model, args.run, on_open, args.host, args.port)
 
 
 def _phi_of(path: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:
     """Phi of the net in a file; where there is none, a line says so."""
     if not path.exists():
-        say(f"no net at {path}, so none of its predictions; --data names another folder")
+        say(f"no net at {path}, so its predictions are not shown; --data names another folder")
         return None
     return as_effect(load_net(path, robot, variant)[0])
 

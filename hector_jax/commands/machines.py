@@ -1,7 +1,5 @@
 """A tuned controller for other machines, and how this one is."""
 
-import jax
-
 from hector_jax import doctor, export
 from hector_jax.commands import asked
 from hector_jax.console import Broken, say
@@ -15,18 +13,16 @@ from hector_jax.storage import as_json, load_weights, locked
 
 def export_controller(args: Export) -> None:
     """Export the controller of a run, checked against the live one."""
-    # before the first array: see hector_jax.export
-    jax.config.update("jax_platforms", "cpu")
     is_run = args.run.is_dir()
     if is_run and args.robot:
-        raise InputError(f"--robot is for a weights file; {args.run} tells its own")
+        raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
     path, config = export.find_weights(args.run, args.set)
     begun = runs.read_asked(args.run) if is_run else None
     robot = asked.robot_of(args.run, begun) if begun else load_robot(args.robot)
     wanted = asked.course(args.traj or (begun.trajectory if begun else "straight"), robot)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
-    say("exporting, walking once and asking both controllers")
+    say("exporting the controller and comparing it with the live one on a walk")
     known = (config or walk_config(robot), robot, weights, wanted.command, folder)
     with locked(folder):
         card = export.export(*known, name=name, seconds=args.seconds)
@@ -39,7 +35,7 @@ def export_controller(args: Export) -> None:
     for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
         times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
         print(f"a call {text} [ms]: {times.format(**found[what])}")
-    say(f"all of it is in {folder}")
+    say(f"the export is in {folder}")
 
 
 def examine(args: Doctor) -> None:
@@ -48,6 +44,7 @@ def examine(args: Doctor) -> None:
     Raises:
         Broken: something does not.
     """
+    say("testing this machine: two short walks and a film")
     told, faults = doctor.examine()
     if args.json:
         print(as_json({**told, "faults": faults}))

@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,11 @@ from hector_jax.evaluation import fidelity, metrics, pictures
 from hector_jax.evaluation.metrics import Score
 from hector_jax.evaluation.report import Picture, Report, environment, print_table, write_report
 from hector_jax.evaluation.runs import read_json
+from hector_jax.evaluation.video import check_film
 from hector_jax.flags import Search, Tune, Walk, as_command, from_file, settings
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
-from hector_jax.inputs import InputError, shown
+from hector_jax.inputs import InputError, plural, shown
 from hector_jax.kept import Journal, Judged
 from hector_jax.robot import Robot, load_robot
 from hector_jax.runtime import workers
@@ -48,16 +49,19 @@ from hector_jax.tuning.search import SearchConfig
 _CODE = (*pipeline.COLLECTION_CODE, "grfm.training", "sim.standin", "evaluation.metrics")
 _NEW = ("config", "resume", "run", "runs")  # of a call, not of the run that it begins or resumes
 _FREE = ("data", "json", "processes", "video")  # may be others when a run is resumed
+_TIME = "%Y%m%d-%H%M%S"  # names a run
 
 
 def tune(args: Tune) -> None:
     """Tune on the trajectories asked for, anew or where a run was left."""
     if args.run and args.resume:
         raise InputError(f"--run {args.run} and --resume {args.resume}: only one can be given")
+    if args.video:
+        check_film(Path("film.mp4"))
     texts = COMMANDS if args.traj == "all" else (args.traj,)
     base = args.resume or args.run
     if base is None:
-        robot, now = load_robot(args.robot), f"{datetime.now():%Y%m%d-%H%M%S}"
+        robot, now = load_robot(args.robot), f"{datetime.now():{_TIME}}"
         runs = asked.folder_of(args.runs, args.robot, robot)
         folders = {text: runs / asked.course(text, robot).name / now for text in texts}
     else:
@@ -68,21 +72,24 @@ def tune(args: Tune) -> None:
     else:
         for folder, one in several.items():
             _asked_for(one, load_robot(args.robot))
-            if folder.exists():
+            if args.run and folder.exists():
                 raise InputError(_taken(folder))
-        for folder, one in several.items():
-            _begin(folder, one)
+        several = {_begin(folder, one): one for folder, one in several.items()}
     for folder, one in several.items():
         with locked(folder):
             _tune_in(folder, one)
 
 
 def _taken(folder: Path) -> str:
-    return f"run folder {folder} exists; take it up by --resume or name another by --run"
+    return f"run folder {folder} exists; continue it with --resume or name another with --run"
 
 
-def _begin(folder: Path, args: Tune) -> None:
-    """Make the folder of a new run, at once with its flags: one that is there can be resumed."""
+def _begin(folder: Path, args: Tune) -> Path:
+    """Make the folder of a new run, at once with its flags: one that is there can be resumed.
+
+    Returns:
+        The folder; if nobody named it and it is there, that of the next free second.
+    """
     make_folder(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
         new = Path(part) / "run"
@@ -92,10 +99,14 @@ def _begin(folder: Path, args: Tune) -> None:
         robot, here = identity(load_robot(args.robot)), str(Path.cwd())
         config = {"flags": flags, "directory": here, "robot": robot, "code": code_hash(*_CODE)}
         write_json(new / "config.json", config)
-        try:
-            new.rename(folder)
-        except OSError:
-            raise InputError(_taken(folder)) from None
+        while True:
+            try:
+                return new.rename(folder)
+            except OSError:
+                if args.run or not folder.exists():
+                    raise InputError(_taken(folder)) from None
+            later = datetime.strptime(folder.name, _TIME) + timedelta(seconds=1)
+            folder = folder.with_name(f"{later:{_TIME}}")
 
 
 def _as_begun(folder: Path, args: Tune) -> Tune:
@@ -177,7 +188,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     shelf, data = folder / "kept", asked.folder_of(args.data, args.robot, robot)
     made_with = environment()
     commit = made_with.get("commit", "")
-    say(f"results go to {folder}")
+    say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         if args.net is None:
             net = pipeline.ground(pool, robot, data, args.variant)
@@ -239,10 +250,10 @@ def _tune_in(folder: Path, args: Tune) -> None:
             seeds,
             shelf / "standin",
             commit,
-            f"judging on {args.seeds} stand-in plants",
+            f"evaluating on {plural(args.seeds, 'stand-in plant')}",
             lasts,
         )
-        title = "walking on the simulator of the data"
+        title = "walking on the high-fidelity simulator"
         there = (command, [hfs()], [0], shelf / "hfs")
         on_hfs = kept.judge(*known, sets, *there, commit, title, lasts)
     verdict = judging.verdict_of(config.loss, seeds, _scores(judged))
@@ -285,8 +296,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
     if args.json:
         print(as_json({"run": str(folder), "traj": wanted.name, **result}))
     else:
-        print_table(verdict, f"{wanted.name}, {args.seeds} stand-in plants")
-    say(f"the whole story, with pictures: {told}")
+        print_table(verdict, f"{wanted.name}, {plural(args.seeds, 'plant')}")
+    say(f"the report is {told}")
 
 
 def _scores(judged: Judged) -> dict[str, list[Score]]:
@@ -319,7 +330,7 @@ def search(args: Search) -> None:
             args.record or out,
             own,
         )
-        say("walking start, expert and the best once more")
+        say("walking with the start, expert and best weights")
         sets = {name: [start, expert(robot), found[name].weights] for name in own}
         at_once = config.population * len(own)
         compared = pipeline.losses_on_hfs(pool, tune, robot, engine, sets, at_once, own)
@@ -351,4 +362,4 @@ def search(args: Search) -> None:
         for name, card in cards.items():
             shown = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
             print(f"{name:10s}{shown}{card['walks']:8d}{card['best_at']:9d}")
-    say(f"weights are in {out}")
+    say(f"the weights are in {out}")

@@ -81,7 +81,7 @@ def named_command(name: str) -> Command:
     if name not in _PIECES:
         raise InputError(
             f"unknown trajectory {shown(name)}{did_you_mean(name, _PIECES)}; "
-            f"there are: {', '.join(_PIECES)}"
+            f"known: {', '.join(_PIECES)}"
         )
     seconds, velocity, rates = _PIECES[name]
     return Command(np.full(2, seconds), np.array(velocity), np.array(rates))

@@ -14,7 +14,6 @@ is told and walked all the same.
 """
 
 import re
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -23,7 +22,7 @@ import numpy as np
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
-from hector_jax.inputs import InputError, Interval, check, from_table, one_line, read_text, shown
+from hector_jax.inputs import InputError, Interval, check, from_table, read_toml, shown
 from hector_jax.robot import Robot
 
 _MOST_SECONDS = 600.0
@@ -79,7 +78,7 @@ class _File:
             raise InputError(f"name must not be that of a built-in trajectory, got {self.name!r}")
         if not 1 <= len(self.segment) <= _MOST_SEGMENTS:
             raise InputError(
-                f"[[segment]] must be there 1 to {_MOST_SEGMENTS} times, got {len(self.segment)}"
+                f"[[segment]] must be given 1 to {_MOST_SEGMENTS} times, got {len(self.segment)}"
             )
 
 
@@ -90,12 +89,7 @@ def load_course(path: Path) -> Course:
         InputError: one line naming the file and the field that is unknown, missing or out of range.
     """
     path = Path(path)
-    text = read_text(path, "a trajectory", _MOST_BYTES)
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: no valid TOML: {one_line(error)}") from None
-    told = from_table(str(path), _File, table)
+    told = from_table(str(path), _File, read_toml(path, "a trajectory", _MOST_BYTES))
     segments = [
         from_table(f"{path}: segment {number}", Segment, one)
         for number, one in enumerate(told.segment, 1)

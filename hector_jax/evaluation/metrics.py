@@ -3,19 +3,20 @@
 A walk becomes a `Score`, the scores of one weight set over the seeds of a world are stacked, and a
 `Verdict` holds those of all sets. The headline is the median over seeds of the ratio of two sets'
 losses on the same seed (the same plant), told as a change in %; means stand beside it. Intervals
-are percentile bootstraps over seeds: plants are redrawn, both sets with them.
+are percentile bootstraps over seeds: plants are redrawn, both sets with them; fewer than four have
+none.
 
 A fall stays in the numbers, charged as the loss charges it. A comparison counts only where neither
 set falls more often than the other by 2 of 32 seeds or the same share of fewer.
 """
 
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from hector_jax.trajectory import Trajectory
 from hector_jax.tuning.loss import LossConfig, losses, switch_loss, total
@@ -24,7 +25,7 @@ BASELINES = ("nominal", "expert")
 PARTS = ("L", "L_Eul", "L_pos", "L_ctrl")
 
 COVERAGE = 0.95
-RESAMPLES = 10_000
+RESAMPLES, FEWEST = 10_000, 4  # draws; samples that have an interval
 FALL_MARGIN = 2 / 32  # a difference in the share of falls from here on makes losses incomparable
 
 _TINY = 1e-9
@@ -46,11 +47,16 @@ class Score(NamedTuple):
 
 
 class Interval(NamedTuple):
-    """A value with the ends of its 95 % bootstrap interval."""
+    """A value with the ends of its 95 % bootstrap interval, NaN where there is none."""
 
     value: float
     low: float
     high: float
+
+    def text(self, write: Callable[[float], str]) -> str:
+        """`value [low, high]`, each as `write` has it; the value alone without an interval."""
+        ends = f" [{write(self.low)}, {write(self.high)}]" if np.isfinite(self.low) else ""
+        return write(self.value) + ends
 
 
 class Comparison(NamedTuple):
@@ -124,33 +130,41 @@ def judge(
     return Verdict(np.asarray(seeds, int), stacked, config)
 
 
-def bootstrap(samples: Float[np.ndarray, " seeds"], statistic: Any = np.mean) -> Interval:
-    """A statistic over seeds with its percentile bootstrap interval.
+def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:
+    """A statistic with its percentile bootstrap interval, the same each time.
 
     Args:
-        samples: one value per seed.
-        statistic: reduces along `axis`, such as `numpy.mean` or `numpy.median`.
+        statistic: of arrays like `samples`, with any axes before theirs.
+        samples: redrawn along their first axis, all in the same way.
 
-    >>> found = bootstrap(np.array([1.0, 2.0, 3.0, 10.0]), np.median)
+    Returns:
+        NaN as the ends of the interval of fewer than `FEWEST` samples.
+
+    >>> found = bootstrap(lambda x: np.median(x, axis=-1), np.array([1.0, 2.0, 3.0, 10.0]))
     >>> found.low <= found.value == 2.5 <= found.high
     True
     """
-    return _bootstrap(np.asarray(samples, float).tobytes(), statistic)
+    value, count = float(statistic(*samples)), len(samples[0])
+    if count < FEWEST:
+        return Interval(value, np.nan, np.nan)
+    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    tail = 50 * (1 - COVERAGE)
+    low, high = np.percentile(statistic(*(x[draws] for x in samples)), [tail, 100 - tail])
+    return Interval(value, float(low), float(high))
 
 
 @lru_cache(maxsize=4096)  # a report tells the same interval in many places
-def _bootstrap(kept: bytes, statistic: Any) -> Interval:
-    samples = np.frombuffer(kept)
-    # the same draws every time: the same scores give the same bytes
-    draws = np.random.default_rng(0).integers(len(samples), size=(RESAMPLES, len(samples)))
-    tail = 50 * (1 - COVERAGE)
-    low, high = np.percentile(statistic(samples[draws], axis=1), [tail, 100 - tail])
-    return Interval(float(statistic(samples, axis=0)), float(low), float(high))
+def _of_bytes(values: bytes, statistic: Callable[..., Any]) -> Interval:
+    return bootstrap(partial(statistic, axis=-1), np.frombuffer(values))
+
+
+def _over_seeds(values: Float[np.ndarray, " seeds"], statistic: Callable[..., Any]) -> Interval:
+    return _of_bytes(np.asarray(values, float).tobytes(), statistic)
 
 
 def mean(verdict: Verdict, name: str, part: str = "L") -> Interval:
     """Mean of a part of the loss over seeds."""
-    return bootstrap(getattr(verdict.scores[name], part))
+    return _over_seeds(getattr(verdict.scores[name], part), np.mean)
 
 
 def falls(verdict: Verdict, name: str) -> int:
@@ -165,7 +179,7 @@ def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
     for part in PARTS:
         # a walk that falls at once has no L_ctrl: keep its ratio a number
         ratio = (getattr(ours, part) + _TINY) / (getattr(theirs, part) + _TINY)
-        change[part] = Interval(*(100.0 * (r - 1.0) for r in bootstrap(ratio, np.median)))
+        change[part] = Interval(*(100.0 * (r - 1.0) for r in _over_seeds(ratio, np.median)))
     gap = abs(ours.fallen.mean() - theirs.fallen.mean())
     return Comparison(change, float(np.mean(ours.L < theirs.L)), bool(gap < FALL_MARGIN - 1e-12))
 

@@ -118,7 +118,7 @@ def of_view(
     if tuned:
         plots.losses(folder / "losses.png", loss, tuned)
     titled = dict(zip(view.titles(walks), walks.values(), strict=True))
-    say("drawing the film")
+    say("making the film")
     write_film(folder / "film.mp4", robot, titled)
     write_strip(folder / "film.png", robot, titled)
 
@@ -130,7 +130,7 @@ def film(
 
     A missing back end costs one line, not the run; returns why there is no film.
     """
-    say(f"drawing {path}")
+    say("making the film")
     try:
         write_film(path, robot, walks)
         if strip is not None:
@@ -138,4 +138,5 @@ def film(
     except VideoUnavailable as error:
         say(str(error))
         return str(error)
+    say(f"the film is in {path}")
     return ""

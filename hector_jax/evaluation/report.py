@@ -25,6 +25,7 @@ from rich.text import Text
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, bounds, weights_to_vector
 from hector_jax.evaluation.metrics import (
     BASELINES,
+    FEWEST,
     PARTS,
     Comparison,
     Interval,
@@ -34,6 +35,7 @@ from hector_jax.evaluation.metrics import (
     mean,
     rms,
 )
+from hector_jax.inputs import plural
 from hector_jax.storage import versions, write_file, write_json
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig, Losses
@@ -142,7 +144,7 @@ def percent(x: float) -> str:
 
 def change_text(change: Interval) -> str:
     """A change in % with its interval."""
-    return f"{percent(change.value)} [{percent(change.low)}, {percent(change.high)}]"
+    return change.text(percent)
 
 
 def _compared(verdict: Verdict, name: str, baseline: str) -> Comparison | None:
@@ -157,6 +159,11 @@ def seeds_text(seeds: Sequence[int] | np.ndarray) -> str:
     return ", ".join(map(str, seeds))
 
 
+def _baselines(verdict: Verdict) -> list[str]:
+    """Those baselines that another set can be compared with."""
+    return [name for name in BASELINES if name in verdict.scores and len(verdict.scores) > 1]
+
+
 def _formula(alpha: LossConfig) -> str:
     return f"L = {_power(alpha.euler)} L_Eul + {_power(alpha.position)} L_pos + L_ctrl"
 
@@ -167,12 +174,17 @@ def _power(x: float) -> str:
 
 def legend(verdict: Verdict) -> list[str]:
     """What the columns of a verdict mean."""
-    plants = f"{len(verdict.seeds)} plants (seeds {seeds_text(verdict.seeds)})"
-    lines = [
-        f"{_formula(verdict.alpha)}; means over {plants}.",
-        "Change of L in %, median over plants of the paired ratio [95 % bootstrap interval]; "
-        "below zero is better.",
-    ]
+    count = len(verdict.seeds)
+    plants = (
+        f"{plural(count, 'plant')} ({'seeds' if count > 1 else 'seed'} {seeds_text(verdict.seeds)})"
+    )
+    interval = " [95 % bootstrap interval]" if len(verdict.seeds) >= FEWEST else ""
+    lines = [f"{_formula(verdict.alpha)}; means over {plants}."]
+    if _baselines(verdict):
+        lines.append(
+            f"Change of L in %, median over plants of the paired ratio{interval}; below zero is "
+            "better."
+        )
     if _void(verdict):
         lines.append(f"{VOID} does not count: one of the two falls more often than the other.")
     touched = {name: float(score.legs_touch.sum()) for name, score in verdict.scores.items()}
@@ -218,12 +230,12 @@ def _terminal_table(verdict: Verdict, padding: int) -> Table:
         power = columns[part][0]
         table.add_column(part + (f"\nx1e{power}" if power else "\n"), justify="right", no_wrap=True)
     table.add_column("falls\n", justify="right", no_wrap=True)
-    for baseline in BASELINES:
+    for baseline in _baselines(verdict):
         table.add_column(f"against {baseline}\n[%]", justify="right", no_wrap=True)
     for name in verdict.scores:
         means = [columns[part][1](mean(verdict, name, part).value) for part in order]
         fell = Text(str(falls(verdict, name)), style="red" if falls(verdict, name) else "")
-        changes = [_terminal_change(_compared(verdict, name, b)) for b in BASELINES]
+        changes = [_terminal_change(_compared(verdict, name, b)) for b in _baselines(verdict)]
         table.add_row(name, *means, fell, *changes)
     return table
 
@@ -379,7 +391,7 @@ def _summary(verdict: Verdict) -> str:
             for baseline in BASELINES
             if (comparison := _compared(verdict, name, baseline)) is not None
         ]
-        fell = f"the robot fell on {falls(verdict, name)} of {len(verdict.seeds)} plants"
+        fell = f"the robot fell on {falls(verdict, name)} of {plural(len(verdict.seeds), 'plant')}"
         told.append(f"Tuned {how[name]} (`{name}`), the loss is {' and '.join(clauses)}; {fell}.")
     return " ".join(told)
 
@@ -390,7 +402,7 @@ def _clause(comparison: Comparison, baseline: str) -> str:
     size = f"{abs(change.value):.1f} % {side} {baseline}"
     if not comparison.counts:
         return f"{size} (void: the falls differ)"
-    clear = change.high < 0.0 or change.low > 0.0
+    clear = not change.low <= 0.0 <= change.high  # also without an interval
     return size if clear else f"{size} (the interval holds zero)"
 
 
@@ -399,16 +411,18 @@ def verdict_table(verdict: Verdict) -> str:
     columns = part_columns(verdict)
     head = ["set", "L_Eul", "L_pos", "L_ctrl", "L", "falls"]
     head = [h + (f" x1e{columns[h][0]}" if h in columns and columns[h][0] else "") for h in head]
-    for baseline in BASELINES:
+    for baseline in _baselines(verdict):
         head += [f"against {baseline} [%]", "wins"]
     rows = []
     for name in verdict.scores:
         row = [f"**{name}**"]
         for part in ("L_Eul", "L_pos", "L_ctrl"):
             row.append(columns[part][1](mean(verdict, name, part).value))
-        value, low, high = (columns["L"][1](x) for x in mean(verdict, name))
-        row += [f"{value} [{low}, {high}]", f"{falls(verdict, name)} / {len(verdict.seeds)}"]
-        for baseline in BASELINES:
+        row += [
+            mean(verdict, name).text(columns["L"][1]),
+            f"{falls(verdict, name)} / {len(verdict.seeds)}",
+        ]
+        for baseline in _baselines(verdict):
             row += _verdict_cells(_compared(verdict, name, baseline), len(verdict.seeds))
         rows.append(row)
     return markdown_table(head, rows)

@@ -3,12 +3,13 @@
 Scenes have a kind and a level: a push of 50 N, a floor of friction 0.4. The scenes of one level
 differ in direction and gait phase and are walked by every set on every plant. Two numbers tell of a
 level: the share of its walks without a fall, and the median of the paired ratios of L to the
-baseline's. Their intervals redraw the plants, each with all of its scenes; of one plant there is
-none.
+baseline's. Their intervals redraw the plants, each with all of its scenes; fewer than four plants
+have none.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -154,15 +155,10 @@ def judge(scores: Score, baseline: Score) -> Cell:
     """
     stood, ratio = ~scores.fallen, scores.L / baseline.L
 
-    def over(rows: np.ndarray, statistic: Any) -> Interval:
-        # what is redrawn are the numbers of the plants
-        pick = lambda plants, axis: statistic(rows[plants.astype(int)], axis=(axis, axis + 1))  # noqa: E731
-        return bootstrap(np.arange(float(len(rows))), pick)
-
     gap = abs(scores.fallen.mean() - baseline.fallen.mean())
     return Cell(
-        survived=over(stood, np.mean),
-        ratio=over(ratio, np.median),
+        survived=bootstrap(partial(np.mean, axis=(-2, -1)), stood),
+        ratio=bootstrap(partial(np.median, axis=(-2, -1)), ratio),
         falls=int(scores.fallen.sum()),
         walks=scores.fallen.size,
         counts=bool(gap < FALL_MARGIN - 1e-12),
@@ -206,9 +202,7 @@ def _falls(cell: Cell) -> str:
 
 
 def _ratio(cell: Cell) -> str:
-    value, low, high = cell.ratio
-    spread = f" [{low:.2f}, {high:.2f}]" if low < high else ""
-    return f"{value:.2f}{spread}" + ("" if cell.counts else " *")
+    return cell.ratio.text("{:.2f}".format) + ("" if cell.counts else " *")
 
 
 def as_result(cell: Cell) -> dict[str, Any]:

@@ -15,16 +15,18 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from hector_jax import inputs
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, vector_to_weights
 from hector_jax.evaluation.metrics import BASELINES, Interval
 from hector_jax.evaluation.report import VOID, change_text
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, shown
 from hector_jax.robot import Robot
 from hector_jax.storage import load_weights
 from hector_jax.tuning.difftune import Evaluation, Iteration
 from hector_jax.tuning.loss import LossConfig, Losses
 
 METRICS, RESULT = "metrics.jsonl", "result.json"
+_MOST_BYTES = 100_000_000
 
 Histories = dict[str, list[Iteration]]  # by set
 
@@ -49,7 +51,7 @@ def load_run(folder: Path) -> Run:
         read_json(folder / name) for name in (RESULT, "config.json", "versions.json")
     )
     if not isinstance(result.get("sets"), dict):
-        raise InputError(f"{folder / RESULT}: no `sets` inside; expected that of a tuning")
+        raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
     return Run(str(folder), result, read_metrics(folder), _flat(config), made_with)
 
 
@@ -71,8 +73,8 @@ def read_asked(folder: Path) -> Asked:
     Raises:
         InputError: the folder is none of a run.
     """
+    config = read_json(folder / "config.json")
     try:
-        config = json.loads((folder / "config.json").read_text())
         # a run that has only just begun knows its flags and nothing else
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return Asked(
@@ -84,10 +86,9 @@ def read_asked(folder: Path) -> Asked:
             robot=Path(flags["robot"]) if flags.get("robot") else None,
             body=config.get("robot"),
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        told = getattr(error, "strerror", None) or repr(error)
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{folder} is no run of `hector tune`: its config.json was expected there ({told})"
+            f"{folder / 'config.json'}: expected the settings of a run of `hector tune` ({error!r})"
         ) from None
 
 
@@ -171,14 +172,9 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         InputError: one line naming the file that is missing or holds something else.
     """
-    try:
-        found = json.loads(_read(path).decode())
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: no valid JSON: {error}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: no text: {error}") from None
+    found = inputs.read_json(path, "a file of a run of `hector tune`", _MOST_BYTES)
     if not isinstance(found, dict):
-        raise InputError(f"{path}: expected an object, got {str(found)[:40]}")
+        raise InputError(f"{path}: expected a JSON object, got {shown(found)}")
     return found
 
 
@@ -362,7 +358,9 @@ def _rows(name: str, sets: Sequence[Mapping[str, Any] | None]) -> dict[str, list
         if baseline not in one["change"]:
             return ""
         found = one["change"][baseline]
-        interval = Interval(*(found[key] for key in ("median", "low", "high")))
+        # null where there is no interval
+        ends = (np.nan if found[key] is None else found[key] for key in ("low", "high"))
+        interval = Interval(found["median"], *ends)
         return change_text(interval) + ("" if found["counts"] else VOID)
 
     rows = {

@@ -33,7 +33,7 @@ from hector_jax.evaluation.report import (
     tuning_section,
     verdict_table,
 )
-from hector_jax.inputs import InputError
+from hector_jax.inputs import InputError, plural, read_json
 from hector_jax.storage import write_file, write_json
 from hector_jax.tuning.difftune import Tuning
 
@@ -135,7 +135,7 @@ class Bar(NamedTuple):
     trajectory: str
     text: str
     measured: str
-    holds: bool | None  # None where a set it needs was not walked
+    holds: bool | None  # None where a set it needs was not walked, or too few plants
 
 
 def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float:
@@ -185,7 +185,8 @@ def bars(found: Mapping[tuple[str, str], Line]) -> list[Bar]:
         line, expert = found.get((t, "with")), found.get((t, "expert"))
         clear = _bar(line, t, "`with` below `without`, interval clear of zero", "without", 0.0)
         if line is not None and clear.holds:
-            clear = clear._replace(holds=line.against["without"].change["L"].high < 0.0)
+            high = line.against["without"].change["L"].high
+            clear = clear._replace(holds=None if math.isnan(high) else high < 0.0)
         told += [
             _bar(line, t, "`with` at least 60 % below nominal", "nominal", -60.0),
             _bar(line, t, "`with` at least 40 % below expert", "expert", -40.0),
@@ -232,21 +233,19 @@ def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
     earlier = _load_earlier(path)
     if earlier.seeds == seeds_text(seeds):
         raise InputError(
-            f"{path}: a table of seeds {earlier.seeds} too; the order is to be held against that "
-            "on other plants"
+            f"{path}: a table of the same plants, seeds {earlier.seeds}; expected others, to "
+            "compare the order of the sets"
         )
     return earlier
 
 
 def _load_earlier(path: Path) -> Earlier:
+    told = read_json(path, "a table.json", 100_000_000)
     try:
-        told = json.loads(path.read_text())
         rankings = {name: list(one["ranking"]) for name, one in told["trajectories"].items()}
         return Earlier(str(told["seeds"]), rankings)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: no table.json of `hector table`: {error}") from error
+    except (TypeError, KeyError, AttributeError) as error:
+        raise InputError(f"{path}: not a table.json of `hector table`: {error!r}") from error
 
 
 def same_order(verdicts: Mapping[str, Verdict], earlier: Earlier) -> list[Bar]:
@@ -295,7 +294,7 @@ def write_table(folder: Path, table: Table) -> Path:
 def _report(table: Table, found: Mapping[tuple[str, str], Line]) -> str:
     first = next(iter(table.verdicts.values()))
     sections = [
-        f"# The paper's table: {', '.join(table.verdicts)}, {len(first.seeds)} plants",
+        f"# The paper's table: {', '.join(table.verdicts)}, {plural(len(first.seeds), 'plant')}",
         _summary(found),
         STAND_IN,
         _SETS,
@@ -361,7 +360,8 @@ def _summary(found: Mapping[tuple[str, str], Line]) -> str:
             for baseline in BASELINES
             if baseline in line.against
         )
-        told.append(f"- {trajectory}: {against}; {line.falls} falls on {line.seeds} plants")
+        fell = f"{plural(line.falls, 'fall')} on {plural(line.seeds, 'plant')}"
+        told.append(f"- {trajectory}: {against}; {fell}")
     return "Loss of the weights tuned through the net (`with`):\n\n" + "\n".join(told)
 
 
@@ -425,7 +425,7 @@ def _paper_table() -> str:
 def _falls(table: Table) -> str:
     walks = sum(len(v.seeds) * len(v.scores) for v in table.verdicts.values())
     if not table.falls:
-        return f"None of the {walks} walks ended in a fall."
+        return f"None of the {plural(walks, 'walk')} ended in a fall."
     rows = [
         [
             f"{fall.trajectory}: {fall.name}",
@@ -439,8 +439,9 @@ def _falls(table: Table) -> str:
     ]
     head = ("set", "plant", "upright [s]", "height [cm]", "roll [deg]", "pitch [deg]")
     return (
-        f"{len(table.falls)} of {walks} walks ended in a fall. Height of the centre of mass, roll "
-        "and pitch are those of the last millisecond before it.\n\n" + markdown_table(head, rows)
+        f"{len(table.falls)} of {plural(walks, 'walk')} ended in a fall. Height of the centre of "
+        "mass, roll and pitch are those of the last millisecond before it.\n\n"
+        + markdown_table(head, rows)
     )
 
 
@@ -491,9 +492,13 @@ def _csv(found: Mapping[tuple[str, str], Line]) -> str:
             rows.append(row)
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows(
-        [f"{cell:.6g}" if isinstance(cell, float) else cell for cell in row] for row in rows
+        [_csv_number(cell) if isinstance(cell, float) else cell for cell in row] for row in rows
     )
     return out.getvalue()
+
+
+def _csv_number(x: float) -> str:
+    return f"{x:.6g}" if math.isfinite(x) else ""
 
 
 def _result(table: Table, found: Mapping[tuple[str, str], Line]) -> dict[str, Any]:
@@ -559,8 +564,9 @@ def _tex_number(x: float) -> str:
 def _tex_change(comparison: Comparison | None) -> str:
     if comparison is None:
         return "--"
-    value, low, high = (percent(x) for x in comparison.change["L"])
-    return f"${value}$ $[{low}, {high}]$" + ("" if comparison.counts else "$^{*}$")
+    value, *ends = comparison.change["L"].text(percent).split(" ", 1)
+    told = " ".join(f"${text}$" for text in (value, *ends))
+    return told + ("" if comparison.counts else "$^{*}$")
 
 
 def _tex(verdicts: Mapping[str, Verdict], found: Mapping[tuple[str, str], Line]) -> str:
@@ -578,8 +584,8 @@ def _tex(verdicts: Mapping[str, Verdict], found: Mapping[tuple[str, str], Line])
         *(cell for b in BASELINES for cell in (rf"against {b} [\%]", "wins", "paper")),
     ]
     rows = [
-        f"% Means over {len(first.seeds)} plants of the hardware stand-in (seeds {seeds}); change "
-        "of L: median of the paired",
+        f"% Means over {plural(len(first.seeds), 'plant')} of the hardware stand-in "
+        f"(seeds {seeds}); change of L: median of the paired",
         "% ratio [95 % bootstrap interval]; * does not count, the falls differ. paper: its own "
         "table, ten iterations.",
         rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",

@@ -16,7 +16,7 @@ from scipy.stats import spearmanr
 
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
 from hector_jax.control.weights import Weights, directions, moved, weights_to_vector
-from hector_jax.evaluation.metrics import COVERAGE, RESAMPLES, Interval
+from hector_jax.evaluation.metrics import Interval, bootstrap
 from hector_jax.evaluation.report import markdown_table
 
 SAG = ("Q_z", "Q_vz", "R_Fz")
@@ -67,18 +67,8 @@ def cosine(
 def over_phases(
     statistic: Callable[..., np.ndarray | float], *gradients: Float[np.ndarray, "P n"]
 ) -> Interval:
-    """A statistic of mean gradients, with its percentile interval when the phases are redrawn.
-
-    The ends of the interval are NaN for a single phase.
-    """
-    count, value = len(gradients[0]), float(statistic(*(g.mean(axis=0) for g in gradients)))
-    if count < 2:
-        return Interval(value, float("nan"), float("nan"))
-    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
-    found = statistic(*(g[draws].mean(axis=1) for g in gradients))
-    tail = 50 * (1 - COVERAGE)
-    low, high = np.percentile(found, [tail, 100 - tail])
-    return Interval(value, float(low), float(high))
+    """A statistic of mean gradients, with its percentile interval when the phases are redrawn."""
+    return bootstrap(lambda *drawn: statistic(*(g.mean(axis=-2) for g in drawn)), *gradients)
 
 
 def compare(
@@ -142,11 +132,7 @@ def rank_correlation(
 
 
 def _told(value: Interval | None) -> str:
-    if value is None:
-        return ""
-    if np.isnan(value.low):
-        return f"{value.value:.2f}"
-    return f"{value.value:.2f} [{value.low:.2f}, {value.high:.2f}]"
+    return "" if value is None else value.text("{:.2f}".format)
 
 
 def gradient_table(rows: Mapping[tuple[str, str], Row | None]) -> str:

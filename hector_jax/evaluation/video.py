@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.console import Broken
 from hector_jax.evaluation.plots import distances, named
 from hector_jax.geometry import rotation_from_euler
-from hector_jax.inputs import SOME, InputError, Interval, check
+from hector_jax.inputs import SOME, InputError, Interval, check, choose
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, from_start
 
@@ -86,6 +86,22 @@ def poses(
     return np.concatenate([trunk, quaternion, joints], axis=1)
 
 
+def check_film(path: Path) -> None:
+    """Find out, before anything is walked for a film, whether it can be asked for.
+
+    Raises:
+        InputError: the ending is none of `ENDINGS`, or MUJOCO_GL names no back end.
+    """
+    _check_ending(path)
+    if asked := os.environ.get("MUJOCO_GL"):
+        choose("MUJOCO_GL", asked.lower(), (*BACK_ENDS, "disable"))
+
+
+def _check_ending(path: Path) -> None:
+    if path.suffix.lower() not in ENDINGS:
+        raise InputError(f"a film must end in {', '.join(ENDINGS)}, got {path.name}")
+
+
 def write_film(
     path: Path, robot: Robot, walks: Mapping[str, Trajectory], config: VideoConfig | None = None
 ) -> str:
@@ -105,8 +121,7 @@ def write_film(
         InputError: the ending is none of these.
     """
     config = config or VideoConfig()
-    if path.suffix.lower() not in ENDINGS:
-        raise InputError(f"a film must end in {', '.join(ENDINGS)}, got {path.name}")
+    _check_ending(path)
     if path.suffix.lower() == ".mp4":
         try:
             imageio_ffmpeg.get_ffmpeg_exe()

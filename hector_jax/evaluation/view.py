@@ -159,10 +159,9 @@ def check_viser() -> None:
 
 
 def serve(
-    motions: Mapping[str, Motion],
+    walk: Callable[[], tuple[Mapping[str, Motion], str]],
     model: mujoco.MjModel,
     folder: Path,
-    story: str,
     on_open: Callable[[str], None],
     host: str = HOST,
     port: int = PORT,
@@ -170,17 +169,16 @@ def serve(
     """Show two walks and the tuning of a run until interrupted.
 
     Args:
-        motions: of the walks, by the words that stand above them, before and after.
-        model: of the body that walked.
+        walk: called once the page can be opened; gives the motions of the walks, before and after,
+            by the words that stand above them, and what is seen, in Markdown.
+        model: of the body that walks.
         folder: of the run, whose metrics are read again as they grow.
-        story: what is seen, in Markdown.
         on_open: called with the page's address once it can be opened.
         host: address to listen on; the default lets no other machine in.
         port: where it is taken, a free one is used instead.
 
     Raises:
-        InputError: viser is not installed, or there is no such port.
-        InputError: the address cannot be listened on.
+        InputError: viser is not installed, or the address cannot be listened on.
     """
     check_viser()
     import viser
@@ -190,8 +188,11 @@ def serve(
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):  # viser tells its own
         server = viser.ViserServer(host, _free_port(host, port), label="hector", verbose=False)
         try:
-            page = Page(server, motions, model, folder, story)
+            note = server.gui.add_markdown("The robots walk in a moment.")
             on_open(f"http://{host}:{server.get_port()}")
+            motions, story = walk()
+            note.remove()
+            page = Page(server, motions, model, folder, story)
             last = time.monotonic()
             while True:
                 time.sleep(1.0 / _RATE)
@@ -204,8 +205,6 @@ def serve(
 
 def _free_port(host: str, asked: int) -> int:
     """The port, or a free one where it is taken."""
-    if not 0 <= asked <= 65535:
-        raise InputError(f"--port must be 0 (any free one) to 65535, got {asked}")
     for port in (asked, 0):
         try:
             with socket.create_server((host, port)) as listening:

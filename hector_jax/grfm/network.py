@@ -159,9 +159,7 @@ def init_params(
         InputError: no such variant.
     """
     if variant not in VARIANTS:
-        raise InputError(
-            f"unknown variant {variant!r} of the net; there are: {', '.join(VARIANTS)}"
-        )
+        raise InputError(f"unknown variant {variant!r} of the net; known: {', '.join(VARIANTS)}")
     inputs, outputs = _sizes(variant)
     net, x = Net(hidden or HIDDEN[variant], outputs), jnp.zeros(inputs)
     draw = jax.jit(jax.vmap(lambda k: net.init(k, x)["params"]))

@@ -11,8 +11,6 @@ feet and between the legs alone, and whether anything else is in the floor is re
 poses.
 """
 
-import contextlib
-import io
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -25,6 +23,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from mujoco import mjx
 
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import Memory, Plan, WalkConfig, init_memory
@@ -55,10 +54,6 @@ from hector_jax.sim.world import (
     standing_qpos,
 )
 from hector_jax.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
-
-with contextlib.redirect_stdout(io.StringIO()):  # it announces what it does not find
-    from mujoco import mjx
-
 
 # Newton steps and steps of their line search: under vmap every walk takes each of them. MJX's own
 # search needs fewer than the C engine's. In 32 bits the fewer move contact forces by 2 mN in the

@@ -41,7 +41,7 @@ from hector_jax.control.walking import (
 )
 from hector_jax.control.weights import Weights
 from hector_jax.inputs import InputError
-from hector_jax.robot import Robot
+from hector_jax.robot import Robot, quiet_mujoco
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.changes import Change, worlds_by_step
@@ -285,6 +285,7 @@ def _programs(config: WalkConfig) -> _Programs:
     )
 
 
+@quiet_mujoco()
 def walk(
     config: WalkConfig,
     robot: Robot,

@@ -20,9 +20,9 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.description import Description
 from hector_jax.inputs import InputError, did_you_mean, shown
-from hector_jax.robot import compile_model
+from hector_jax.mjcf import TIME_STEP
+from hector_jax.robot import compile_model, quiet_mujoco
 
-TIME_STEP = 0.001  # [s] of plant, joint control and samples
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold
 SLACK = "_backlash"  # ending of the names of backlash joints
@@ -174,8 +174,7 @@ def named_world(name: str, seed: int = 0) -> Imperfections:
     """
     if name not in WORLDS:
         raise InputError(
-            f"unknown world {shown(name)}{did_you_mean(name, WORLDS)}; "
-            f"there are: {', '.join(WORLDS)}"
+            f"unknown world {shown(name)}{did_you_mean(name, WORLDS)}; known: {', '.join(WORLDS)}"
         )
     return {"ideal": ideal, "hfs": hfs, "hfs-varied": lambda: hfs_varied(seed)}[name]()
 
@@ -286,6 +285,7 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
     return replace(world, model=model)
 
 
+@quiet_mujoco()
 def build_worlds(
     imperfections: Sequence[Imperfections], description: Description | None = None
 ) -> list[World]:

@@ -140,4 +140,4 @@ def _read(path: Path, head: Mapping[str, Any]) -> list[dict[str, Any]] | None:
     try:
         return None if lines is None else [json.loads(line) for line in lines]
     except ValueError as error:
-        raise InputError(f"{path}: no record of a race: {error}") from error
+        raise InputError(f"{path}: not the record of a race: {error}") from error

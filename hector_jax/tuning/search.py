@@ -272,12 +272,12 @@ def read_record(path: Path, head: Mapping[str, Any], what: str) -> list[bytes] |
         kept = json.loads(first)
         differs = [name for name in head | kept if kept.get(name) != head.get(name)]
     except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: no record of a {what}: {error}") from error
+        raise InputError(f"{path}: not the record of a {what}: {error}") from error
     if differs:
         name = differs[0]
         raise InputError(
-            f"{path}: record of another {what}, its {name} is {str(kept.get(name))[:80]}, asked "
-            f"for is {str(head.get(name))[:80]}; choose another folder"
+            f"{path}: record of another {what}: its {name} is {str(kept.get(name))[:80]}, expected "
+            f"{str(head.get(name))[:80]}; choose another folder"
         )
     os.truncate(path, end)
     return lines

@@ -1,0 +1,169 @@
+"""Whatever the environment is, a program works, or one line says what of it is wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hector_jax import runtime
+from hector_jax.robot import load_robot
+
+WRONG = [
+    ({"JAX_PLATFORMS": "abacus"}, "JAX does not start with JAX_PLATFORMS=abacus: "),
+    ({"JAX_PLATFORMS": "tpu"}, "JAX does not start with JAX_PLATFORMS=tpu: "),
+    ({"JAX_NUM_CPU_DEVICES": "x"}, "JAX does not start with JAX_NUM_CPU_DEVICES=x: Invalid value"),
+    ({"XLA_FLAGS": "--nonsense=1"}, "XLA_FLAGS=--nonsense=1: Unknown flag in XLA_FLAGS"),
+]
+
+
+def hector(*words, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "hector_jax.cli", *map(str, words)],
+        capture_output=True,
+        text=True,
+        **options,
+    )
+
+
+@pytest.mark.parametrize(("wrong", "line"), WRONG, ids=[next(iter(w)) for w, _ in WRONG])
+def test_what_jax_cannot_start_with_is_one_line(wrong, line):
+    environment = os.environ | wrong
+    done = hector("walk", env=environment)
+    assert (done.returncode, done.stdout) == (2, "")
+    said = [text for text in done.stderr.splitlines() if text != "loading JAX and MuJoCo"]
+    assert len(said) == 1
+    assert said[0].startswith(f"hector: {line}")
+
+
+@pytest.mark.parametrize(("wrong", "line"), WRONG[2:], ids=["JAX", "XLA"])
+def test_the_doctor_names_what_jax_cannot_start_with(wrong, line):
+    done = hector("doctor", "--json", env=os.environ | wrong)
+    assert done.returncode == 1
+    (fault,) = json.loads(done.stdout)["faults"]
+    assert fault.startswith(line)
+    assert f"hector: {line}" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_too_little_memory_is_told_before_anything_hangs():
+    line = "hector: the limit on virtual memory (ulimit -v) is 1.5 GB, expected at least 3 GB\n"
+    for command, code in (("walk", 2), ("doctor", 1)):
+        limited = f'ulimit -v 1500000; exec "$0" -m hector_jax.cli {command}'
+        done = subprocess.run(
+            ["bash", "-c", limited, sys.executable], capture_output=True, text=True
+        )
+        assert (done.returncode, done.stderr) == (code, line)
+
+
+def test_a_renderer_is_needed_for_a_film_alone(tmp_path):
+    environment = os.environ | {"MUJOCO_GL": "crayon"}
+    done = hector("view", tmp_path, "--headless", env=environment)
+    line = "hector: MUJOCO_GL must be 'egl', 'osmesa', 'glfw' or 'disable', got 'crayon'"
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (2, line)
+    done = hector("compare", tmp_path, env=environment)
+    assert "result.json: cannot read" in done.stderr
+
+
+def test_workers_need_no_renderer(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "crayon")
+    with runtime.workers(1) as pool:
+        assert pool.submit(load_robot).result().mass > 0.0
+    assert os.environ["MUJOCO_GL"] == "crayon"
+
+
+def test_a_home_that_cannot_be_written_is_told_in_one_line(tmp_path):
+    wall = tmp_path / "wall"
+    wall.write_text("a file, where a folder is wanted")
+    places = {"XDG_CACHE_HOME": str(wall), "TMPDIR": str(tmp_path), "MPLCONFIGDIR": str(wall)}
+    done = hector("compare", tmp_path, env=os.environ | places)
+    told = f"{wall}/hector_jax/jax cannot be written: compiled programs are kept in {tmp_path}/"
+    said = [line for line in done.stderr.splitlines() if line != "loading JAX and MuJoCo"]
+    assert said[0].startswith(told)
+    assert len(said) == 2  # and the refusal
+
+
+# Streams and signals
+
+TOY = """
+import sys
+from hector_jax.console import exit_code, say
+def work():
+    say("working")
+    print("result")
+sys.exit(exit_code("toy", work))
+"""
+
+
+@pytest.mark.parametrize(
+    ("redirected", "code", "out", "err"),
+    [
+        (">&-", 0, "", "working\n"),
+        ("2>&-", 0, "result\n", ""),
+        ("<&- >&- 2>&-", 0, "", ""),
+        (">/dev/full", 1, "", "working\ntoy: cannot write the output: No space left on device\n"),
+        (">/dev/full 2>/dev/full", 1, "", ""),
+    ],
+)
+def test_streams_that_are_closed_or_full_cost_at_most_a_line(redirected, code, out, err):
+    line = f'"$0" -c "$1" {redirected}'
+    done = subprocess.run(["bash", "-c", line, sys.executable, TOY], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (code, out, err)
+
+
+DEAF = """
+import ctypes, sys
+from hector_jax import console
+console._PATIENCE = 0.5
+def work():
+    mutex = ctypes.create_string_buffer(64)
+    lock = ctypes.CDLL(None).pthread_mutex_lock
+    lock(mutex)
+    print("deaf", flush=True)
+    lock(mutex)  # for ever, as compiled code may
+sys.exit(console.exit_code("toy", work))
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "word"), [(signal.SIGTERM, "terminated"), (signal.SIGINT, "interrupted")]
+)
+def test_a_signal_ends_a_program_that_hangs_in_compiled_code(number, word):
+    toy = subprocess.Popen(
+        [sys.executable, "-c", DEAF], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert toy.stdout.readline() == "deaf\n"
+    time.sleep(0.3)  # until it is
+    start = time.monotonic()
+    toy.send_signal(number)
+    assert toy.wait(timeout=10) == 128 + number
+    assert 0.4 < time.monotonic() - start
+    assert toy.stderr.read() == f"toy: {word}, at once\n"
+
+
+IMPORTS = """
+import io, os, pkgutil, sys, warnings
+import jax, flax, optax, mujoco, matplotlib.figure, scipy.spatial, rich.progress
+import jaxtyping, imageio_ffmpeg
+import hector_jax
+sys.stdout = stream = io.StringIO()
+import mujoco.mjx
+seen = lambda: (
+    mujoco.get_mju_user_warning(), sys.stdout, sys.stderr, list(warnings.filters),
+    dict(jax.config.values), matplotlib.rcParams._get_backend_or_none(), dict(os.environ),
+)
+before = seen()
+for module in pkgutil.walk_packages(hector_jax.__path__, "hector_jax."):
+    __import__(module.name)
+after = seen()
+for one, other in zip(before, after):
+    assert one is other or one == other, (one, other)
+"""
+
+
+def test_importing_every_module_leaves_the_process_as_it_was():
+    done = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,187 @@
+"""The command line: its words become flags, or one line says which word is wrong."""
+
+import os
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from hector_jax import flags
+from hector_jax.cli import main
+from hector_jax.flags import Command, Compare, Evaluate, Export, Tune, View, Walk, from_line
+from hector_jax.inputs import InputError
+
+
+def refused(monkeypatch, capsys, *words):
+    """The one line that a command is refused with."""
+    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
+    assert main() == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    return err.strip()
+
+
+def test_flags_are_taken_in_any_order_and_spelling():
+    expected = Evaluate(weights=("nominal", "a.json"), first_seed=3, json=True)
+    for words in (
+        "evaluate --weights nominal a.json --first-seed 3 --json",
+        "evaluate --json --first_seed=3 --weights nominal a.json",
+    ):
+        assert from_line(words.split()) == expected
+    assert from_line(["tune", "--no-video"]) == Tune(video=False)
+    assert from_line("view runs/a --sets a b --seconds 2".split()) == View(
+        Path("runs/a"), sets=("a", "b"), seconds=2.0
+    )
+    assert from_line("export --set without runs/a --json".split()) == Export(
+        Path("runs/a"), set="without", json=True
+    )
+    assert from_line("compare a --json b".split()) == Compare((Path("a"), Path("b")), json=True)
+    assert from_line(["walk", "--out", "-dash.npz"]) == Walk(out=Path("-dash.npz"))
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ("", "no command; the commands are collect, train, "),
+        ("wlak", "unknown command 'wlak'; did you mean 'walk'?"),
+        ("wlak --help", "unknown command 'wlak'; did you mean 'walk'?"),
+        ("walk --wrold hfs", "walk has no flag '--wrold'; did you mean '--world'?"),
+        ("walk --zzz", "walk has no flag '--zzz'; see hector walk --help"),
+        ("walk --no-seed", "walk has no flag '--no-seed'; did you mean '--seed'?"),
+        ("view a --run b", "view has no flag '--run'; see hector view --help"),
+        ("walk there", "walk does not expect 'there'; see hector walk --help"),
+        ("walk --seed 1 2", "walk does not expect '2'; see hector walk --help"),
+        ("walk --json yes", "walk does not expect 'yes'; see hector walk --help"),
+        ("walk --json=yes", "--json takes no value, got 'yes'"),
+        ("walk --seed", "--seed expects a value, got none"),
+        ("walk --seed 1 --seed 2", "--seed is given twice"),
+        ("tune --video --no-video", "--video is given twice"),
+        ("evaluate --weights", "--weights expects a value, got none"),
+        ("evaluate --weights nominal nominal", "--weights names 'nominal' twice"),
+        ("evaluate --weights nominal --weights expert", "--weights is given twice"),
+        ("view . --sets with", "--sets expects 2 values, got with"),
+        ("view", "view expects RUN; see hector view --help"),
+        ("completion cmd.exe", "SHELL must be 'bash', 'zsh' or 'fish', got 'cmd.exe'"),
+        ("walk --seconds long", "--seconds must be a number from 0.01 to 600, got 'long'"),
+        ("walk --world moon", "'hfs-varied' or 'standin', got 'moon'"),
+        ("evaluate --world srbm", "'hfs-varied' or 'standin', got 'srbm'"),
+        ("tune --alpha both", "--alpha must be 'paper' or 'auto', got 'both'"),
+        ("collect --engine warp", "--engine must be 'auto', 'c' or 'mjx', got 'warp'"),
+        ("walk --robot assets/hector.xml", "--robot must be a TOML file that names an MJCF"),
+        (f"walk --weights {300 * 'x'}.json", "cannot read the file: File name too long"),
+        (f"tune --resume {300 * 'x'}", "--resume must be the folder of a run of `hector tune`"),
+        ("walk --weights exprt", "weights file, got 'exprt'; did you mean 'expert'?"),
+        ("tune --seeds 3.5", "--seeds must be a whole number from 1 to 10000, got '3.5'"),
+    ],
+)
+def test_a_wrong_word_is_one_line_with_the_nearest_name(monkeypatch, capsys, line, fault):
+    assert fault in refused(monkeypatch, capsys, *line.split())
+
+
+COUNTS = [
+    (kind, field.name)
+    for kind in get_args(Command)
+    for field in fields(kind)
+    if type(field.default) is int
+]
+
+
+@pytest.mark.parametrize(("kind", "name"), COUNTS, ids=[f"{k.__name__}.{n}" for k, n in COUNTS])
+def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, kind, name):
+    """Nothing is made of the number before: a list of 10**12 jobs would take all memory."""
+    words = [flags.command_name(kind), *["."] * len(flags._positional(kind))]
+    line = refused(monkeypatch, capsys, *words, f"--{name.replace('_', '-')}", 10**12)
+    rule = get_args(flags._hints(kind)[name])[1]
+    assert f"from {rule.low} to {rule.high}, got 1000000000000" in line
+
+
+def test_the_last_seed_may_not_pass_the_largest(monkeypatch, capsys):
+    largest = 2**32 - 1
+    line = refused(monkeypatch, capsys, "evaluate", "--first-seed", largest, "--seeds", 2)
+    assert "--first-seed 4294967295 and --seeds 2 reach beyond the largest seed" in line
+    flags.check(Evaluate(first_seed=largest, seeds=1))
+
+
+@pytest.mark.parametrize(
+    ("make", "fault"),
+    [
+        (lambda path: None, "No such file or directory"),
+        (lambda path: path.mkdir(), "not a plain file"),
+        (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
+        (lambda path: os.mkfifo(path), "not a plain file"),
+    ],
+    ids=["missing", "folder", "loop", "pipe"],
+)
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["walk", "--weights"], "own.json"),
+        (["walk", "--traj"], "own.toml"),
+        (["walk", "--robot"], "own.toml"),
+        (["replay"], "own.npz"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
+    tmp_path, make, fault, words, name
+):
+    make(tmp_path / name)
+    code = (
+        "import sys; from hector_jax.cli import main; code = main(); "
+        "print(code, 'jax' in sys.modules)"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", code, *words, tmp_path / name], capture_output=True, text=True
+    )
+    assert shown.stdout == "2 False\n"
+    assert shown.stderr == f"hector: {tmp_path / name}: cannot read the file: {fault}\n"
+
+
+@pytest.mark.parametrize("words", ["tune --data", "tune --runs", "grfm --out", "collect --out"])
+def test_a_folder_that_cannot_be_one_is_told_before_anything_is_made(
+    monkeypatch, capsys, tmp_path, words
+):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("")
+    for name in ("/dev/null", "file", "file/below"):
+        line = refused(monkeypatch, capsys, *words.split(), name)
+        assert line == f"hector: {words.split()[1]} must be a folder, got {name!r}"
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_latest_is_the_newest_run(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for age, name in ((9, "c/1"), (5, "strider/s/2"), (7, "s/3")):
+        run = tmp_path / "runs" / name
+        run.mkdir(parents=True)
+        (run / "config.json").touch()
+        os.utime(run / "config.json", (1e9 - age, 1e9 - age))
+    for words in (["view", "latest"], ["export", "latest"], ["tensorboard", "latest"]):
+        assert flags.resolve_latest(from_line(words)).run == Path("runs/strider/s/2")
+    found = flags.resolve_latest(from_line(["compare", "runs/c/1", "latest"]))
+    assert found.runs == (Path("runs/c/1"), Path("runs/strider/s/2"))
+    found = flags.resolve_latest(from_line(["tune", "--resume", "latest"]))
+    assert found == Tune(resume=Path("runs/strider/s/2"))
+    (tmp_path / "latest").mkdir()  # one that is there under that name is meant
+    assert flags.resolve_latest(from_line(["view", "latest"])).run == Path("latest")
+
+
+def test_latest_without_a_run_is_refused(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="latest: there is no run in the folder `runs`"):
+        flags.resolve_latest(from_line(["view", "latest"]))
+
+
+def test_help_shows_no_python(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "120")
+    for kind in get_args(Command):
+        monkeypatch.setattr(sys, "argv", ["hector", flags.command_name(kind), "--help"])
+        with pytest.raises(SystemExit) as left:
+            main()
+        assert left.value.code == 0
+        shown = capsys.readouterr().out
+        assert "None" not in shown
+        assert "{None}" not in shown
