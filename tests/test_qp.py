@@ -227,7 +227,7 @@ def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
     made = [general_qp(seed, 5, 12)[0] for seed in (16, 52, 104)]
 
     def evidence(qp):
-        normal, wanted = qp_door._normalise(qp), jnp.ones((), bool)
+        normal, wanted = qp_door._normalise(FLOORS, qp), jnp.ones((), bool)
         found = [
             method(QpConfig(), FLOORS, normal, wanted)[0]
             for method in (qp_door._interior_point, qp_door._approach)
@@ -251,7 +251,7 @@ def as_on_a_gpu(monkeypatch):
 def first_guess(qp):
     """The normalised problem, where its active set starts from, and with which rows."""
     qp = jax.tree.map(jnp.asarray, qp)
-    normal = qp_door._normalise(qp)
+    normal = qp_door._normalise(FLOORS, qp)
     loose = qp_door._Point(-jnp.linalg.solve(normal.P, normal.q), jnp.zeros(normal.side.shape))
     return normal, *qp_door._first_guess(normal, loose)
 

@@ -50,13 +50,42 @@ SAVED = "qp"
 
 
 class Status(IntEnum):
-    """What a solution is worth; `Solution.status` holds these codes."""
+    """What a solution is worth; `Solution.status` holds these codes, `meaning` says what to do."""
 
-    SOLVED = 0  # all three residuals are at most the tolerance
-    INACCURATE = 1  # the best point found; its residuals say how far off it is
-    INFEASIBLE = 2  # no x meets the rows (proved by a multiplier, or l > u)
-    UNBOUNDED = 3  # the objective falls for ever (proved by a direction)
-    BAD_DATA = 4  # NaN, an infinite number that is no bound, or P with a negative eigenvalue
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str) -> "Status":
+        """A code with its sentence."""
+        member = int.__new__(cls, code)
+        member._value_, member.meaning = code, meaning
+        return member
+
+    SOLVED = 0, "All residuals are at most the tolerance and the minimiser is unique."
+    INACCURATE = (
+        1,
+        "The best point that was found; its residuals are above the tolerance. "
+        "Scale the data, or raise QpConfig.max_iterations or the tolerance.",
+    )
+    INFEASIBLE = (
+        2,
+        "No x meets all rows. Widen the bounds, or give rows a slack variable that is priced in q.",
+    )
+    UNBOUNDED = (
+        3,
+        "The objective falls without end along a direction. Price that direction in P, or bound it "
+        "by a row.",
+    )
+    BAD_DATA = (
+        4,
+        "A number is NaN, an entry of P, q or A is infinite, a bound excludes every number, or P "
+        "has a negative eigenvalue. Look for it in what P, q, A, l and u are made of.",
+    )
+    NOT_UNIQUE = (
+        5,
+        "x is a minimiser, but along a direction neither P nor a row with force holds it: others "
+        "lie beside it, and it has no derivative. Add a small multiple of the unit matrix to P, or "
+        "use x without its derivative.",
+    )
 
 
 class QP(NamedTuple):
@@ -136,13 +165,15 @@ class _Floors(NamedTuple):
     rounding: float  # a multiplier or violation this small has no sign
     kink: float  # e of the derivative
     certificate: float  # of infeasible and unbounded problems
+    curvature: float  # a direction with less than this along it is flat
+    zero: float  # a row with no larger entry, beside the longest, is a row of zeros
 
 
 def _floors(config: QpConfig, dtype: jnp.dtype) -> _Floors:
     if jnp.finfo(dtype).bits == 64:
-        floors = _Floors(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-7)
+        floors = _Floors(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-7, 1e-8, 1e-15)
     else:
-        floors = _Floors(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4)
+        floors = _Floors(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4, 1e-5, 1e-7)
     tolerance = config.tolerance or floors.tolerance
     return floors._replace(
         tolerance=tolerance,
@@ -249,10 +280,10 @@ class _Normal(NamedTuple):
     P: Array
     q: Array
     A: Array
-    bound: Array  # (2, m), zero where infinite
-    given: Array  # (2, m) bool: there is such a bound
-    side: Array  # (2, m) bool: a given bound of a row that is neither an equality nor empty
+    bound: Array  # (2, m), zero where infinite; both sides of an equality the same
+    side: Array  # (2, m) bool: a finite bound of a row that is neither an equality nor of zeros
     equality: Array  # (m,) bool
+    unmet: Array  # (m,) violation of a row of zeros, or of crossed bounds, whatever x is
     column: Array  # (n,)
     row: Array  # (m,)
     size: Array
@@ -260,22 +291,34 @@ class _Normal(NamedTuple):
 
 
 _INFINITE = 1e20  # a bound as large as this is none, as most solvers have it
+_ROUNDING = 8  # machine epsilons; what is smaller than that beside its like is rounding
 _SMALL = 1e-3  # keeps relative residuals meaningful where the solution is zero
 _SIGN = np.array([[1.0], [-1.0]])  # a side holds where sign * (A v - bound) <= 0
 
 
-def _scales(qp: QP) -> tuple[Array, Array]:
-    """Columns D = diag(P)^-1/2, and rows that make those of A D unit vectors; else 1."""
+def _scales(floors: _Floors, qp: QP) -> tuple[Array, Array, Array]:
+    """Columns D, rows that make those of A D unit vectors, and which rows are zeros.
+
+    D = diag(P)^-1/2. A column that P does not price is scaled by its largest entry in A, so that it
+    is as large there as the largest priced one: D keeps one unit when the objective changes its.
+    A row of zeros has no length and gets the geometric mean of the others' largest entries.
+    """
     diagonal = jnp.diagonal(qp.P)
     reach = jnp.max(jnp.abs(qp.A), axis=-2, initial=0.0).ravel()  # largest entry of a column
     priced = diagonal > 1e-3 * jnp.finfo(qp.P.dtype).eps * jnp.max(diagonal)
-    column = lax.rsqrt(jnp.where(priced, diagonal, jnp.where(reach > 0, reach, 1.0) ** 2))
+    column = lax.rsqrt(jnp.where(priced, diagonal, 1.0))
+    widest = jnp.max(jnp.where(priced, column * reach, 0.0))
+    unpriced = jnp.where(widest > 0, widest, 1.0) / jnp.where(reach > 0, reach, 1.0)
+    column = jnp.where(priced, column, unpriced)
     wide = column if qp.A.ndim == 2 else column.reshape(qp.A.shape[0], 1, qp.A.shape[2])
     rows = qp.A * wide
-    most = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)  # first, or squares leave the range
-    most = jnp.where(most > 0, most, 1.0)
+    most = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)
+    zeros = most <= floors.zero * jnp.max(most, initial=0.0)
+    most = jnp.where(zeros, 1.0, most)  # divided by first, or squares leave the range
     squares = jnp.sum((rows / most[..., None]) ** 2, axis=-1)
-    return column, (lax.rsqrt(jnp.where(squares > 0, squares, 1.0)) / most).ravel()
+    mean = jnp.exp(jnp.sum(jnp.log(most)) / jnp.maximum(jnp.sum(~zeros), 1))
+    row = jnp.where(zeros, 1.0 / mean, lax.rsqrt(jnp.where(zeros, 1.0, squares)) / most)
+    return column, row.ravel(), zeros.ravel()
 
 
 def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
@@ -285,35 +328,43 @@ def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
     return row.reshape(N, r, 1) * A * column.reshape(N, 1, b)
 
 
-def _normalise(qp: QP) -> _Normal:
-    column, row = _scales(qp)
+def _normalise(floors: _Floors, qp: QP) -> _Normal:
+    column, row, zeros = _scales(floors, qp)
     A = _scale_rows_and_columns(qp.A, row, column)
-    # rows of zeros bind nothing once 0 lies between their bounds, and nothing helps where not
-    empty = jnp.all(A == 0, axis=-1).ravel()
+    sign = jnp.asarray(_SIGN, A.dtype)
     bound = jnp.stack([qp.u, qp.l])
     given = jnp.abs(bound) < _INFINITE
-    bound = row * bound
+    bound = jnp.where(given, row * bound, 0.0)
+    rounding = _ROUNDING * jnp.finfo(A.dtype).eps
+    # no x mends a row of zeros, nor brings a row nearer to crossed bounds than their middle
+    width = jnp.where(given[0] & given[1], bound[0] - bound[1], jnp.inf)
+    crossed = width < 0
+    unmet = jnp.maximum(-0.5 * width, jnp.where(zeros, jnp.max(-sign * bound, axis=0), 0.0))
+    unmet = jnp.where(unmet > rounding * _largest(bound), unmet, 0.0)
+    given &= ~zeros
+    bound = jnp.where(crossed, 0.5 * (bound[0] + bound[1]), bound)
     bound = jnp.where(given, bound, 0.0)
     q = column * qp.q
-    pressed = jnp.max(jnp.where(empty, 0.0, -jnp.asarray(_SIGN, q.dtype) * bound), initial=0.0)
-    size = jnp.maximum(_largest(q), pressed)
+    size = jnp.maximum(_largest(q), jnp.max(-sign * bound, initial=0.0))  # violated at v = 0
     size = jnp.where(size > 0, size, 1.0)
     bound = bound / size
     # a row narrower than rounding has no interior: it is an equality
-    close = 8 * jnp.finfo(q.dtype).eps * jnp.maximum(1.0, jnp.abs(bound[0]))
-    equality = given[0] & given[1] & (bound[0] - bound[1] <= close) & ~empty
+    narrow = width / size <= rounding * jnp.maximum(1.0, jnp.abs(bound[0]))
+    equality = narrow & ~zeros
+    bound = jnp.where(equality, 0.5 * (bound[0] + bound[1]), bound)
+    largest = _largest(bound)
     return _Normal(
         column[:, None] * qp.P * column,
         q / size,
         A,
         bound,
-        given,
-        given & ~equality & ~empty,
+        given & ~equality,
         equality,
+        unmet / size,
         column,
         row,
         size,
-        jnp.where(_largest(bound) > 0, jnp.minimum(_largest(bound), 1.0), 1.0),
+        jnp.where(largest > rounding, jnp.minimum(largest, 1.0), 1.0),
     )
 
 
@@ -466,6 +517,7 @@ def _choose(first: Array, a, b):
 
 class _Loop(NamedTuple):
     point: _Point
+    step: _Point  # that led there; a multiplier that fell is left out of it
     slack: Array  # (2, m), positive; 1 on sides that are not there
     proximal: Array  # (2,) rho and delta
     iterations: Array
@@ -474,8 +526,8 @@ class _Loop(NamedTuple):
 
 def _interior_point(
     config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
-) -> tuple[_Point, Array, Array]:
-    """Mehrotra's proximal method, cold; last finite point, its slacks, iterations."""
+) -> tuple[_Point, _Point, Array, Array]:
+    """Mehrotra's proximal method, cold; last finite point, step to it, its slacks, iterations."""
     dtype = qp.q.dtype
     least = jnp.array([10.0 * floors.proximal, 50.0 * jnp.finfo(dtype).eps], dtype)
     sign = jnp.asarray(_SIGN, dtype)
@@ -531,29 +583,33 @@ def _interior_point(
         point, slack = _choose(fine, new, (state.point, state.slack))
         factors = jnp.where(fine, 0.1, jnp.array([10.0, 100.0], dtype))
         proximal = jnp.maximum(factors * state.proximal, least)
+        rise = point.z - z
+        last = _Point(point.x - x, jnp.where(free, rise, jnp.maximum(rise, 0.0)))
         done = jnp.max(_evidence(qp, point)) <= floors.target
-        infeasible, unbounded = _certificates(floors, qp, point)
+        infeasible, unbounded = _certificates(floors, qp, point, last)
         iterations = state.iterations + 1
         going = ~done & ~infeasible & ~unbounded & (proximal[0] < 1.0)
         going &= iterations < config.max_iterations
-        return _Loop(point, slack, proximal, iterations, going)
+        return _Loop(point, last, slack, proximal, iterations, going)
 
     # every product of slack and multiplier the same, however far the bound
     room = jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0)
-    start = _Loop(
-        _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0)),
+    start = _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0))
+    begin = _Loop(
+        start,
+        jax.tree.map(jnp.zeros_like, start),
         room,
         least,
         jnp.zeros((), jnp.int32),
         wanted,
     )
-    end = lax.while_loop(lambda state: state.going, advance, start)
-    return end.point, end.slack, end.iterations
+    end = lax.while_loop(lambda state: state.going, advance, begin)
+    return end.point, end.step, end.slack, end.iterations
 
 
 def _approach(
     config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
-) -> tuple[_Point, Array, Array]:
+) -> tuple[_Point, _Point, Array, Array]:
     """The interior point, again in the sizes of what it found where it did not get near.
 
     One size was taken for x and slope from q and the bounds. Where rows hold x far from where q
@@ -561,30 +617,33 @@ def _approach(
     """
 
     def attempt(state: tuple) -> tuple:
-        point, slack, steps, (size, slope), _ = state
+        best, steps, (size, slope), _ = state
         sized = qp._replace(
             P=size / slope * qp.P, q=qp.q / slope, bound=qp.bound / size, reach=qp.reach / size
         )
-        found, room, more = _interior_point(config, floors, sized, wanted)
-        found = _Point(size * found.x, slope * found.z)
+        point, step, slack, more = _interior_point(config, floors, sized, wanted)
+        point, step = (_Point(size * found.x, slope * found.z) for found in (point, step))
         first = steps == 0
-        better = first | (jnp.max(_evidence(qp, found)) < jnp.max(_evidence(qp, point)))
-        point, slack = _choose(better, (found, size * room), (point, slack))
+        better = first | (jnp.max(_evidence(qp, point)) < jnp.max(_evidence(qp, best[0])))
+        point, step, slack = best = _choose(better, (point, step, size * slack), best)
         near = jnp.max(_evidence(qp, point)) <= floors.target
-        proved = jnp.any(jnp.stack(_certificates(floors, qp, point)))
+        proved = jnp.any(jnp.stack(_certificates(floors, qp, point, step)))
         sizes = jnp.stack(
             [_largest(point.x), jnp.maximum(_largest(qp.P @ point.x), _largest(qp.q))]
         )
         again = first & ~near & ~proved & jnp.all(sizes > 0.0)
-        return point, slack, steps + more, jnp.where(again, sizes, 1.0), again
+        return best, steps + more, jnp.where(again, sizes, 1.0), again
 
     nowhere = _Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
     ones, none = jnp.ones(2, qp.q.dtype), jnp.zeros((), jnp.int32)
-    start = (nowhere, jnp.ones_like(qp.bound), none, ones, wanted)
-    return lax.while_loop(lambda state: state[-1], attempt, start)[:3]
+    start = ((nowhere, nowhere, jnp.ones_like(qp.bound)), none, ones, wanted)
+    best, steps, *_ = lax.while_loop(lambda state: state[-1], attempt, start)
+    return *best, steps
 
 
-def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, Array, Array]:
+def _box_osqp(
+    config: QpConfig, floors: _Floors, qp: _Normal
+) -> tuple[_Point, _Point, Array, Array]:
     """BoxOSQP of jaxopt, its derivative left aside; returns what `_interior_point` does."""
     from jaxopt import BoxOSQP
 
@@ -604,7 +663,8 @@ def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, A
     y = jnp.where(finite, params.dual_eq, 0.0)
     z = jnp.maximum(jnp.asarray(_SIGN, y.dtype) * y, 0.0)
     z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(held, z, 0.0))
-    return _Point(x, z), jnp.maximum(-_violation(qp, x), 0.0), state.iter_num.astype(jnp.int32)
+    point, slack = _Point(x, z), jnp.maximum(-_violation(qp, x), 0.0)
+    return point, point, slack, state.iter_num.astype(jnp.int32)
 
 
 def _support(qp: _Normal, y: Array) -> Array:
@@ -612,34 +672,90 @@ def _support(qp: _Normal, y: Array) -> Array:
     return jnp.sum(jnp.where(y > 0, qp.bound[0], qp.bound[1]) * y)
 
 
-def _certificates(floors: _Floors, qp: _Normal, point: _Point) -> tuple[Array, Array]:
-    """Whether z proves that no x of moderate size meets the rows, and x an endless fall."""
-    y = _multiplier(point.z)
-    infeasible = _largest(_columns(qp.A, y)) < -floors.certificate * _support(qp, y)
-    along = jnp.asarray(_SIGN, y.dtype) * _rows(qp.A, point.x)
+def _slope(qp: _Normal, point: _Point) -> Array:
+    """What a residual of P x + q + A'y is measured by: its largest term, and a little."""
+    pull = _columns(qp.A, _multiplier(point.z))
+    return _SMALL + jnp.maximum(
+        jnp.maximum(_largest(qp.P @ point.x), _largest(pull)), _largest(qp.q)
+    )
+
+
+def _certificates(floors: _Floors, qp: _Normal, point: _Point, step: _Point) -> tuple[Array, Array]:
+    """Whether a step proves that no x of moderate size meets the rows, or an endless fall.
+
+    Multipliers without a solution grow for ever along a combination of rows that cancels, and so
+    does x along a free fall; what the point itself had before does not cancel. Contradiction and
+    fall must be more than the tolerance, or they are within it and the problem is solved.
+    """
+    y, along = _multiplier(step.z), jnp.asarray(_SIGN, step.x.dtype) * _rows(qp.A, step.x)
+    gain, fall = -_support(qp, y), -jnp.dot(qp.q, step.x)
+    infeasible = _largest(_columns(qp.A, y)) < floors.certificate * gain
+    infeasible &= gain > floors.tolerance * jnp.sum(jnp.abs(step.z) * _sizes(qp, point.x))
     outward = jnp.where(qp.equality, jnp.abs(along), jnp.where(qp.side, along, 0.0))
-    needed = jnp.maximum(_largest(qp.P @ point.x), jnp.max(outward, initial=0.0))
-    return infeasible, needed < -floors.certificate * jnp.dot(qp.q, point.x)
+    needed = jnp.maximum(_largest(qp.P @ step.x), jnp.max(outward, initial=0.0))
+    unbounded = needed < floors.certificate * fall
+    unbounded &= fall > floors.tolerance * jnp.sum(jnp.abs(step.x)) * _slope(qp, point)
+    return infeasible, unbounded
 
 
 def _evidence(qp: _Normal, point: _Point) -> Array:
     """Primal residual, dual residual and gap, as `Solution` defines them; infinite for NaN."""
     x, y = point.x, _multiplier(point.z)
-    rows, pull, price = _rows(qp.A, x), _columns(qp.A, y), qp.P @ x
-    outside = jnp.where(qp.given, jnp.asarray(_SIGN, x.dtype) * (rows - qp.bound), 0.0)
+    pull, price = _columns(qp.A, y), qp.P @ x
     terms = jnp.stack([jnp.dot(x, price), jnp.dot(qp.q, x), _support(qp, y)])
-    pushed = jnp.maximum(jnp.maximum(_largest(price), _largest(pull)), _largest(qp.q))
-    primal = jnp.max(outside / _sizes(qp, x), initial=0.0)
-    dual = _largest(price + qp.q + pull) / (_SMALL + pushed)
+    primal = jnp.max(_violation(qp, x) / _sizes(qp, x), initial=0.0)
+    dual = _largest(price + qp.q + pull) / _slope(qp, point)
     gap = jnp.abs(jnp.sum(terms)) / (_SMALL * qp.reach + _largest(terms))
     proof = jnp.stack([primal, dual, gap])
     return jnp.where(jnp.isfinite(jnp.sum(proof)), proof, jnp.inf)
 
 
-def _where_sane(sane: Array, qp: QP) -> QP:
+def _or_plain(valid: Array, qp: QP) -> QP:
     """The QP, or a plain one in its place, so that nothing that follows meets a NaN."""
     plain = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
-    return _choose(sane, qp, plain)
+    return _choose(valid, qp, plain)
+
+
+def _probe(n: int) -> np.ndarray:
+    """Where inverse iteration starts; at random, lest it is square to what is looked for."""
+    return np.random.default_rng(0).normal(size=n)
+
+
+def _least_curvature(factor: Array, once: Array) -> Array:
+    """Smallest eigenvalue of a factorised matrix, or little more.
+
+    The Rayleigh quotient after a second inverse iteration. Pivots cannot stand for it: that of a
+    singular matrix grows with the number of variables that share the flat direction.
+
+    Args:
+        factor: Cholesky factor, of NaNs where there is none; then so is the answer.
+        once: the inverse times `_probe`.
+    """
+    twice = cho_solve((factor, True), once)
+    return jnp.dot(once, twice) / jnp.dot(twice, twice)
+
+
+def _held(floors: _Floors, qp: _Normal, point: _Point, wanted: Array) -> Array:
+    """Whether P and the rows hold a minimiser in every direction; false unless `wanted`.
+
+    A row holds where it is an equality or presses with more than the tolerance. One that is active
+    without force does not: the minimiser can leave it.
+    """
+    force = point.z / _slope(qp, point)
+    slack = jnp.abs(_violation(qp, point.x)) / _sizes(qp, point.x)
+    pressing = qp.side & (force > floors.tolerance) & (force > slack)
+    holding = qp.equality | jnp.any(pressing, axis=0)
+    eye = jnp.eye(len(qp.q), dtype=qp.q.dtype)
+
+    def look(_: tuple) -> tuple[Array, Array]:
+        # the cap's rounding could hide a flat direction; this one's is a hundredth of the curvature
+        weight = jnp.where(holding, 0.01 * floors.curvature / jnp.finfo(eye.dtype).eps, 0.0)
+        factor = _cholesky(_plus_gram(qp.P + floors.proximal * eye, qp.A, weight))
+        once = cho_solve((factor, True), jnp.asarray(_probe(len(eye)), eye.dtype))
+        return jnp.zeros((), bool), _least_curvature(factor, once) > floors.curvature
+
+    # a loop, as vmap would make a cond factorise for every problem of the batch
+    return lax.while_loop(lambda state: state[0], look, (wanted, jnp.zeros((), bool)))[1]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -648,31 +764,28 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     floors = _floors(config, qp.q.dtype)
     n, dtype = len(qp.q), qp.q.dtype
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= _INFINITE) | (qp.u <= -_INFINITE)
-    numbers = jnp.isfinite(jnp.sum(jnp.abs(qp.P)) + _largest(qp.q) + jnp.sum(jnp.abs(qp.A)))
-    numbers &= ~jnp.any(no_bound)
-    crossed = jnp.any(qp.l > qp.u)
-    sane = numbers & ~crossed
-    normal = _normalise(_where_sane(sane, qp))
-    idle = normal.given & ~normal.side & ~normal.equality  # rows of zeros
-    unmet = jnp.any(idle & (jnp.asarray(_SIGN, dtype) * normal.bound < 0))
+    finite = [jnp.all(jnp.isfinite(part)) for part in (qp.P, qp.q, qp.A)]
+    valid = jnp.all(jnp.stack(finite)) & ~jnp.any(no_bound)
+    normal = _normalise(floors, _or_plain(valid, qp))
     factor = _cholesky(normal.P + floors.proximal * jnp.eye(n, dtype=dtype))
-    convex = jnp.isfinite(factor[-1, -1])
-    sane &= convex & ~unmet
+    valid &= jnp.isfinite(factor[-1, -1])
 
-    nothing = jnp.zeros(normal.side.shape, dtype)
-    loose = _Point(-cho_solve((factor, True), normal.q), nothing)
+    both = jnp.stack([-normal.q, jnp.asarray(_probe(n), dtype)], axis=1)
+    free, once = cho_solve((factor, True), both).T
+    definite = _least_curvature(factor, once) > floors.curvature
+    loose = _Point(free, jnp.zeros(normal.side.shape, dtype))
     tries = config.active_set_tries
     if config.solver == "interior_point":
         start, guess = _first_guess(normal, loose)
-        quick, proof, first = _active_set(floors, normal, start, guess, sane, tries)
+        quick, proof, first = _active_set(floors, normal, start, guess, valid, tries)
         settled = jnp.max(proof) <= floors.target
-        near, slack, steps = _approach(config, floors, normal, sane & ~settled)
+        near, step, slack, steps = _approach(config, floors, normal, valid & ~settled)
     else:
         quick, proof = loose, jnp.full(3, jnp.inf, dtype)
         first, settled = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-        near, slack, steps = _box_osqp(config, floors, normal)
-    infeasible, unbounded = _certificates(floors, normal, near)
-    hopeful = sane & ~settled & ~infeasible & ~unbounded
+        near, step, slack, steps = _box_osqp(config, floors, normal)
+    infeasible, unbounded = _certificates(floors, normal, near, step)
+    hopeful = valid & ~settled & ~infeasible & ~unbounded
     # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
     pushes = near.z * normal.reach > slack * _largest(near.z)
     exact, exact_proof, last = _active_set(
@@ -683,22 +796,26 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
         better = ~settled & (jnp.max(its_proof) < jnp.max(proof))
         point, proof = _choose(better, (other, its_proof), (point, proof))
     # far from any solution (infeasible, unbounded) all evidence may be infinite, and so may x
-    usable = sane & jnp.all(jnp.isfinite(proof))
+    usable = valid & jnp.all(jnp.isfinite(proof))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), point)
 
-    solved = jnp.max(proof) <= floors.tolerance
-    infeasible, unbounded = infeasible & ~settled & ~solved, unbounded & ~settled & ~solved
-    status = jnp.where(solved, Status.SOLVED, Status.INACCURATE)
-    status = jnp.where(unbounded, Status.UNBOUNDED, status)
-    status = jnp.where(infeasible | unmet | crossed, Status.INFEASIBLE, status)
-    status = jnp.where(numbers & convex, status, Status.BAD_DATA).astype(jnp.int32)
-    told = jnp.where(sane, proof, jnp.inf)
+    solved = usable & (jnp.max(proof) <= floors.tolerance)
+    # an x that solves nothing is no measure of what the bounds themselves leave unmet
+    sizes = jnp.min(_sizes(normal, jnp.where(solved, point.x, 0.0)), axis=0)
+    unmet = jnp.max(normal.unmet / sizes, initial=0.0)
+    unique = definite | _held(floors, normal, point, solved & ~definite)
+    status = jnp.where(unbounded & ~settled, Status.UNBOUNDED, Status.INACCURATE)
+    status = jnp.where(infeasible & ~settled, Status.INFEASIBLE, status)
+    status = jnp.where(solved, jnp.where(unique, Status.SOLVED, Status.NOT_UNIQUE), status)
+    status = jnp.where(unmet > floors.tolerance, Status.INFEASIBLE, status)
+    status = jnp.where(valid, status, Status.BAD_DATA).astype(jnp.int32)
+    primal, dual, gap = jnp.where(valid, proof, jnp.inf)
     solution = Solution(
         normal.size * normal.column * point.x,
         normal.size * normal.row * _multiplier(point.z),
-        told[0],
-        told[1],
-        told[2],
+        jnp.maximum(primal, unmet),
+        dual,
+        gap,
         first + steps + last,
         status,
     )
@@ -730,10 +847,8 @@ def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tup
     firm = both >= floors.cap
     eye = jnp.eye(len(qp.q), dtype=dtype)
     factor = _cholesky(_plus_gram(normal.P + floors.proximal * eye, normal.A, both))
-    # a pivot of the size of rho: other minimisers lie beside this one, and it has no derivative
-    unique = jnp.min(jnp.diagonal(factor)) ** 2 > 10.0 * floors.proximal
-    sound = (solution.status == Status.SOLVED) & unique
-    factor = jnp.where(unique, factor, eye)
+    sound = solution.status == Status.SOLVED
+    factor = jnp.where(sound, factor, eye)
     pull, shift = jnp.zeros_like(solution.x), jnp.zeros_like(solution.y)
     if _moves(d.P):
         pull += d.P @ solution.x
