@@ -1,6 +1,8 @@
 """The QP door against independent answers: solutions, statuses, derivatives."""
 
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +10,12 @@ import numpy as np
 import pytest
 from oracles import (
     central_difference,
+    condensed_walk,
     dense_rows,
     exact_solution,
     general_qp,
     kkt_residual,
+    other_minimiser,
     walking_qp,
 )
 
@@ -73,13 +77,24 @@ def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking):
 def test_general_qps_are_right(n, m):
     made = [general_qp(seed, n, m) for seed in range(EACH)]
     found = solve_all(stack([qp for qp, _, _ in made]))
-    solved = np.asarray(found.status) == Status.SOLVED
-    assert solved.all()
+    definite = np.isfinite([cond for *_, cond in made])
+    assert (np.asarray(found.status)[definite] == Status.SOLVED).all()
+    assert np.isin(found.status, (Status.SOLVED, Status.NOT_UNIQUE)).all()
     for i, (qp, x, cond) in enumerate(made):
         residual = kkt_residual(qp, np.asarray(found.x[i]), np.asarray(found.y[i]))
         assert residual <= (1e-8 if cond <= 1e4 else 1e-6), (i, residual, cond)
         if cond <= 1e4:
             np.testing.assert_allclose(found.x[i], x, atol=1e-4 * np.abs(x).max())
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES[1:3])
+def test_a_minimiser_is_not_unique_just_where_a_linear_program_finds_another(n, m):
+    made = [general_qp(seed, n, m) for seed in range(EACH)]
+    found = solve_all(stack([qp for qp, _, _ in made]))
+    flat = [i for i, (_, _, cond) in enumerate(made) if np.isinf(cond)]
+    unique = np.array([other_minimiser(made[i][0], np.asarray(found.x[i])) < 1e-3 for i in flat])
+    np.testing.assert_array_equal(np.asarray(found.status)[flat] == Status.SOLVED, unique)
+    assert 10 < unique.sum() < len(flat) - 10
 
 
 @pytest.mark.parametrize("far", [1e3, 1e6, 1e9, 1e12, 1e20, 1e30, 1e200])
@@ -126,6 +141,284 @@ def test_a_qp_without_a_solution_says_so(qp, status):
     assert not np.asarray(moved).any()
     with pytest.raises(ValueError, match=status.name):
         check_solved(found)
+
+
+EYE, ZERO = np.eye(2), (0.0, 0.0)
+NONE = (0.5, 0.5), -INF, INF  # a row that is not there
+
+
+def three(*rows, P=EYE, q=(-2.0, -5.0)):
+    """A QP of two variables and three rows (a, l, u): one shape, compiled once."""
+    A, l, u = zip(*rows, *[NONE] * (3 - len(rows)), strict=True)  # noqa: E741
+    return small(P, q, A, l, u)
+
+
+def correlated(off, q):
+    return three(P=((1.0, off), (off, 1.0)), q=q)
+
+
+FIRST, SECOND, BOTH = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
+FLAT = ((1.0, 0.0), (0.0, 0.0))
+EDGES = {
+    "a row of zeros past zero": (
+        lambda t: three((ZERO, -INF, -t)),
+        (0.0, 1e-17, 1e-8, Status.SOLVED),
+        (1e-6, 1.0, Status.INFEASIBLE),
+    ),
+    "the only row, all else at rest": (
+        lambda t: small(q=ZERO, A=(ZERO, ZERO, ZERO), l=(t, -INF, -1.0), u=(INF, -t, 1.0)),
+        (0.0, 1e-17, Status.SOLVED),
+        (1e-6, 1.0, Status.INFEASIBLE),
+    ),
+    "a row of zeros, at rest on a bound": (
+        lambda t: three((ZERO, -INF, -t), (FIRST, -INF, -t), (BOTH, -0.1, 0.1), q=ZERO),
+        (0.0, 1e-17, 1e-16, Status.SOLVED),
+    ),
+    "crossed bounds": (
+        lambda t: three((FIRST, 1.0 + t, 1.0)),
+        (1e-16, 1e-9, 2e-8, Status.SOLVED),
+        (2e-7, 1e-3, Status.INFEASIBLE),
+    ),
+    "crossed bounds about zero, at rest": (
+        lambda t: three((FIRST, t, -t), (BOTH, -0.1, 0.1), q=ZERO),
+        (0.0, 1e-17, Status.SOLVED),
+        (1e-6, Status.INFEASIBLE),
+    ),
+    "crossed bounds, unbounded otherwise": (
+        lambda t: three((FIRST, 1.0 + t, 1.0), P=FLAT, q=(0.0, 1.0)),
+        (1e-16, Status.UNBOUNDED),
+        (1e-3, Status.INFEASIBLE),
+    ),
+    "two rows that contradict each other": (
+        lambda t: three((BOTH, 1.0, 1.0), (BOTH, 1.0 + t, 1.0 + t)),
+        (1e-12, 1e-9, 2e-8, Status.SOLVED),
+        (1e-6, 1e-3, 1.0, Status.INFEASIBLE),
+    ),
+    "three rows that contradict each other": (
+        lambda t: three((FIRST, -INF, 1.0), (SECOND, -INF, 1.0), (BOTH, 2.0 + t, INF)),
+        (1e-12, 1e-9, 2e-8, Status.SOLVED),
+        (1e-6, 1e-3, 1.0, Status.INFEASIBLE),
+    ),
+    "a fall along a free variable": (
+        lambda t: three(P=FLAT, q=(1.0, -t)),
+        (0.0, 1e-12, 1e-10, Status.NOT_UNIQUE),
+        (1e-6, 1e-3, 1.0, Status.UNBOUNDED),
+    ),
+    "a fall along a direction with little curvature": (
+        lambda t: correlated(1.0 - t, (1.0, -1.0)),
+        (0.0, 1e-12, Status.UNBOUNDED),
+        (3e-8, 1e-6, Status.SOLVED),
+    ),
+    "curvature": (
+        lambda t: correlated(1.0 - t, (1.0, 1.0)),
+        (0.0, 1e-10, 9.9e-9, Status.NOT_UNIQUE),
+        (1.01e-8, 1e-6, Status.SOLVED),
+    ),
+    "negative curvature": (
+        lambda t: correlated(1.0 + t, (1.0, 1.0)),
+        (0.0, 1e-12, 9.9e-10, Status.NOT_UNIQUE),
+        (1.01e-9, 1e-3, Status.BAD_DATA),
+    ),
+    "force of the row that holds": (
+        lambda t: three((SECOND, 1.0, 2.0), P=FLAT, q=(-1.0, t)),
+        (0.0, 1e-12, 9e-9, Status.NOT_UNIQUE),
+        (5e-8, 1e-3, Status.SOLVED),
+    ),
+    "size of a number": (
+        lambda t: three(q=(t, 0.0)),
+        (1e300, 1e308, Status.SOLVED),
+        (INF, np.nan, Status.BAD_DATA),
+    ),
+    "a bound that excludes every number": (
+        lambda t: three((FIRST, t, INF)),
+        (-INF, 9e19, Status.SOLVED),
+        (1e20, INF, np.nan, Status.BAD_DATA),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_a_verdict_changes_at_its_threshold_and_the_derivative_with_it(name):
+    make, *sides = EDGES[name]
+    for *values, status in sides:
+        for value in values:
+            qp = make(value)
+            alone = solve(qp)
+            found, moved = along(qp, jax.tree.map(lambda v: jnp.ones_like(v), qp))
+            assert Status(int(alone.status)) == status, value
+            assert found.status == alone.status
+            worst = max(alone.primal_residual, alone.dual_residual, alone.gap)
+            assert (worst <= 1e-8) == (status in (Status.SOLVED, Status.NOT_UNIQUE))
+            assert np.isfinite(alone.x).all()
+            assert np.isfinite(moved).all()
+            if status != Status.SOLVED:
+                assert not np.asarray(moved).any()
+
+
+def test_a_solution_is_as_good_as_the_tolerance_says():
+    qp = walking_qp(8)
+    stopped = QpConfig(active_set_tries=1, max_iterations=3)
+    found = solve(qp, stopped)
+    worst = float(max(found.primal_residual, found.dual_residual, found.gap))
+    assert found.status == Status.INACCURATE
+    for factor, status in ((1.01, Status.SOLVED), (0.99, Status.INACCURATE)):
+        assert solve(qp, replace(stopped, tolerance=factor * worst)).status == status
+
+
+def test_a_row_of_rounding_is_a_row_of_zeros():
+    free = solve(three())
+    noise = 1e-17 * np.array([0.3, -1.0])
+    for row in ((noise, -INF, -1e-17), (noise, 1e-17, INF), (noise, -1.0, 1e-17)):
+        found = solve(three(row, (BOTH, -INF, 9.0)))
+        check_solved(found)
+        np.testing.assert_allclose(found.x, free.x, atol=1e-12)
+    pressed = solve(three((1e-9 * np.array(FIRST), -INF, -1e-9), (BOTH, -INF, 9.0)))
+    np.testing.assert_allclose(pressed.x, [-1.0, 5.0], atol=1e-9)
+
+
+def test_crossed_bounds_are_an_equality_with_their_middle():
+    qp = three((FIRST, 1.0 + 1e-9, 1.0 - 1e-9))
+    found, moved = along(qp, jax.tree.map(jnp.zeros_like, qp)._replace(u=jnp.ones(3)))
+    np.testing.assert_allclose(found.x, [1.0, 5.0], atol=1e-13)
+    np.testing.assert_allclose(moved, [0.5, 0.0], atol=1e-9)
+
+
+def test_condensed_walks_are_solved_though_the_first_rows_are_zeros():
+    walks = [condensed_walk(seed) for seed in range(64)]
+    first = np.array([qp.u[:2].min() for qp in walks])
+    assert (first < 0).sum() >= 5
+    assert np.abs(first).max() < 1e-16
+    found = solve_all(stack(walks))
+    check_solved(found)
+    for qp, x in zip(walks, np.asarray(found.x), strict=True):
+        free = qp._replace(A=qp.A[2:], l=qp.l[2:], u=qp.u[2:])
+        np.testing.assert_allclose(x, exact_solution(free)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("price", "status"), [(0.0, "NOT_UNIQUE"), (1e-3, "SOLVED")])
+def test_forces_of_two_feet_are_unique_if_they_are_priced(price, status):
+    """States are variables, dynamics equalities, and two feet push one mass."""
+    horizon, dt = 4, 0.1
+    n = 4 * horizon  # of a step: position, speed, two forces
+    P = np.diag(np.tile([1.0, 0.1, price, price], horizon))
+    rows, bound = np.zeros((2 * horizon, n)), np.zeros(2 * horizon)
+    for k in range(horizon):
+        rows[2 * k : 2 * k + 2, 4 * k : 4 * k + 2] = np.eye(2)
+        rows[2 * k + 1, 4 * k + 2 : 4 * k + 4] = -dt
+        if k:
+            rows[2 * k : 2 * k + 2, 4 * k - 4 : 4 * k - 2] = [[-1.0, -dt], [0.0, -1.0]]
+    bound[0] = 0.3
+    push = np.kron(np.eye(horizon), [[0, 0, 1, 0], [0, 0, 0, 1]])
+    A = np.concatenate([rows, push])
+    lower, upper = np.r_[bound, -np.ones(2 * horizon)], np.r_[bound, np.ones(2 * horizon)]
+    found = solve(QP(P, np.zeros(n), A, lower, upper))
+    assert Status(int(found.status)).name == status
+    assert max(found.primal_residual, found.dual_residual, found.gap) <= 1e-8
+
+
+def of_kind(seed):
+    """A QP of six variables and ten rows, in turn of each verdict; and which it is."""
+    rng, kind = np.random.default_rng(seed), seed % 6
+    M, A, x = rng.normal(size=(6, 6)), rng.normal(size=(10, 6)), rng.normal(size=6)
+    P, q = M @ M.T + 0.1 * np.eye(6), 10.0 * rng.normal(size=6)
+    v = rng.normal(size=6)
+    flat = np.eye(6) - np.outer(v, v) / (v @ v)
+    if kind in (1, 3):
+        P, q, A = flat @ P @ flat, flat @ q - (kind == 3) * 3.0 * v, A @ flat
+    if kind == 4:
+        P = P - 1.5 * (v @ P @ v) / (v @ v) ** 2 * np.outer(v, v)
+    if kind == 5:  # four variables have no price
+        P = P * np.outer([1, 1, 0, 0, 0, 0], [1, 1, 0, 0, 0, 0])
+    lower, upper = A @ x + (0.05 + rng.exponential(size=(2, 10))) * [[-1.0], [1.0]]
+    lower[0], upper[9] = -INF, INF
+    if kind == 0:
+        lower[4] = upper[4] = A[4] @ x
+    if kind == 2:
+        A[1], lower[1], upper[1] = -A[0], -INF, -upper[0] - 0.5
+    names = "SOLVED", "NOT_UNIQUE", "INFEASIBLE", "UNBOUNDED", "BAD_DATA", "SOLVED"
+    return QP(P, q, A, lower, upper), Status[names[kind]]
+
+
+def with_rows(qp, rows, lower, upper):
+    """Three more rows, so that all have one shape."""
+    return qp._replace(
+        A=np.concatenate([qp.A, np.broadcast_to(rows, (3, 6))]),
+        l=np.concatenate([qp.l, lower]),
+        u=np.concatenate([qp.u, upper]),
+    )
+
+
+def in_units(qp, objective, row, variable):
+    """The same problem with objective, rows and variables in other units."""
+    return QP(
+        objective * qp.P * np.outer(variable, variable),
+        objective * qp.q * variable,
+        row[:, None] * qp.A * variable,
+        row * qp.l,
+        row * qp.u,
+    )
+
+
+def test_units_redundant_rows_and_rounding_change_no_verdict():
+    cases, expected = [], []
+    for seed in range(24):
+        (qp, status), rng = of_kind(seed), np.random.default_rng(100 + seed)
+        never = [-INF] * 3, [INF] * 3
+        twice = np.stack([qp.A[9], -2.0 * qp.A[1], 0.1 * qp.A[2]])
+        variants = [
+            with_rows(qp, 0.0, *never),
+            with_rows(qp, twice, [qp.l[9], -2.0 * qp.u[1], -INF], [INF, -2.0 * qp.l[1], INF]),
+            with_rows(qp, 0.0, [-INF, 1e-17, -1.0], [-1e-17, INF, 2.0]),
+            with_rows(qp, 1e-17 * rng.normal(size=(3, 6)), [-INF, 1e-17, -1.0], [-1e-17, INF, 0]),
+        ]
+        for variant in variants:
+            expected += [status] * 15
+            one = lambda n, size: np.where(np.arange(n) == rng.integers(n), size, 1.0)  # noqa: E731, B023
+            for size in (1e-6, 1e-3, 1e3, 1e6):
+                cases += [
+                    in_units(variant, size, np.ones(13), np.ones(6)),
+                    in_units(variant, 1.0, np.r_[one(10, size), np.ones(3)], np.ones(6)),
+                    in_units(variant, 1.0, np.ones(13), one(6, size)),
+                ]
+            rows = np.r_[10 ** rng.uniform(-3, 3, 10), np.ones(3)]
+            variables = 10 ** rng.uniform(-3, 3, 6)
+            cases += [
+                variant,
+                in_units(variant, 1.0, np.ones(13), variables),
+                in_units(variant, 1e4, rows, variables),
+            ]
+        for bound, still in (
+            (0.0, True),
+            (1e-17, True),
+            (1e-9, True),
+            (-1e-9, True),
+            (-1e-6, False),
+        ):
+            found = status if still or status == Status.BAD_DATA else Status.INFEASIBLE
+            expected += [found] * 2
+            cases += [
+                with_rows(qp, 0.0, never[0], [bound, INF, INF]),
+                with_rows(qp, 0.0, [-INF, -bound, -INF], never[1]),
+            ]
+    found = np.asarray(solve_all(stack(cases)).status)
+    wrong = [
+        (i, Status(int(is_)).name, was.name)
+        for i, (is_, was) in enumerate(zip(found, expected, strict=True))
+        if is_ != was
+    ]
+    assert not wrong
+    some = slice(None, None, 7)
+    together = jax.jit(jax.vmap(solve_qp))(stack(cases[some]))
+    np.testing.assert_array_equal(together.status, found[some])
+
+
+def test_each_status_has_its_meaning_and_is_documented():
+    page = (Path(__file__).parents[1] / "docs" / "qp.md").read_text()
+    for status in Status:
+        assert status.meaning.endswith(".")
+        assert f"| {status.value} `{status.name}` |" in page
+    with pytest.raises(ValueError, match=r"QP: NOT_UNIQUE \(.*\)\. x is a minimiser"):
+        check_solved(solve(three(P=FLAT, q=(1.0, 0.0))))
 
 
 def test_small_cases_by_hand():

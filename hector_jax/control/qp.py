@@ -7,6 +7,25 @@ Size. Every problem is first brought to one size (`_normalise`): x = kappa D v, 
 rows of A D of length one, kappa the larger of |D q| and the bounds violated at v = 0. Residuals are
 those of (x, y) alone in that form, and nothing is called solved by another measure.
 
+Verdicts. All are comparisons in that form, so that the units of objective, rows and variables do
+not matter; t is the tolerance.
+
+- SOLVED: the three residuals are at most t, and the minimiser is held in every direction: P less
+  1e-8 of the unit matrix is positive definite, or it is with the rows added to P that are
+  equalities or press with a force of more than t. Where it is not held: NOT_UNIQUE.
+- INFEASIBLE: a step of the multipliers proves that rows contradict each other by more than t. Or a
+  row of zeros, or a row with l > u, is violated by more than t whatever x is. Within t, crossed
+  bounds are an equality with their middle, and a row of zeros is met.
+- UNBOUNDED: a step of x proves a fall of more than t that neither P nor a row ends.
+- BAD_DATA: a number is not finite, or P plus 1e-9 of the unit matrix is not positive definite.
+
+A violation is measured by the larger of x and the row's bound. A row of zeros (entries of at most
+1e-15 of the longest row's) has neither a length nor a bound that counts: it is measured by x, its
+length is the geometric mean of the others, and what is below the rounding of the largest bound is
+none. Units do matter where nothing else gives a size: a column without price in P is scaled by its
+largest entry in A, and where q and the violated bounds are zero, kappa is 1. (In 32 bits: 1e-5,
+1e-6 and 1e-7 for 1e-8, 1e-9 and 1e-15.)
+
 Algorithm. First the active set is guessed and corrected by signs (`_active_set`, a semismooth
 Newton method): one n x n Cholesky per try, five tries on the QPs of walking, exact to rounding
 where it settles; on a GPU a kernel (`control.pivot`) makes the guess and one try proves it. Where
@@ -25,7 +44,8 @@ W_side = ((z + e) / (s + e))^2 from multiplier z and slack s of a side: infinite
 zero on the others. The square is that of the central path: a row barely active (z = s = 0), where
 the true derivative has one value on either side, gets one between. W is capped in the matrix that
 is factorised, and a second pass takes the cap's bias off; degenerate vertices stay regular.
-The derivative is zero without status SOLVED, and where the minimiser is not unique.
+The derivative is zero without status SOLVED. (In 32 bits the matrix of a minimiser that is barely
+held may have no Cholesky factor; the derivative is then NaN.)
 """
 
 from dataclasses import dataclass
@@ -50,21 +70,24 @@ SAVED = "qp"
 
 
 class Status(IntEnum):
-    """What a solution is worth; `Solution.status` holds these codes, `meaning` says what to do."""
+    """What a solution is worth; `Solution.status` holds these codes.
+
+    `meaning` says it in words, with a remedy.
+    """
 
     meaning: str
 
     def __new__(cls, code: int, meaning: str) -> "Status":
-        """A code with its sentence."""
+        """A code that carries its meaning."""
         member = int.__new__(cls, code)
         member._value_, member.meaning = code, meaning
         return member
 
-    SOLVED = 0, "All residuals are at most the tolerance and the minimiser is unique."
+    SOLVED = 0, "All residuals are at most the tolerance, and the minimiser is unique."
     INACCURATE = (
         1,
-        "The best point that was found; its residuals are above the tolerance. "
-        "Scale the data, or raise QpConfig.max_iterations or the tolerance.",
+        "The residuals of the best point that was found are above the tolerance. Raise "
+        "QpConfig.max_iterations or tolerance, or bring P and A nearer to one scale.",
     )
     INFEASIBLE = (
         2,
@@ -93,8 +116,8 @@ class QP(NamedTuple):
 
     P is positive semidefinite (its symmetric part counts). A is dense (m, n), or block-diagonal by
     step (N, r, b) with m = N r rows and n = N b: rows r k .. r (k+1) read variables b k .. b (k+1).
-    Infinite bounds (1e20 and more), rows with l = u, redundant rows and rows of zeros are legal. A
-    batch is vmap.
+    Infinite bounds (1e20 and more), rows with l = u, redundant rows and rows of zeros are legal,
+    and so are bounds that only rounding has crossed. A batch is vmap.
     """
 
     P: Float[Array, "n n"]
@@ -111,8 +134,8 @@ class Solution(NamedTuple):
     and compare between problems: `primal_residual` is the largest violation of a row over the
     larger of x and the row's bound, `dual_residual` the largest entry of P x + q + A'y over the
     largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (and a
-    little, so that a solution of zeros has residuals too). Where nothing was tried (BAD_DATA, l >
-    u, a row of zeros that cannot hold), x and y are zero and the residuals infinite.
+    little, so that a solution of zeros has residuals too). With BAD_DATA x and y are zero and the
+    residuals infinite.
     """
 
     x: Float[Array, " n"]
@@ -210,7 +233,7 @@ def check_solved(solution: Solution, what: str = "QP") -> None:
     """Look at a solution, or a batch of them, outside jit before believing it.
 
     Raises:
-        ValueError: names the first one that is not SOLVED, its status and residuals.
+        ValueError: names the first one that is not SOLVED, its status, residuals and remedy.
     """
     status = np.atleast_1d(np.asarray(solution.status))
     bad = np.argwhere(status != Status.SOLVED)
@@ -222,7 +245,8 @@ def check_solved(solution: Solution, what: str = "QP") -> None:
         for name in ("primal_residual", "dual_residual", "gap")
     )
     count = f"{len(bad)} of {status.size} problems, first at {first}: " if status.size > 1 else ""
-    raise ValueError(f"{what} not solved: {count}{Status(status[first]).name} ({residuals})")
+    found = Status(status[first])
+    raise ValueError(f"{what}: {count}{found.name} ({residuals}). {found.meaning}")
 
 
 def _check_shapes(qp: QP) -> None:
@@ -517,17 +541,17 @@ def _choose(first: Array, a, b):
 
 class _Loop(NamedTuple):
     point: _Point
-    step: _Point  # that led there; a multiplier that fell is left out of it
     slack: Array  # (2, m), positive; 1 on sides that are not there
     proximal: Array  # (2,) rho and delta
+    proved: Array  # (2,) bool: infeasible, unbounded
     iterations: Array
     going: Array
 
 
 def _interior_point(
     config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
-) -> tuple[_Point, _Point, Array, Array]:
-    """Mehrotra's proximal method, cold; last finite point, step to it, its slacks, iterations."""
+) -> tuple[_Point, Array, Array, Array]:
+    """Mehrotra's proximal method, cold; last finite point, slacks, what is proved, iterations."""
     dtype = qp.q.dtype
     least = jnp.array([10.0 * floors.proximal, 50.0 * jnp.finfo(dtype).eps], dtype)
     sign = jnp.asarray(_SIGN, dtype)
@@ -583,33 +607,32 @@ def _interior_point(
         point, slack = _choose(fine, new, (state.point, state.slack))
         factors = jnp.where(fine, 0.1, jnp.array([10.0, 100.0], dtype))
         proximal = jnp.maximum(factors * state.proximal, least)
-        rise = point.z - z
-        last = _Point(point.x - x, jnp.where(free, rise, jnp.maximum(rise, 0.0)))
         done = jnp.max(_evidence(qp, point)) <= floors.target
-        infeasible, unbounded = _certificates(floors, qp, point, last)
+        rise = point.z - z
+        step = _Point(point.x - x, jnp.where(free, rise, jnp.maximum(rise, 0.0)))
+        proved = _certificates(floors, qp, point, step)
         iterations = state.iterations + 1
-        going = ~done & ~infeasible & ~unbounded & (proximal[0] < 1.0)
+        going = ~done & ~jnp.any(proved) & (proximal[0] < 1.0)
         going &= iterations < config.max_iterations
-        return _Loop(point, last, slack, proximal, iterations, going)
+        return _Loop(point, slack, proximal, proved, iterations, going)
 
     # every product of slack and multiplier the same, however far the bound
     room = jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0)
-    start = _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0))
-    begin = _Loop(
-        start,
-        jax.tree.map(jnp.zeros_like, start),
+    start = _Loop(
+        _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0)),
         room,
         least,
+        jnp.zeros(2, bool),
         jnp.zeros((), jnp.int32),
         wanted,
     )
-    end = lax.while_loop(lambda state: state.going, advance, begin)
-    return end.point, end.step, end.slack, end.iterations
+    end = lax.while_loop(lambda state: state.going, advance, start)
+    return end.point, end.slack, end.proved, end.iterations
 
 
 def _approach(
     config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
-) -> tuple[_Point, _Point, Array, Array]:
+) -> tuple[_Point, Array, Array, Array]:
     """The interior point, again in the sizes of what it found where it did not get near.
 
     One size was taken for x and slope from q and the bounds. Where rows hold x far from where q
@@ -617,33 +640,30 @@ def _approach(
     """
 
     def attempt(state: tuple) -> tuple:
-        best, steps, (size, slope), _ = state
+        best, best_slack, steps, (size, slope), _, _ = state
         sized = qp._replace(
             P=size / slope * qp.P, q=qp.q / slope, bound=qp.bound / size, reach=qp.reach / size
         )
-        point, step, slack, more = _interior_point(config, floors, sized, wanted)
-        point, step = (_Point(size * found.x, slope * found.z) for found in (point, step))
+        point, slack, proved, more = _interior_point(config, floors, sized, wanted)
+        point = _Point(size * point.x, slope * point.z)
         first = steps == 0
-        better = first | (jnp.max(_evidence(qp, point)) < jnp.max(_evidence(qp, best[0])))
-        point, step, slack = best = _choose(better, (point, step, size * slack), best)
+        better = first | (jnp.max(_evidence(qp, point)) < jnp.max(_evidence(qp, best)))
+        point, slack = _choose(better, (point, size * slack), (best, best_slack))
         near = jnp.max(_evidence(qp, point)) <= floors.target
-        proved = jnp.any(jnp.stack(_certificates(floors, qp, point, step)))
         sizes = jnp.stack(
             [_largest(point.x), jnp.maximum(_largest(qp.P @ point.x), _largest(qp.q))]
         )
-        again = first & ~near & ~proved & jnp.all(sizes > 0.0)
-        return best, steps + more, jnp.where(again, sizes, 1.0), again
+        again = first & ~near & ~jnp.any(proved) & jnp.all(sizes > 0.0)
+        return point, slack, steps + more, jnp.where(again, sizes, 1.0), proved, again
 
     nowhere = _Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
-    ones, none = jnp.ones(2, qp.q.dtype), jnp.zeros((), jnp.int32)
-    start = ((nowhere, nowhere, jnp.ones_like(qp.bound)), none, ones, wanted)
-    best, steps, *_ = lax.while_loop(lambda state: state[-1], attempt, start)
-    return *best, steps
+    none, ones = jnp.zeros((), jnp.int32), jnp.ones(2, qp.q.dtype)
+    start = (nowhere, jnp.ones_like(qp.bound), none, ones, jnp.zeros(2, bool), wanted)
+    point, slack, steps, _, proved, _ = lax.while_loop(lambda state: state[-1], attempt, start)
+    return point, slack, proved, steps
 
 
-def _box_osqp(
-    config: QpConfig, floors: _Floors, qp: _Normal
-) -> tuple[_Point, _Point, Array, Array]:
+def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, Array, Array, Array]:
     """BoxOSQP of jaxopt, its derivative left aside; returns what `_interior_point` does."""
     from jaxopt import BoxOSQP
 
@@ -663,8 +683,10 @@ def _box_osqp(
     y = jnp.where(finite, params.dual_eq, 0.0)
     z = jnp.maximum(jnp.asarray(_SIGN, y.dtype) * y, 0.0)
     z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(held, z, 0.0))
-    point, slack = _Point(x, z), jnp.maximum(-_violation(qp, x), 0.0)
-    return point, point, slack, state.iter_num.astype(jnp.int32)
+    point = _Point(x, z)
+    proved = _certificates(floors, qp, point, point)  # it tells no step; the point grows, too
+    slack = jnp.maximum(-_violation(qp, x), 0.0)
+    return point, slack, proved, state.iter_num.astype(jnp.int32)
 
 
 def _support(qp: _Normal, y: Array) -> Array:
@@ -680,12 +702,12 @@ def _slope(qp: _Normal, point: _Point) -> Array:
     )
 
 
-def _certificates(floors: _Floors, qp: _Normal, point: _Point, step: _Point) -> tuple[Array, Array]:
-    """Whether a step proves that no x of moderate size meets the rows, or an endless fall.
+def _certificates(floors: _Floors, qp: _Normal, point: _Point, step: _Point) -> Array:
+    """Whether a step proves that no x of moderate size meets the rows, and an endless fall (2,).
 
-    Multipliers without a solution grow for ever along a combination of rows that cancels, and so
-    does x along a free fall; what the point itself had before does not cancel. Contradiction and
-    fall must be more than the tolerance, or they are within it and the problem is solved.
+    Where there is no solution the multipliers grow for ever along a combination of rows that
+    cancels, or x along a fall that nothing ends. A step shows that purely; the point itself holds
+    a part that does not cancel. Less than the tolerance proves nothing: such a problem is solved.
     """
     y, along = _multiplier(step.z), jnp.asarray(_SIGN, step.x.dtype) * _rows(qp.A, step.x)
     gain, fall = -_support(qp, y), -jnp.dot(qp.q, step.x)
@@ -695,7 +717,7 @@ def _certificates(floors: _Floors, qp: _Normal, point: _Point, step: _Point) -> 
     needed = jnp.maximum(_largest(qp.P @ step.x), jnp.max(outward, initial=0.0))
     unbounded = needed < floors.certificate * fall
     unbounded &= fall > floors.tolerance * jnp.sum(jnp.abs(step.x)) * _slope(qp, point)
-    return infeasible, unbounded
+    return jnp.stack([infeasible, unbounded])
 
 
 def _evidence(qp: _Normal, point: _Point) -> Array:
@@ -716,23 +738,34 @@ def _or_plain(valid: Array, qp: QP) -> QP:
     return _choose(valid, qp, plain)
 
 
-def _probe(n: int) -> np.ndarray:
-    """Where inverse iteration starts; at random, lest it is square to what is looked for."""
-    return np.random.default_rng(0).normal(size=n)
+def _shifted(matrix: Array, shift: float) -> tuple[Array, Array]:
+    """Cholesky factor of a matrix plus a multiple of the unit matrix, and whether there is one.
 
-
-def _least_curvature(factor: Array, once: Array) -> Array:
-    """Smallest eigenvalue of a factorised matrix, or little more.
-
-    The Rayleigh quotient after a second inverse iteration. Pivots cannot stand for it: that of a
-    singular matrix grows with the number of variables that share the flat direction.
-
-    Args:
-        factor: Cholesky factor, of NaNs where there is none; then so is the answer.
-        once: the inverse times `_probe`.
+    So a smallest eigenvalue is compared exactly. Pivots would not tell: that of a singular matrix
+    grows with the number of variables that share the flat direction.
     """
-    twice = cho_solve((factor, True), once)
-    return jnp.dot(once, twice) / jnp.dot(twice, twice)
+    factor = _cholesky(matrix + shift * jnp.eye(len(matrix), dtype=matrix.dtype))
+    return factor, jnp.isfinite(factor[-1, -1])
+
+
+def _without_rows(floors: _Floors, qp: _Normal) -> tuple[Array, Array, Array]:
+    """Minimiser without rows; whether P curves in every direction; whether it is semidefinite.
+
+    One factorisation where P does. The other is in a loop, not a cond, because vmap would make it
+    for every problem of a batch.
+    """
+
+    def minimiser(shift: float) -> tuple[Array, Array]:
+        factor, exists = _shifted(qp.P, shift)
+        return -cho_solve((factor, True), qp.q), exists
+
+    x, curved = minimiser(-floors.curvature)
+    _, x, convex = lax.while_loop(
+        lambda state: state[0],
+        lambda _: (jnp.zeros((), bool), *minimiser(floors.proximal)),
+        (~curved, x, curved),
+    )
+    return x, curved, convex
 
 
 def _held(floors: _Floors, qp: _Normal, point: _Point, wanted: Array) -> Array:
@@ -741,20 +774,17 @@ def _held(floors: _Floors, qp: _Normal, point: _Point, wanted: Array) -> Array:
     A row holds where it is an equality or presses with more than the tolerance. One that is active
     without force does not: the minimiser can leave it.
     """
-    force = point.z / _slope(qp, point)
-    slack = jnp.abs(_violation(qp, point.x)) / _sizes(qp, point.x)
-    pressing = qp.side & (force > floors.tolerance) & (force > slack)
-    holding = qp.equality | jnp.any(pressing, axis=0)
-    eye = jnp.eye(len(qp.q), dtype=qp.q.dtype)
 
     def look(_: tuple) -> tuple[Array, Array]:
+        force = point.z / _slope(qp, point)
+        slack = jnp.abs(_violation(qp, point.x)) / _sizes(qp, point.x)
+        pressing = qp.side & (force > floors.tolerance) & (force > slack)
+        holding = qp.equality | jnp.any(pressing, axis=0)
         # the cap's rounding could hide a flat direction; this one's is a hundredth of the curvature
-        weight = jnp.where(holding, 0.01 * floors.curvature / jnp.finfo(eye.dtype).eps, 0.0)
-        factor = _cholesky(_plus_gram(qp.P + floors.proximal * eye, qp.A, weight))
-        once = cho_solve((factor, True), jnp.asarray(_probe(len(eye)), eye.dtype))
-        return jnp.zeros((), bool), _least_curvature(factor, once) > floors.curvature
+        weight = jnp.where(holding, 0.01 * floors.curvature / jnp.finfo(force.dtype).eps, 0.0)
+        curved = _shifted(_plus_gram(qp.P, qp.A, weight), -floors.curvature)[1]
+        return jnp.zeros((), bool), curved
 
-    # a loop, as vmap would make a cond factorise for every problem of the batch
     return lax.while_loop(lambda state: state[0], look, (wanted, jnp.zeros((), bool)))[1]
 
 
@@ -762,30 +792,24 @@ def _held(floors: _Floors, qp: _Normal, point: _Point, wanted: Array) -> Array:
 def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     """Solution, the ratios W (2, m) of its derivative, and the problem they belong to."""
     floors = _floors(config, qp.q.dtype)
-    n, dtype = len(qp.q), qp.q.dtype
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= _INFINITE) | (qp.u <= -_INFINITE)
     finite = [jnp.all(jnp.isfinite(part)) for part in (qp.P, qp.q, qp.A)]
     valid = jnp.all(jnp.stack(finite)) & ~jnp.any(no_bound)
     normal = _normalise(floors, _or_plain(valid, qp))
-    factor = _cholesky(normal.P + floors.proximal * jnp.eye(n, dtype=dtype))
-    valid &= jnp.isfinite(factor[-1, -1])
-
-    both = jnp.stack([-normal.q, jnp.asarray(_probe(n), dtype)], axis=1)
-    free, once = cho_solve((factor, True), both).T
-    definite = _least_curvature(factor, once) > floors.curvature
-    loose = _Point(free, jnp.zeros(normal.side.shape, dtype))
+    free, definite, convex = _without_rows(floors, normal)
+    valid &= convex
+    loose = _Point(free, jnp.zeros(normal.side.shape, qp.q.dtype))
     tries = config.active_set_tries
     if config.solver == "interior_point":
         start, guess = _first_guess(normal, loose)
         quick, proof, first = _active_set(floors, normal, start, guess, valid, tries)
         settled = jnp.max(proof) <= floors.target
-        near, step, slack, steps = _approach(config, floors, normal, valid & ~settled)
+        near, slack, proved, steps = _approach(config, floors, normal, valid & ~settled)
     else:
-        quick, proof = loose, jnp.full(3, jnp.inf, dtype)
+        quick, proof = loose, jnp.full(3, jnp.inf, qp.q.dtype)
         first, settled = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-        near, step, slack, steps = _box_osqp(config, floors, normal)
-    infeasible, unbounded = _certificates(floors, normal, near, step)
-    hopeful = valid & ~settled & ~infeasible & ~unbounded
+        near, slack, proved, steps = _box_osqp(config, floors, normal)
+    hopeful = valid & ~settled & ~jnp.any(proved)
     # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
     pushes = near.z * normal.reach > slack * _largest(near.z)
     exact, exact_proof, last = _active_set(
@@ -800,12 +824,12 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), point)
 
     solved = usable & (jnp.max(proof) <= floors.tolerance)
-    # an x that solves nothing is no measure of what the bounds themselves leave unmet
-    sizes = jnp.min(_sizes(normal, jnp.where(solved, point.x, 0.0)), axis=0)
+    # what no x can meet; an x that solves nothing is no measure of it
+    sizes = jnp.min(_sizes(normal, jnp.where(solved, point.x, normal.reach)), axis=0)
     unmet = jnp.max(normal.unmet / sizes, initial=0.0)
     unique = definite | _held(floors, normal, point, solved & ~definite)
-    status = jnp.where(unbounded & ~settled, Status.UNBOUNDED, Status.INACCURATE)
-    status = jnp.where(infeasible & ~settled, Status.INFEASIBLE, status)
+    status = jnp.where(proved[1], Status.UNBOUNDED, Status.INACCURATE)
+    status = jnp.where(proved[0], Status.INFEASIBLE, status)
     status = jnp.where(solved, jnp.where(unique, Status.SOLVED, Status.NOT_UNIQUE), status)
     status = jnp.where(unmet > floors.tolerance, Status.INFEASIBLE, status)
     status = jnp.where(valid, status, Status.BAD_DATA).astype(jnp.int32)
@@ -863,9 +887,9 @@ def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tup
     pull, shift = jnp.where(sound, column * pull, 0.0), jnp.where(sound, row * shift, 0.0)
     dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
     for _ in range(2):  # as in `_active_set`: later passes take off what cap and rho did
-        known = jnp.where(firm, dz, 0.0) + both * _rows(normal.A, dv) + shift
-        step = -cho_solve((factor, True), normal.P @ dv + pull + _columns(normal.A, known))
-        dv, dz = dv + step, known + both * _rows(normal.A, step)
+        force = jnp.where(firm, dz, 0.0) + both * _rows(normal.A, dv) + shift
+        step = -cho_solve((factor, True), normal.P @ dv + pull + _columns(normal.A, force))
+        dv, dz = dv + step, force + both * _rows(normal.A, step)
     zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)
     return solution, Solution(column * dv, row * dz, zero, zero, zero, none, none)
