@@ -178,11 +178,11 @@ def other_minimiser(qp: QP, x: np.ndarray) -> float:
     return reach
 
 
-def condensed_walk(seed: int, horizon: int = 16) -> QP:
+def condensed_walk(seed: int, horizon: int = 12) -> QP:
     """Condensed MPC of a linear inverted pendulum, its ZMP between two bounds from now on.
 
-    Inputs are jerks, as in Kajita et al. 2003. The ZMP now is on a bound and no input moves it: the
-    first two rows are zeros, and the bound of one is zero but for rounding.
+    Inputs are jerks, as in Kajita et al. 2003, the first half of them bounded. The ZMP now is on a
+    bound and no input moves it: the first two rows are zeros, one bound of them but for rounding.
     """
     rng = np.random.default_rng(seed)
     dt, height = 0.1, 0.8
@@ -206,9 +206,11 @@ def condensed_walk(seed: int, horizon: int = 16) -> QP:
     error = A @ power @ state - [centres[-1], 0.0, 0.0]
     P = last.T @ last + C.T @ C + 1e-3 * np.eye(horizon)
     q = last.T @ error + C.T @ (free - centres)
-    G = np.stack([C, -C], axis=1).reshape(-1, horizon)
+    jerks = np.eye(horizon)[: horizon // 2]
+    G = np.concatenate([np.stack([C, -C], axis=1).reshape(-1, horizon), jerks])
     upper = np.stack([centres + half - free, free - centres + half], axis=1).ravel()
-    return QP(P, q, G, np.full(2 * horizon, -np.inf), upper)
+    most = np.full(horizon // 2, 20.0)
+    return QP(P, q, G, np.r_[np.full(2 * horizon, -np.inf), -most], np.r_[upper, most])
 
 
 def moved(qp: QP, tangent: QP, step: float) -> QP:
