@@ -163,8 +163,8 @@ FLAT = ((1.0, 0.0), (0.0, 0.0))
 EDGES = {
     "a row of zeros past zero": (
         lambda t: rows((ZERO, -INF, -t)),
-        (0.0, 1e-17, 1e-8, Status.SOLVED),
-        (1e-6, 1.0, Status.INFEASIBLE),
+        (0.0, 1e-17, 2e-8, Status.SOLVED),
+        (3e-8, 1.0, Status.INFEASIBLE),
     ),
     "the only row, all else at rest": (
         lambda t: small(q=ZERO, A=(ZERO, ZERO, ZERO), l=(t, -INF, -1.0), u=(INF, -t, 1.0)),
@@ -177,8 +177,8 @@ EDGES = {
     ),
     "crossed bounds": (
         lambda t: rows((FIRST, 1.0 + t, 1.0)),
-        (1e-16, 1e-9, 2e-8, Status.SOLVED),
-        (2e-7, 1e-3, Status.INFEASIBLE),
+        (1e-16, 1e-9, 9e-8, Status.SOLVED),
+        (1.1e-7, 1e-3, Status.INFEASIBLE),
     ),
     "crossed bounds about zero, at rest": (
         lambda t: rows((FIRST, t, -t), (BOTH, -0.1, 0.1), q=ZERO),
@@ -192,19 +192,19 @@ EDGES = {
     ),
     "two rows that contradict each other": (
         lambda t: rows((BOTH, 1.0, 1.0), (BOTH, 1.0 + t, 1.0 + t)),
-        (1e-12, 1e-9, 2e-8, Status.SOLVED),
-        (1e-6, 1e-3, 1.0, Status.INFEASIBLE),
+        (1e-12, 5e-8, Status.SOLVED),
+        (1e-7, 1e-3, 1.0, Status.INFEASIBLE),
     ),
     "three rows that contradict each other": (
         lambda t: rows((FIRST, -INF, 1.0), (SECOND, -INF, 1.0), (BOTH, 2.0 + t, INF)),
-        (1e-12, 1e-9, 2e-8, Status.SOLVED),
-        (1e-6, 1e-3, 1.0, Status.INFEASIBLE),
+        (1e-12, 3e-8, Status.SOLVED),
+        (5e-8, 1e-3, 1.0, Status.INFEASIBLE),
     ),
     "a fall along a free variable": (
         lambda t: rows(P=FLAT, q=(1.0, -t)),
         (0.0, 1e-12, 1e-9, Status.NOT_UNIQUE),
-        (1.1e-8, Status.INACCURATE),
-        (1e-6, 1e-3, 1.0, Status.UNBOUNDED),
+        (3e-9, 8e-9, Status.INACCURATE),
+        (1.1e-8, 1e-3, 1.0, Status.UNBOUNDED),
     ),
     "a fall along a direction with little curvature": (
         lambda t: correlated(1.0 - t, (1.0, -1.0)),
@@ -223,8 +223,8 @@ EDGES = {
     ),
     "force of the row that holds": (
         lambda t: rows((SECOND, 1.0, 2.0), P=FLAT, q=(-1.0, t)),
-        (0.0, 1e-12, 9e-9, Status.NOT_UNIQUE),
-        (5e-8, 1e-3, Status.SOLVED),
+        (0.0, 1e-12, 2e-8, Status.NOT_UNIQUE),
+        (3e-8, 1e-3, Status.SOLVED),
     ),
     "price of two forces that share a load": (
         lambda t: rows((BOTH, 1.0, 1.0), (FIRST, 0.0, 2.0), (SECOND, 0.0, 2.0), P=t * EYE, q=ZERO),

@@ -541,9 +541,9 @@ def _choose(first: Array, a, b):
 
 class _Loop(NamedTuple):
     point: _Point
+    before: _Point
     slack: Array  # (2, m), positive; 1 on sides that are not there
     proximal: Array  # (2,) rho and delta
-    proved: Array  # (2,) bool: infeasible, unbounded
     iterations: Array
     going: Array
 
@@ -608,26 +608,18 @@ def _interior_point(
         factors = jnp.where(fine, 0.1, jnp.array([10.0, 100.0], dtype))
         proximal = jnp.maximum(factors * state.proximal, least)
         done = jnp.max(_evidence(qp, point)) <= floors.target
-        rise = point.z - z
-        step = _Point(point.x - x, jnp.where(free, rise, jnp.maximum(rise, 0.0)))
-        proved = _certificates(floors, qp, point, step)
         iterations = state.iterations + 1
-        going = ~done & ~jnp.any(proved) & (proximal[0] < 1.0)
+        shown, _ = _rays(floors, qp, state.point, point)
+        going = ~done & ~jnp.any(shown) & (proximal[0] < 1.0)
         going &= iterations < config.max_iterations
-        return _Loop(point, slack, proximal, proved, iterations, going)
+        return _Loop(point, state.point, slack, proximal, iterations, going)
 
     # every product of slack and multiplier the same, however far the bound
     room = jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0)
-    start = _Loop(
-        _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0)),
-        room,
-        least,
-        jnp.zeros(2, bool),
-        jnp.zeros((), jnp.int32),
-        wanted,
-    )
+    begin = _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0))
+    start = _Loop(begin, begin, room, least, jnp.zeros((), jnp.int32), wanted)
     end = lax.while_loop(lambda state: state.going, advance, start)
-    return end.point, end.slack, end.proved, end.iterations
+    return end.point, end.slack, _proofs(floors, qp, end.before, end.point), end.iterations
 
 
 def _approach(
@@ -684,7 +676,7 @@ def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, A
     z = jnp.maximum(jnp.asarray(_SIGN, y.dtype) * y, 0.0)
     z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(held, z, 0.0))
     point = _Point(x, z)
-    proved = _certificates(floors, qp, point, point)  # it tells no step; the point grows, too
+    proved = _proofs(floors, qp, jax.tree.map(jnp.zeros_like, point), point)
     slack = jnp.maximum(-_violation(qp, x), 0.0)
     return point, slack, proved, state.iter_num.astype(jnp.int32)
 
@@ -702,22 +694,35 @@ def _slope(qp: _Normal, point: _Point) -> Array:
     )
 
 
-def _certificates(floors: _Floors, qp: _Normal, point: _Point, step: _Point) -> Array:
-    """Whether a step proves that no x of moderate size meets the rows, and an endless fall (2,).
+def _rays(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> tuple[Array, Array]:
+    """Whether a step shows that no x of moderate size meets the rows, an endless fall; by how much.
 
-    Where there is no solution the multipliers grow for ever along a combination of rows that
-    cancels, or x along a fall that nothing ends. A step shows that purely; the point itself holds
-    a part that does not cancel. Less than the tolerance proves nothing: such a problem is solved.
+    Without a solution the multipliers grow for ever along a combination of rows that cancels, or x
+    along a fall. A step shows that purely; in the point itself is a part that does not cancel.
     """
-    y, along = _multiplier(step.z), jnp.asarray(_SIGN, step.x.dtype) * _rows(qp.A, step.x)
-    gain, fall = -_support(qp, y), -jnp.dot(qp.q, step.x)
-    infeasible = _largest(_columns(qp.A, y)) < floors.certificate * gain
-    infeasible &= gain > floors.tolerance * jnp.sum(jnp.abs(step.z) * _sizes(qp, point.x))
-    outward = jnp.where(qp.equality, jnp.abs(along), jnp.where(qp.side, along, 0.0))
-    needed = jnp.maximum(_largest(qp.P @ step.x), jnp.max(outward, initial=0.0))
-    unbounded = needed < floors.certificate * fall
-    unbounded &= fall > floors.tolerance * jnp.sum(jnp.abs(step.x)) * _slope(qp, point)
-    return jnp.stack([infeasible, unbounded])
+    dx, rise = point.x - before.x, point.z - before.z
+    sign = jnp.asarray(_SIGN, dx.dtype)
+    grown = jnp.where(qp.equality, rise, jnp.maximum(rise, 0.0))  # what falls counts against it
+    gap = -jnp.sum(sign * qp.bound * grown + (grown - rise) / floors.certificate)
+    # differences of products that an iteration needs at both points anyway
+    pull = _columns(qp.A, _multiplier(point.z)) - _columns(qp.A, _multiplier(before.z))
+    outside = sign * (_rows(qp.A, point.x) - _rows(qp.A, before.x))
+    outward = jnp.where(qp.equality, jnp.abs(outside), jnp.where(qp.side, outside, 0.0))
+    needed = jnp.maximum(_largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
+    by = jnp.stack([gap, -jnp.dot(qp.q, dx)])
+    return jnp.stack([_largest(pull), needed]) < floors.certificate * by, by
+
+
+def _proofs(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> Array:
+    """Whether the step proves that the problem is infeasible, and unbounded (2,).
+
+    By more than the tolerance, within which it can be solved.
+    """
+    dx, rise = point.x - before.x, point.z - before.z
+    rows = jnp.sum(jnp.abs(rise) * _sizes(qp, point.x))
+    sizes = jnp.stack([rows, jnp.sum(jnp.abs(dx)) * _slope(qp, point)])
+    shown, by = _rays(floors, qp, before, point)
+    return shown & (by > floors.tolerance * sizes)
 
 
 def _evidence(qp: _Normal, point: _Point) -> Array:
