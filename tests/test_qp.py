@@ -202,8 +202,8 @@ EDGES = {
     ),
     "a fall along a free variable": (
         lambda t: rows(P=FLAT, q=(1.0, -t)),
-        (0.0, 1e-12, 1e-9, Status.NOT_UNIQUE),
-        (3e-9, 8e-9, Status.INACCURATE),
+        (0.0, 1e-12, 2e-9, Status.NOT_UNIQUE),
+        (5e-9, 8e-9, Status.INACCURATE),
         (1.1e-8, 1e-3, 1.0, Status.UNBOUNDED),
     ),
     "a fall along a direction with little curvature": (

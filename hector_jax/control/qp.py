@@ -48,6 +48,7 @@ The derivative is zero without status SOLVED. (In 32 bits the matrix of a minimi
 held may have no Cholesky factor; the derivative is then NaN.)
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -364,7 +365,6 @@ def _normalise(floors: _Floors, qp: QP) -> _Normal:
     width = jnp.where(given[0] & given[1], bound[0] - bound[1], jnp.inf)
     crossed = width < 0
     unmet = jnp.maximum(-0.5 * width, jnp.where(zeros, jnp.max(-sign * bound, axis=0), 0.0))
-    unmet = jnp.where(unmet > rounding * _largest(bound), unmet, 0.0)
     given &= ~zeros
     bound = jnp.where(crossed, 0.5 * (bound[0] + bound[1]), bound)
     bound = jnp.where(given, bound, 0.0)
@@ -384,7 +384,7 @@ def _normalise(floors: _Floors, qp: QP) -> _Normal:
         bound,
         given & ~equality,
         equality,
-        unmet / size,
+        jnp.where(unmet / size > rounding * largest, unmet / size, 0.0),
         column,
         row,
         size,
@@ -753,44 +753,49 @@ def _shifted(matrix: Array, shift: float) -> tuple[Array, Array]:
     return factor, jnp.isfinite(factor[-1, -1])
 
 
+def _only_if(wanted: Array, function: Callable, otherwise: Any, operands: Any) -> Any:
+    """`function(operands)` where `wanted`, else `otherwise`; costs nothing where none is wanted.
+
+    A loop of one round, because vmap makes a cond compute for every problem of a batch.
+    """
+
+    def once(state: tuple) -> tuple:
+        # that reads the state, or the compiler would compute it once, before the loop
+        _, hidden = lax.optimization_barrier((state[0], operands))
+        return jnp.zeros((), bool), function(hidden)
+
+    return lax.while_loop(lambda state: state[0], once, (wanted, otherwise))[1]
+
+
 def _without_rows(floors: _Floors, qp: _Normal) -> tuple[Array, Array, Array]:
     """Minimiser without rows; whether P curves in every direction; whether it is semidefinite.
 
-    One factorisation where P does. The other is in a loop, not a cond, because vmap would make it
-    for every problem of a batch.
+    One factorisation where P curves.
     """
 
-    def minimiser(shift: float) -> tuple[Array, Array]:
+    def minimiser(shift: float, qp: _Normal) -> tuple[Array, Array]:
         factor, exists = _shifted(qp.P, shift)
         return -cho_solve((factor, True), qp.q), exists
 
-    x, curved = minimiser(-floors.curvature)
-    _, x, convex = lax.while_loop(
-        lambda state: state[0],
-        lambda _: (jnp.zeros((), bool), *minimiser(floors.proximal)),
-        (~curved, x, curved),
-    )
+    x, curved = minimiser(-floors.curvature, qp)
+    softened = partial(minimiser, floors.proximal)
+    x, convex = _only_if(~curved, softened, (x, curved), qp)
     return x, curved, convex
 
 
-def _held(floors: _Floors, qp: _Normal, point: _Point, wanted: Array) -> Array:
-    """Whether P and the rows hold a minimiser in every direction; false unless `wanted`.
+def _held(floors: _Floors, qp: _Normal, point: _Point) -> Array:
+    """Whether P and the rows hold a minimiser in every direction.
 
     A row holds where it is an equality or presses with more than the tolerance. One that is active
     without force does not: the minimiser can leave it.
     """
-
-    def look(_: tuple) -> tuple[Array, Array]:
-        force = point.z / _slope(qp, point)
-        slack = jnp.abs(_violation(qp, point.x)) / _sizes(qp, point.x)
-        pressing = qp.side & (force > floors.tolerance) & (force > slack)
-        holding = qp.equality | jnp.any(pressing, axis=0)
-        # the cap's rounding could hide a flat direction; this one's is a hundredth of the curvature
-        weight = jnp.where(holding, 0.01 * floors.curvature / jnp.finfo(force.dtype).eps, 0.0)
-        curved = _shifted(_plus_gram(qp.P, qp.A, weight), -floors.curvature)[1]
-        return jnp.zeros((), bool), curved
-
-    return lax.while_loop(lambda state: state[0], look, (wanted, jnp.zeros((), bool)))[1]
+    force = point.z / _slope(qp, point)
+    slack = jnp.abs(_violation(qp, point.x)) / _sizes(qp, point.x)
+    pressing = qp.side & (force > floors.tolerance) & (force > slack)
+    holding = qp.equality | jnp.any(pressing, axis=0)
+    # the cap's rounding could hide a flat direction; this one's is a hundredth of the curvature
+    weight = jnp.where(holding, 0.01 * floors.curvature / jnp.finfo(force.dtype).eps, 0.0)
+    return _shifted(_plus_gram(qp.P, qp.A, weight), -floors.curvature)[1]
 
 
 @partial(jax.jit, static_argnums=0)
@@ -798,8 +803,8 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     """Solution, the ratios W (2, m) of its derivative, and the problem they belong to."""
     floors = _floors(config, qp.q.dtype)
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= _INFINITE) | (qp.u <= -_INFINITE)
-    finite = [jnp.all(jnp.isfinite(part)) for part in (qp.P, qp.q, qp.A)]
-    valid = jnp.all(jnp.stack(finite)) & ~jnp.any(no_bound)
+    numbers = jnp.maximum(jnp.maximum(_largest(qp.P), _largest(qp.q)), _largest(qp.A))
+    valid = jnp.isfinite(numbers) & ~jnp.any(no_bound)
     normal = _normalise(floors, _or_plain(valid, qp))
     free, definite, convex = _without_rows(floors, normal)
     valid &= convex
@@ -832,7 +837,8 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     # what no x can meet; an x that solves nothing is no measure of it
     sizes = jnp.min(_sizes(normal, jnp.where(solved, point.x, normal.reach)), axis=0)
     unmet = jnp.max(normal.unmet / sizes, initial=0.0)
-    unique = definite | _held(floors, normal, point, solved & ~definite)
+    held = lambda operands: _held(floors, *operands)  # noqa: E731
+    unique = _only_if(solved & ~definite, held, definite, (normal, point))
     status = jnp.where(proved[1], Status.UNBOUNDED, Status.INACCURATE)
     status = jnp.where(proved[0], Status.INFEASIBLE, status)
     status = jnp.where(solved, jnp.where(unique, Status.SOLVED, Status.NOT_UNIQUE), status)
