@@ -36,6 +36,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from hector_jax.console import Broken
+from hector_jax.control.qp import Status
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import (
     Feet,
@@ -318,7 +319,8 @@ _SIGNATURE = {
         "moment": "the same, at the foot point [N m]",
         "torque": "of the joints [N m], within the limits: this goes to the motors",
         "contact": "planned stance",
-        "status": "of the QP: 0 solved, 1 inaccurate, 2 infeasible, 3 unbounded, 4 bad data",
+        "status": "of the QP: "
+        + ", ".join(f"{code.value} {code.name.lower().replace('_', ' ')}" for code in Status),
         "residual": "worst relative residual of the QP",
     },
 }
@@ -466,7 +468,7 @@ def check(
         force=float(np.abs(out["force"][walked.lead :] - walked.wrench.force).max()),
         moment=float(np.abs(out["moment"][walked.lead :] - walked.wrench.moment).max()),
         torque=float(np.abs(out["torque"] - walked.torque).max()),
-        unsolved=int((out["status"][plans] != 0).sum()),
+        unsolved=int((~np.isin(out["status"][plans], (Status.SOLVED, Status.NOT_UNIQUE))).sum()),
         plan_ms=spread(np.array(spent)[plans]),
         hold_ms=spread(np.array(spent)[~plans]),
     )

@@ -4,6 +4,7 @@ import daqp
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from scipy.optimize import linprog
 
 from hector_jax.control.qp import QP
 from hector_jax.geometry import rot_z, skew
@@ -148,6 +149,68 @@ def exact_solution(qp: QP) -> tuple[np.ndarray, np.ndarray]:
     y = np.zeros(len(row))
     y[active] = answer[len(q) :]
     return size * column * answer[: len(q)].astype(float), size * row * y
+
+
+def other_minimiser(qp: QP, x: np.ndarray) -> float:
+    """How far minimisers beside x reach, in a box of half-width 1: 0 where x is the only one.
+
+    Directions d with P d = 0 and q'd = 0 that cross no active row, by linear programs in normalised
+    units.
+    """
+    diagonal, widest = np.diag(qp.P), np.abs(qp.A).max(axis=0)
+    priced = diagonal > 1e-12 * diagonal.max()
+    column = np.where(widest > 0, 1.0 / np.where(widest > 0, widest, 1.0), 1.0)
+    column[priced] = diagonal[priced] ** -0.5
+    length = np.linalg.norm(qp.A * column, axis=1)
+    A = qp.A * column / np.where(length > 0, length, 1.0)[:, None]
+    q = column * qp.q
+    near = 1e-9 * (np.abs(A) @ np.abs(x / column) + 1e-3)
+    room = [(qp.u - qp.A @ x) / np.where(length > 0, length, 1.0)]
+    room += [(qp.A @ x - qp.l) / np.where(length > 0, length, 1.0)]
+    up, down = (slack <= near for slack in room)
+    still = np.concatenate([qp.P * np.outer(column, column), q[None] / (np.abs(q).max() or 1.0)])
+    rows = np.concatenate([A[up], -A[down], still, -still])
+    reach = 0.0
+    for towards in np.random.default_rng(0).normal(size=(3, len(x))):
+        for sign in (1.0, -1.0):
+            found = linprog(sign * towards, rows, np.zeros(len(rows)), bounds=(-1, 1))
+            reach = max(reach, np.abs(found.x).max())
+    return reach
+
+
+def condensed_walk(seed: int, horizon: int = 12) -> QP:
+    """Condensed MPC of a linear inverted pendulum, its ZMP between two bounds from now on.
+
+    Inputs are jerks, as in Kajita et al. 2003, the first half of them bounded. The ZMP now is on a
+    bound and no input moves it: the first two rows are zeros, one bound of them but for rounding.
+    """
+    rng = np.random.default_rng(seed)
+    dt, height = 0.1, 0.8
+    A = np.array([[1.0, dt, dt**2 / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+    B = np.array([dt**3 / 6, dt**2 / 2, dt])
+    zmp = np.array([1.0, 0.0, -height / 9.81])
+    before, jerk, half = rng.normal(size=3) * [0.05, 0.2, 0.2], rng.normal(), 0.1
+    state, now = A @ before + B * jerk, (zmp @ A) @ before + (zmp @ B) * jerk
+    centre = now + half * rng.choice([-1.0, 1.0])  # of the foot that stands now
+    centres = centre + 0.15 * (np.arange(horizon) // 8)
+    rows, free, power = [np.zeros(horizon)], [zmp @ state], np.eye(3)
+    response = np.zeros((3, horizon))
+    for k in range(horizon - 1):
+        response = A @ response
+        response[:, k] += B
+        power = A @ power
+        rows.append(zmp @ response)
+        free.append(zmp @ power @ state)
+    C, free = np.array(rows), np.array(free)
+    last = A @ response + np.outer(B, np.arange(horizon) == horizon - 1)
+    error = A @ power @ state - [centres[-1], 0.0, 0.0]
+    P = last.T @ last + C.T @ C + 1e-3 * np.eye(horizon)
+    q = last.T @ error + C.T @ (free - centres)
+    jerks = np.eye(horizon)[: horizon // 2]
+    G = np.concatenate([np.stack([C, -C], axis=1).reshape(-1, horizon), jerks])
+    upper = np.stack([centres + half - free, free - centres + half], axis=1).ravel()
+    most = np.full(horizon // 2, 20.0)
+    return QP(P, q, G, np.r_[np.full(2 * horizon, -np.inf), -most], np.r_[upper, most])
 
 
 def moved(qp: QP, tangent: QP, step: float) -> QP:

@@ -41,6 +41,7 @@ class Fault(IntEnum):
     GRADIENT = 2
     QP = 3
     FALL = 4
+    FLAT = 5
 
 
 REASONS = {
@@ -48,12 +49,14 @@ REASONS = {
     Fault.GRADIENT: "loss or gradient not finite",
     Fault.QP: "QP residual inf above 1e-08",
     Fault.FALL: "the robot fell",
+    Fault.FLAT: "QP residual inf above 1e-08",
 }
 FIRST = {
     Fault.STATE: {"not finite": AT, "fallen": AT, "unsolved": AT},
     Fault.GRADIENT: {"not finite": None, "fallen": None, "unsolved": None},
     Fault.QP: {"not finite": None, "fallen": None, "unsolved": AT},
     Fault.FALL: {"not finite": None, "fallen": AT, "unsolved": None},
+    Fault.FLAT: {"not finite": None, "fallen": None, "unsolved": AT},
 }
 
 
@@ -90,6 +93,8 @@ def planted(config, robot, weights, command, effect, carry, tick, variation=None
     carry = carry._replace(state=carry.state._replace(position=position))
     curved = jnp.where(is_now(Fault.QP), -1.0, weights.R.force)  # a QP that is not convex
     weights = weights._replace(R=weights.R._replace(force=curved))
+    # a QP without a price, solved by any wrench
+    weights = jax.tree.map(lambda w: jnp.where(is_now(Fault.FLAT), 0.0, w), weights)
     return step_carry(config, robot, weights, walked, effect, carry, tick, variation)
 
 
@@ -165,7 +170,8 @@ def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(tmp_path, params, fau
     assert weights_to_vector(found.converged)[0] != weights_to_vector(nominal())[0]
 
     dumps = sorted((tmp_path / "dumps").iterdir())
-    kind = {Fault.QP: "unsolved", Fault.FALL: "fell"}.get(fault, "not-finite")
+    kinds = {Fault.QP: "unsolved", Fault.FLAT: "unsolved", Fault.FALL: "fell"}
+    kind = kinds.get(fault, "not-finite")
     assert [path.name for path in dumps[:2]] == [f"with-00{i}-{kind}.npz" for i in (1, 2)]
     assert len(dumps) == replay.MOST
     for path in dumps:

@@ -9,7 +9,14 @@ from oracles import exact_solution
 
 from hector_jax.control.mpc import Horizon, MpcConfig, _rows, solve_mpc, write_qp
 from hector_jax.control.qp import QP, Status
-from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import (
+    Weights,
+    bounds,
+    expert,
+    nominal,
+    vector_to_weights,
+    weights_to_vector,
+)
 from hector_jax.geometry import rot_z
 from hector_jax.model import srbm
 from hector_jax.robot import load_robot
@@ -250,6 +257,16 @@ def standing():
     horizon = Horizon(State(zero, still, zero, zero), zero, lever, np.zeros((N, 2)), BOTH)
     state = State(*(np.array(row[0]) for row in horizon.reference))
     return jax.tree.map(jnp.asarray, (state, horizon))
+
+
+def test_two_feet_in_the_corner_of_the_box_have_no_unique_wrench():
+    """R of 1e-7 beside Q of 1e4 hardly prices how two feet share a wrench."""
+    weights = Weights(bounds()[1].Q, bounds()[0].R)
+    for slots, status in ((1, Status.SOLVED), (2, Status.NOT_UNIQUE)):
+        state, horizon = problem(1, contact=BOTH if slots == 2 else None)
+        _, solution = solve(CONFIG, ROBOT, weights, state, horizon, DT, slots)
+        assert solution.status == status
+        assert max(solution.primal_residual, solution.dual_residual, solution.gap) <= 1e-8
 
 
 def test_standing_feet_share_the_weight():

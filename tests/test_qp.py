@@ -1,6 +1,7 @@
 """The QP door against independent answers: solutions, statuses, derivatives."""
 
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 from oracles import (
     central_difference,
+    condensed_walk,
     dense_rows,
     exact_solution,
     general_qp,
     kkt_residual,
+    other_minimiser,
     walking_qp,
 )
 
@@ -73,13 +76,24 @@ def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking):
 def test_general_qps_are_right(n, m):
     made = [general_qp(seed, n, m) for seed in range(EACH)]
     found = solve_all(stack([qp for qp, _, _ in made]))
-    solved = np.asarray(found.status) == Status.SOLVED
-    assert solved.all()
+    definite = np.isfinite([cond for *_, cond in made])
+    assert (np.asarray(found.status)[definite] == Status.SOLVED).all()
+    assert np.isin(found.status, (Status.SOLVED, Status.NOT_UNIQUE)).all()
     for i, (qp, x, cond) in enumerate(made):
         residual = kkt_residual(qp, np.asarray(found.x[i]), np.asarray(found.y[i]))
         assert residual <= (1e-8 if cond <= 1e4 else 1e-6), (i, residual, cond)
         if cond <= 1e4:
             np.testing.assert_allclose(found.x[i], x, atol=1e-4 * np.abs(x).max())
+
+
+@pytest.mark.parametrize(("n", "m"), SHAPES[1:3])
+def test_a_minimiser_is_not_unique_just_where_a_linear_program_finds_another(n, m):
+    made = [general_qp(seed, n, m) for seed in range(EACH)]
+    found = solve_all(stack([qp for qp, _, _ in made]))
+    flat = [i for i, (_, _, cond) in enumerate(made) if np.isinf(cond)]
+    unique = np.array([other_minimiser(made[i][0], np.asarray(found.x[i])) < 1e-3 for i in flat])
+    np.testing.assert_array_equal(np.asarray(found.status)[flat] == Status.SOLVED, unique)
+    assert 10 < unique.sum() < len(flat) - 10
 
 
 @pytest.mark.parametrize("far", [1e3, 1e6, 1e9, 1e12, 1e20, 1e30, 1e200])
@@ -99,6 +113,9 @@ INF = np.inf
 
 
 def small(P=((2.0, 0.0), (0.0, 2.0)), q=(-2.0, -5.0), A=((1.0, 0.0),), l=(-INF,), u=(INF,)):  # noqa: E741
+    """A QP of two variables, with rows that bind nothing up to three: one shape for all."""
+    more = 3 - len(l)
+    A, l, u = (*A, *[(0.5, 0.5)] * more), (*l, *[-INF] * more), (*u, *[INF] * more)  # noqa: E741
     return QP(*(np.array(part, float) for part in (P, q, A, l, u)))
 
 
@@ -128,12 +145,251 @@ def test_a_qp_without_a_solution_says_so(qp, status):
         check_solved(found)
 
 
+EYE, ZERO = np.eye(2), (0.0, 0.0)
+
+
+def rows(*rows, P=EYE, q=(-2.0, -5.0)):
+    """A small QP from rows (a, l, u)."""
+    A, l, u = zip(*rows, strict=True) if rows else ((), (), ())  # noqa: E741
+    return small(P, q, A, l, u)
+
+
+def correlated(off, q):
+    return rows(P=((1.0, off), (off, 1.0)), q=q)
+
+
+FIRST, SECOND, BOTH = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
+FLAT = ((1.0, 0.0), (0.0, 0.0))
+EDGES = {
+    "a row of zeros past zero": (
+        lambda t: rows((ZERO, -INF, -t)),
+        (0.0, 1e-17, 2e-8, Status.SOLVED),
+        (3e-8, 1.0, Status.INFEASIBLE),
+    ),
+    "the only row, all else at rest": (
+        lambda t: small(q=ZERO, A=(ZERO, ZERO, ZERO), l=(t, -INF, -1.0), u=(INF, -t, 1.0)),
+        (0.0, 1e-17, Status.SOLVED),
+        (1e-6, 1.0, Status.INFEASIBLE),
+    ),
+    "a row of zeros, at rest on a bound": (
+        lambda t: rows((ZERO, -INF, -t), (FIRST, -INF, -t), (BOTH, -0.1, 0.1), q=ZERO),
+        (0.0, 1e-17, 1e-16, Status.SOLVED),
+    ),
+    "crossed bounds": (
+        lambda t: rows((FIRST, 1.0 + t, 1.0)),
+        (1e-16, 1e-9, 9e-8, Status.SOLVED),
+        (1.1e-7, 1e-3, Status.INFEASIBLE),
+    ),
+    "crossed bounds about zero, at rest": (
+        lambda t: rows((FIRST, t, -t), (BOTH, -0.1, 0.1), q=ZERO),
+        (0.0, 1e-17, Status.SOLVED),
+        (1e-6, Status.INFEASIBLE),
+    ),
+    "crossed bounds, unbounded otherwise": (
+        lambda t: rows((FIRST, 1.0 + t, 1.0), P=FLAT, q=(0.0, 1.0)),
+        (1e-16, Status.UNBOUNDED),
+        (1e-3, Status.INFEASIBLE),
+    ),
+    "two rows that contradict each other": (
+        lambda t: rows((BOTH, 1.0, 1.0), (BOTH, 1.0 + t, 1.0 + t)),
+        (1e-12, 5e-8, Status.SOLVED),
+        (1e-7, 1e-3, 1.0, Status.INFEASIBLE),
+    ),
+    "three rows that contradict each other": (
+        lambda t: rows((FIRST, -INF, 1.0), (SECOND, -INF, 1.0), (BOTH, 2.0 + t, INF)),
+        (1e-12, 3e-8, Status.SOLVED),
+        (5e-8, 1e-3, 1.0, Status.INFEASIBLE),
+    ),
+    "a fall along a free variable": (
+        lambda t: rows(P=FLAT, q=(1.0, -t)),
+        (0.0, 1e-12, 2e-9, Status.NOT_UNIQUE),
+        (5e-9, 8e-9, Status.INACCURATE),
+        (1.1e-8, 1e-3, 1.0, Status.UNBOUNDED),
+    ),
+    "a fall along a direction with little curvature": (
+        lambda t: correlated(1.0 - t, (1.0, -1.0)),
+        (0.0, 1e-12, Status.UNBOUNDED),
+        (3e-8, 1e-6, Status.SOLVED),
+    ),
+    "curvature": (
+        lambda t: correlated(1.0 - t, (1.0, 1.0)),
+        (0.0, 1e-10, 9.9e-9, Status.NOT_UNIQUE),
+        (1.01e-8, 1e-6, Status.SOLVED),
+    ),
+    "negative curvature": (
+        lambda t: correlated(1.0 + t, (1.0, 1.0)),
+        (0.0, 1e-12, 9.9e-10, Status.NOT_UNIQUE),
+        (1.01e-9, 1e-3, Status.BAD_DATA),
+    ),
+    "force of the row that holds": (
+        lambda t: rows((SECOND, 1.0, 2.0), P=FLAT, q=(-1.0, t)),
+        (0.0, 1e-12, 2e-8, Status.NOT_UNIQUE),
+        (3e-8, 1e-3, Status.SOLVED),
+    ),
+    "price of two forces that share a load": (
+        lambda t: rows((BOTH, 1.0, 1.0), (FIRST, 0.0, 2.0), (SECOND, 0.0, 2.0), P=t * EYE, q=ZERO),
+        (0.0, Status.NOT_UNIQUE),
+        (1e-200, 1e-6, Status.SOLVED),
+    ),
+    "size of a number": (
+        lambda t: rows(q=(t, 0.0)),
+        (1e300, 1e308, Status.SOLVED),
+        (INF, np.nan, Status.BAD_DATA),
+    ),
+    "a bound that excludes every number": (
+        lambda t: rows((FIRST, t, INF)),
+        (-INF, 9e19, Status.SOLVED),
+        (1e20, INF, np.nan, Status.BAD_DATA),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EDGES)
+def test_a_verdict_changes_at_its_threshold_and_the_derivative_with_it(name):
+    make, *sides = EDGES[name]
+    for *values, status in sides:
+        for value in values:
+            qp = make(value)
+            alone = solve(qp)
+            found, moved = along(qp, jax.tree.map(lambda v: jnp.ones_like(v), qp))
+            assert Status(int(alone.status)) == status, value
+            assert found.status == alone.status
+            worst = max(alone.primal_residual, alone.dual_residual, alone.gap)
+            assert (worst <= 1e-8) == (status in (Status.SOLVED, Status.NOT_UNIQUE))
+            assert np.isfinite(alone.x).all()
+            assert np.isfinite(moved).all()
+            if status != Status.SOLVED:
+                assert not np.asarray(moved).any()
+
+
+def test_a_row_of_rounding_is_a_row_of_zeros():
+    free = solve(rows())
+    noise = 1e-17 * np.array([0.3, -1.0])
+    for row in ((noise, -INF, -1e-17), (noise, 1e-17, INF), (noise, -1.0, 1e-17)):
+        found = solve(rows(row, (BOTH, -INF, 9.0)))
+        check_solved(found)
+        np.testing.assert_allclose(found.x, free.x, atol=1e-12)
+    pressed = solve(rows((1e-9 * np.array(FIRST), -INF, -1e-9), (BOTH, -INF, 9.0)))
+    np.testing.assert_allclose(pressed.x, [-1.0, 5.0], atol=1e-9)
+
+
+def test_crossed_bounds_are_an_equality_with_their_middle():
+    qp = rows((FIRST, 1.0 + 1e-9, 1.0 - 1e-9))
+    found, moved = along(qp, jax.tree.map(jnp.zeros_like, qp)._replace(u=jnp.ones(3)))
+    np.testing.assert_allclose(found.x, [1.0, 5.0], atol=1e-13)
+    np.testing.assert_allclose(moved, [0.5, 0.0], atol=1e-9)
+
+
+def test_condensed_walks_are_solved_though_the_first_rows_are_zeros():
+    walks = [condensed_walk(seed) for seed in range(EACH)]  # SHAPES[3], compiled once
+    first = np.array([qp.u[:2].min() for qp in walks])
+    assert (first < 0).sum() >= 5
+    assert np.abs(first).max() < 1e-16
+    found = solve_all(stack(walks))
+    check_solved(found)
+    for qp, x in zip(walks, np.asarray(found.x), strict=True):
+        free = qp._replace(A=qp.A[2:], l=qp.l[2:], u=qp.u[2:])
+        np.testing.assert_allclose(x, exact_solution(free)[0], atol=1e-9)
+
+
+def of_kind(seed):
+    """A QP of five variables and nine rows, in turn of each verdict; and which it is."""
+    rng, kind = np.random.default_rng(seed), seed % 6
+    M, A, x = rng.normal(size=(5, 5)), rng.normal(size=(9, 5)), rng.normal(size=5)
+    P, q = M @ M.T + 0.1 * np.eye(5), 10.0 * rng.normal(size=5)
+    v = rng.normal(size=5)
+    flat = np.eye(5) - np.outer(v, v) / (v @ v)
+    if kind in (1, 3):
+        P, q, A = flat @ P @ flat, flat @ q - (kind == 3) * 3.0 * v, A @ flat
+    if kind == 4:
+        P = P - 1.5 * (v @ P @ v) / (v @ v) ** 2 * np.outer(v, v)
+    if kind == 5:  # three variables have no price
+        P = P * np.outer([1, 1, 0, 0, 0], [1, 1, 0, 0, 0])
+    lower, upper = A @ x + (0.05 + rng.exponential(size=(2, 9))) * [[-1.0], [1.0]]
+    if kind == 0:
+        lower[4] = upper[4] = A[4] @ x
+    if kind == 2:
+        A[1], lower[1], upper[1] = -A[0], -INF, -upper[0] - 0.5
+    names = "SOLVED", "NOT_UNIQUE", "INFEASIBLE", "UNBOUNDED", "BAD_DATA", "SOLVED"
+    return QP(P, q, A, lower, upper), Status[names[kind]]
+
+
+def with_rows(qp, rows, lower, upper):
+    """Three more rows, so that all have one shape."""
+    return qp._replace(
+        A=np.concatenate([qp.A, np.broadcast_to(rows, (3, 5))]),
+        l=np.concatenate([qp.l, lower]),
+        u=np.concatenate([qp.u, upper]),
+    )
+
+
+def in_units(qp, objective=1.0, row=1.0, variable=1.0):
+    """The same problem with objective, rows and variables in other units; new rows keep theirs."""
+    row = np.r_[np.broadcast_to(row, 9), np.ones(3)]
+    variable = np.broadcast_to(variable, 5)
+    return QP(
+        objective * qp.P * np.outer(variable, variable),
+        objective * qp.q * variable,
+        row[:, None] * qp.A * variable,
+        row * qp.l,
+        row * qp.u,
+    )
+
+
+def test_units_redundant_rows_and_rounding_change_no_verdict():
+    cases, expected = [], []
+    for seed in range(24):
+        (qp, status), rng = of_kind(seed), np.random.default_rng(100 + seed)
+        never = [-INF] * 3, [INF] * 3
+        past, noise = ([-INF, 1e-17, -1.0], [-1e-17, INF, 1e-17]), 1e-17 * rng.normal(size=(3, 5))
+        again = [qp.l[8], -2.0 * qp.u[1], -INF], [INF, -2.0 * qp.l[1], INF]
+        for more in (
+            with_rows(qp, 0.0, *never),
+            with_rows(qp, [qp.A[8], -2.0 * qp.A[1], 0.1 * qp.A[2]], *again),
+            with_rows(qp, 0.0, *past),
+            with_rows(qp, noise, *past),
+        ):
+            for size in (1.0, 1e-6, 1e-3, 1e3, 1e6):
+                one_row, one_variable = np.ones(9), np.ones(5)
+                one_row[rng.integers(9)] = one_variable[rng.integers(5)] = size
+                cases += [in_units(more, size), in_units(more, row=one_row)]
+                cases += [in_units(more, variable=one_variable)]
+            each_row, each_variable = 10 ** rng.uniform(-3, 3, 9), 10 ** rng.uniform(-3, 3, 5)
+            cases += [in_units(more, variable=each_variable)]
+            cases += [in_units(more, 1e4, each_row, each_variable)]
+            expected += [status] * 17
+        for bound in (0.0, 1e-17, 1e-9, -1e-9, -1e-6):
+            cases += [with_rows(qp, 0.0, never[0], [bound, INF, INF])]
+            cases += [with_rows(qp, 0.0, [-INF, -bound, -INF], never[1])]
+            unmet = bound == -1e-6 and status != Status.BAD_DATA
+            expected += [Status.INFEASIBLE if unmet else status] * 2
+    short = -len(cases) % EACH  # as many as SHAPES[2] was compiled for
+    batches = np.arange(len(cases) + short).reshape(-1, EACH) % len(cases)
+    found = [solve_all(stack([cases[i] for i in batch])).status for batch in batches]
+    found = np.concatenate(found)[: len(cases)]
+    wrong = [
+        (i, Status(int(found[i])).name, expected[i].name) for i in np.flatnonzero(found != expected)
+    ]
+    assert not wrong
+
+
+def test_each_status_has_its_meaning_and_is_documented():
+    page = (Path(__file__).parents[1] / "docs" / "qp.md").read_text()
+    for status in Status:
+        assert status.meaning.endswith(".")
+        assert f"| {status.value} `{status.name}` |" in page
+    with pytest.raises(ValueError, match=r"QP: NOT_UNIQUE \(.*\)\. x is a minimiser"):
+        check_solved(solve(rows(P=FLAT, q=(1.0, 0.0))))
+
+
 def test_small_cases_by_hand():
     free = solve(small())
     np.testing.assert_allclose(free.x, [1.0, 2.5], atol=1e-9)
     pressed = solve(small(u=(0.5,)))
     np.testing.assert_allclose(pressed.x, [0.5, 2.5], atol=1e-9)
-    np.testing.assert_allclose(pressed.y, [1.0], atol=1e-8)  # positive: the upper bound presses
+    np.testing.assert_allclose(
+        pressed.y, [1.0, 0.0, 0.0], atol=1e-8
+    )  # positive: the upper bound presses
     held = solve(small(A=((1.0, 1.0),), l=(1.0,), u=(1.0,)))
     np.testing.assert_allclose(held.x, [-0.25, 1.25], atol=1e-9)
     line = solve(QP(*(np.array(v, float) for v in ([[3.0]], [-6.0], [[1.0]], [-1.0], [1.0]))))
@@ -149,11 +405,18 @@ def test_block_rows_are_those_of_the_dense_matrix(walking):
     np.testing.assert_allclose(block.y, dense.y, atol=1e-8)
 
 
-def test_a_batch_is_a_loop(walking):
-    qps = stack(walking[:6])
+def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
+    first = walking[0]
+    flat = first._replace(P=0.0 * first.P, q=0.0 * first.q)
+    falls = flat._replace(q=np.tile([0.0, 0.0, 0.0, 0.0, 1.0], 10))  # a moment without a bound
+    crossed = first._replace(l=np.where(first.u == 500.0, 501.0, first.l))
+    made = [*walking[:6], flat, falls, crossed, first._replace(q=np.nan * first.q)]
+    qps = stack(made)
     batch, loop = jax.jit(jax.vmap(solve_qp))(qps), solve_all(qps)
     np.testing.assert_allclose(batch.x, loop.x, atol=1e-8)
     np.testing.assert_array_equal(batch.status, loop.status)
+    expected = ["SOLVED"] * 6 + ["NOT_UNIQUE", "UNBOUNDED", "INFEASIBLE", "BAD_DATA"]
+    assert [Status(code).name for code in np.asarray(batch.status)] == expected
 
 
 def test_the_problem_may_be_measured_in_any_unit(walking):
@@ -227,7 +490,7 @@ def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
     made = [general_qp(seed, 5, 12)[0] for seed in (16, 52, 104)]
 
     def evidence(qp):
-        normal, wanted = qp_door._normalise(qp), jnp.ones((), bool)
+        normal, wanted = qp_door._normalise(FLOORS, qp), jnp.ones((), bool)
         found = [
             method(QpConfig(), FLOORS, normal, wanted)[0]
             for method in (qp_door._interior_point, qp_door._approach)
@@ -251,7 +514,7 @@ def as_on_a_gpu(monkeypatch):
 def first_guess(qp):
     """The normalised problem, where its active set starts from, and with which rows."""
     qp = jax.tree.map(jnp.asarray, qp)
-    normal = qp_door._normalise(qp)
+    normal = qp_door._normalise(FLOORS, qp)
     loose = qp_door._Point(-jnp.linalg.solve(normal.P, normal.q), jnp.zeros(normal.side.shape))
     return normal, *qp_door._first_guess(normal, loose)
 
@@ -285,13 +548,13 @@ def test_on_a_gpu_a_guess_that_did_not_settle_is_not_taken(walking, as_on_a_gpu,
 def test_bounds_move_the_solution():
     qp = small(u=(0.5,))
     zero = jax.tree.map(jnp.zeros_like, qp)
-    _, moved = along(qp, zero._replace(l=jnp.zeros(1), u=jnp.ones(1)))
+    _, moved = along(qp, zero._replace(l=jnp.zeros(3), u=jnp.ones(3)))
     np.testing.assert_allclose(moved, [1.0, 0.0], atol=1e-8)
 
 
 def test_derivative_is_finite_where_it_is_one_sided():
     weak = small(u=(1.0,))  # the row passes through the free minimiser: active without force
-    zero = jax.tree.map(jnp.zeros_like, weak)._replace(l=jnp.zeros(1), u=jnp.zeros(1))
+    zero = jax.tree.map(jnp.zeros_like, weak)._replace(l=jnp.zeros(3), u=jnp.zeros(3))
     _, moved = along(weak, zero._replace(q=jnp.array([-1.0, 0.0])))
     assert 0.0 <= moved[0] <= 0.5  # between that of the row held and that of the row free
     apex = small(

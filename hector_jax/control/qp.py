@@ -7,6 +7,25 @@ Size. Every problem is first brought to one size (`_normalise`): x = kappa D v, 
 rows of A D of length one, kappa the larger of |D q| and the bounds violated at v = 0. Residuals are
 those of (x, y) alone in that form, and nothing is called solved by another measure.
 
+Verdicts. All are comparisons in that form, so that the units of objective, rows and variables do
+not matter; t is the tolerance.
+
+- SOLVED: the three residuals are at most t, and the minimiser is held in every direction: P less
+  1e-8 of the unit matrix is positive definite, or it is with the rows added to P that are
+  equalities or press with a force of more than t. Where it is not held: NOT_UNIQUE.
+- INFEASIBLE: a step of the multipliers proves that rows contradict each other by more than t. Or a
+  row of zeros, or a row with l > u, is violated by more than t whatever x is. Within t, crossed
+  bounds are an equality with their middle, and a row of zeros is met.
+- UNBOUNDED: a step of x proves a fall of more than t that neither P nor a row ends.
+- BAD_DATA: a number is not finite, or P plus 1e-9 of the unit matrix is not positive definite.
+
+A violation is measured by the larger of x and the row's bound. A row of zeros (entries of at most
+1e-15 of the longest row's) has neither a length nor a bound that counts: it is measured by x, its
+length is the geometric mean of the others, and what is below the rounding of the largest bound is
+none. Units do matter where nothing else gives a size: a column without price in P is scaled by its
+largest entry in A, and where q and the violated bounds are zero, kappa is 1. (In 32 bits: 1e-5,
+1e-6 and 1e-7 for 1e-8, 1e-9 and 1e-15.)
+
 Algorithm. First the active set is guessed and corrected by signs (`_active_set`, a semismooth
 Newton method): one n x n Cholesky per try, five tries on the QPs of walking, exact to rounding
 where it settles; on a GPU a kernel (`control.pivot`) makes the guess and one try proves it. Where
@@ -25,9 +44,11 @@ W_side = ((z + e) / (s + e))^2 from multiplier z and slack s of a side: infinite
 zero on the others. The square is that of the central path: a row barely active (z = s = 0), where
 the true derivative has one value on either side, gets one between. W is capped in the matrix that
 is factorised, and a second pass takes the cap's bias off; degenerate vertices stay regular.
-The derivative is zero without status SOLVED, and where the minimiser is not unique.
+The derivative is zero without status SOLVED. (In 32 bits the matrix of a minimiser that is barely
+held may have no Cholesky factor; the derivative is then NaN.)
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -50,13 +71,45 @@ SAVED = "qp"
 
 
 class Status(IntEnum):
-    """What a solution is worth; `Solution.status` holds these codes."""
+    """What a solution is worth; `Solution.status` holds these codes.
 
-    SOLVED = 0  # all three residuals are at most the tolerance
-    INACCURATE = 1  # the best point found; its residuals say how far off it is
-    INFEASIBLE = 2  # no x meets the rows (proved by a multiplier, or l > u)
-    UNBOUNDED = 3  # the objective falls for ever (proved by a direction)
-    BAD_DATA = 4  # NaN, an infinite number that is no bound, or P with a negative eigenvalue
+    `meaning` says it in words, with a remedy.
+    """
+
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str) -> "Status":
+        """A code that carries its meaning."""
+        member = int.__new__(cls, code)
+        member._value_, member.meaning = code, meaning
+        return member
+
+    SOLVED = 0, "All residuals are at most the tolerance, and the minimiser is unique."
+    INACCURATE = (
+        1,
+        "The residuals of the best point that was found are above the tolerance. Raise "
+        "QpConfig.max_iterations or tolerance, or bring P and A nearer to one scale.",
+    )
+    INFEASIBLE = (
+        2,
+        "No x meets all rows. Widen the bounds, or give rows a slack variable that is priced in q.",
+    )
+    UNBOUNDED = (
+        3,
+        "The objective falls without end along a direction. Price that direction in P, or bound it "
+        "by a row.",
+    )
+    BAD_DATA = (
+        4,
+        "A number is NaN, an entry of P, q or A is infinite, a bound excludes every number, or P "
+        "has a negative eigenvalue. Look for it in what P, q, A, l and u are made of.",
+    )
+    NOT_UNIQUE = (
+        5,
+        "x is a minimiser, but along a direction neither P nor a row with force holds it: others "
+        "lie beside it, and it has no derivative. Add a small multiple of the unit matrix to P, or "
+        "use x without its derivative.",
+    )
 
 
 class QP(NamedTuple):
@@ -64,8 +117,8 @@ class QP(NamedTuple):
 
     P is positive semidefinite (its symmetric part counts). A is dense (m, n), or block-diagonal by
     step (N, r, b) with m = N r rows and n = N b: rows r k .. r (k+1) read variables b k .. b (k+1).
-    Infinite bounds (1e20 and more), rows with l = u, redundant rows and rows of zeros are legal. A
-    batch is vmap.
+    Infinite bounds (1e20 and more), rows with l = u, redundant rows and rows of zeros are legal,
+    and so are bounds that only rounding has crossed. A batch is vmap.
     """
 
     P: Float[Array, "n n"]
@@ -82,8 +135,8 @@ class Solution(NamedTuple):
     and compare between problems: `primal_residual` is the largest violation of a row over the
     larger of x and the row's bound, `dual_residual` the largest entry of P x + q + A'y over the
     largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (and a
-    little, so that a solution of zeros has residuals too). Where nothing was tried (BAD_DATA, l >
-    u, a row of zeros that cannot hold), x and y are zero and the residuals infinite.
+    little, so that a solution of zeros has residuals too). With BAD_DATA x and y are zero and the
+    residuals infinite.
     """
 
     x: Float[Array, " n"]
@@ -136,13 +189,15 @@ class _Floors(NamedTuple):
     rounding: float  # a multiplier or violation this small has no sign
     kink: float  # e of the derivative
     certificate: float  # of infeasible and unbounded problems
+    curvature: float  # a direction with less than this along it is flat
+    zero: float  # a row with no larger entry, beside the longest, is a row of zeros
 
 
 def _floors(config: QpConfig, dtype: jnp.dtype) -> _Floors:
     if jnp.finfo(dtype).bits == 64:
-        floors = _Floors(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-7)
+        floors = _Floors(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-7, 1e-8, 1e-15)
     else:
-        floors = _Floors(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4)
+        floors = _Floors(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4, 1e-5, 1e-7)
     tolerance = config.tolerance or floors.tolerance
     return floors._replace(
         tolerance=tolerance,
@@ -179,7 +234,7 @@ def check_solved(solution: Solution, what: str = "QP") -> None:
     """Look at a solution, or a batch of them, outside jit before believing it.
 
     Raises:
-        ValueError: names the first one that is not SOLVED, its status and residuals.
+        ValueError: names the first one that is not SOLVED, its status, residuals and remedy.
     """
     status = np.atleast_1d(np.asarray(solution.status))
     bad = np.argwhere(status != Status.SOLVED)
@@ -191,7 +246,8 @@ def check_solved(solution: Solution, what: str = "QP") -> None:
         for name in ("primal_residual", "dual_residual", "gap")
     )
     count = f"{len(bad)} of {status.size} problems, first at {first}: " if status.size > 1 else ""
-    raise ValueError(f"{what} not solved: {count}{Status(status[first]).name} ({residuals})")
+    found = Status(status[first])
+    raise ValueError(f"{what}: {count}{found.name} ({residuals}). {found.meaning}")
 
 
 def _check_shapes(qp: QP) -> None:
@@ -249,10 +305,10 @@ class _Normal(NamedTuple):
     P: Array
     q: Array
     A: Array
-    bound: Array  # (2, m), zero where infinite
-    given: Array  # (2, m) bool: there is such a bound
-    side: Array  # (2, m) bool: a given bound of a row that is neither an equality nor empty
+    bound: Array  # (2, m), zero where infinite; both sides of an equality the same
+    side: Array  # (2, m) bool: a finite bound of a row that is neither an equality nor of zeros
     equality: Array  # (m,) bool
+    unmet: Array  # (m,) violation of a row of zeros, or of crossed bounds, whatever x is
     column: Array  # (n,)
     row: Array  # (m,)
     size: Array
@@ -260,22 +316,34 @@ class _Normal(NamedTuple):
 
 
 _INFINITE = 1e20  # a bound as large as this is none, as most solvers have it
+_ROUNDING = 8  # machine epsilons; what is smaller than that beside its like is rounding
 _SMALL = 1e-3  # keeps relative residuals meaningful where the solution is zero
 _SIGN = np.array([[1.0], [-1.0]])  # a side holds where sign * (A v - bound) <= 0
 
 
-def _scales(qp: QP) -> tuple[Array, Array]:
-    """Columns D = diag(P)^-1/2, and rows that make those of A D unit vectors; else 1."""
+def _scales(floors: _Floors, qp: QP) -> tuple[Array, Array, Array]:
+    """Columns D, rows that make those of A D unit vectors, and which rows are zeros.
+
+    D = diag(P)^-1/2. A column that P does not price is scaled by its largest entry in A, so that it
+    is as large there as the largest priced one: D keeps one unit when the objective changes its.
+    A row of zeros has no length and gets the geometric mean of the others' largest entries.
+    """
     diagonal = jnp.diagonal(qp.P)
     reach = jnp.max(jnp.abs(qp.A), axis=-2, initial=0.0).ravel()  # largest entry of a column
     priced = diagonal > 1e-3 * jnp.finfo(qp.P.dtype).eps * jnp.max(diagonal)
-    column = lax.rsqrt(jnp.where(priced, diagonal, jnp.where(reach > 0, reach, 1.0) ** 2))
+    column = lax.rsqrt(jnp.where(priced, diagonal, 1.0))
+    widest = jnp.max(jnp.where(priced, column * reach, 0.0))
+    unpriced = jnp.where(widest > 0, widest, 1.0) / jnp.where(reach > 0, reach, 1.0)
+    column = jnp.where(priced, column, unpriced)
     wide = column if qp.A.ndim == 2 else column.reshape(qp.A.shape[0], 1, qp.A.shape[2])
     rows = qp.A * wide
-    most = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)  # first, or squares leave the range
-    most = jnp.where(most > 0, most, 1.0)
+    most = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)
+    zeros = most <= floors.zero * jnp.max(most, initial=0.0)
+    most = jnp.where(zeros, 1.0, most)  # divided by first, or squares leave the range
     squares = jnp.sum((rows / most[..., None]) ** 2, axis=-1)
-    return column, (lax.rsqrt(jnp.where(squares > 0, squares, 1.0)) / most).ravel()
+    mean = jnp.exp(jnp.sum(jnp.log(most)) / jnp.maximum(jnp.sum(~zeros), 1))
+    row = jnp.where(zeros, 1.0 / mean, lax.rsqrt(jnp.where(zeros, 1.0, squares)) / most)
+    return column, row.ravel(), zeros.ravel()
 
 
 def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
@@ -285,35 +353,42 @@ def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
     return row.reshape(N, r, 1) * A * column.reshape(N, 1, b)
 
 
-def _normalise(qp: QP) -> _Normal:
-    column, row = _scales(qp)
+def _normalise(floors: _Floors, qp: QP) -> _Normal:
+    column, row, zeros = _scales(floors, qp)
     A = _scale_rows_and_columns(qp.A, row, column)
-    # rows of zeros bind nothing once 0 lies between their bounds, and nothing helps where not
-    empty = jnp.all(A == 0, axis=-1).ravel()
+    sign = jnp.asarray(_SIGN, A.dtype)
     bound = jnp.stack([qp.u, qp.l])
     given = jnp.abs(bound) < _INFINITE
-    bound = row * bound
+    bound = jnp.where(given, row * bound, 0.0)
+    rounding = _ROUNDING * jnp.finfo(A.dtype).eps
+    # no x mends a row of zeros, nor brings a row nearer to crossed bounds than their middle
+    width = jnp.where(given[0] & given[1], bound[0] - bound[1], jnp.inf)
+    crossed = width < 0
+    unmet = jnp.maximum(-0.5 * width, jnp.where(zeros, jnp.max(-sign * bound, axis=0), 0.0))
+    given &= ~zeros
+    bound = jnp.where(crossed, 0.5 * (bound[0] + bound[1]), bound)
     bound = jnp.where(given, bound, 0.0)
     q = column * qp.q
-    pressed = jnp.max(jnp.where(empty, 0.0, -jnp.asarray(_SIGN, q.dtype) * bound), initial=0.0)
-    size = jnp.maximum(_largest(q), pressed)
+    size = jnp.maximum(_largest(q), jnp.max(-sign * bound, initial=0.0))  # violated at v = 0
     size = jnp.where(size > 0, size, 1.0)
     bound = bound / size
     # a row narrower than rounding has no interior: it is an equality
-    close = 8 * jnp.finfo(q.dtype).eps * jnp.maximum(1.0, jnp.abs(bound[0]))
-    equality = given[0] & given[1] & (bound[0] - bound[1] <= close) & ~empty
+    narrow = width / size <= rounding * jnp.maximum(1.0, jnp.abs(bound[0]))
+    equality = narrow & ~zeros
+    bound = jnp.where(equality, 0.5 * (bound[0] + bound[1]), bound)
+    largest = _largest(bound)
     return _Normal(
         column[:, None] * qp.P * column,
         q / size,
         A,
         bound,
-        given,
-        given & ~equality & ~empty,
+        given & ~equality,
         equality,
+        jnp.where(unmet / size > rounding * largest, unmet / size, 0.0),
         column,
         row,
         size,
-        jnp.where(_largest(bound) > 0, jnp.minimum(_largest(bound), 1.0), 1.0),
+        jnp.where(largest > rounding, jnp.minimum(largest, 1.0), 1.0),
     )
 
 
@@ -466,6 +541,7 @@ def _choose(first: Array, a, b):
 
 class _Loop(NamedTuple):
     point: _Point
+    before: _Point
     slack: Array  # (2, m), positive; 1 on sides that are not there
     proximal: Array  # (2,) rho and delta
     iterations: Array
@@ -474,8 +550,8 @@ class _Loop(NamedTuple):
 
 def _interior_point(
     config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
-) -> tuple[_Point, Array, Array]:
-    """Mehrotra's proximal method, cold; last finite point, its slacks, iterations."""
+) -> tuple[_Point, Array, Array, Array]:
+    """Mehrotra's proximal method, cold; last finite point, slacks, what is proved, iterations."""
     dtype = qp.q.dtype
     least = jnp.array([10.0 * floors.proximal, 50.0 * jnp.finfo(dtype).eps], dtype)
     sign = jnp.asarray(_SIGN, dtype)
@@ -532,28 +608,23 @@ def _interior_point(
         factors = jnp.where(fine, 0.1, jnp.array([10.0, 100.0], dtype))
         proximal = jnp.maximum(factors * state.proximal, least)
         done = jnp.max(_evidence(qp, point)) <= floors.target
-        infeasible, unbounded = _certificates(floors, qp, point)
         iterations = state.iterations + 1
-        going = ~done & ~infeasible & ~unbounded & (proximal[0] < 1.0)
+        shown, _ = _rays(floors, qp, state.point, point)
+        going = ~done & ~jnp.any(shown) & (proximal[0] < 1.0)
         going &= iterations < config.max_iterations
-        return _Loop(point, slack, proximal, iterations, going)
+        return _Loop(point, state.point, slack, proximal, iterations, going)
 
     # every product of slack and multiplier the same, however far the bound
     room = jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0)
-    start = _Loop(
-        _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0)),
-        room,
-        least,
-        jnp.zeros((), jnp.int32),
-        wanted,
-    )
+    begin = _Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0))
+    start = _Loop(begin, begin, room, least, jnp.zeros((), jnp.int32), wanted)
     end = lax.while_loop(lambda state: state.going, advance, start)
-    return end.point, end.slack, end.iterations
+    return end.point, end.slack, _proofs(floors, qp, end.before, end.point), end.iterations
 
 
 def _approach(
     config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
-) -> tuple[_Point, Array, Array]:
+) -> tuple[_Point, Array, Array, Array]:
     """The interior point, again in the sizes of what it found where it did not get near.
 
     One size was taken for x and slope from q and the bounds. Where rows hold x far from where q
@@ -561,30 +632,30 @@ def _approach(
     """
 
     def attempt(state: tuple) -> tuple:
-        point, slack, steps, (size, slope), _ = state
+        best, best_slack, steps, (size, slope), _, _ = state
         sized = qp._replace(
             P=size / slope * qp.P, q=qp.q / slope, bound=qp.bound / size, reach=qp.reach / size
         )
-        found, room, more = _interior_point(config, floors, sized, wanted)
-        found = _Point(size * found.x, slope * found.z)
+        point, slack, proved, more = _interior_point(config, floors, sized, wanted)
+        point = _Point(size * point.x, slope * point.z)
         first = steps == 0
-        better = first | (jnp.max(_evidence(qp, found)) < jnp.max(_evidence(qp, point)))
-        point, slack = _choose(better, (found, size * room), (point, slack))
+        better = first | (jnp.max(_evidence(qp, point)) < jnp.max(_evidence(qp, best)))
+        point, slack = _choose(better, (point, size * slack), (best, best_slack))
         near = jnp.max(_evidence(qp, point)) <= floors.target
-        proved = jnp.any(jnp.stack(_certificates(floors, qp, point)))
         sizes = jnp.stack(
             [_largest(point.x), jnp.maximum(_largest(qp.P @ point.x), _largest(qp.q))]
         )
-        again = first & ~near & ~proved & jnp.all(sizes > 0.0)
-        return point, slack, steps + more, jnp.where(again, sizes, 1.0), again
+        again = first & ~near & ~jnp.any(proved) & jnp.all(sizes > 0.0)
+        return point, slack, steps + more, jnp.where(again, sizes, 1.0), proved, again
 
     nowhere = _Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
-    ones, none = jnp.ones(2, qp.q.dtype), jnp.zeros((), jnp.int32)
-    start = (nowhere, jnp.ones_like(qp.bound), none, ones, wanted)
-    return lax.while_loop(lambda state: state[-1], attempt, start)[:3]
+    none, ones = jnp.zeros((), jnp.int32), jnp.ones(2, qp.q.dtype)
+    start = (nowhere, jnp.ones_like(qp.bound), none, ones, jnp.zeros(2, bool), wanted)
+    point, slack, steps, _, proved, _ = lax.while_loop(lambda state: state[-1], attempt, start)
+    return point, slack, proved, steps
 
 
-def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, Array, Array]:
+def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, Array, Array, Array]:
     """BoxOSQP of jaxopt, its derivative left aside; returns what `_interior_point` does."""
     from jaxopt import BoxOSQP
 
@@ -604,7 +675,10 @@ def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, A
     y = jnp.where(finite, params.dual_eq, 0.0)
     z = jnp.maximum(jnp.asarray(_SIGN, y.dtype) * y, 0.0)
     z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(held, z, 0.0))
-    return _Point(x, z), jnp.maximum(-_violation(qp, x), 0.0), state.iter_num.astype(jnp.int32)
+    point = _Point(x, z)
+    proved = _proofs(floors, qp, jax.tree.map(jnp.zeros_like, point), point)
+    slack = jnp.maximum(-_violation(qp, x), 0.0)
+    return point, slack, proved, state.iter_num.astype(jnp.int32)
 
 
 def _support(qp: _Normal, y: Array) -> Array:
@@ -612,67 +686,140 @@ def _support(qp: _Normal, y: Array) -> Array:
     return jnp.sum(jnp.where(y > 0, qp.bound[0], qp.bound[1]) * y)
 
 
-def _certificates(floors: _Floors, qp: _Normal, point: _Point) -> tuple[Array, Array]:
-    """Whether z proves that no x of moderate size meets the rows, and x an endless fall."""
-    y = _multiplier(point.z)
-    infeasible = _largest(_columns(qp.A, y)) < -floors.certificate * _support(qp, y)
-    along = jnp.asarray(_SIGN, y.dtype) * _rows(qp.A, point.x)
-    outward = jnp.where(qp.equality, jnp.abs(along), jnp.where(qp.side, along, 0.0))
-    needed = jnp.maximum(_largest(qp.P @ point.x), jnp.max(outward, initial=0.0))
-    return infeasible, needed < -floors.certificate * jnp.dot(qp.q, point.x)
+def _slope(qp: _Normal, point: _Point) -> Array:
+    """What a residual of P x + q + A'y is measured by: its largest term, and a little."""
+    pull = _columns(qp.A, _multiplier(point.z))
+    return _SMALL + jnp.maximum(
+        jnp.maximum(_largest(qp.P @ point.x), _largest(pull)), _largest(qp.q)
+    )
+
+
+def _rays(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> tuple[Array, Array]:
+    """Whether a step shows that no x of moderate size meets the rows, an endless fall; by how much.
+
+    Without a solution the multipliers grow for ever along a combination of rows that cancels, or x
+    along a fall. A step shows that purely; in the point itself is a part that does not cancel.
+    """
+    dx, rise = point.x - before.x, point.z - before.z
+    sign = jnp.asarray(_SIGN, dx.dtype)
+    grown = jnp.where(qp.equality, rise, jnp.maximum(rise, 0.0))  # what falls counts against it
+    gap = -jnp.sum(sign * qp.bound * grown + (grown - rise) / floors.certificate)
+    # differences of products that an iteration needs at both points anyway
+    pull = _columns(qp.A, _multiplier(point.z)) - _columns(qp.A, _multiplier(before.z))
+    outside = sign * (_rows(qp.A, point.x) - _rows(qp.A, before.x))
+    outward = jnp.where(qp.equality, jnp.abs(outside), jnp.where(qp.side, outside, 0.0))
+    needed = jnp.maximum(_largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
+    by = jnp.stack([gap, -jnp.dot(qp.q, dx)])
+    return jnp.stack([_largest(pull), needed]) < floors.certificate * by, by
+
+
+def _proofs(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> Array:
+    """Whether the step proves that the problem is infeasible, and unbounded (2,).
+
+    By more than the tolerance, within which it can be solved.
+    """
+    dx, rise = point.x - before.x, point.z - before.z
+    rows = jnp.sum(jnp.abs(rise) * _sizes(qp, point.x))
+    sizes = jnp.stack([rows, jnp.sum(jnp.abs(dx)) * _slope(qp, point)])
+    shown, by = _rays(floors, qp, before, point)
+    return shown & (by > floors.tolerance * sizes)
 
 
 def _evidence(qp: _Normal, point: _Point) -> Array:
     """Primal residual, dual residual and gap, as `Solution` defines them; infinite for NaN."""
     x, y = point.x, _multiplier(point.z)
-    rows, pull, price = _rows(qp.A, x), _columns(qp.A, y), qp.P @ x
-    outside = jnp.where(qp.given, jnp.asarray(_SIGN, x.dtype) * (rows - qp.bound), 0.0)
+    pull, price = _columns(qp.A, y), qp.P @ x
     terms = jnp.stack([jnp.dot(x, price), jnp.dot(qp.q, x), _support(qp, y)])
-    pushed = jnp.maximum(jnp.maximum(_largest(price), _largest(pull)), _largest(qp.q))
-    primal = jnp.max(outside / _sizes(qp, x), initial=0.0)
-    dual = _largest(price + qp.q + pull) / (_SMALL + pushed)
+    primal = jnp.max(_violation(qp, x) / _sizes(qp, x), initial=0.0)
+    dual = _largest(price + qp.q + pull) / _slope(qp, point)
     gap = jnp.abs(jnp.sum(terms)) / (_SMALL * qp.reach + _largest(terms))
     proof = jnp.stack([primal, dual, gap])
     return jnp.where(jnp.isfinite(jnp.sum(proof)), proof, jnp.inf)
 
 
-def _where_sane(sane: Array, qp: QP) -> QP:
+def _or_plain(valid: Array, qp: QP) -> QP:
     """The QP, or a plain one in its place, so that nothing that follows meets a NaN."""
     plain = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
-    return _choose(sane, qp, plain)
+    return _choose(valid, qp, plain)
+
+
+def _shifted(matrix: Array, shift: float) -> tuple[Array, Array]:
+    """Cholesky factor of a matrix plus a multiple of the unit matrix, and whether there is one.
+
+    So a smallest eigenvalue is compared exactly. Pivots would not tell: that of a singular matrix
+    grows with the number of variables that share the flat direction.
+    """
+    factor = _cholesky(matrix + shift * jnp.eye(len(matrix), dtype=matrix.dtype))
+    return factor, jnp.isfinite(factor[-1, -1])
+
+
+def _only_if(wanted: Array, function: Callable, otherwise: Any, operands: Any) -> Any:
+    """`function(operands)` where `wanted`, else `otherwise`; costs nothing where none is wanted.
+
+    A loop of one round, because vmap makes a cond compute for every problem of a batch.
+    """
+
+    def once(state: tuple) -> tuple:
+        # that reads the state, or the compiler would compute it once, before the loop
+        _, hidden = lax.optimization_barrier((state[0], operands))
+        return jnp.zeros((), bool), function(hidden)
+
+    return lax.while_loop(lambda state: state[0], once, (wanted, otherwise))[1]
+
+
+def _without_rows(floors: _Floors, qp: _Normal) -> tuple[Array, Array, Array]:
+    """Minimiser without rows; whether P curves in every direction; whether it is semidefinite.
+
+    One factorisation where P curves.
+    """
+
+    def minimiser(shift: float, qp: _Normal) -> tuple[Array, Array]:
+        factor, exists = _shifted(qp.P, shift)
+        return -cho_solve((factor, True), qp.q), exists
+
+    x, curved = minimiser(-floors.curvature, qp)
+    softened = partial(minimiser, floors.proximal)
+    x, convex = _only_if(~curved, softened, (x, curved), qp)
+    return x, curved, convex
+
+
+def _held(floors: _Floors, qp: _Normal, point: _Point) -> Array:
+    """Whether P and the rows hold a minimiser in every direction.
+
+    A row holds where it is an equality or presses with more than the tolerance. One that is active
+    without force does not: the minimiser can leave it.
+    """
+    force = point.z / _slope(qp, point)
+    slack = jnp.abs(_violation(qp, point.x)) / _sizes(qp, point.x)
+    pressing = qp.side & (force > floors.tolerance) & (force > slack)
+    holding = qp.equality | jnp.any(pressing, axis=0)
+    # the cap's rounding could hide a flat direction; this one's is a hundredth of the curvature
+    weight = jnp.where(holding, 0.01 * floors.curvature / jnp.finfo(force.dtype).eps, 0.0)
+    return _shifted(_plus_gram(qp.P, qp.A, weight), -floors.curvature)[1]
 
 
 @partial(jax.jit, static_argnums=0)
 def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     """Solution, the ratios W (2, m) of its derivative, and the problem they belong to."""
     floors = _floors(config, qp.q.dtype)
-    n, dtype = len(qp.q), qp.q.dtype
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= _INFINITE) | (qp.u <= -_INFINITE)
-    numbers = jnp.isfinite(jnp.sum(jnp.abs(qp.P)) + _largest(qp.q) + jnp.sum(jnp.abs(qp.A)))
-    numbers &= ~jnp.any(no_bound)
-    crossed = jnp.any(qp.l > qp.u)
-    sane = numbers & ~crossed
-    normal = _normalise(_where_sane(sane, qp))
-    idle = normal.given & ~normal.side & ~normal.equality  # rows of zeros
-    unmet = jnp.any(idle & (jnp.asarray(_SIGN, dtype) * normal.bound < 0))
-    factor = _cholesky(normal.P + floors.proximal * jnp.eye(n, dtype=dtype))
-    convex = jnp.isfinite(factor[-1, -1])
-    sane &= convex & ~unmet
-
-    nothing = jnp.zeros(normal.side.shape, dtype)
-    loose = _Point(-cho_solve((factor, True), normal.q), nothing)
+    numbers = jnp.maximum(jnp.maximum(_largest(qp.P), _largest(qp.q)), _largest(qp.A))
+    valid = jnp.isfinite(numbers) & ~jnp.any(no_bound)
+    normal = _normalise(floors, _or_plain(valid, qp))
+    free, definite, convex = _without_rows(floors, normal)
+    valid &= convex
+    loose = _Point(free, jnp.zeros(normal.side.shape, qp.q.dtype))
     tries = config.active_set_tries
     if config.solver == "interior_point":
         start, guess = _first_guess(normal, loose)
-        quick, proof, first = _active_set(floors, normal, start, guess, sane, tries)
+        quick, proof, first = _active_set(floors, normal, start, guess, valid, tries)
         settled = jnp.max(proof) <= floors.target
-        near, slack, steps = _approach(config, floors, normal, sane & ~settled)
+        near, slack, proved, steps = _approach(config, floors, normal, valid & ~settled)
     else:
-        quick, proof = loose, jnp.full(3, jnp.inf, dtype)
+        quick, proof = loose, jnp.full(3, jnp.inf, qp.q.dtype)
         first, settled = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-        near, slack, steps = _box_osqp(config, floors, normal)
-    infeasible, unbounded = _certificates(floors, normal, near)
-    hopeful = sane & ~settled & ~infeasible & ~unbounded
+        near, slack, proved, steps = _box_osqp(config, floors, normal)
+    hopeful = valid & ~settled & ~jnp.any(proved)
     # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
     pushes = near.z * normal.reach > slack * _largest(near.z)
     exact, exact_proof, last = _active_set(
@@ -683,22 +830,27 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
         better = ~settled & (jnp.max(its_proof) < jnp.max(proof))
         point, proof = _choose(better, (other, its_proof), (point, proof))
     # far from any solution (infeasible, unbounded) all evidence may be infinite, and so may x
-    usable = sane & jnp.all(jnp.isfinite(proof))
+    usable = valid & jnp.all(jnp.isfinite(proof))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), point)
 
-    solved = jnp.max(proof) <= floors.tolerance
-    infeasible, unbounded = infeasible & ~settled & ~solved, unbounded & ~settled & ~solved
-    status = jnp.where(solved, Status.SOLVED, Status.INACCURATE)
-    status = jnp.where(unbounded, Status.UNBOUNDED, status)
-    status = jnp.where(infeasible | unmet | crossed, Status.INFEASIBLE, status)
-    status = jnp.where(numbers & convex, status, Status.BAD_DATA).astype(jnp.int32)
-    told = jnp.where(sane, proof, jnp.inf)
+    solved = usable & (jnp.max(proof) <= floors.tolerance)
+    # what no x can meet; an x that solves nothing is no measure of it
+    sizes = jnp.min(_sizes(normal, jnp.where(solved, point.x, normal.reach)), axis=0)
+    unmet = jnp.max(normal.unmet / sizes, initial=0.0)
+    held = lambda operands: _held(floors, *operands)  # noqa: E731
+    unique = _only_if(solved & ~definite, held, definite, (normal, point))
+    status = jnp.where(proved[1], Status.UNBOUNDED, Status.INACCURATE)
+    status = jnp.where(proved[0], Status.INFEASIBLE, status)
+    status = jnp.where(solved, jnp.where(unique, Status.SOLVED, Status.NOT_UNIQUE), status)
+    status = jnp.where(unmet > floors.tolerance, Status.INFEASIBLE, status)
+    status = jnp.where(valid, status, Status.BAD_DATA).astype(jnp.int32)
+    primal, dual, gap = jnp.where(valid, proof, jnp.inf)
     solution = Solution(
         normal.size * normal.column * point.x,
         normal.size * normal.row * _multiplier(point.z),
-        told[0],
-        told[1],
-        told[2],
+        jnp.maximum(primal, unmet),
+        dual,
+        gap,
         first + steps + last,
         status,
     )
@@ -730,10 +882,8 @@ def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tup
     firm = both >= floors.cap
     eye = jnp.eye(len(qp.q), dtype=dtype)
     factor = _cholesky(_plus_gram(normal.P + floors.proximal * eye, normal.A, both))
-    # a pivot of the size of rho: other minimisers lie beside this one, and it has no derivative
-    unique = jnp.min(jnp.diagonal(factor)) ** 2 > 10.0 * floors.proximal
-    sound = (solution.status == Status.SOLVED) & unique
-    factor = jnp.where(unique, factor, eye)
+    sound = solution.status == Status.SOLVED
+    factor = jnp.where(sound, factor, eye)
     pull, shift = jnp.zeros_like(solution.x), jnp.zeros_like(solution.y)
     if _moves(d.P):
         pull += d.P @ solution.x
@@ -748,9 +898,9 @@ def _solve_jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tup
     pull, shift = jnp.where(sound, column * pull, 0.0), jnp.where(sound, row * shift, 0.0)
     dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
     for _ in range(2):  # as in `_active_set`: later passes take off what cap and rho did
-        known = jnp.where(firm, dz, 0.0) + both * _rows(normal.A, dv) + shift
-        step = -cho_solve((factor, True), normal.P @ dv + pull + _columns(normal.A, known))
-        dv, dz = dv + step, known + both * _rows(normal.A, step)
+        force = jnp.where(firm, dz, 0.0) + both * _rows(normal.A, dv) + shift
+        step = -cho_solve((factor, True), normal.P @ dv + pull + _columns(normal.A, force))
+        dv, dz = dv + step, force + both * _rows(normal.A, step)
     zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)
     return solution, Solution(column * dv, row * dz, zero, zero, zero, none, none)

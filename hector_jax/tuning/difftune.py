@@ -72,7 +72,9 @@ class Evaluation(NamedTuple):
     parts: Losses
     gradient: Weights  # dL/dtheta
     fallen: Float[Array, "*batch"]  # share of the ticks after a fall
-    residual: Float[Array, "*batch"]  # worst of the rollout
+    residual: Float[
+        Array, "*batch"
+    ]  # worst of the rollout; infinite where a minimiser is not unique
 
 
 class Reason(IntEnum):

@@ -221,7 +221,10 @@ def step_carry(
         joints=jnp.asarray(robot.standing_joints),
         fallen=fallen,
         legs_touch=jnp.zeros_like(fallen),  # a rigid body has none
-        residual=decided.residual,
+        # A plan whose QP has no unique minimiser can be walked, so `plan` and the simulators keep
+        # its residual. It has no derivative, for which alone a rollout is walked: whoever tunes
+        # looks at the residual and refuses.
+        residual=jnp.where(decided.status == qp.Status.NOT_UNIQUE, jnp.inf, decided.residual),
     )
     return Carry(moved, feet, commands, anchor, fallen, late), sample
 
