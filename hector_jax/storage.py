@@ -389,7 +389,9 @@ def _check_card(path: Path, card: Any) -> None:
         )
     kinds = {"kind": str, "robot": str | None, "about": dict, "versions": dict}
     for name, kind in kinds.items():
-        if told := problem(card.get(name), kind):
+        if name not in card:
+            raise InputError(f"{path}: card.{name} is missing")
+        if told := problem(card[name], kind):
             raise InputError(f"{path}: card.{name} {told}")
 
 

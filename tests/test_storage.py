@@ -184,6 +184,16 @@ def test_a_card_without_versions_is_refused_by_name(tmp_path, monkeypatch):
         load_tree(tmp_path / "tree.npz", TREE, kind="thing")
 
 
+@pytest.mark.parametrize("name", ["kind", "robot", "about", "versions"])
+def test_a_card_without_an_entry_is_refused_by_its_name(tmp_path, monkeypatch, name):
+    whole = json.dumps
+    with monkeypatch.context() as patch:
+        patch.setattr(json, "dumps", lambda card: whole({k: card[k] for k in card if k != name}))
+        save_tree(tmp_path / "tree.npz", TREE, kind="thing")
+    with pytest.raises(InputError, match=rf"tree.npz: card\.{name} is missing$"):
+        load_tree(tmp_path / "tree.npz", TREE, kind="thing", robot=ROBOT)
+
+
 def test_a_robot_is_known_by_its_numbers():
     same = jax.tree.map(lambda x: np.array(x, copy=True), ROBOT)
     other = ROBOT._replace(flag=np.array(0.2501))
