@@ -30,7 +30,7 @@ from hector_jax.flags import (
     resolve_latest,
 )
 from hector_jax.inputs import InputError
-from hector_jax.runtime import cache_folder, check_jax, home_cache, setup_jax, without_renderer
+from hector_jax.runtime import cache_folder, check_jax, home_cache, setup_jax
 
 _ABOUT = (
     "Gradient tuning of a walking biped's model predictive controller. "
@@ -57,8 +57,7 @@ def _run(words: Sequence[str]) -> None:
         with say_if_slow("loading JAX and MuJoCo"):
             check_jax(on_cpu=isinstance(args, Export))  # see hector_jax.export
             setup_jax()
-            with without_renderer():
-                from hector_jax import commands  # after the flags: `hector --help` answers at once
+            from hector_jax import commands  # after the flags: `hector --help` answers at once
     except InputError as error:
         if not isinstance(args, Doctor):
             raise

@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -26,6 +25,7 @@ from hector_jax.description import (
     Description,
     read_description,
 )
+from hector_jax.headless import mujoco
 from hector_jax.inputs import InputError
 from hector_jax.mjcf import read_mjcf, refusal
 

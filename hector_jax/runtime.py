@@ -102,18 +102,6 @@ def check_jax(on_cpu: bool = False) -> None:
         raise InputError(f"{told}: {one_line(error) or 'no such device here'}") from None
 
 
-@contextmanager
-def without_renderer() -> Iterator[None]:
-    """Import MuJoCo within without OpenGL: only a film needs it, which another process draws."""
-    before = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = "disable"
-    try:
-        yield
-    finally:
-        del os.environ["MUJOCO_GL"]
-        os.environ.update({} if before is None else {"MUJOCO_GL": before})
-
-
 def setup_jax() -> None:
     """Turn on 64 bits, full precision and the compilation cache; call before the first array.
 
@@ -213,8 +201,6 @@ def start_worker(cores: Any, lifeline: Connection) -> None:
 
     jax.config.update("jax_platforms", "cpu")
     setup_jax()
-    with without_renderer():
-        import mujoco  # noqa: F401
 
 
 def _cores(processes: int) -> list[int | None]:

@@ -7,7 +7,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
-    ["inputs", "geometry"],
+    ["inputs", "geometry", "headless"],
     ["console", "runtime"],
     ["trajectory", "mjcf"],
     ["description"],
@@ -27,7 +27,7 @@ FLOORS = [
 ]
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
-    "mujoco": ("runtime", "robot", "sim", "evaluation.video", "evaluation.view"),
+    "mujoco": ("headless", "sim.parallel"),
     "viser": ("evaluation.view",),
     "trimesh": ("evaluation.view",),
     "flax": ("grfm.network",),

@@ -75,6 +75,18 @@ def test_workers_need_no_renderer(monkeypatch):
     assert os.environ["MUJOCO_GL"] == "crayon"
 
 
+@pytest.mark.parametrize("module", ["robot", "sim.parallel", "evaluation.view"])
+def test_a_module_needs_no_renderer_and_leaves_the_variable(module):
+    program = f"import hector_jax.{module}, os; print(os.environ['MUJOCO_GL'])"
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"MUJOCO_GL": "crayon"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout.split()[-1]) == (0, "crayon")
+
+
 def test_a_home_that_cannot_be_written_is_told_in_one_line(tmp_path):
     wall = tmp_path / "wall"
     wall.write_text("a file, where a folder is wanted")

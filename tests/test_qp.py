@@ -491,11 +491,9 @@ def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
 
     def evidence(qp):
         normal, wanted = qp_door._normalise(FLOORS, qp), jnp.ones((), bool)
-        found = [
-            method(QpConfig(), FLOORS, normal, wanted)[0]
-            for method in (qp_door._interior_point, qp_door._approach)
-        ]
-        return [jnp.max(qp_door._evidence(normal, point)) for point in found]
+        once, *_ = qp_door._interior_point(QpConfig(), FLOORS, normal, wanted)
+        again = qp_door._approach(QpConfig(), FLOORS, normal, wanted)
+        return jnp.max(qp_door._evidence(normal, once)), jnp.max(again.proof)
 
     far = stack([qp._replace(q=1e6 * qp.q) for qp in made])
     once, again = jax.jit(partial(jax.lax.map, evidence))(far)
@@ -525,7 +523,7 @@ def test_on_a_gpu_the_kernels_guess_is_proved_at_once(walking, as_on_a_gpu):
     def tries(qp):
         normal, start, active = first_guess(qp)
         wanted = jnp.ones((), bool)
-        _, proof, count = qp_door._active_set(FLOORS, normal, start, active, wanted, 15)
+        _, proof, count = qp_door._active_set(FLOORS, normal, start, active, wanted, jnp.array(15))
         return jnp.max(proof), count
 
     proof, count = tries(stack(walking[:8]))

@@ -446,7 +446,7 @@ def _worst(qp: _Normal, wrong: Array, active: Array, by: Array) -> Array:
 
 
 def _active_set(
-    floors: _Floors, qp: _Normal, start: _Point, active: Array, wanted: Array, limit: int
+    floors: _Floors, qp: _Normal, start: _Point, active: Array, wanted: Array, limit: Array
 ) -> tuple[_Point, Array, Array]:
     """Semismooth Newton: active sides as equations, the guess corrected by signs until it stays.
 
@@ -578,12 +578,16 @@ def _interior_point(
 
         def direction(product: Array) -> tuple[Array, Array, Array]:
             """Newton step that takes slack * z to slack * z + product."""
-            dx, dz = jnp.zeros_like(x), inverse * product - weight * primal
-            for _ in range(3):  # later passes take off what rounding and rho did
-                step = -cho_solve(
-                    (factor, True), dual + qp.P @ dx + _columns(qp.A, _multiplier(dz))
-                )
-                dx, dz = dx + step, dz + weight * sign * _rows(qp.A, step)
+
+            def closer(_: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+                dx, dz = found
+                pull = dual + qp.P @ dx + _columns(qp.A, _multiplier(dz))
+                step = -cho_solve((factor, True), pull)
+                return dx + step, dz + weight * sign * _rows(qp.A, step)
+
+            # later passes take off what rounding and rho did
+            begin = jnp.zeros_like(x), inverse * product - weight * primal
+            dx, dz = lax.fori_loop(0, 3, closer, begin)
             along = sign * _rows(qp.A, dx)
             return dx, dz, jnp.where(qp.side, primal - along + delta * dz, 0.0)
 
@@ -622,9 +626,15 @@ def _interior_point(
     return end.point, end.slack, _proofs(floors, qp, end.before, end.point), end.iterations
 
 
-def _approach(
-    config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array
-) -> tuple[_Point, Array, Array, Array]:
+class _Approach(NamedTuple):
+    point: _Point
+    slack: Array  # (2, m)
+    proof: Array  # evidence of the point; infinite where nothing was tried
+    proved: Array  # (2,) bool: infeasible, unbounded
+    iterations: Array
+
+
+def _approach(config: QpConfig, floors: _Floors, qp: _Normal, wanted: Array) -> _Approach:
     """The interior point, again in the sizes of what it found where it did not get near.
 
     One size was taken for x and slope from q and the bounds. Where rows hold x far from where q
@@ -632,31 +642,37 @@ def _approach(
     """
 
     def attempt(state: tuple) -> tuple:
-        best, best_slack, steps, (size, slope), _, _ = state
+        best, (size, slope), _ = state
         sized = qp._replace(
             P=size / slope * qp.P, q=qp.q / slope, bound=qp.bound / size, reach=qp.reach / size
         )
         point, slack, proved, more = _interior_point(config, floors, sized, wanted)
         point = _Point(size * point.x, slope * point.z)
-        first = steps == 0
-        better = first | (jnp.max(_evidence(qp, point)) < jnp.max(_evidence(qp, best)))
-        point, slack = _choose(better, (point, size * slack), (best, best_slack))
-        near = jnp.max(_evidence(qp, point)) <= floors.target
+        proof = _evidence(qp, point)
+        first = best.iterations == 0
+        better = first | (jnp.max(proof) < jnp.max(best.proof))
+        kept = best.point, best.slack, best.proof
+        point, slack, proof = _choose(better, (point, size * slack, proof), kept)
         sizes = jnp.stack(
             [_largest(point.x), jnp.maximum(_largest(qp.P @ point.x), _largest(qp.q))]
         )
-        again = first & ~near & ~jnp.any(proved) & jnp.all(sizes > 0.0)
-        return point, slack, steps + more, jnp.where(again, sizes, 1.0), proved, again
+        again = first & (jnp.max(proof) > floors.target) & ~jnp.any(proved) & jnp.all(sizes > 0.0)
+        best = _Approach(point, slack, proof, proved, best.iterations + more)
+        return best, jnp.where(again, sizes, 1.0), again
 
-    nowhere = _Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
-    none, ones = jnp.zeros((), jnp.int32), jnp.ones(2, qp.q.dtype)
-    start = (nowhere, jnp.ones_like(qp.bound), none, ones, jnp.zeros(2, bool), wanted)
-    point, slack, steps, _, proved, _ = lax.while_loop(lambda state: state[-1], attempt, start)
-    return point, slack, proved, steps
+    nowhere = _Approach(
+        _Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound)),
+        jnp.ones_like(qp.bound),
+        jnp.full(3, jnp.inf, qp.q.dtype),
+        jnp.zeros(2, bool),
+        jnp.zeros((), jnp.int32),
+    )
+    start = nowhere, jnp.ones(2, qp.q.dtype), wanted
+    return lax.while_loop(lambda state: state[-1], attempt, start)[0]
 
 
-def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, Array, Array, Array]:
-    """BoxOSQP of jaxopt, its derivative left aside; returns what `_interior_point` does."""
+def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> _Approach:
+    """BoxOSQP of jaxopt, its derivative left aside."""
     from jaxopt import BoxOSQP
 
     held = qp.side | qp.equality
@@ -678,7 +694,54 @@ def _box_osqp(config: QpConfig, floors: _Floors, qp: _Normal) -> tuple[_Point, A
     point = _Point(x, z)
     proved = _proofs(floors, qp, jax.tree.map(jnp.zeros_like, point), point)
     slack = jnp.maximum(-_violation(qp, x), 0.0)
-    return point, slack, proved, state.iter_num.astype(jnp.int32)
+    return _Approach(point, slack, _evidence(qp, point), proved, state.iter_num.astype(jnp.int32))
+
+
+class _Best(NamedTuple):
+    point: _Point
+    proof: Array
+    proved: Array  # (2,) bool
+    iterations: Array
+    approached: Array  # whether the next round begins with an approach
+    going: Array
+
+
+def _best(config: QpConfig, floors: _Floors, qp: _Normal, loose: _Point, wanted: Array) -> _Best:
+    """Best point found: by the active set from a guess, else from where another method gets near.
+
+    Both rounds are one loop, so that the active set is compiled once.
+    """
+    has_guess = config.solver == "interior_point"
+    start, guess = _first_guess(qp, loose) if has_guess else (loose, jnp.zeros_like(qp.side))
+
+    def attempt(state: _Best) -> _Best:
+        if has_guess:
+            near = _approach(config, floors, qp, state.going & state.approached)
+        else:
+            near = _box_osqp(config, floors, qp)
+        # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
+        pushes = near.point.z * qp.reach > near.slack * _largest(near.point.z)
+        begin, active = _choose(state.approached, (near.point, pushes), (start, guess))
+        limit = jnp.where(state.approached, config.max_iterations, config.active_set_tries)
+        hopeful = state.going & ~jnp.any(near.proved)
+        exact, exact_proof, tries = _active_set(floors, qp, begin, active, hopeful, limit)
+        point, proof = state.point, state.proof
+        for other, its_proof in ((near.point, near.proof), (exact, exact_proof)):
+            better = jnp.max(its_proof) < jnp.max(proof)
+            point, proof = _choose(better, (other, its_proof), (point, proof))
+        steps = state.iterations + near.iterations + tries
+        going = ~state.approached & (jnp.max(proof) > floors.target)
+        return _Best(point, proof, near.proved, steps, jnp.ones((), bool), going)
+
+    first = _Best(
+        loose,
+        jnp.full(3, jnp.inf, qp.q.dtype),
+        jnp.zeros(2, bool),
+        jnp.zeros((), jnp.int32),
+        jnp.asarray(not has_guess),
+        wanted,
+    )
+    return lax.while_loop(lambda state: state.going, attempt, first)
 
 
 def _support(qp: _Normal, y: Array) -> Array:
@@ -809,26 +872,7 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     free, definite, convex = _without_rows(floors, normal)
     valid &= convex
     loose = _Point(free, jnp.zeros(normal.side.shape, qp.q.dtype))
-    tries = config.active_set_tries
-    if config.solver == "interior_point":
-        start, guess = _first_guess(normal, loose)
-        quick, proof, first = _active_set(floors, normal, start, guess, valid, tries)
-        settled = jnp.max(proof) <= floors.target
-        near, slack, proved, steps = _approach(config, floors, normal, valid & ~settled)
-    else:
-        quick, proof = loose, jnp.full(3, jnp.inf, qp.q.dtype)
-        first, settled = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-        near, slack, proved, steps = _box_osqp(config, floors, normal)
-    hopeful = valid & ~settled & ~jnp.any(proved)
-    # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
-    pushes = near.z * normal.reach > slack * _largest(near.z)
-    exact, exact_proof, last = _active_set(
-        floors, normal, near, pushes, hopeful, config.max_iterations
-    )
-    point = quick
-    for other, its_proof in ((near, _evidence(normal, near)), (exact, exact_proof)):
-        better = ~settled & (jnp.max(its_proof) < jnp.max(proof))
-        point, proof = _choose(better, (other, its_proof), (point, proof))
+    point, proof, proved, iterations, *_ = _best(config, floors, normal, loose, valid)
     # far from any solution (infeasible, unbounded) all evidence may be infinite, and so may x
     usable = valid & jnp.all(jnp.isfinite(proof))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), point)
@@ -851,7 +895,7 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
         jnp.maximum(primal, unmet),
         dual,
         gap,
-        first + steps + last,
+        iterations,
         status,
     )
     slack = jnp.maximum(-_violation(normal, point.x), 0.0)

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 
 import imageio_ffmpeg
 import jax
-import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
@@ -29,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.console import Broken
 from hector_jax.evaluation.plots import distances, named
 from hector_jax.geometry import rotation_from_euler
+from hector_jax.headless import mujoco
 from hector_jax.inputs import SOME, InputError, Interval, check, choose
 from hector_jax.robot import Robot
 from hector_jax.trajectory import State, Trajectory, from_start
@@ -197,7 +197,9 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
     places = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"MUJOCO_GL": back_end, "PYTHONPATH": os.pathsep.join(places)}
     environment.pop("PYOPENGL_PLATFORM", None)
-    command = [sys.executable, "-m", "hector_jax.evaluation.video", "request.npz"]
+    # MuJoCo first, with this back end; the package would load it without any
+    program = "import mujoco; from hector_jax.evaluation import video; video.main()"
+    command = [sys.executable, "-c", program, "request.npz"]
     try:
         done = subprocess.run(
             command,
@@ -431,6 +433,7 @@ def _strip(request: Mapping[str, Any], rows: list[list[np.ndarray]]) -> Image.Im
     return picture
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Draw the request that the first argument names."""
     with np.load(sys.argv[1], allow_pickle=False) as archive:
         _draw(dict(archive))

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -27,6 +26,7 @@ from hector_jax.evaluation.plots import named
 from hector_jax.evaluation.runs import METRICS, RESULT, as_sentence, curves, read_histories
 from hector_jax.evaluation.video import COLOURS, poses
 from hector_jax.geometry import rot_z
+from hector_jax.headless import mujoco
 from hector_jax.inputs import InputError
 from hector_jax.robot import Robot
 from hector_jax.trajectory import Trajectory, Wrench, from_start

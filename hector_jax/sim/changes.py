@@ -14,9 +14,9 @@ from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
+from hector_jax.headless import mujoco
 from hector_jax.inputs import InputError
 from hector_jax.sim.world import TIME_STEP, World
 

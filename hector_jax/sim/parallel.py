@@ -18,9 +18,11 @@ from functools import partial
 from math import ceil
 from typing import Any, NamedTuple
 
+from hector_jax.headless import mujoco  # before MJX loads it with OpenGL
+
+# isort: split
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx

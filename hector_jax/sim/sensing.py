@@ -9,12 +9,12 @@ world frame. The controller gets an estimate; losses and labels read the truth.
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax.control.walking import Measurement
 from hector_jax.geometry import euler_from_rotation, rotation_from_quaternion, wrap_angle
+from hector_jax.headless import mujoco
 from hector_jax.model.kinematics import foot_poses
 from hector_jax.robot import Robot
 from hector_jax.sim.world import TIME_STEP, Estimator, World

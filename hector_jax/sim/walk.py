@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -40,6 +39,7 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
+from hector_jax.headless import mujoco
 from hector_jax.inputs import InputError
 from hector_jax.robot import Robot, quiet_mujoco
 from hector_jax.sim import sensing

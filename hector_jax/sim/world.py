@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hector_jax.description import Description
+from hector_jax.headless import mujoco
 from hector_jax.inputs import InputError, did_you_mean, shown
 from hector_jax.mjcf import TIME_STEP
 from hector_jax.robot import compile_model, quiet_mujoco
