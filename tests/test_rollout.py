@@ -130,9 +130,9 @@ def check_gradient(config, robot, weights, command, anchor, effect, bar):
     assert relative(forward, reverse) <= 1e-8
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor, seed):
-    command = named_command(COMMANDS[seed % 3])
+    command = named_command(COMMANDS[seed])
     check_gradient(SHORT, robot, random_weights(seed), command, anchor, PLAIN, 1e-6)
 
 
