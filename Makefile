@@ -8,7 +8,10 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	>/dev/null 2>&1 && echo $$p && break; done)
 
-.PHONY: help setup tune table grfm ceiling test test-all bench check format docs lock
+QUICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,footstep gait legs reference trajectories weights mpc walking \
+	qp pivot loss difftune rollout measured))
+
+.PHONY: help setup tune table grfm ceiling test quick test-all bench check format docs lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -17,7 +20,7 @@ setup: $(STAMP) ## build .venv from the lock
 
 $(STAMP): requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "hector_jax needs Python 3.11 to 3.13; none found" >&2; exit 2; }
-	@echo "setting up $(VENV) with $$($(PYTHON) --version) (once, about a minute)"
+	@echo "setting up $(VENV) with $$($(PYTHON) --version) (once, one to two minutes)"
 	@$(PYTHON) -m venv --clear $(VENV)
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -r requirements.lock
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
@@ -36,11 +39,14 @@ ceiling: $(STAMP) ## search of 2000 walks for each trajectory, taken up where it
 	@$(BIN)/hector search --traj all --budget 2000 --population 40 --record runs/ceiling \
 		--out docs/results/ceiling
 
-test: $(STAMP) ## the fast suite (under 8 minutes on 2 cores)
-	@$(BIN)/pytest -q -n 2
+test: $(STAMP) ## the fast suite
+	@$(BIN)/pytest -q -n 2 --dist loadfile
+
+quick: $(STAMP) ## the fast tests of controller, QP and tuner
+	@$(BIN)/pytest -q -n 2 --dist loadfile $(QUICK_TESTS)
 
 test-all: $(STAMP) ## the fast suite and the slow stories
-	@$(BIN)/pytest -q -n 2 -m "slow or not slow"
+	@$(BIN)/pytest -q -n 2 --dist loadfile -m "slow or not slow"
 
 bench: $(STAMP) ## benchmarks on this machine; peers come with pip install -e ".[bench]"
 	@$(BIN)/python -m benchmarks

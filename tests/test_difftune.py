@@ -214,11 +214,12 @@ def test_the_papers_ten_steps_are_taken_uphill_too_and_later_ones_are_not(monkey
     assert (np.diff(kept) < 0).all()
 
 
-def test_it_stops_where_nothing_is_gained(monkeypatch):
-    config = TuneConfig(patience=5, gain=5e-3)
-    found = tune_toy(monkeypatch, quadratic(fixed=1e9), config)
-    assert found.stop == "the loss fell by less than 0.5% in 5 iterations"
-    assert len(found.history) - 1 == 11
+@pytest.mark.parametrize(("patience", "last"), [(5, 11), (15, 15)])
+def test_it_stops_where_nothing_is_gained(monkeypatch, patience, last):
+    config = TuneConfig(patience=patience, gain=5e-3)
+    found = tune_toy(monkeypatch, quadratic(fixed=1e12), config)
+    assert found.stop == f"the loss fell by less than 0.5% in {patience} iterations"
+    assert sum(one.accepted for one in found.history) - 1 == last
 
 
 def test_a_fall_halves_the_step_goes_back_and_is_told(monkeypatch):

@@ -179,7 +179,7 @@ def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(tmp_path, params, fau
         assert done.same
         assert done.recorded["reason"] == done.again["reason"] == REASONS[fault]
         assert done.first == FIRST[fault]
-        assert done.changed == {}
+        assert done.changed.keys() <= {"commit"}  # this checkout may change beside a test
 
 
 @pytest.mark.parametrize("fault", [Fault.FALL])

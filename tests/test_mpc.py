@@ -286,6 +286,14 @@ def test_effort_about_the_weight_stands_with_exactly_the_weight():
     np.testing.assert_allclose(wrench.moment, 0.0, atol=1e-6)
 
 
+def test_effort_about_the_weight_is_all_of_it_on_one_foot():
+    state, horizon = standing()
+    horizon = horizon._replace(contact=jnp.asarray(BOTH).at[:, 1].set(False))
+    dear = expert()._replace(R=jax.tree.map(lambda r: 1e9 * r, expert().R))
+    wrench, _ = solve(MpcConfig(effort_about="weight"), ROBOT, dear, state, horizon, DT, 1)
+    np.testing.assert_allclose(wrench.force, [[0.0, 0.0, WEIGHT], [0.0] * 3], atol=1e-3)
+
+
 def test_only_the_ratio_of_weights_matters():
     state, horizon = problem(6, push=2.0)
     one, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
