@@ -130,25 +130,26 @@ def check_gradient(config, robot, weights, command, anchor, effect, bar):
     assert relative(forward, reverse) <= 1e-8
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor, seed):
-    command = named_command(COMMANDS[seed])
-    check_gradient(SHORT, robot, random_weights(seed), command, anchor, PLAIN, 1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
-def test_gradient_over_50_ticks_with_a_net_is_that_of_differences(robot, anchor, net, seed):
-    command = named_command(COMMANDS[seed % 3])
-    check_gradient(SHORT, robot, random_weights(seed), command, anchor, net, 1e-6)
+def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor):
+    check_gradient(SHORT, robot, random_weights(0), named_command("s"), anchor, PLAIN, 1e-6)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("with_net", [False, True])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
+def test_gradient_over_50_ticks_is_that_of_differences_from_anywhere(
+    robot, anchor, net, seed, with_net
+):
+    effect, command = net if with_net else PLAIN, named_command(COMMANDS[seed])
+    check_gradient(SHORT, robot, random_weights(seed), command, anchor, effect, 1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_net", [False, True])
+@pytest.mark.parametrize("seed", range(3))
 def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, net, seed, with_net):
     effect, weights = net if with_net else PLAIN, random_weights(seed)
-    command = named_command(COMMANDS[seed % 3])
+    command = named_command(COMMANDS[seed])
     assert not walk(LONG, robot, weights, command, anchor, effect).fallen.any()
     check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4)
 
