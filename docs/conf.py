@@ -23,7 +23,7 @@ extensions = [
 html_theme = "furo"
 html_title = f"hector_jax {release}"
 html_show_sphinx = False
-exclude_patterns = ["_build", "**.ipynb_checkpoints"]
+exclude_patterns = ["_build", "jupyter_execute", "**.ipynb_checkpoints"]
 
 nb_execution_mode = "off"  # tests execute the notebooks; the site shows what is committed
 myst_enable_extensions = ["dollarmath"]
