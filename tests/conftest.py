@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 
@@ -39,6 +40,14 @@ def _forget_programs():
         return
     if crowded:
         jax.clear_caches()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _no_machine_is_slow():
+    """What a command prints in a test does not depend on how long JAX takes to load."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hector_jax.cli.say_if_slow", lambda text: nullcontext())
+        yield
 
 
 def has_name(axes, which):
