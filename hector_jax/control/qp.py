@@ -312,6 +312,7 @@ class _Normal(NamedTuple):
     column: Array  # (n,)
     row: Array  # (m,)
     size: Array
+    flat: Array  # () bool: P may have no curvature along some direction
     reach: Array  # size of A v: largest finite bound, but 1 at most, and where all are zero
 
 
@@ -388,6 +389,7 @@ def _normalise(floors: _Floors, qp: QP) -> _Normal:
         column,
         row,
         size,
+        jnp.ones((), bool),
         jnp.where(largest > rounding, jnp.minimum(largest, 1.0), 1.0),
     )
 
@@ -772,8 +774,12 @@ def _rays(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> tuple[
     outside = sign * (_rows(qp.A, point.x) - _rows(qp.A, before.x))
     outward = jnp.where(qp.equality, jnp.abs(outside), jnp.where(qp.side, outside, 0.0))
     needed = jnp.maximum(_largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
+    # rows have length one: so much of the difference may be rounding, which proves nothing
+    noise = jnp.finfo(dx.dtype).eps * jnp.sum(jnp.abs(point.z))
     by = jnp.stack([gap, -jnp.dot(qp.q, dx)])
-    return jnp.stack([_largest(pull), needed]) < floors.certificate * by, by
+    # where P curves in every direction no fall is endless
+    needed = jnp.where(qp.flat, needed, jnp.inf)
+    return jnp.stack([_largest(pull) + noise, needed]) < floors.certificate * by, by
 
 
 def _proofs(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> Array:
@@ -870,6 +876,7 @@ def _solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, _Normal]:
     valid = jnp.isfinite(numbers) & ~jnp.any(no_bound)
     normal = _normalise(floors, _or_plain(valid, qp))
     free, definite, convex = _without_rows(floors, normal)
+    normal = normal._replace(flat=~definite)
     valid &= convex
     loose = _Point(free, jnp.zeros(normal.side.shape, qp.q.dtype))
     point, proof, proved, iterations, *_ = _best(config, floors, normal, loose, valid)
