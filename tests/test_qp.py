@@ -501,6 +501,14 @@ def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
     assert (np.asarray(again) <= FLOORS.target).all()
 
 
+@pytest.mark.parametrize("times", [1e3, 1e6])
+def test_a_q_that_is_too_large_makes_no_problem_infeasible_or_unbounded(times):
+    for begin in range(0, 400, EACH):  # as many as SHAPES[1] was compiled for
+        made = [general_qp(seed, 5, 12)[0] for seed in range(begin, begin + EACH)]
+        found = solve_all(stack([qp._replace(q=times * qp.q) for qp in made]))
+        assert np.isin(found.status, [Status.SOLVED, Status.NOT_UNIQUE]).all()
+
+
 @pytest.fixture
 def as_on_a_gpu(monkeypatch):
     """Programs traced here take the branch of a GPU, its kernel interpreted."""

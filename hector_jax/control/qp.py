@@ -615,8 +615,8 @@ def _interior_point(
         proximal = jnp.maximum(factors * state.proximal, least)
         done = jnp.max(_evidence(qp, point)) <= floors.target
         iterations = state.iterations + 1
-        shown, _ = _rays(floors, qp, state.point, point)
-        going = ~done & ~jnp.any(shown) & (proximal[0] < 1.0)
+        left, share = _rays(floors, qp, state.point, point)
+        going = ~done & ~jnp.any(left < share) & (proximal[0] < 1.0)
         going &= iterations < config.max_iterations
         return _Loop(point, state.point, slack, proximal, iterations, going)
 
@@ -760,10 +760,14 @@ def _slope(qp: _Normal, point: _Point) -> Array:
 
 
 def _rays(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> tuple[Array, Array]:
-    """Whether a step shows that no x of moderate size meets the rows, an endless fall; by how much.
+    """What a step leaves of a proof that no x of moderate size meets the rows, of an endless fall.
 
     Without a solution the multipliers grow for ever along a combination of rows that cancels, or x
     along a fall. A step shows that purely; in the point itself is a part that does not cancel.
+
+    Returns:
+        What should be zero (2,), and a share of what it is to be small beside: below it, the step
+        shows a ray.
     """
     dx, rise = point.x - before.x, point.z - before.z
     sign = jnp.asarray(_SIGN, dx.dtype)
@@ -774,24 +778,27 @@ def _rays(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> tuple[
     outside = sign * (_rows(qp.A, point.x) - _rows(qp.A, before.x))
     outward = jnp.where(qp.equality, jnp.abs(outside), jnp.where(qp.side, outside, 0.0))
     needed = jnp.maximum(_largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
-    # rows have length one: so much of the difference may be rounding, which proves nothing
-    noise = jnp.finfo(dx.dtype).eps * jnp.sum(jnp.abs(point.z))
-    by = jnp.stack([gap, -jnp.dot(qp.q, dx)])
     # where P curves in every direction no fall is endless
-    needed = jnp.where(qp.flat, needed, jnp.inf)
-    return jnp.stack([_largest(pull) + noise, needed]) < floors.certificate * by, by
+    left = jnp.stack([_largest(pull), jnp.where(qp.flat, needed, jnp.inf)])
+    return left, floors.certificate * jnp.stack([gap, -jnp.dot(qp.q, dx)])
 
 
 def _proofs(floors: _Floors, qp: _Normal, before: _Point, point: _Point) -> Array:
     """Whether the step proves that the problem is infeasible, and unbounded (2,).
 
-    By more than the tolerance, within which it can be solved.
+    By more than the tolerance, within which it can be solved, and by more than rounding.
     """
     dx, rise = point.x - before.x, point.z - before.z
     rows = jnp.sum(jnp.abs(rise) * _sizes(qp, point.x))
     sizes = jnp.stack([rows, jnp.sum(jnp.abs(dx)) * _slope(qp, point)])
-    shown, by = _rays(floors, qp, before, point)
-    return shown & (by > floors.tolerance * sizes)
+    left, share = _rays(floors, qp, before, point)
+    A, x = jnp.abs(qp.A), jnp.abs(point.x)
+    terms = _largest(_columns(A, jnp.sum(jnp.abs(point.z), axis=0)))
+    rounding = jnp.finfo(x.dtype).eps * jnp.stack(
+        [terms, jnp.maximum(_largest(jnp.abs(qp.P) @ x), _largest(_rows(A, x)))]
+    )
+    shown = left + rounding < share
+    return shown & (share > floors.certificate * floors.tolerance * sizes)
 
 
 def _evidence(qp: _Normal, point: _Point) -> Array:
