@@ -268,9 +268,10 @@ SECTIONS: dict[str, Section] = {
 
 
 def difference(before: np.ndarray, now: np.ndarray) -> float:
-    """Largest difference over the largest entry; infinite for another shape."""
-    if before.shape != now.shape:
+    """Largest difference over the largest entry; infinite for another shape, or NaN elsewhere."""
+    if before.shape != now.shape or np.any(np.isnan(before) != np.isnan(now)):
         return np.inf
+    before, now = np.nan_to_num(before), np.nan_to_num(now)
     largest = np.max(np.abs(before), initial=0.0)
     return float(np.max(np.abs(before - now), initial=0.0) / (largest or 1.0))
 

@@ -12,21 +12,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import synthetic_walk
 
 from hector_jax import pipeline, replay, storage
 from hector_jax.cli import main
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import bounds, nominal, weights_to_vector
 from hector_jax.evaluation.report import tuning_section
-from hector_jax.grfm.dataset import at_interval, make_dataset
-from hector_jax.grfm.network import init_params
 from hector_jax.robot import load_robot
 from hector_jax.runtime import workers
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
 from hector_jax.tuning.loss import Losses
 from hector_jax.tuning.rollout import RolloutConfig
+from tests.model import small_net
 
 ROBOT = load_robot()
 TICKS, AT = 24, 9  # of the walk, of the fault
@@ -109,12 +107,7 @@ def plant():
 @pytest.fixture(scope="module")
 def params():
     """A small net that adds a newton or so to what was commanded."""
-    walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
-    data = make_dataset(ROBOT, jax.tree.map(lambda *x: np.stack(x), *walks))[0]
-    made = init_params(jax.random.key(0), data, "residual", hidden=(4,))
-    quiet = jax.tree.map(jnp.zeros_like, made.linear)
-    linear = quiet._replace(ticks=made.linear.ticks, gates=made.linear.gates)
-    return made._replace(linear=linear, left=jnp.ones_like(made.left))
+    return small_net()
 
 
 def tune(folder, command, params, config=CONFIG, robot=ROBOT):

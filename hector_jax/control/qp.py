@@ -13,10 +13,12 @@ not matter; t is the tolerance.
 - SOLVED: the three residuals are at most t, and the minimiser is held in every direction: P less
   1e-8 of the unit matrix is positive definite, or it is with the rows added to P that are
   equalities or press with a force of more than t. Where it is not held: NOT_UNIQUE.
-- INFEASIBLE: a step of the multipliers proves that rows contradict each other by more than t. Or a
-  row of zeros, or a row with l > u, is violated by more than t whatever x is. Within t, crossed
-  bounds are an equality with their middle, and a row of zeros is met.
-- UNBOUNDED: a step of x proves a fall of more than t that neither P nor a row ends.
+- INFEASIBLE: a step of the multipliers proves that rows contradict each other, by more than t and
+  by more than its own rounding. Or a row of zeros, or a row with l > u, is violated by more than t
+  whatever x is. Within t, crossed bounds are an equality with their middle, and a row of zeros is
+  met.
+- UNBOUNDED: P is not positive definite, and a step of x proves a fall that neither P nor a row
+  ends, likewise by more than t and rounding.
 - BAD_DATA: a number is not finite, or P plus 1e-9 of the unit matrix is not positive definite.
 
 A violation is measured by the larger of x and the row's bound. A row of zeros (entries of at most

@@ -13,7 +13,7 @@ closed loop to a weight, and a recursion begun anew in each would see the first 
 hfs, from nominal weights, the three ways of `ESTIMATORS` gain about the same.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -226,10 +226,11 @@ def step_adaptation(
     state = MeasuredState(measurement.state, _feet(robot, measurement))
     states = (*carry.states, jax.tree.map(np.asarray, state))
     carry, iteration = carry._replace(states=states), None
-    if carry.trace is None:
-        carry = carry._replace(trace=init_trace(anchor, state, last))
+    trace = init_trace(anchor, state, last) if carry.trace is None else carry.trace
+    carry = carry._replace(trace=trace)
     if len(carry.used) == config.window:
-        trace, evaluation = _follow_window(config, robot, command, anchor, effect, carry, tick)
+        walked = carry.states, carry.used, tick - config.window
+        trace, evaluation = _follow_window(config, robot, command, anchor, effect, trace, *walked)
         reason = refusal(config.tune, evaluation)
         iteration = Iteration(carry.count, carry.weights, evaluation, not reason, reason, carry.led)
         if reason:
@@ -251,13 +252,14 @@ def _follow_window(
     command: Command,
     anchor: Anchor,
     effect: jax.tree_util.Partial,
-    carry: Adaptation,
-    tick: int,
+    trace: Trace,
+    states: Sequence[MeasuredState],
+    used: Sequence[Weights],
+    begin: int,
 ) -> tuple[Trace, Evaluation]:
-    """`window_gradient` of the window that ends at `tick`."""
+    """`window_gradient` of the window from tick `begin`, as numbers of NumPy."""
     stack = lambda rows: jax.tree.map(lambda *x: np.stack(x), *rows)  # noqa: E731
-    trace = carry.trace
-    if trace is not None and config.estimator != "carried":
+    if config.estimator != "carried":
         trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
     found = follow(
         config.tune,
@@ -266,9 +268,9 @@ def _follow_window(
         anchor,
         effect,
         trace,
-        stack(carry.used),
-        np.asarray(tick - config.window, np.int32),
-        stack(carry.states),
+        stack(used),
+        np.asarray(begin, np.int32),
+        stack(states),
         measured=config.estimator != "model",
     )
     return jax.tree.map(np.asarray, found)
