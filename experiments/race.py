@@ -153,8 +153,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
     if not folder.exists():
         shutil.rmtree(part, ignore_errors=True)  # a cut would leave its seconds unknown
         begin = time.monotonic()
-        collection = pipeline.CollectConfig(engine=flags.engine)
-        pipeline.collect(pool, collection, robot, part / "walks")
+        pipeline.collect(pool, pipeline.CollectConfig(), robot, part / "walks")  # see `ground`
         collected = time.monotonic()
         path = pipeline.net_path(part, TrainConfig().variant)
         pipeline.train(TrainConfig(), robot, part / "walks", path)

@@ -103,3 +103,13 @@ def test_batch_sets_up_its_devices_and_refuses_a_missing_net(tmp_path):
     )
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("batch: cannot read")
+
+
+def test_a_race_on_another_engine_collects_as_every_run_does(tmp_path, monkeypatch):
+    race, made = script("race"), []
+    monkeypatch.setattr(race.pipeline, "collect", lambda pool, config, *rest: made.append(config))
+    monkeypatch.setattr(race.pipeline, "train", lambda *rest: (tmp_path / "data.part").mkdir())
+    monkeypatch.setattr(race.pipeline, "ground", lambda pool, robot, folder: race.pipeline.Learned)
+    monkeypatch.setattr(race.pipeline.Learned, "params", None, raising=False)
+    race.prepare(None, race.Flags(engine="c", out=tmp_path), None)
+    assert made == [race.pipeline.CollectConfig()]  # what `ground` takes up
