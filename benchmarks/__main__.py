@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from benchmarks.measuring import Check, Report, child
-from hector_jax.console import say
+from hector_jax.core.console import say
 
 SECTIONS = ("qp_layer", "closed_loop", "realtime", "collection", "batch", "throughput")
 QUICK = {

@@ -30,9 +30,9 @@ def one(ticks: int, batch: int, repeats: int) -> dict[str, float]:
 
     from hector_jax.control.reference import named_command, standing_anchor
     from hector_jax.control.weights import nominal
-    from hector_jax.model.effect import last_command
-    from hector_jax.robot import load_robot
-    from hector_jax.runtime import setup_jax
+    from hector_jax.core.runtime import setup_jax
+    from hector_jax.grfm.effect import last_command
+    from hector_jax.robot.model import load_robot
     from hector_jax.tuning.difftune import TuneConfig, evaluate
     from hector_jax.tuning.rollout import RolloutConfig
 

@@ -13,10 +13,10 @@ import jax
 
 from benchmarks.measuring import Check, Report, show
 from hector_jax.control.walking import WalkConfig
+from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm.dataset import draw_jobs
-from hector_jax.pipeline import mjx_walks
-from hector_jax.robot import load_robot
-from hector_jax.runtime import setup_jax
+from hector_jax.robot.model import load_robot
+from hector_jax.runs.pipeline import mjx_walks
 from hector_jax.sim.walk import first_tick, substeps
 
 BAR = 0.7  # million robot-steps per second of 4096 walks at once, on one H200

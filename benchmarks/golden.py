@@ -25,27 +25,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import problems
-from hector_jax.console import say
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.qp import QpConfig, solve_qp
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.export import controller, export_controller, load_controller
+from hector_jax.core.console import say
+from hector_jax.core.runtime import setup_jax
+from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.grfm import dataset, training
+from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.model.effect import last_command
-from hector_jax.robot import Robot, load_robot
-from hector_jax.runtime import setup_jax
+from hector_jax.qp.solve import QpConfig, solve_qp
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.runs.export import controller, export_controller, load_controller
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import hfs, ideal
-from hector_jax.trajectory import State, Trajectory
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
 from hector_jax.tuning.loss import LossConfig, losses, total
@@ -242,7 +242,7 @@ def table() -> Arrays:
     """A quick table from nothing: data, net, tunings, verdicts."""
     with tempfile.TemporaryDirectory() as folder:
         words = ["table", "--quick", "--data", f"{folder}/data", "--out", f"{folder}/table"]
-        subprocess.run([sys.executable, "-m", "hector_jax.cli", *words], check=True)
+        subprocess.run([sys.executable, "-m", "hector_jax.cli.main", *words], check=True)
         told = json.loads((Path(folder) / "table" / "quick" / "table.json").read_text())
     return _numbers(told["trajectories"])
 

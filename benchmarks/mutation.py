@@ -30,10 +30,10 @@ PARTS = {
         " control/trajectories control/walking control/weights",
         "gait footstep legs reference trajectories weights config mpc walking rollout export",
     ),
-    "qp": ("control/qp control/pivot", "qp pivot mpc"),
+    "qp": ("qp/solve qp/pivot", "qp pivot mpc"),
     "tuning": (
         "tuning/batch tuning/difftune tuning/loss tuning/measured tuning/online tuning/rollout"
-        " tuning/search tuning/sensitivity",
+        " tuning/sensitivity search/cmaes",
         "loss config rollout difftune faults measured online search batch",
     ),
     "sim": (

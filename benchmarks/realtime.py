@@ -19,8 +19,8 @@ import numpy as np
 from hector_jax.control.reference import anchor_at, named_command
 from hector_jax.control.walking import WalkConfig, actuate, init_memory, step_plan
 from hector_jax.control.weights import expert
-from hector_jax.robot import load_robot
-from hector_jax.runtime import setup_jax
+from hector_jax.core.runtime import setup_jax
+from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.walk import substeps, walk
 from hector_jax.sim.world import ideal

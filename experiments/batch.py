@@ -23,30 +23,30 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from hector_jax import pipeline
-from hector_jax.console import bar, exit_code, made_at
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.evaluation import metrics, plots
-from hector_jax.evaluation.metrics import Score
-from hector_jax.evaluation.report import environment, markdown_table
-from hector_jax.evaluation.transfer import disturbed
+from hector_jax.core.console import bar, exit_code, made_at
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import all_devices, setup_jax, workers
+from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net, member_effects
-from hector_jax.inputs import InputError
-from hector_jax.model.effect import last_command
-from hector_jax.robot import Robot, load_robot
-from hector_jax.runtime import all_devices, setup_jax, workers
+from hector_jax.report import plots
+from hector_jax.report.report import markdown_table
+from hector_jax.report.transfer import disturbed
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.runs import metrics, pipeline
+from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
-from hector_jax.storage import load_weights, make_folder, save_weights, write_file, write_json
-from hector_jax.tuning.batch import (
-    Problem,
-    Scenario,
-    Tunings,
-    stack,
-    tail_weights,
-    tune_batch,
+from hector_jax.storage import (
+    environment,
+    load_weights,
+    make_folder,
+    save_weights,
+    write_file,
+    write_json,
 )
+from hector_jax.tuning.batch import Problem, Scenario, Tunings, stack, tail_weights, tune_batch
 from hector_jax.tuning.difftune import Reason, Stop, TuneConfig, stopped
 from hector_jax.tuning.loss import LossConfig, Losses
 from hector_jax.tuning.rollout import Variation, no_variation

@@ -29,29 +29,23 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import kept, pipeline
-from hector_jax.console import bar, exit_code, made_at
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import (
-    WEIGHT_NAMES,
-    Weights,
-    expert,
-    nominal,
-    weights_to_vector,
-)
-from hector_jax.evaluation import plots
-from hector_jax.evaluation.report import environment, markdown_table
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
+from hector_jax.core.console import bar, exit_code, made_at
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
-from hector_jax.inputs import InputError
-from hector_jax.model.effect import last_command
-from hector_jax.robot import Robot, load_robot
-from hector_jax.runtime import setup_jax, workers
+from hector_jax.report import plots
+from hector_jax.report.report import markdown_table
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.runs import kept, pipeline
 from hector_jax.sim.changes import Change
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import digest, load_weights, write_file, write_json
-from hector_jax.trajectory import Trajectory
+from hector_jax.storage import digest, environment, load_weights, write_file, write_json
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
 from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner

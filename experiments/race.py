@@ -27,24 +27,20 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import pipeline
-from hector_jax.console import bar, exit_code, made_at, say
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.evaluation import plots
-from hector_jax.evaluation.report import environment, markdown_table
+from hector_jax.core.console import bar, exit_code, made_at, say
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.inputs import InputError
-from hector_jax.robot import Robot, load_robot
-from hector_jax.runtime import setup_jax, workers
-from hector_jax.sim.walk import Job, walk_job
-from hector_jax.sim.world import hfs
-from hector_jax.storage import digest, fingerprint, make_folder, write_file, write_json
-from hector_jax.tuning import difftune
-from hector_jax.tuning.difftune import Iteration, TuneConfig
-from hector_jax.tuning.race import Raced, Turn, lowest, race, walks
-from hector_jax.tuning.rivals import (
+from hector_jax.report import plots
+from hector_jax.report.report import markdown_table
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.runs import pipeline
+from hector_jax.search.cmaes import Generation, SearchConfig
+from hector_jax.search.race import Raced, Turn, lowest, race, walks
+from hector_jax.search.rivals import (
     Bayes,
     CmaEs,
     Differences,
@@ -55,8 +51,12 @@ from hector_jax.tuning.rivals import (
     adam,
     steps_to,
 )
+from hector_jax.sim.walk import Job, walk_job
+from hector_jax.sim.world import hfs
+from hector_jax.storage import digest, environment, fingerprint, make_folder, write_file, write_json
+from hector_jax.tuning import difftune
+from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
-from hector_jax.tuning.search import Generation, SearchConfig
 
 MARKS = (25, 50, 100, 200)  # walks after which the table tells the lowest loss
 ON_MODEL = ("without", "with", "adam")

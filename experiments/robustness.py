@@ -22,14 +22,15 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import kept
-from hector_jax.console import exit_code, made_at
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.evaluation import metrics, plots
-from hector_jax.evaluation.metrics import Score
-from hector_jax.evaluation.report import WORLDS, environment
-from hector_jax.evaluation.robustness import (
+from hector_jax.core.console import exit_code, made_at
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.grfm.dataset import SOLVED
+from hector_jax.report import plots
+from hector_jax.report.report import WORLDS
+from hector_jax.report.robustness import (
     Cell,
     Level,
     SceneConfig,
@@ -40,14 +41,13 @@ from hector_jax.evaluation.robustness import (
     scenes,
     table,
 )
-from hector_jax.grfm.dataset import SOLVED
-from hector_jax.inputs import InputError
-from hector_jax.robot import load_robot
-from hector_jax.runtime import setup_jax, workers
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import kept, metrics
+from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk_many
 from hector_jax.sim.world import named_world
-from hector_jax.storage import fingerprint, load_weights, write_file, write_json
+from hector_jax.storage import environment, fingerprint, load_weights, write_file, write_json
 from hector_jax.tuning.loss import LossConfig
 
 BASELINE = "nominal"

@@ -27,25 +27,24 @@ import jax
 import numpy as np
 import tyro
 
-from hector_jax import kept, pipeline
-from hector_jax.console import bar, exit_code, made_at, say
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import DIRECTION_NAMES, Weights, expert, moved, nominal
-from hector_jax.evaluation import plots, transfer
-from hector_jax.evaluation.report import environment
+from hector_jax.core.console import bar, exit_code, made_at, say
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.trajectory import Load, Trajectory
 from hector_jax.grfm.dataset import walked_with
+from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect, linear_effect
-from hector_jax.inputs import InputError
-from hector_jax.model.effect import Effect, Window, last_command
-from hector_jax.robot import Robot, load_robot
-from hector_jax.runtime import setup_jax, workers
+from hector_jax.report import plots, transfer
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.runs import kept, pipeline
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import hfs
-from hector_jax.storage import load_weights, write_file, write_json
-from hector_jax.trajectory import Load, Trajectory
+from hector_jax.storage import environment, load_weights, write_file, write_json
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tune_step
 from hector_jax.tuning.loss import LossConfig, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout

@@ -19,6 +19,7 @@ import json
 import os
 import platform
 import secrets
+import subprocess
 import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,14 +31,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from filelock import FileLock, Timeout
 
-from hector_jax.console import Broken, say
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import InputError, Interval, one_line, problem, read_json, shown
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Wrench
+from hector_jax.core.console import Broken, say
+from hector_jax.core.inputs import InputError, Interval, one_line, problem, read_json, shown
+from hector_jax.core.trajectory import State, Wrench
+from hector_jax.robot.model import Robot
 
 FORMAT = 1
 WEIGHTS = Interval(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
@@ -45,7 +47,7 @@ _MOST_WEIGHTS = 1_000_000  # bytes
 _PART = ".hector_jax-part"  # ends the name of a file that is being written, and of no other
 _DIGEST = 64  # hexadecimal digits of a sha256
 _NUMERIC = ("jax", "jaxlib", "mujoco", "numpy")  # packages that decide the numbers of a result
-_NO_NUMBERS = ("console", "inputs", "runtime", "storage")  # modules that decide none
+_NO_NUMBERS = ("core.console", "core.inputs", "core.runtime", "storage")  # modules that decide none
 _PACKAGES = (
     "hector-jax",
     "jax",
@@ -119,6 +121,36 @@ def digest(*parts: Any, code: Sequence[str]) -> str:
 
     key = "\n".join([*map(text, parts), code_hash(*code)])
     return hashlib.sha256(key.encode()).hexdigest()[:12]
+
+
+def environment() -> dict[str, str]:
+    """What the numbers were made with: versions, platform, device and, if known, the commit."""
+    found = versions() | {
+        "platform": f"{platform.system()} {platform.machine()}",
+        "cores": str(os.cpu_count()),
+        "device": jax.default_backend(),
+        "precision": str(jnp.asarray(0.0).dtype),
+    }
+    commit = _commit(Path(__file__).parents[1])
+    return found | ({"commit": commit} if commit else {})
+
+
+def _commit(folder: Path) -> str:
+    """Commit of the checkout in `folder`, marked where files differ from it; empty elsewhere."""
+    if not (folder / ".git").exists():  # an installed package may lie inside some other checkout
+        return ""
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        changed = " with changes" if git("status", "--porcelain", "--untracked-files=no") else ""
+        return git("describe", "--tags", "--always", "--abbrev=40", "--long") + changed
+    except (OSError, subprocess.SubprocessError):
+        return ""
 
 
 @cache

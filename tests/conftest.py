@@ -19,7 +19,7 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import configuration  # noqa: E402
 
-from hector_jax.runtime import setup_jax  # noqa: E402
+from hector_jax.core.runtime import setup_jax  # noqa: E402
 
 setup_jax()
 # what it notes about the code names the machine's paths: not into the checkout
@@ -46,7 +46,7 @@ def _forget_programs():
 def _no_machine_is_slow():
     """What a command prints in a test does not depend on how long JAX takes to load."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hector_jax.cli.say_if_slow", lambda text: nullcontext())
+        patch.setattr("hector_jax.cli.main.say_if_slow", lambda text: nullcontext())
         yield
 
 

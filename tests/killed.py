@@ -19,17 +19,17 @@ import numpy as np
 from pretend import pretend_walk
 from synthetic import synthetic_walk
 
-from hector_jax import kept, pipeline
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm import dataset
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.kept import Journal
-from hector_jax.robot import load_robot
-from hector_jax.runtime import setup_jax
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import kept, pipeline
+from hector_jax.runs.course import save_tuning
+from hector_jax.runs.kept import Journal
 from hector_jax.sim.world import hfs
 from hector_jax.storage import locked
-from hector_jax.tuning.course import save_tuning
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, Tuning, descend
 from hector_jax.tuning.loss import Losses
 

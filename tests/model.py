@@ -9,7 +9,7 @@ from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import standing_anchor
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, effect_of, init_params
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 

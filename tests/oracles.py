@@ -6,8 +6,8 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import linprog
 
-from hector_jax.control.qp import QP
-from hector_jax.geometry import rot_z, skew
+from hector_jax.core.geometry import rot_z, skew
+from hector_jax.qp.solve import QP
 
 
 def dense_rows(A: np.ndarray) -> np.ndarray:

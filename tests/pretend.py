@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hector_jax.control.weights import nominal
-from hector_jax.evaluation.metrics import Score, Verdict
-from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.runs.metrics import Score, Verdict
 from hector_jax.tuning.difftune import Evaluation, Iteration
 from hector_jax.tuning.loss import LossConfig, Losses
 

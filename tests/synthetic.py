@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax.geometry import rot_z
-from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.trajectory import State, Trajectory, Wrench
 
 CYCLE, SUBSTEPS = 40, 10
 

@@ -13,9 +13,9 @@ import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
-from hector_jax.evaluation.transfer import disturbed
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
+from hector_jax.grfm.effect import last_command
+from hector_jax.report.transfer import disturbed
+from hector_jax.robot.model import load_robot
 from hector_jax.tuning import difftune
 from hector_jax.tuning.batch import (
     PER_CALL,
@@ -167,7 +167,7 @@ def test_impossible_problems_are_refused(wrong, told):
 TWO_DEVICES = """
 import sys, numpy as np, jax
 from functools import partial
-from hector_jax.runtime import setup_jax
+from hector_jax.core.runtime import setup_jax
 setup_jax()
 import test_batch as t
 if sys.argv[1] == "toy":
@@ -206,7 +206,7 @@ def test_two_devices_give_the_numbers_of_one(kind):
 
 
 TWO_HOSTS = """
-from hector_jax.runtime import all_devices, setup_jax
+from hector_jax.core.runtime import all_devices, setup_jax
 setup_jax()
 all_devices()
 import jax, numpy as np

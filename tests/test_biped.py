@@ -12,23 +12,24 @@ import numpy as np
 import pytest
 from pretend import pretend_history
 
-from hector_jax import cli, pipeline, replay
+from hector_jax.cli import main as cli
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.trajectories import limits
 from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import expert, nominal
-from hector_jax.description import Description, read_description
-from hector_jax.evaluation import runs
-from hector_jax.export import find_weights
+from hector_jax.core.trajectory import State, has_fallen
 from hector_jax.grfm.dataset import load_walks
-from hector_jax.model.kinematics import foot_jacobians, foot_poses, inverse_legs
-from hector_jax.pipeline import CollectConfig
-from hector_jax.robot import describe, load_model, load_robot
+from hector_jax.report import folder as runs
+from hector_jax.robot.description import Description, read_description
+from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs
+from hector_jax.robot.model import describe, load_model, load_robot
+from hector_jax.runs import pipeline, replay
+from hector_jax.runs.export import find_weights
+from hector_jax.runs.pipeline import CollectConfig
 from hector_jax.sim.parallel import _places, batched_model
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
 from hector_jax.storage import save_weights, write_json
-from hector_jax.trajectory import State, has_fallen
 from hector_jax.tuning.difftune import TuneConfig
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"

@@ -8,7 +8,7 @@ import pytest
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.changes import Change, changed_world, worlds_by_step
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos

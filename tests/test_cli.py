@@ -15,16 +15,16 @@ import pytest
 from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
-from hector_jax import doctor, pipeline, study
-from hector_jax.cli import main
-from hector_jax.commands import asked, judging
+from hector_jax.cli import asked, doctor, judging, study
+from hector_jax.cli.flags import Command, Tune, command_name, from_file
+from hector_jax.cli.main import main
 from hector_jax.control.weights import expert
-from hector_jax.evaluation import fidelity
-from hector_jax.flags import Command, Tune, command_name, from_file
 from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
-from hector_jax.model.effect import last_command
-from hector_jax.pipeline import CollectConfig
-from hector_jax.robot import MODEL_PATH, load_robot
+from hector_jax.grfm.effect import last_command
+from hector_jax.report import fidelity
+from hector_jax.robot.model import MODEL_PATH, load_robot
+from hector_jax.runs import pipeline
+from hector_jax.runs.pipeline import CollectConfig
 from hector_jax.storage import load_weights, read_card, save_weights
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
@@ -47,7 +47,7 @@ def refused(monkeypatch, capsys, *arguments):
 
 def test_help_names_the_commands():
     shown = subprocess.run(
-        [sys.executable, "-m", "hector_jax.cli", "--help"], capture_output=True, text=True
+        [sys.executable, "-m", "hector_jax.cli.main", "--help"], capture_output=True, text=True
     )
     assert shown.returncode == 0
     for name in map(command_name, get_args(Command)):
@@ -57,7 +57,7 @@ def test_help_names_the_commands():
 
 def test_importing_the_commands_prints_nothing_and_leaves_no_file(tmp_path):
     shown = subprocess.run(
-        [sys.executable, "-c", "import hector_jax.commands"],
+        [sys.executable, "-c", "import hector_jax.cli.commands"],
         capture_output=True,
         text=True,
         cwd=tmp_path,
@@ -473,8 +473,8 @@ def test_a_reader_that_has_enough_is_no_error():
         [
             "bash",
             "-c",
-            f"{sys.executable} -m hector_jax.cli completion bash | head -n 1; "
-            f"{sys.executable} -c 'from hector_jax.console import exit_code; "
+            f"{sys.executable} -m hector_jax.cli.main completion bash | head -n 1; "
+            f"{sys.executable} -c 'from hector_jax.core.console import exit_code; "
             'exit(exit_code("x", lambda: print("y\\n" * 99999)))\' | head -n 1; '
             "exit ${PIPESTATUS[0]}",
         ],

@@ -8,10 +8,10 @@ import sys
 import pytest
 from rich.console import Console
 
-from hector_jax import cli
-from hector_jax.evaluation.runs import compare_runs, load_run, print_comparison, read_metrics
-from hector_jax.evaluation.tensorboard import write_events
-from hector_jax.flags import Tune, from_file, settings
+from hector_jax.cli import main as cli
+from hector_jax.cli.flags import Tune, from_file, settings
+from hector_jax.report.folder import compare_runs, load_run, print_comparison, read_metrics
+from hector_jax.report.tensorboard import write_events
 
 
 def change(median, counts=True):

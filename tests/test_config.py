@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import settings as settings_of
 from hypothesis import strategies as st
 
-from hector_jax import cli, flags
-from hector_jax.evaluation.report import PAPER_ITERATIONS
-from hector_jax.flags import Command, Configured, Evaluate, Table, Tune, from_file, settings
-from hector_jax.inputs import InputError, problem
+from hector_jax.cli import flags
+from hector_jax.cli import main as cli
+from hector_jax.cli.flags import Command, Configured, Evaluate, Table, Tune, from_file, settings
+from hector_jax.core.inputs import InputError, problem
+from hector_jax.report.report import PAPER_ITERATIONS
 
 FILES = [kind for kind in get_args(Command) if issubclass(kind, Configured)]
 

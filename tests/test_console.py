@@ -5,7 +5,7 @@ import time
 
 from rich.console import Console
 
-from hector_jax import console
+from hector_jax.core import console
 
 
 def test_a_bar_ends_at_its_end_whatever_converged_early(monkeypatch):

@@ -24,9 +24,9 @@ from hector_jax.grfm.dataset import (
     walked_with,
     with_mirror,
 )
-from hector_jax.model import srbm
-from hector_jax.model.effect import HISTORY, turn
-from hector_jax.robot import load_robot
+from hector_jax.grfm.effect import HISTORY, turn
+from hector_jax.robot import srbm
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import Push
 
 TICKS = 40

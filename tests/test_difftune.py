@@ -9,16 +9,10 @@ from model import CONFIG as SHORT
 from model import PLAIN
 
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import (
-    bounds,
-    expert,
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
-from hector_jax.trajectory import Wrench
+from hector_jax.control.weights import bounds, expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.core.trajectory import Wrench
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
 from hector_jax.tuning import difftune, sensitivity
 from hector_jax.tuning.difftune import (
     Evaluation,

@@ -15,7 +15,8 @@ from typing import get_args
 import pytest
 
 import hector_jax
-from hector_jax import cli, flags
+from hector_jax.cli import flags
+from hector_jax.cli import main as cli
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -9,8 +9,8 @@ import time
 
 import pytest
 
-from hector_jax import runtime
-from hector_jax.robot import load_robot
+from hector_jax.core import runtime
+from hector_jax.robot.model import load_robot
 
 WRONG = [
     ({"JAX_PLATFORMS": "abacus"}, "JAX does not start with JAX_PLATFORMS=abacus: "),
@@ -22,7 +22,7 @@ WRONG = [
 
 def hector(*words, **options):
     return subprocess.run(
-        [sys.executable, "-m", "hector_jax.cli", *map(str, words)],
+        [sys.executable, "-m", "hector_jax.cli.main", *map(str, words)],
         capture_output=True,
         text=True,
         **options,
@@ -52,7 +52,7 @@ def test_the_doctor_names_what_jax_cannot_start_with(wrong, line):
 def test_too_little_memory_is_told_before_anything_hangs():
     line = "hector: the limit on virtual memory (ulimit -v) is 1.5 GB, expected at least 3 GB\n"
     for command, code in (("walk", 2), ("doctor", 1)):
-        limited = f'ulimit -v 1500000; exec "$0" -m hector_jax.cli {command}'
+        limited = f'ulimit -v 1500000; exec "$0" -m hector_jax.cli.main {command}'
         done = subprocess.run(
             ["bash", "-c", limited, sys.executable], capture_output=True, text=True
         )
@@ -75,7 +75,7 @@ def test_workers_need_no_renderer(monkeypatch):
     assert os.environ["MUJOCO_GL"] == "crayon"
 
 
-@pytest.mark.parametrize("module", ["robot", "sim.parallel", "evaluation.view"])
+@pytest.mark.parametrize("module", ["robot.model", "sim.parallel", "report.view"])
 def test_a_module_needs_no_renderer_and_leaves_the_variable(module):
     program = f"import hector_jax.{module}, os; print(os.environ['MUJOCO_GL'])"
     done = subprocess.run(
@@ -102,7 +102,7 @@ def test_a_home_that_cannot_be_written_is_told_in_one_line(tmp_path):
 
 TOY = """
 import sys
-from hector_jax.console import exit_code, say
+from hector_jax.core.console import exit_code, say
 def work():
     say("working")
     print("result")
@@ -128,7 +128,7 @@ def test_streams_that_are_closed_or_full_cost_at_most_a_line(redirected, code, o
 
 DEAF = """
 import ctypes, sys
-from hector_jax import console
+from hector_jax.core import console
 console._PATIENCE = 0.5
 def work():
     mutex = ctypes.create_string_buffer(64)

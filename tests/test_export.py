@@ -17,15 +17,18 @@ import pytest
 from oracles import exact_solution
 from scipy.spatial.transform import Rotation
 
-from hector_jax import export
-from hector_jax.cli import main
+from hector_jax.cli.main import main
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
-from hector_jax.control.qp import QP, Status
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
-from hector_jax.export import (
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State, pack_wrench
+from hector_jax.qp.solve import QP, Status
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import export
+from hector_jax.runs.export import (
     PLATFORMS,
     SCHEMA,
     TOLERANCE,
@@ -39,10 +42,7 @@ from hector_jax.export import (
     weights_cpp,
     weights_schema,
 )
-from hector_jax.inputs import InputError
-from hector_jax.robot import load_robot
 from hector_jax.storage import load_weights, save_weights, weights_tree
-from hector_jax.trajectory import State, pack_wrench
 
 ROBOT, CONFIG = load_robot(), WalkConfig()
 EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"

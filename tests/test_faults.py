@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax import pipeline, replay, storage
-from hector_jax.cli import main
+from hector_jax import storage
+from hector_jax.cli.main import main
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import bounds, nominal, weights_to_vector
-from hector_jax.evaluation.report import tuning_section
-from hector_jax.robot import load_robot
-from hector_jax.runtime import workers
+from hector_jax.core.runtime import workers
+from hector_jax.report.report import tuning_section
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import pipeline, replay
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
 from hector_jax.tuning.loss import Losses
@@ -233,7 +234,9 @@ def test_a_dump_of_a_worker_is_reproduced_by_the_console_script(tmp_path, params
     number = min(i.iteration for i in found.history if i.reason == "the robot fell")
     assert path.name == f"with-{number:03d}-fell.npz"
     shown = subprocess.run(
-        [sys.executable, "-m", "hector_jax.cli", "replay", path], capture_output=True, text=True
+        [sys.executable, "-m", "hector_jax.cli.main", "replay", path],
+        capture_output=True,
+        text=True,
     )
     assert shown.returncode == 0, shown.stderr
     print(shown.stdout)

@@ -10,12 +10,12 @@ from synthetic import synthetic_walk
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
-from hector_jax.evaluation import fidelity
-from hector_jax.evaluation.report import Picture, write_fidelity
 from hector_jax.grfm.dataset import at_interval, make_dataset
+from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.training import errors, report
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
+from hector_jax.report import fidelity
+from hector_jax.report.report import Picture, write_fidelity
+from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 

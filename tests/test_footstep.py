@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hector_jax.control.footstep import FootstepConfig, touchdown_points
-from hector_jax.geometry import rot_z
-from hector_jax.robot import load_robot
-from hector_jax.trajectory import State
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.trajectory import State
+from hector_jax.robot.model import load_robot
 
 RAIBERT, PAPER = FootstepConfig(), FootstepConfig(rule="paper")
 ROBOT = load_robot()

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.geometry import (
+from hector_jax.core.geometry import (
     euler_from_rotation,
     euler_rates,
     rot_x,

@@ -20,23 +20,23 @@ from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.qp import QpConfig
 from hector_jax.control.trajectories import load_course
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
-from hector_jax.evaluation.robustness import SceneConfig
-from hector_jax.evaluation.video import VideoConfig
+from hector_jax.core.inputs import Interval, did_you_mean, problem, shown
 from hector_jax.grfm import dataset, network
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.inputs import Interval, did_you_mean, problem, shown
-from hector_jax.pipeline import CollectConfig
-from hector_jax.robot import load_robot
+from hector_jax.qp.solve import QpConfig
+from hector_jax.report.robustness import SceneConfig
+from hector_jax.report.video import VideoConfig
+from hector_jax.robot.model import load_robot
+from hector_jax.runs.pipeline import CollectConfig
+from hector_jax.search.cmaes import SearchConfig
 from hector_jax.storage import load_weights, save_tree, save_weights
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.online import OnlineConfig
 from hector_jax.tuning.rollout import RolloutConfig
-from hector_jax.tuning.search import SearchConfig
 
 ROBOT = load_robot()
 

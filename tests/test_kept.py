@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from pretend import pretend_history, pretend_walk
 
-from hector_jax import kept, pipeline
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import bounds, expert, nominal
-from hector_jax.evaluation import metrics
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import kept, metrics, pipeline
+from hector_jax.runs.course import KIND, load_tuning, save_tuning
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.storage import Checkpoint, digest
-from hector_jax.tuning.course import KIND, load_tuning, save_tuning
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.geometry import rotation_from_euler
-from hector_jax.model.kinematics import foot_jacobians, foot_poses, inverse_legs, leg_gravity
-from hector_jax.robot import FOOT_POINTS, load_model, load_robot
+from hector_jax.core.geometry import rotation_from_euler
+from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs, leg_gravity
+from hector_jax.robot.model import FOOT_POINTS, load_model, load_robot
 
 foot_poses_jit = jax.jit(foot_poses)
 foot_jacobians_jit = jax.jit(foot_jacobians)

@@ -14,10 +14,10 @@ from hector_jax.control.legs import (
     swing_path,
     trunk_position,
 )
-from hector_jax.geometry import rotation_from_euler
-from hector_jax.model.kinematics import foot_poses, leg_gravity
-from hector_jax.robot import FOOT_POINTS, STANDING, load_model, load_robot
-from hector_jax.trajectory import State, Wrench, zero_wrench
+from hector_jax.core.geometry import rotation_from_euler
+from hector_jax.core.trajectory import State, Wrench, zero_wrench
+from hector_jax.robot.kinematics import foot_poses, leg_gravity
+from hector_jax.robot.model import FOOT_POINTS, STANDING, load_model, load_robot
 
 CONFIG = LegConfig()
 ROBOT = load_robot()

@@ -9,10 +9,10 @@ from typing import get_args
 
 import pytest
 
-from hector_jax import flags
-from hector_jax.cli import main
-from hector_jax.flags import Command, Compare, Evaluate, Export, Tune, View, Walk, from_line
-from hector_jax.inputs import InputError
+from hector_jax.cli import flags
+from hector_jax.cli.flags import Command, Compare, Evaluate, Export, Tune, View, Walk, from_line
+from hector_jax.cli.main import main
+from hector_jax.core.inputs import InputError
 
 
 def refused(monkeypatch, capsys, *words):
@@ -130,7 +130,7 @@ def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
 ):
     make(tmp_path / name)
     code = (
-        "import sys; from hector_jax.cli import main; code = main(); "
+        "import sys; from hector_jax.cli.main import main; code = main(); "
         "print(code, 'jax' in sys.modules)"
     )
     shown = subprocess.run(

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.loss import LossConfig, losses, switch_loss, total
 
 parts_of, switches_of = jax.jit(losses), jax.jit(switch_loss)

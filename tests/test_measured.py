@@ -6,8 +6,8 @@ import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, weights_to_vector
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, TuneConfig

@@ -4,8 +4,8 @@ import struct
 
 import pytest
 
-from hector_jax.mjcf import read_mjcf
-from hector_jax.robot import MODEL_PATH, load_model
+from hector_jax.robot.mjcf import read_mjcf
+from hector_jax.robot.model import MODEL_PATH, load_model
 
 TEXT = MODEL_PATH.read_text()
 HEAD = '<mujoco model="hector">'

@@ -8,7 +8,6 @@ import scipy.linalg
 from oracles import exact_solution
 
 from hector_jax.control.mpc import Horizon, MpcConfig, _rows, solve_mpc, write_qp
-from hector_jax.control.qp import QP, Status
 from hector_jax.control.weights import (
     Weights,
     bounds,
@@ -17,10 +16,11 @@ from hector_jax.control.weights import (
     vector_to_weights,
     weights_to_vector,
 )
-from hector_jax.geometry import rot_z
-from hector_jax.model import srbm
-from hector_jax.robot import load_robot
-from hector_jax.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
+from hector_jax.qp.solve import QP, Status
+from hector_jax.robot import srbm
+from hector_jax.robot.model import load_robot
 
 ROBOT = load_robot()
 CONFIG = MpcConfig()

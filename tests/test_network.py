@@ -9,7 +9,9 @@ import pytest
 from synthetic import synthetic_walk
 
 from hector_jax.control.gait import GaitConfig
+from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
+from hector_jax.grfm.effect import HISTORY, Window, last_command
 from hector_jax.grfm.gated import fit_gated, gated_effect, hats
 from hector_jax.grfm.network import (
     BOUND,
@@ -25,9 +27,7 @@ from hector_jax.grfm.network import (
     plain_net,
     save_net,
 )
-from hector_jax.model.effect import HISTORY, Window, last_command
-from hector_jax.robot import load_robot
-from hector_jax.trajectory import Wrench
+from hector_jax.robot.model import load_robot
 
 apply = jax.jit(lambda effect, window: effect(window))
 

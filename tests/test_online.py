@@ -8,11 +8,11 @@ import pytest
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.walking import Measurement, Retune, WalkConfig
 from hector_jax.control.weights import bounds, nominal, vector_to_weights, weights_to_vector
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
+from hector_jax.core.trajectory import State, zero_wrench
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
-from hector_jax.trajectory import State, zero_wrench
 from hector_jax.tuning import online
 from hector_jax.tuning.difftune import Evaluation, TuneConfig
 from hector_jax.tuning.loss import Losses, losses, total

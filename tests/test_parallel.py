@@ -11,7 +11,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.grfm.dataset import at_interval
-from hector_jax.robot import MODEL_PATH, load_robot
+from hector_jax.robot.model import MODEL_PATH, load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.changes import Change
 from hector_jax.sim.parallel import _in_floor, _places, batched_model, mjx, mjx_contacts, walk_batch

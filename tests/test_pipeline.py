@@ -10,18 +10,19 @@ import pytest
 from pretend import pretend_history
 from synthetic import synthetic_walk
 
-from hector_jax import commands, flags, pipeline
+from hector_jax.cli import commands, flags
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
-from hector_jax.evaluation.metrics import score
+from hector_jax.core.inputs import InputError
 from hector_jax.grfm import dataset
 from hector_jax.grfm.dataset import collect, draw_jobs, draw_jobs_near
 from hector_jax.grfm.network import NetParams
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.inputs import InputError
-from hector_jax.pipeline import CollectConfig
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import pipeline
+from hector_jax.runs.metrics import score
+from hector_jax.runs.pipeline import CollectConfig
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.storage import read_card

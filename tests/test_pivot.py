@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles import dense_rows, exact_solution, walking_qp
 
-from hector_jax.control import pivot
+from hector_jax.qp import pivot
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

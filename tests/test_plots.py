@@ -8,11 +8,11 @@ from PIL import Image
 from pretend import elsewhere, pretend_history, pretend_verdict, pretend_walk
 
 from hector_jax.control.weights import WEIGHT_NAMES
-from hector_jax.evaluation import plots
-from hector_jax.evaluation.fidelity import Drift
-from hector_jax.evaluation.plots.style import looks_of
+from hector_jax.core.trajectory import State
 from hector_jax.grfm.training import History
-from hector_jax.trajectory import State
+from hector_jax.report import plots
+from hector_jax.report.fidelity import Drift
+from hector_jax.report.plots.style import looks_of
 from hector_jax.tuning.loss import LossConfig
 
 FOUR = ("nominal", "expert", "without", "with")

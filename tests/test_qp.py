@@ -18,8 +18,8 @@ from oracles import (
     walking_qp,
 )
 
-from hector_jax.control import qp as qp_door
-from hector_jax.control.qp import QP, QpConfig, Status, check_solved, solve_qp
+from hector_jax.qp import solve as qp_door
+from hector_jax.qp.solve import QP, QpConfig, Status, check_solved, solve_qp
 
 WALKING = 500
 SHAPES = [(1, 4), (2, 6), (5, 12), (12, 30), (30, 40), (60, 90), (120, 100)]

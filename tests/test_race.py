@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from hector_jax.control.weights import bounds, nominal, weights_to_vector
-from hector_jax.evaluation import plots
+from hector_jax.report import plots
+from hector_jax.search.cmaes import Generation, SearchConfig, placed, room
+from hector_jax.search.race import lowest, race, walks
+from hector_jax.search.rivals import Bayes, CmaEs, Differences, Given, Random, steps_to
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.race import lowest, race, walks
-from hector_jax.tuning.rivals import Bayes, CmaEs, Differences, Given, Random, steps_to
-from hector_jax.tuning.search import Generation, SearchConfig, placed, room
 
 GOAL = np.linspace(-1.0, 1.0, 18)
 RIVALS = {
@@ -166,7 +166,7 @@ def test_differences_step_by_beta_at_most_and_halve_while_the_loss_rises():
 
 
 def test_bayes_without_its_package_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("hector_jax.tuning.rivals.find_spec", lambda name: None)
+    monkeypatch.setattr("hector_jax.search.rivals.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"hector-jax\[race\]"):
         Bayes().ask(nominal(), [Generation(np.zeros((1, 18)), np.ones(1))])
 

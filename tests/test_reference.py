@@ -3,13 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.reference import (
-    COMMANDS,
-    UNSEEN,
-    Anchor,
-    named_command,
-    reference_at,
-)
+from hector_jax.control.reference import COMMANDS, UNSEEN, Anchor, named_command, reference_at
 
 ANCHOR = Anchor(jnp.array([0.3, -0.2, 0.42]), jnp.array(0.7), jnp.array(10))
 

@@ -1,7 +1,6 @@
 """The table on the terminal and report.md: both tell all, and the same."""
 
 import io
-import json
 import re
 
 import numpy as np
@@ -10,9 +9,10 @@ from pretend import SETS, pretend_history, pretend_verdict
 from rich.console import Console
 
 from hector_jax.control.weights import bounds
-from hector_jax.evaluation import report
-from hector_jax.evaluation.metrics import Verdict
-from hector_jax.evaluation.report import Picture, Report, print_table, write_report
+from hector_jax.report import report
+from hector_jax.report.report import Picture, Report, print_table, write_report
+from hector_jax.runs.metrics import Verdict
+from hector_jax.storage import environment
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import LossConfig, Losses
 
@@ -40,7 +40,7 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         pictures=[Picture("loss.png", "Loss by iteration.")],
         film=film,
         config={"traj": "straight", "seeds": 8},
-        environment=report.environment(),
+        environment=environment(),
         command="make tune TRAJ=straight",
     )
 
@@ -183,17 +183,3 @@ def test_the_film_is_linked_where_there_is_one(tmp_path):
         tmp_path, _report(film=Picture("film.mp4", "Before and after."))
     ).read_text()
     assert "[Before and after.](film.mp4)" in text
-
-
-def test_the_environment_is_plain_words_without_folders():
-    found = report.environment()
-    assert json.loads(json.dumps(found)) == found
-    assert {"python", "jax", "mujoco", "platform", "device"} <= found.keys()
-    assert found["precision"] == "float64"
-    assert not any("/" in value for value in found.values())
-
-
-def test_a_folder_that_is_no_checkout_has_no_commit(tmp_path):
-    assert report._commit(tmp_path) == ""
-    (tmp_path / ".git").mkdir()
-    assert report._commit(tmp_path) == ""

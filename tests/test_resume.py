@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from killed import look
 
-from hector_jax import flags, storage
-from hector_jax.commands import tuning
-from hector_jax.console import exit_code
+from hector_jax import storage
+from hector_jax.cli import flags, tuning
 from hector_jax.control.weights import nominal
-from hector_jax.inputs import InputError
-from hector_jax.robot import load_robot
-from hector_jax.runtime import workers
+from hector_jax.core.console import exit_code
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import workers
+from hector_jax.robot.model import load_robot
+from hector_jax.runs.course import KIND, load_tuning, save_tuning
 from hector_jax.storage import Checkpoint, WriteError, locked, write_file
-from hector_jax.tuning.course import KIND, load_tuning, save_tuning
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
@@ -176,8 +176,8 @@ def test_what_stands_is_never_half_of_a_file(tmp_path):
 
 PROGRAM = """
 import sys, time
-from hector_jax.console import exit_code
-from hector_jax.runtime import workers
+from hector_jax.core.console import exit_code
+from hector_jax.core.runtime import workers
 
 def work():
     with workers(1) as pool:
@@ -258,7 +258,7 @@ def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
         "import sys, tempfile\n"
         f"tempfile.gettempdir = lambda: {str(wall)!r}\n"
         "sys.argv = ['hector', 'walk']\n"
-        "from hector_jax.cli import main\n"
+        "from hector_jax.cli.main import main\n"
         "sys.exit(main())"
     )
     ran = subprocess.run(

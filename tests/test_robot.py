@@ -9,13 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.robot import (
-    FOOT_POINTS,
-    JOINT_NAMES,
-    MODEL_PATH,
-    load_model,
-    load_robot,
-)
+from hector_jax.robot.model import FOOT_POINTS, JOINT_NAMES, MODEL_PATH, load_model, load_robot
 
 TEXT = MODEL_PATH.read_text()
 
@@ -290,7 +284,7 @@ def test_binary_file_is_refused(tmp_path):
 
 def test_loading_the_robot_prints_nothing():
     done = subprocess.run(
-        [sys.executable, "-c", "from hector_jax.robot import load_robot; load_robot()"],
+        [sys.executable, "-c", "from hector_jax.robot.model import load_robot; load_robot()"],
         capture_output=True,
         text=True,
         check=True,

@@ -12,9 +12,8 @@ from pretend import pretend_score
 
 from hector_jax.control.reference import UNSEEN
 from hector_jax.control.weights import nominal
-from hector_jax.evaluation import plots
-from hector_jax.evaluation.metrics import Score
-from hector_jax.evaluation.robustness import (
+from hector_jax.report import plots
+from hector_jax.report.robustness import (
     DIRECTIONS,
     Level,
     SceneConfig,
@@ -25,6 +24,7 @@ from hector_jax.evaluation.robustness import (
     scenes,
     table,
 )
+from hector_jax.runs.metrics import Score
 from hector_jax.sim.world import hfs
 from hector_jax.storage import as_json
 

@@ -8,7 +8,7 @@ from model import PLAIN, SHORT, small_effect
 
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.tuning import difftune, sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune_step
 from hector_jax.tuning.loss import LossConfig, losses, total

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import pytest
 
-from hector_jax import runtime
+from hector_jax.core import runtime
 
 
 def test_the_cache_lies_in_the_users_cache_folder(monkeypatch, tmp_path):
@@ -32,7 +32,7 @@ def test_a_home_that_cannot_be_written_has_its_cache_elsewhere(monkeypatch, tmp_
 
 def test_importing_the_library_leaves_jax_alone_and_computes_nothing():
     told = (
-        "import jax, hector_jax.tuning.difftune, hector_jax.runtime\n"
+        "import jax, hector_jax.tuning.difftune, hector_jax.core.runtime\n"
         "from jax._src import xla_bridge\n"
         "print(jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir,"
         " xla_bridge.backends_are_initialized())"

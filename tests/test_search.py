@@ -14,7 +14,7 @@ from hector_jax.control.weights import (
     nominal,
     weights_to_vector,
 )
-from hector_jax.tuning.search import SearchConfig, search
+from hector_jax.search.cmaes import SearchConfig, search
 
 GOAL = np.linspace(-2.0, 2.0, 24)
 CONFIG = SearchConfig(budget=60, population=10, seed=3)
@@ -214,6 +214,6 @@ def test_wrong_settings_are_named(wrong, says):
 
 
 def test_a_search_without_its_package_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr("hector_jax.tuning.search.find_spec", lambda name: None)
+    monkeypatch.setattr("hector_jax.search.cmaes.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"hector-jax\[search\]"):
         run(tmp_path)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos, truth

@@ -14,9 +14,9 @@ from model import SHORT, small_net
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
+from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.rollout import RolloutConfig
 

@@ -3,10 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.geometry import euler_from_rotation, rot_z, rotation_from_euler, skew
-from hector_jax.model import srbm
-from hector_jax.robot import load_robot
-from hector_jax.trajectory import (
+from hector_jax.core.geometry import euler_from_rotation, rot_z, rotation_from_euler, skew
+from hector_jax.core.trajectory import (
     Load,
     State,
     Wrench,
@@ -15,6 +13,8 @@ from hector_jax.trajectory import (
     unpack_state,
     zero_wrench,
 )
+from hector_jax.robot import srbm
+from hector_jax.robot.model import load_robot
 
 
 @pytest.fixture(scope="module")

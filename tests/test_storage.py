@@ -11,7 +11,7 @@ import pytest
 
 from hector_jax import storage
 from hector_jax.control.weights import expert, nominal
-from hector_jax.inputs import InputError
+from hector_jax.core.inputs import InputError
 from hector_jax.storage import (
     WriteError,
     load_tree,
@@ -308,8 +308,8 @@ def edited(tmp_path, monkeypatch):
         ("control.footstep", "stance / 2 * state.velocity", "stance / 3 * state.velocity", False),
         ("control.footstep", "    points = (", "    # a comment\n    points = (", True),
         ("control.footstep", "Where the feet come down next", "Another docstring", True),
-        ("console", "_QUIET = 15.0", "_QUIET = 16.0", True),
-        ("export", "TOLERANCE = 1e-6", "TOLERANCE = 1e-7", True),
+        ("core.console", "_QUIET = 15.0", "_QUIET = 16.0", True),
+        ("runs.export", "TOLERANCE = 1e-6", "TOLERANCE = 1e-7", True),
     ],
 )
 def test_a_result_holds_for_the_code_that_computes_it(edited, module, before, after, same):
@@ -328,3 +328,17 @@ def test_a_result_holds_for_the_packages_that_compute_it(monkeypatch, package, s
     monkeypatch.setattr(storage, "version", others)
     assert (storage.code_hash("sim.walk") == before) is same
     storage.code_hash.cache_clear()
+
+
+def test_the_environment_is_plain_words_without_folders():
+    found = storage.environment()
+    assert json.loads(json.dumps(found)) == found
+    assert {"python", "jax", "mujoco", "platform", "device"} <= found.keys()
+    assert found["precision"] == "float64"
+    assert not any("/" in value for value in found.values())
+
+
+def test_a_folder_that_is_no_checkout_has_no_commit(tmp_path):
+    assert storage._commit(tmp_path) == ""
+    (tmp_path / ".git").mkdir()
+    assert storage._commit(tmp_path) == ""

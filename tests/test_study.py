@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from pretend import pretend_history, pretend_walk
 
-from hector_jax import flags, kept, pipeline, study
-from hector_jax.commands import tuning
+from hector_jax.cli import flags, study, tuning
+from hector_jax.cli.flags import Table, as_command
 from hector_jax.control.weights import expert, nominal
-from hector_jax.evaluation.video import VideoUnavailable
-from hector_jax.flags import Table, as_command
+from hector_jax.report.video import VideoUnavailable
+from hector_jax.runs import kept, pipeline
+from hector_jax.runs.course import Record
+from hector_jax.search.cmaes import Found, Generation
 from hector_jax.sim.world import hfs
 from hector_jax.storage import save_weights
-from hector_jax.tuning.course import Record
 from hector_jax.tuning.difftune import Tuning
-from hector_jax.tuning.search import Found, Generation
 
 
 def plants(seeds):

@@ -9,10 +9,11 @@ import pytest
 from pretend import pretend_history, pretend_score, pretend_verdict
 
 from hector_jax.control.weights import nominal
-from hector_jax.evaluation import metrics, table
-from hector_jax.evaluation.metrics import BASELINES
-from hector_jax.evaluation.report import Picture
-from hector_jax.evaluation.table import PAPER, Fall, Search, Table, bars, lines, write_table
+from hector_jax.report import table
+from hector_jax.report.report import Picture
+from hector_jax.report.table import PAPER, Fall, Search, Table, bars, lines, write_table
+from hector_jax.runs import metrics
+from hector_jax.runs.metrics import BASELINES
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import LossConfig
 

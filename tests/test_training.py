@@ -6,11 +6,11 @@ import pytest
 from synthetic import synthetic_walk
 
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk
+from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.gated import fit_gated, gated_effect
 from hector_jax.grfm.network import as_effect, fit_linear, linear_effect
 from hector_jax.grfm.training import TrainConfig, errors, report, train
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
+from hector_jax.robot.model import load_robot
 
 
 def dataset(seeds, ticks=200, noise=0.3):

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hector_jax.cli import main
-from hector_jax.commands import asked
+from hector_jax.cli import asked
+from hector_jax.cli.main import main
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import (
     COMMANDS,
@@ -19,8 +19,8 @@ from hector_jax.control.reference import (
 from hector_jax.control.trajectories import beyond, course, limits, load_course
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
-from hector_jax.inputs import InputError
-from hector_jax.robot import load_robot
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 from pretend import elsewhere, pretend_walk
 
-from hector_jax.trajectory import State, from_start, has_fallen
+from hector_jax.core.trajectory import State, from_start, has_fallen
 
 
 def upright(**change):

@@ -7,8 +7,8 @@ import pytest
 
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
 from hector_jax.control.weights import directions, moved, nominal, weights_to_vector
-from hector_jax.evaluation import plots, transfer
-from hector_jax.evaluation.transfer import BEYOND_SAG, SAG
+from hector_jax.report import plots, transfer
+from hector_jax.report.transfer import BEYOND_SAG, SAG
 from hector_jax.storage import as_json
 
 RNG = np.random.default_rng(1)

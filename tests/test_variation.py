@@ -7,17 +7,11 @@ import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
-from hector_jax.model import srbm
-from hector_jax.model.effect import last_command
-from hector_jax.robot import load_robot
-from hector_jax.trajectory import Load, State, Wrench
-from hector_jax.tuning.rollout import (
-    Late,
-    RolloutConfig,
-    _moved_by,
-    _within_friction,
-    rollout,
-)
+from hector_jax.core.trajectory import Load, State, Wrench
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot import srbm
+from hector_jax.robot.model import load_robot
+from hector_jax.tuning.rollout import Late, RolloutConfig, _moved_by, _within_friction, rollout
 from hector_jax.tuning.rollout import no_variation as as_believed
 
 ROBOT = load_robot()

@@ -10,11 +10,11 @@ from PIL import Image
 from pretend import elsewhere, pretend_walk
 from scipy.spatial.transform import Rotation
 
-from hector_jax.evaluation import video
-from hector_jax.evaluation.video import VideoConfig, VideoUnavailable, write_film, write_strip
-from hector_jax.inputs import InputError
-from hector_jax.robot import MODEL_PATH, load_robot
-from hector_jax.trajectory import State
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State
+from hector_jax.report import video
+from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip
+from hector_jax.robot.model import MODEL_PATH, load_robot
 
 
 @pytest.fixture(scope="module")

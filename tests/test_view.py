@@ -11,14 +11,15 @@ import pytest
 from browser import CHROMIUM, opened
 from pretend import elsewhere, pretend_history, pretend_walk
 
-from hector_jax import pipeline
-from hector_jax.cli import main
-from hector_jax.commands import asked
+from hector_jax.cli import asked
+from hector_jax.cli.main import main
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.evaluation import pictures, runs, view
-from hector_jax.evaluation.view import Shown, motion
-from hector_jax.inputs import InputError
-from hector_jax.robot import load_model, load_robot
+from hector_jax.core.inputs import InputError
+from hector_jax.report import folder as runs
+from hector_jax.report import pictures, view
+from hector_jax.report.view import Shown, motion
+from hector_jax.robot.model import load_model, load_robot
+from hector_jax.runs import pipeline
 from hector_jax.storage import save_weights, write_json
 
 
@@ -330,7 +331,17 @@ def _drawn(picture):
 def test_a_browser_shows_the_run_until_it_is_interrupted(tmp_path):
     pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
     run = pretend_run(tmp_path / "run", weights=["with"])
-    words = [sys.executable, "-m", "hector_jax.cli", "view", run, "--seconds", "0.5", "--port", "0"]
+    words = [
+        sys.executable,
+        "-m",
+        "hector_jax.cli.main",
+        "view",
+        run,
+        "--seconds",
+        "0.5",
+        "--port",
+        "0",
+    ]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as page:
         try:
             told = next(line for line in page.stderr if line.startswith("open http"))

@@ -8,8 +8,8 @@ import pytest
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
-from hector_jax.robot import load_robot
-from hector_jax.runtime import workers
+from hector_jax.core.runtime import workers
+from hector_jax.robot.model import load_robot
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import Push, build_world, hfs, ideal

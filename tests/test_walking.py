@@ -10,7 +10,6 @@ import pytest
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import stance_torques, trunk_position
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.qp import Status
 from hector_jax.control.reference import Anchor, named_command
 from hector_jax.control.walking import (
     Measurement,
@@ -24,10 +23,11 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import expert
-from hector_jax.geometry import rot_z
-from hector_jax.model.kinematics import foot_poses
-from hector_jax.robot import load_robot
-from hector_jax.trajectory import State
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.trajectory import State
+from hector_jax.qp.solve import Status
+from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.model import load_robot
 
 CONFIG = WalkConfig()
 ROBOT = load_robot()

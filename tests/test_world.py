@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.description import Description
-from hector_jax.robot import load_robot, quiet_mujoco
+from hector_jax.robot.description import Description
+from hector_jax.robot.model import load_robot, quiet_mujoco
 from hector_jax.sim.actuators import init_actuators, step_actuators
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import (

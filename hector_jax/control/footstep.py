@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hector_jax.geometry import rot_z
-from hector_jax.inputs import NOT_NEGATIVE, check
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.inputs import NOT_NEGATIVE, check
+from hector_jax.core.trajectory import State
+from hector_jax.robot.model import Robot
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SOME, InputError, check
+from hector_jax.core.inputs import NOT_NEGATIVE, POSITIVE, SOME, InputError, check
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hector_jax.geometry import rot_z, rotation_from_euler, wrap_angle
-from hector_jax.inputs import NOT_NEGATIVE, InputError, check, shown
-from hector_jax.model.kinematics import foot_jacobians, inverse_legs, leg_gravity
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Wrench
+from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
+from hector_jax.core.inputs import NOT_NEGATIVE, InputError, check, shown
+from hector_jax.core.trajectory import State, Wrench
+from hector_jax.robot.kinematics import foot_jacobians, inverse_legs, leg_gravity
+from hector_jax.robot.model import Robot
 
 
 @dataclass(frozen=True)

@@ -30,13 +30,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hector_jax.control.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.control.weights import Weights
-from hector_jax.geometry import rot_z
-from hector_jax.inputs import POSITIVE, SOME, check
-from hector_jax.model import srbm
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Wrench, pack_wrench, unpack_wrench
+from hector_jax.core.geometry import rot_z
+from hector_jax.core.inputs import POSITIVE, SOME, check
+from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
+from hector_jax.qp.solve import QP, QpConfig, Solution, block_diagonal, solve_qp
+from hector_jax.robot import srbm
+from hector_jax.robot.model import Robot
 
 
 @dataclass(frozen=True)

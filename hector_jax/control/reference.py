@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
-from hector_jax.inputs import InputError, did_you_mean, shown
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State
+from hector_jax.core.inputs import InputError, did_you_mean, shown
+from hector_jax.core.trajectory import State
+from hector_jax.robot.model import Robot
 
 
 class Command(NamedTuple):

@@ -22,8 +22,8 @@ import numpy as np
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
-from hector_jax.inputs import InputError, Interval, check, from_table, read_toml, shown
-from hector_jax.robot import Robot
+from hector_jax.core.inputs import InputError, Interval, check, from_table, read_toml, shown
+from hector_jax.robot.model import Robot
 
 _MOST_SECONDS = 600.0
 _GRID = 0.05  # [s]

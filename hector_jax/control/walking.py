@@ -20,11 +20,11 @@ from hector_jax.control.legs import LegConfig, joint_torques, swing_joints, trun
 from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
-from hector_jax.geometry import rotation_from_euler, wrap_angle
-from hector_jax.inputs import InputError, check, from_table
-from hector_jax.model.kinematics import foot_poses
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Wrench
+from hector_jax.core.geometry import rotation_from_euler, wrap_angle
+from hector_jax.core.inputs import InputError, check, from_table
+from hector_jax.core.trajectory import State, Wrench
+from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.model import Robot
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Wrench
+from hector_jax.core.trajectory import State, Wrench
+from hector_jax.robot.model import Robot
 
 
 class Weights(NamedTuple):

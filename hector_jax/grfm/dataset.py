@@ -22,20 +22,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from hector_jax.console import say
 from hector_jax.control import gait
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.inputs import InputError, shown
-from hector_jax.model import srbm
-from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
-from hector_jax.robot import Robot
+from hector_jax.core.console import say
+from hector_jax.core.inputs import InputError, shown
+from hector_jax.core.trajectory import Load, State, Trajectory, Wrench
+from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
+from hector_jax.robot import srbm
+from hector_jax.robot.model import Robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import NO_PUSH, Push, hfs, hfs_drawn
 from hector_jax.storage import check_settings, load_tree, read_card, save_tree, write_file
-from hector_jax.trajectory import Load, State, Trajectory, Wrench
 
 KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre

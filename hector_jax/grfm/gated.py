@@ -23,9 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hector_jax.core.trajectory import Load, Wrench
 from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset
-from hector_jax.model.effect import HISTORY, Effect, Window, sure
-from hector_jax.trajectory import Load, Wrench
+from hector_jax.grfm.effect import HISTORY, Effect, Window, sure
 
 CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
 MOTION = 3  # of the base: yaw rate, forward and sideways velocity

@@ -29,7 +29,10 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hector_jax.control.gait import GaitConfig, since_switch
+from hector_jax.core.inputs import InputError, Interval, problem, shown
+from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import Dataset
+from hector_jax.grfm.effect import HISTORY, Effect, Window, sure
 from hector_jax.grfm.gated import (
     CHANGES,
     GATES,
@@ -44,11 +47,8 @@ from hector_jax.grfm.gated import (
     seen_labels,
     views,
 )
-from hector_jax.inputs import InputError, Interval, problem, shown
-from hector_jax.model.effect import HISTORY, Effect, Window, sure
-from hector_jax.robot import Robot
+from hector_jax.robot.model import Robot
 from hector_jax.storage import load_tree, read_card, save_tree
-from hector_jax.trajectory import Wrench
 
 HIDDEN = {"paper": (64, 64, 64), "residual": (32, 32)}  # widths of the layers, by variant
 MEMBERS = {"paper": 1, "residual": 4}  # nets of each kind that are trained side by side

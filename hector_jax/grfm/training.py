@@ -21,7 +21,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Key
 
+from hector_jax.core.inputs import NOT_NEGATIVE, POSITIVE, SEED, SOME, InputError, check
+from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import Dataset, with_mirror
+from hector_jax.grfm.effect import Window
 from hector_jax.grfm.gated import apply_gated, seen_labels, views
 from hector_jax.grfm.network import (
     MEMBERS,
@@ -35,10 +38,7 @@ from hector_jax.grfm.network import (
     residual_inputs,
     standardised,
 )
-from hector_jax.inputs import NOT_NEGATIVE, POSITIVE, SEED, SOME, InputError, check
-from hector_jax.model.effect import Window
 from hector_jax.storage import Checkpoint
-from hector_jax.trajectory import Wrench
 
 KIND = "training"  # of a checkpoint
 

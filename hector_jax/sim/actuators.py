@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hector_jax.robot import Robot
+from hector_jax.robot.model import Robot
 from hector_jax.sim.world import MAX_DELAY, TIME_STEP, Imperfections
 
 MEMORY = round(MAX_DELAY / TIME_STEP) + 1  # commands remembered, the present one included

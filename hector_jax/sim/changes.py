@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hector_jax.headless import mujoco
-from hector_jax.inputs import InputError
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
 from hector_jax.sim.world import TIME_STEP, World
 
 TRUNK_TOP = (0.0, 0.0, 0.124)  # [m] in the trunk's frame

@@ -18,7 +18,7 @@ from functools import partial
 from math import ceil
 from typing import Any, NamedTuple
 
-from hector_jax.headless import mujoco  # before MJX loads it with OpenGL
+from hector_jax.core.headless import mujoco  # before MJX loads it with OpenGL
 
 # isort: split
 import jax
@@ -30,8 +30,9 @@ from mujoco import mjx
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import Memory, Plan, WalkConfig, init_memory
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import InputError
-from hector_jax.robot import Robot
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
+from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators
 from hector_jax.sim.sensing import Contacts, Touches
@@ -47,15 +48,7 @@ from hector_jax.sim.walk import (
     substeps,
     walk_ticks,
 )
-from hector_jax.sim.world import (
-    Imperfections,
-    Push,
-    World,
-    build_worlds,
-    push_force,
-    standing_qpos,
-)
-from hector_jax.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
+from hector_jax.sim.world import Imperfections, Push, World, build_worlds, push_force, standing_qpos
 
 # Newton steps and steps of their line search: under vmap every walk takes each of them. MJX's own
 # search needs fewer than the C engine's. In 32 bits the fewer move contact forces by 2 mN in the

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax.control.walking import Measurement
-from hector_jax.geometry import euler_from_rotation, rotation_from_quaternion, wrap_angle
-from hector_jax.headless import mujoco
-from hector_jax.model.kinematics import foot_poses
-from hector_jax.robot import Robot
+from hector_jax.core.geometry import euler_from_rotation, rotation_from_quaternion, wrap_angle
+from hector_jax.core.headless import mujoco
+from hector_jax.core.trajectory import State, Wrench
+from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.model import Robot
 from hector_jax.sim.world import TIME_STEP, Estimator, World
-from hector_jax.trajectory import State, Wrench
 
 CONTACTS = 16  # contacts kept of a millisecond in MuJoCo C
 READING = 43  # entries of a flat reading

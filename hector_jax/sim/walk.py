@@ -20,13 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.control.reference import (
-    Anchor,
-    Command,
-    anchor_at,
-    reference_at,
-    standing_anchor,
-)
+from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at, standing_anchor
 from hector_jax.control.walking import (
     Measurement,
     Memory,
@@ -39,9 +33,10 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
-from hector_jax.headless import mujoco
-from hector_jax.inputs import InputError
-from hector_jax.robot import Robot, quiet_mujoco
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.robot.model import Robot, quiet_mujoco
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, init_actuators, step_actuators
 from hector_jax.sim.changes import Change, worlds_by_step
@@ -56,7 +51,6 @@ from hector_jax.sim.world import (
     push_force,
     standing_qpos,
 )
-from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
 
 
 class Job(NamedTuple):

@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hector_jax.description import Description
-from hector_jax.headless import mujoco
-from hector_jax.inputs import InputError, did_you_mean, shown
-from hector_jax.mjcf import TIME_STEP
-from hector_jax.robot import compile_model, quiet_mujoco
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError, did_you_mean, shown
+from hector_jax.robot.description import Description
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.model import compile_model, quiet_mujoco
 
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
-from hector_jax.robot import Robot
+from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Progress, Stop, TuneConfig
 from hector_jax.tuning.loss import Losses, LossWeights

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hector_jax.inputs import NOT_NEGATIVE, check
-from hector_jax.trajectory import Trajectory, Wrench
+from hector_jax.core.inputs import NOT_NEGATIVE, check
+from hector_jax.core.trajectory import Trajectory, Wrench
 
 SAMPLE = 1e-3  # [s] the rate at which the paper sums
 FALL_POSITION = 0.5  # [m] least error charged after a fall

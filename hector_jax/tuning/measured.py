@@ -18,8 +18,8 @@ from jaxtyping import Array
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.walking import Measurement, measured_feet
 from hector_jax.control.weights import Weights
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import (
     PAPER_ITERATIONS,
     Evaluation,

@@ -25,20 +25,15 @@ from jaxtyping import Array, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.walking import Feet, Measurement, Retune, measured_feet
 from hector_jax.control.weights import Weights
-from hector_jax.inputs import NOT_NEGATIVE, SHARE, InputError, Interval, check
-from hector_jax.model.effect import HISTORY
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.core.inputs import NOT_NEGATIVE, SHARE, InputError, Interval, check
+from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.grfm.effect import HISTORY
+from hector_jax.robot.model import Robot
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, refusal, step_weights
 from hector_jax.tuning.loss import losses
 from hector_jax.tuning.rollout import Carry
-from hector_jax.tuning.sensitivity import (
-    Sensitivities,
-    Varied,
-    no_tangents,
-    step_sensitivities,
-)
+from hector_jax.tuning.sensitivity import Sensitivities, Varied, no_tangents, step_sensitivities
 
 ESTIMATORS = ("carried", "cut", "model")
 

@@ -17,17 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.control import gait, qp
+from hector_jax.control import gait
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
-from hector_jax.geometry import rotation_from_euler
-from hector_jax.inputs import NOT_NEGATIVE, SOME, InputError, Interval, check
-from hector_jax.model import srbm
-from hector_jax.model.effect import HISTORY, Window, from_yaw_frame, turn
-from hector_jax.model.kinematics import foot_poses
-from hector_jax.robot import Robot
-from hector_jax.trajectory import Load, State, Trajectory, Wrench, has_fallen
+from hector_jax.core.geometry import rotation_from_euler
+from hector_jax.core.inputs import NOT_NEGATIVE, SOME, InputError, Interval, check
+from hector_jax.core.trajectory import Load, State, Trajectory, Wrench, has_fallen
+from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
+from hector_jax.qp import solve as qp
+from hector_jax.robot import srbm
+from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.model import Robot
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,9 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.walking import Feet
-from hector_jax.control.weights import (
-    WEIGHT_NAMES,
-    Weights,
-    vector_to_weights,
-    weights_to_vector,
-)
-from hector_jax.robot import Robot
-from hector_jax.trajectory import State, Trajectory, Wrench
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, vector_to_weights, weights_to_vector
+from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import LossConfig, losses, total
 from hector_jax.tuning.rollout import (
     Carry,

@@ -1,0 +1,115 @@
+"""What the flags mean that several commands share."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from hector_jax.cli.flags import View, Walk
+from hector_jax.control import trajectories
+from hector_jax.control.trajectories import Course, beyond, limits
+from hector_jax.control.walking import walk_config
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.core.console import say
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.report.folder import Asked
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.runs import pipeline
+from hector_jax.sim.standin import standin
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import Imperfections, named_world
+from hector_jax.storage import identity, load_weights
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.rollout import RolloutConfig
+
+
+def weights(text: str, robot: Robot) -> Weights:
+    """A weight set by its name, or from a file.
+
+    Raises:
+        InputError: the file holds none.
+    """
+    named = {"nominal": nominal, "expert": expert}
+    return named[text](robot) if text in named else load_weights(Path(text))
+
+
+def tune_config(robot: Robot, **others: Any) -> TuneConfig:
+    """Settings of a tuning, with the controller that the robot's description asks for."""
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **others)
+
+
+def folder_of(folder: Path, path: Path | None, robot: Robot) -> Path:
+    """Another robot than the packaged one, so one with a `path`, has its own folder in there."""
+    return folder if path is None else folder / robot.description.name
+
+
+def robot_of(run: Path, begun: Asked) -> Robot:
+    """The robot that a run was tuned for.
+
+    Raises:
+        InputError: its files say something else now.
+    """
+    robot = load_robot(begun.robot)
+    if begun.body not in (None, identity(robot)):
+        path = robot.description.path
+        raise InputError(f"{run} was tuned for another robot: {path} or its MJCF has changed")
+    return robot
+
+
+def default_of(flag: Path, usual: Path, path: Path | None, robot: Robot) -> Path:
+    """A folder as it was given; where it was not, that of the robot: DATA/NAME for DATA/..."""
+    if path is None or flag != usual:
+        return flag
+    return folder_of(Path(usual.parts[0]), path, robot).joinpath(*usual.parts[1:])
+
+
+def plants(world: str, seeds: range) -> list[Imperfections]:
+    """One plant of a world for each seed."""
+    if world == "standin":
+        return [standin(seed) for seed in seeds]
+    return [named_world(world, seed) for seed in seeds]
+
+
+def course(text: str, robot: Robot) -> Course:
+    """What to walk; one line says where a file asks for more than the robot may be able to.
+
+    Raises:
+        InputError: there is no such trajectory, or its file is wrong.
+    """
+    found = trajectories.course(text)
+    if found.seconds and (told := beyond(limits(robot, walk_config(robot).gait), found.command)):
+        say(f"warning: {text}: {told}")
+    return found
+
+
+def seconds(given: float, wanted: Course) -> float:
+    """Length of a walk [s]: what the trajectory's file says, else what the flag does.
+
+    Raises:
+        InputError: both say one.
+    """
+    if wanted.seconds is None:
+        return given
+    if given != Walk.seconds:
+        raise InputError(
+            f"--seconds is for built-in trajectories: {wanted.name} lasts {wanted.seconds:g} s, "
+            f"as its file says, got {given:g}"
+        )
+    return wanted.seconds
+
+
+def lasting(config: TuneConfig, wanted: Course) -> TuneConfig:
+    """The tuning with rollouts as long as the trajectory, where its file says how long."""
+    if wanted.seconds is None:
+        return config
+    ticks = round(wanted.seconds / config.rollout.walk.gait.tick)
+    return replace(config, rollout=replace(config.rollout, ticks=ticks))
+
+
+def walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) -> Trajectory:
+    """One walk in the world of the flags."""
+    lasts = seconds(args.seconds, wanted)
+    if args.world == "srbm":
+        return pipeline.walk_rigid_body(robot, weights, wanted.command, lasts)
+    plant = plants(args.world, range(args.seed, args.seed + 1))[0]
+    return walk(walk_config(robot), robot, weights, wanted.command, plant, lasts, args.seed)

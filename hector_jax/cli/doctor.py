@@ -1,0 +1,90 @@
+"""What this machine offers, and whether the program works on it."""
+
+import os
+import tempfile
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from hector_jax.control.reference import named_command
+from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import expert
+from hector_jax.core.inputs import one_line
+from hector_jax.core.runtime import cache_folder
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.grfm.dataset import SOLVED
+from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
+from hector_jax.robot.model import MODEL_PATH, Robot, load_robot
+from hector_jax.runs.pipeline import walk_rigid_body
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import named_world
+from hector_jax.storage import environment
+
+_EXTRAS = {  # by name, the package that it needs and what it is for
+    "export": ("flatbuffers", "hector export"),
+    "race": ("sklearn", "experiments/race.py"),
+    "search": ("cmaes", "hector search, hector table"),
+    "tensorboard": ("tensorboardX", "hector tensorboard"),
+    "view": ("viser", "hector view"),
+}
+
+
+def examine() -> tuple[dict[str, str], list[str]]:
+    """Look over the machine and walk a little.
+
+    Returns:
+        What there is, a line by name, and what is broken, empty on a sound machine. A missing
+        extra or video back end is told but breaks nothing: runs go on without.
+    """
+    faults: list[str] = []
+    told = {name: text for name, text in environment().items() if name != "device"}
+    if told.get("mujoco") != told.get("mujoco-mjx"):
+        faults.append("mujoco and mujoco-mjx are of different releases")
+    told["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in jax.devices())
+    if jnp.asarray(0.0).dtype != jnp.float64:
+        faults.append("JAX computes in 32 bits")
+    told["cache"] = str(cache_folder())
+    told["extras"] = ", ".join(
+        f"{name}: {'yes' if find_spec(package) else 'no'} (for {use})"
+        for name, (package, use) in _EXTRAS.items()
+    )
+    try:
+        robot = load_robot()
+        told["robot"] = f"{MODEL_PATH}, {float(robot.mass):.2f} kg"
+        start = time.monotonic()
+        walks = _walks(robot)
+        told["self-test"] = f"walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s"
+    except (ValueError, OSError, RuntimeError) as error:
+        faults.append(f"self-test: {one_line(error)}")
+        return told, faults
+    faults += [
+        f"self-test: the robot does not walk in {world}"
+        for world, found in walks.items()
+        if found.fallen.any() or not found.residual.max() <= SOLVED
+    ]
+    try:
+        told["video"] = f"works ({_film(robot, walks['ideal'])})"
+    except VideoUnavailable as error:
+        told["video"] = str(error)
+        if "MUJOCO_GL" in os.environ:  # a back end was asked for
+            faults.append(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}")
+    return told, faults
+
+
+def _walks(robot: Robot) -> dict[str, Trajectory]:
+    """Two seconds on the rigid body; in MuJoCo the start and a little more."""
+    command = named_command("straight")
+    return {
+        "srbm": walk_rigid_body(robot, expert(), command, 2.0),
+        "ideal": walk(WalkConfig(), robot, expert(), command, named_world("ideal", 0), 0.2),
+    }
+
+
+def _film(robot: Robot, walked: Trajectory) -> str:
+    """Draw a film; the back end that drew it."""
+    with tempfile.TemporaryDirectory() as folder:
+        film, pair = Path(folder) / "film.mp4", {"one": walked, "other": walked}
+        return write_film(film, robot, pair, VideoConfig(rate=2))

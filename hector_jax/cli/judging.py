@@ -1,0 +1,135 @@
+"""Evaluation of weight sets, walks and runs."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hector_jax.cli import asked, study
+from hector_jax.cli.flags import Compare, Evaluate, Table, Walk, settings
+from hector_jax.control.walking import walk_config
+from hector_jax.control.weights import expert, nominal
+from hector_jax.core.console import Broken, say
+from hector_jax.core.inputs import plural, printable
+from hector_jax.core.runtime import workers
+from hector_jax.grfm.dataset import SOLVED
+from hector_jax.report import folder as runs
+from hector_jax.report import pictures
+from hector_jax.report.report import print_table
+from hector_jax.report.video import check_film
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import metrics, pipeline
+from hector_jax.runs.metrics import Score, Verdict
+from hector_jax.storage import as_json, save_tree
+from hector_jax.tuning.loss import LossConfig
+
+
+def evaluate(args: Evaluate) -> None:
+    """Evaluate weight sets on the plants of a world."""
+    robot = load_robot(args.robot)
+    wanted = asked.course(args.traj, robot)
+    seconds = asked.seconds(args.seconds, wanted)
+    # ideal and hfs are one plant each, without chance
+    count = args.seeds if args.world in ("standin", "hfs-varied") else 1
+    seeds = range(args.first_seed, args.first_seed + count)
+    sets = {text: asked.weights(text, robot) for text in args.weights}
+    plants = asked.plants(args.world, seeds)
+    with workers(args.processes) as pool:
+        title = f"evaluating on {plural(count, 'plant')} of {args.world}"
+        known = (pool, asked.tune_config(robot), robot)
+        walks = pipeline.judge(*known, sets, wanted.command, plants, seeds, title, seconds)
+    scores = {n: [metrics.score(LossConfig(), walk) for walk in each] for n, each in walks.items()}
+    verdict = verdict_of(LossConfig(), seeds, scores)
+    if args.json:
+        print(as_json(metrics.as_result(verdict, args.world)))
+    else:
+        print_table(verdict, f"{wanted.name}, {plural(count, 'plant')}", args.world)
+
+
+def verdict_of(
+    loss: LossConfig, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
+) -> Verdict:
+    """`metrics.judge`; says where a QP of the walks was not solved."""
+    verdict = metrics.judge(loss, seeds, scores)
+    for name, score in verdict.scores.items():
+        if score.residual.max() > SOLVED:
+            worst = f"{score.residual.max():.0e}"
+            say(f"{name}: at least one QP of its walks was not solved (residual {worst})")
+    return verdict
+
+
+def walk(args: Walk) -> None:
+    """Walk once and report on it.
+
+    Raises:
+        Broken: QPs of the walk were not solved.
+    """
+    if args.video is not None:
+        check_film(args.video)
+    robot = load_robot(args.robot)
+    weights, wanted = asked.weights(args.weights, robot), asked.course(args.traj, robot)
+    say("compiling (only the first time on a machine) and walking")
+    trajectory = asked.walked(args, robot, wanted, weights)
+    found = metrics.score(LossConfig(), trajectory)
+    upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
+    samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
+    plans = np.asarray(trajectory.residual)[::samples]
+    unsolved = int(np.sum(~(plans <= SOLVED)))
+    fell = bool(found.fallen) and not unsolved  # without a plan it is no fall of these weights
+    if args.out is not None:
+        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=settings(args))
+    if args.json:
+        losses = {part: float(getattr(found, part)) for part in metrics.PARTS}
+        errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}
+        solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(found.residual)}
+        # a walk that falls at once has no errors
+        print(as_json({"seconds": upright, "fell": fell, **losses, **errors, **solved}))
+    else:
+        end = "fell after" if fell else "ended after" if found.fallen else "walked"
+        print(
+            f"{wanted.name} in {args.world}, {printable(args.weights)} weights: {end} "
+            f"{upright:.2f} s; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
+            f"L_pos {found.L_pos:.2f} m^2, L_ctrl {found.L_ctrl / 1e6:.3f}e6)"
+        )
+        cm, degrees = 100 * found.rms_position, np.degrees(found.rms_euler)
+        print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
+        print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
+    if unsolved:
+        raise Broken(
+            f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
+            f"{float(found.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
+        )
+    if args.video is not None:
+        beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
+        say(f"walking with {beside} weights for the other half of the film")
+        walks = {
+            beside: asked.walked(args, robot, wanted, other(robot)),
+            Path(args.weights).stem: trajectory,
+        }
+        pictures.film(args.video, robot, walks)
+
+
+def table(args: Table) -> None:
+    """Make the table of all sets on all trajectories."""
+    told, verdicts = study.make_table(args, partial(asked.plants, "standin"))
+    if args.json:
+        results = {name: metrics.as_result(verdict) for name, verdict in verdicts.items()}
+        print(as_json({"report": str(told), "trajectories": results}))
+    else:
+        for name, verdict in verdicts.items():
+            print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
+    say(f"the report is {told}")
+
+
+def compare(args: Compare) -> None:
+    """Put finished runs side by side."""
+    finished = [folder for folder in args.runs if (folder / runs.RESULT).exists()]
+    for folder in args.runs:
+        if finished and folder not in finished:
+            say(f"{folder} is left out: it is not a finished run")
+    told = runs.compare_runs([runs.load_run(folder) for folder in finished or args.runs])
+    if args.json:
+        print(as_json(told))
+    else:
+        runs.print_comparison(told)

@@ -1,0 +1,55 @@
+"""A tuned controller for other machines, and how this one is."""
+
+from hector_jax.cli import asked, doctor
+from hector_jax.cli.flags import Doctor, Export
+from hector_jax.control.walking import walk_config
+from hector_jax.core.console import Broken, say
+from hector_jax.core.inputs import InputError
+from hector_jax.report import folder as runs
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import export
+from hector_jax.storage import as_json, load_weights, locked
+
+
+def export_controller(args: Export) -> None:
+    """Export the controller of a run, checked against the live one."""
+    is_run = args.run.is_dir()
+    if is_run and args.robot:
+        raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
+    path, config = export.find_weights(args.run, args.set)
+    begun = runs.read_asked(args.run) if is_run else None
+    robot = asked.robot_of(args.run, begun) if begun else load_robot(args.robot)
+    wanted = asked.course(args.traj or (begun.trajectory if begun else "straight"), robot)
+    weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
+    folder = args.out or (args.run if is_run else args.run.parent) / "export"
+    say("exporting the controller and comparing it with the live one on a walk")
+    known = (config or walk_config(robot), robot, weights, wanted.command, folder)
+    with locked(folder):
+        card = export.export(*known, name=name, seconds=args.seconds)
+    if args.json:
+        print(as_json(card))
+        return
+    found = card["check"]
+    differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
+    print(f"largest difference from the live controller: {differences.format(**found)}")
+    for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
+        times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+        print(f"a call {text} [ms]: {times.format(**found[what])}")
+    say(f"the export is in {folder}")
+
+
+def examine(args: Doctor) -> None:
+    """Tell what is installed here, and whether it works.
+
+    Raises:
+        Broken: something does not.
+    """
+    say("testing this machine: two short walks and a film")
+    told, faults = doctor.examine()
+    if args.json:
+        print(as_json({**told, "faults": faults}))
+    else:
+        for name, text in told.items():
+            print(f"{name:12s} {text}")
+    if faults:
+        raise Broken("; ".join(faults))

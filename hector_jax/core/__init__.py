@@ -1,0 +1,1 @@
+"""Geometry, types, input checks, processes: what every other package uses."""

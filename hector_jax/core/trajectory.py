@@ -1,0 +1,130 @@
+"""What is walked: state, wrench and trajectory, and the one place that packs them into x and u.
+
+Frames: everything is in the world frame. A wrench is that of the ground on the robot, at the foot
+    point (on the sole, under the ankle axis), left foot then right. The paper's state is x = [e; p;
+    omega; v; g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hector_jax.core.geometry import rot_z
+
+LEFT, RIGHT = 0, 1
+MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen
+MAX_TILT = 0.8  # [rad] of roll or pitch; beyond it too
+
+
+class State(NamedTuple):
+    """Floating base of the single rigid body, in the world frame."""
+
+    euler: Float[Array, "*batch 3"]  # roll, pitch, yaw [rad]; yaw is continuous, not wrapped
+    position: Float[Array, "*batch 3"]  # centre of mass [m]
+    ang_velocity: Float[Array, "*batch 3"]  # [rad/s]
+    velocity: Float[Array, "*batch 3"]  # [m/s]
+
+
+class Wrench(NamedTuple):
+    """Force and moment of the ground on each foot at its foot point, world frame."""
+
+    force: Float[Array, "*batch 2 3"]  # [N], left then right
+    moment: Float[Array, "*batch 2 3"]  # [N m]
+
+
+class Load(NamedTuple):
+    """Force on the centre of mass and torque about it."""
+
+    force: Float[Array, "*batch 3"]  # [N]
+    torque: Float[Array, "*batch 3"]  # [N m]
+
+
+class Trajectory(NamedTuple):
+    """One walk, sampled evenly; every world returns this and nothing else.
+
+    Sample j covers the interval from j*period to (j+1)*period: `command` is held over it, `effect`
+    is the mean wrench of the ground over it, `state`, `joints` and `feet` are true values at its
+    end, `reference` is what the state should be there.
+    """
+
+    period: Float[Array, "*batch"]  # [s] between samples: 0.01 in srbm, 0.001 in the MuJoCo worlds
+    initial: State  # true state at t = 0, batch axes only
+    state: State  # (T, 3) each
+    reference: State  # (T, 3) each
+    command: Wrench  # (T, 2, 3) each, what the MPC asked for
+    effect: Wrench  # (T, 2, 3) each, what the ground returned
+    contact: Bool[Array, "*batch T 2"]  # planned stance
+    feet: Float[Array, "*batch T 2 3"]  # foot points [m]
+    joints: Float[Array, "*batch T 10"]  # [rad] hip yaw, roll, pitch, knee, ankle; left, right
+    fallen: Bool[Array, "*batch T"]  # true from the sample of the fall on
+    legs_touch: Bool[Array, "*batch T"]  # one leg touched the other, which is no fall
+    residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
+
+
+def from_start(walk: Trajectory) -> Trajectory:
+    """The same walk in the frame of its start: at the origin, facing along x (numpy, no batch).
+
+    A reference begins where its robot stood at t = 0, and each set of weights leaves the robot
+    elsewhere by then. In this frame all walks of a command have one reference.
+    """
+    walk = jax.tree.map(np.asarray, walk)
+    yaw, origin = np.zeros(3), np.zeros(3)
+    yaw[2], origin[:2] = walk.initial.euler[2], walk.initial.position[:2]
+    R = np.asarray(rot_z(jnp.asarray(yaw[2])))  # v @ R turns v back by the yaw
+
+    def turned(state: State) -> State:
+        position = (state.position - origin) @ R
+        rates = state.ang_velocity @ R, state.velocity @ R
+        return State(state.euler - yaw, position, *rates)
+
+    return walk._replace(
+        initial=turned(walk.initial),
+        state=turned(walk.state),
+        reference=turned(walk.reference),
+        command=Wrench(*(part @ R for part in walk.command)),
+        effect=Wrench(*(part @ R for part in walk.effect)),
+        feet=(walk.feet - origin) @ R,
+    )
+
+
+def has_fallen(
+    state: State, min_height: float = MIN_HEIGHT, max_tilt: float = MAX_TILT
+) -> Bool[Array, "*batch"]:
+    """Whether a base state is that of a fallen robot: too low, too tilted, or not finite."""
+    low = state.position[..., 2] < min_height
+    tilted = jnp.any(jnp.abs(state.euler[..., :2]) > max_tilt, axis=-1)
+    finite = jnp.all(jnp.stack([jnp.isfinite(x).all(axis=-1) for x in state]), axis=0)
+    return low | tilted | ~finite
+
+
+def pack_state(state: State, gravity: Float[Array, "3"]) -> Float[Array, "15"]:
+    """The paper's x = [e; p; omega; v; g] (Eq. 3)."""
+    return jnp.concatenate([*state, gravity])
+
+
+def unpack_state(x: Float[Array, "15"]) -> State:
+    """State of x = [e; p; omega; v; g]."""
+    return State(x[0:3], x[3:6], x[6:9], x[9:12])
+
+
+def pack_wrench(wrench: Wrench) -> Float[Array, "12"]:
+    """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3).
+
+    >>> left = Wrench(jnp.array([[1.0, 2, 3], [0, 0, 0]]), jnp.array([[4.0, 5, 6], [0, 0, 0]]))
+    >>> pack_wrench(left).tolist()
+    [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 4.0, 5.0, 6.0, 0.0, 0.0, 0.0]
+    """
+    return jnp.concatenate([wrench.force.reshape(6), wrench.moment.reshape(6)])
+
+
+def unpack_wrench(u: Float[Array, "12"]) -> Wrench:
+    """Wrench of u = [F_0; F_1; M_0; M_1]."""
+    return Wrench(u[:6].reshape(2, 3), u[6:].reshape(2, 3))
+
+
+def zero_wrench(shape: tuple[int, ...] = ()) -> Wrench:
+    """No wrench on either foot, with leading axes `shape`."""
+    return Wrench(jnp.zeros((*shape, 2, 3)), jnp.zeros((*shape, 2, 3)))

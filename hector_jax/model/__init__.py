@@ -1,1 +1,0 @@
-"""What the body does under forces."""

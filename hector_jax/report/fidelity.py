@@ -1,0 +1,215 @@
+"""How well a phi tells what the ground returns, and where the body goes.
+
+Errors of the wrench by axis and by the phase of the step; and open-loop prediction: from recorded
+states, the rigid body is moved for up to 0.4 s under the recorded commands through phi, and
+compared with where the robot was. The row `measured` moves it by the wrench that was measured: what
+is left there is no matter of the ground, but of a rigid body standing for a robot with legs.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hector_jax.control import gait
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.walking import walk_config
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.grfm.dataset import Dataset, make_dataset
+from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
+from hector_jax.grfm.training import predict
+from hector_jax.robot import srbm
+from hector_jax.robot.model import Robot
+
+PHASES = {  # time [s] since the switch of stance
+    "first 30 ms": (0.0, 0.03),
+    "middle": (0.03, 0.15),
+    "last 50 ms": (0.15, np.inf),
+}
+HORIZONS = (0.2, 0.4)  # [s]
+FIRST, APART = 5, 35  # ticks: of the first prediction in a walk, and from one to the next
+
+
+class Drift(NamedTuple):
+    """RMS error of open-loop predictions by time ahead; NaN where no walk stayed up so long."""
+
+    time: Float[np.ndarray, " ticks"]  # [s]
+    position: Float[np.ndarray, " ticks"]  # [m], distance of the centres of mass
+    euler: Float[np.ndarray, " ticks"]  # [rad], all three angles
+
+
+def _mean(rows: np.ndarray) -> np.ndarray:
+    """Mean over the rows; NaN, without a warning, where there are none."""
+    return rows.mean(axis=0) if len(rows) else np.full(rows.shape[1:], np.nan)
+
+
+def by_phase(
+    effects: Mapping[str, jax.tree_util.Partial], dataset: Dataset
+) -> dict[str, dict[str, dict[str, list[float]]]]:
+    """Mean square errors by phi, phase of the step and planned contact, per axis.
+
+    Returns:
+        `[phi][phase]["stance" | "swing"]`: F_x F_y F_z [N^2], M_x M_y M_z [(N m)^2]; NaN where no
+        sample is in the phase.
+    """
+    since, stands = dataset.window.since_switch, np.asarray(dataset.window.contact)
+    told: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for name, effect in effects.items():
+        guess = predict(effect, jax.tree.map(jnp.asarray, dataset.window))
+        wrong = np.concatenate(
+            [np.square(np.asarray(g) - y) for g, y in zip(guess, dataset.label, strict=True)],
+            axis=-1,
+        )
+        told[name] = {}
+        for phase, (low, high) in PHASES.items():
+            inside = ((since > low - 1e-6) & (since < high - 1e-6))[:, None]
+            told[name][phase] = {
+                "stance": _mean(wrong[inside & stands]).tolist(),
+                "swing": _mean(wrong[inside & ~stands]).tolist(),
+            }
+    return told
+
+
+def _ahead(
+    config: GaitConfig,
+    robot: Robot,
+    effect: jax.tree_util.Partial | None,
+    walk: Trajectory,
+    start_tick: Int[Array, ""],
+    first: Int[Array, ""],
+    ticks: int,
+) -> State:
+    """States of the rigid body at the ends of `ticks` ticks from `first` on."""
+
+    def step(state: State, j: Int[Array, ""]) -> tuple[State, State]:
+        yaw = state.euler[2]
+        if effect is None:
+            returned, push = jax.tree.map(lambda w: w[j], walk.effect), None
+        else:
+            past = j - jnp.arange(HISTORY)
+            window = Window(
+                commands=turn(jax.tree.map(lambda w: w[past], walk.command), -yaw),
+                contact=walk.contact[j],
+                phase=gait.cycle_phase(config, start_tick + j),
+                since_switch=gait.since_switch(config, start_tick + j),
+                base=from_yaw_frame(state),
+            )
+            found = effect(window)
+            returned, push = turn(found.wrench, yaw), turn(found.legs, yaw)
+        feet = 0.5 * (walk.feet[j - 1] + walk.feet[j])
+        moved = srbm.step(robot, state, returned, feet, config.tick, push)
+        return moved, moved
+
+    begin = jax.tree.map(lambda s: s[first - 1], walk.state)
+    return jax.lax.scan(step, begin, first + jnp.arange(ticks))[1]
+
+
+def drift(
+    robot: Robot,
+    effect: jax.tree_util.Partial | None,
+    walks: Trajectory,
+    start_tick: Int[np.ndarray, " W"],
+    config: GaitConfig | None = None,
+) -> Drift:
+    """Open-loop prediction errors of a phi over walks at the plan interval.
+
+    Args:
+        robot: the rigid body.
+        effect: phi; None moves the body by the measured wrench.
+        walks: W walks of T ticks; what follows a fall is left out.
+        start_tick: gait tick of their t = 0.
+        config: the gait that was walked.
+
+    Raises:
+        InputError: no walk is long enough to predict in.
+    """
+    config = config or walk_config(robot).gait
+    ticks = round(HORIZONS[-1] / config.tick)
+    fallen = np.asarray(walks.fallen)
+    starts = np.arange(FIRST, fallen.shape[1] - ticks + 1, APART)
+    if not len(starts):
+        raise InputError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
+
+    def errors(
+        effect: jax.tree_util.Partial | None, walk: Trajectory, start_tick: Array, first: Array
+    ) -> tuple[Array, Array]:
+        guess = _ahead(config, robot, effect, walk, start_tick, first, ticks)
+        true = jax.tree.map(lambda s: jax.lax.dynamic_slice_in_dim(s, first, ticks), walk.state)
+        return (
+            jnp.sum((guess.position - true.position) ** 2, axis=-1),
+            jnp.sum((guess.euler - true.euler) ** 2, axis=-1),
+        )
+
+    over_starts = jax.vmap(errors, in_axes=(None, None, None, 0))
+    position, euler = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
+        effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
+    )
+    whole = np.stack([~fallen[:, s : s + ticks].any(axis=1) for s in starts], axis=1)
+    rms = lambda square: np.sqrt(_mean(np.asarray(square)[whole]))  # noqa: E731
+    return Drift(config.tick * np.arange(1, ticks + 1), rms(position), rms(euler))
+
+
+def drifts(
+    robot: Robot,
+    effects: Mapping[str, jax.tree_util.Partial],
+    walks: Trajectory,
+    start_tick: Int[np.ndarray, " W"],
+) -> dict[str, Drift]:
+    """`drift` of several phi, and of the measured wrench."""
+    named: dict[str, jax.tree_util.Partial | None] = {**effects, "measured": None}
+    return {name: drift(robot, effect, walks, start_tick) for name, effect in named.items()}
+
+
+def as_result(
+    whole: Mapping[str, Mapping[str, Any]],
+    phases: Mapping[str, Any],
+    found: Mapping[str, Drift],
+) -> dict[str, Any]:
+    """All errors of one world as JSON values; `whole` is `training.report`."""
+    ahead = {
+        name: {
+            f"{horizon:g} s": {
+                "position": float(np.interp(horizon, one.time, one.position)),
+                "euler": float(np.interp(horizon, one.time, one.euler)),
+            }
+            for horizon in HORIZONS
+        }
+        for name, one in found.items()
+    }
+    return {"errors": dict(whole), "phases": dict(phases), "open_loop": ahead}
+
+
+def curves(
+    robot: Robot, walks: Trajectory, effects: Mapping[str, jax.tree_util.Partial]
+) -> dict[str, Wrench]:
+    """Command, predictions and measurement of the first of some walks, for a picture.
+
+    Args:
+        robot: the body that walked.
+        walks: as `make_dataset` takes them.
+        effects: phis by name; drawn are `linear`, `paper` and `residual`, the last as `predicted`.
+
+    Returns:
+        Wrenches (ticks, 2, 3) in the yaw frame, from t = 0; NaN at ticks that are no samples.
+    """
+    one = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
+    samples, _ = make_dataset(robot, one)
+    window = jax.tree.map(jnp.asarray, samples.window)
+    names = {"linear": "linear", "paper": "paper", "residual": "predicted"}
+    found = {
+        "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
+        "measured": samples.label,
+        **{names[n]: predict(effect, window) for n, effect in effects.items() if n in names},
+    }
+
+    def by_tick(values: Any) -> np.ndarray:
+        """NaN at ticks that are no samples: the first, unsolved ones, those after a fall."""
+        rows = np.full((one.fallen.shape[1], *values.shape[1:]), np.nan)
+        rows[samples.tick] = values
+        return rows
+
+    return {name: jax.tree.map(by_tick, wrench) for name, wrench in found.items()}

@@ -1,0 +1,142 @@
+"""The pictures and the film that a command leaves, each drawn by plots or video.py."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, weights_to_vector
+from hector_jax.core.console import say
+from hector_jax.core.trajectory import Trajectory, Wrench
+from hector_jax.grfm.training import History
+from hector_jax.report import plots, view
+from hector_jax.report.fidelity import Drift
+from hector_jax.report.folder import Histories
+from hector_jax.report.report import WORLDS, Picture
+from hector_jax.report.video import VideoUnavailable, write_film, write_strip
+from hector_jax.robot.model import Robot
+from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.loss import LossConfig
+
+
+def of_run(
+    folder: Path,
+    config: TuneConfig,
+    sets: Mapping[str, Weights],
+    tunings: Mapping[str, Tuning],
+    walks: Mapping[str, Trajectory],
+    ground: Mapping[str, Wrench],
+    training: History,
+) -> list[Picture]:
+    """Draw what a tuning did, into `pictures/` of its folder.
+
+    Args:
+        folder: of the run.
+        config: of the tunings.
+        sets: weights by name.
+        tunings: the tunings by set.
+        walks: one of each set, at the plan interval.
+        ground: by `fidelity.curves`.
+        training: of the net.
+
+    Returns:
+        The pictures, in the order of the report.
+    """
+    four = {name: walks[name] for name in ("nominal", "expert", "without", "with")}
+    flat = {name: np.asarray(weights_to_vector(sets[name])) for name in four}
+    histories = {name: tunings[name].history for name in ("without", "with")}
+    path = folder / "pictures"
+    path.mkdir(exist_ok=True)
+    captions = {
+        "tracking": plots.tracking(path / "tracking.png", four),
+        "path": plots.path_from_above(path / "path.png", four),
+        "losses": plots.losses(path / "losses.png", config.loss, histories),
+        "weights": plots.weights(path / "weights.png", WEIGHT_NAMES, flat),
+        "wrenches": plots.wrenches(path / "wrenches.png", config.rollout.walk.gait.tick, ground),
+        "training": plots.training(path / "training.png", training),
+    }
+    return [Picture(f"pictures/{name}.png", caption) for name, caption in captions.items()]
+
+
+def of_nets(
+    folder: Path,
+    tick: float,
+    ground: Mapping[str, Wrench],
+    drifts: Mapping[str, Mapping[str, Drift]],
+    trainings: Mapping[str, History],
+) -> list[Picture]:
+    """Draw what nets are worth.
+
+    Args:
+        folder: where to.
+        tick: from one plan to the next [s].
+        ground: by `fidelity.curves`, of the first held-out walk.
+        drifts: by `fidelity.drifts`, by world.
+        trainings: by the name of the picture.
+
+    Returns:
+        The pictures, in the order of the report.
+    """
+    wrenches = plots.wrenches(folder / "wrenches.png", tick, ground)
+    captions = {
+        "wrenches": f"{wrenches} The first held-out walk, in the robot's yaw frame.",
+        "open_loop": plots.open_loop(
+            folder / "open_loop.png", {WORLDS.get(w, w): found for w, found in drifts.items()}
+        ),
+        **{name: plots.training(folder / f"{name}.png", one) for name, one in trainings.items()},
+    }
+    return [Picture(f"{name}.png", caption) for name, caption in captions.items()]
+
+
+def of_view(
+    folder: Path,
+    robot: Robot,
+    histories: Histories,
+    loss: LossConfig,
+    shown: Mapping[str, view.Shown],
+) -> None:
+    """Draw what the page of `view` shows, as a film and pictures.
+
+    Args:
+        folder: where to.
+        robot: the body that walked.
+        histories: of the run.
+        loss: that its L is of.
+        shown: walks by the name of their set, before and after.
+
+    Raises:
+        VideoUnavailable: no film can be made here.
+    """
+    walks = {name: one.walk for name, one in shown.items()}
+    plots.tracking(folder / "tracking.png", walks)
+    plots.path_from_above(folder / "path.png", walks)
+    after = list(shown.values())[-1]
+    period, ticks = float(after.walk.period), len(after.walk.fallen)
+    first = min(0.4, period * ticks)  # [s], two steps
+    plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
+    tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
+    if tuned:
+        plots.losses(folder / "losses.png", loss, tuned)
+    titled = dict(zip(view.titles(walks), walks.values(), strict=True))
+    say("making the film")
+    write_film(folder / "film.mp4", robot, titled)
+    write_strip(folder / "film.png", robot, titled)
+
+
+def film(
+    path: Path, robot: Robot, walks: Mapping[str, Trajectory], strip: Path | None = None
+) -> str:
+    """Film two walks and leave a strip of snapshots where asked to.
+
+    A missing back end costs one line, not the run; returns why there is no film.
+    """
+    say("making the film")
+    try:
+        write_film(path, robot, walks)
+        if strip is not None:
+            write_strip(strip, robot, walks)
+    except VideoUnavailable as error:
+        say(str(error))
+        return str(error)
+    say(f"the film is in {path}")
+    return ""

@@ -1,0 +1,56 @@
+"""TensorBoard's event files from a run's metrics.jsonl, which stays the truth."""
+
+from pathlib import Path
+
+from hector_jax.core.inputs import InputError
+from hector_jax.report.folder import read_metrics
+
+
+def write_events(folder: Path, out: Path) -> list[Path]:
+    """Write the tunings of a run as scalars, each in a folder of its own under `out`.
+
+    Scalars are `loss/*` in the units of metrics.jsonl, `step/*`, `weights/*` and `gradient_log/*`,
+    by iteration. What an earlier call wrote there is replaced, so it can be called again while the
+    run goes on.
+
+    Args:
+        folder: of the run.
+        out: folder for `tensorboard --logdir`.
+
+    Returns:
+        The folders, one for each tuned set.
+
+    Raises:
+        InputError: no run, or tensorboardX is not installed.
+        InputError: a folder cannot be written.
+    """
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise InputError(
+            "TensorBoard's files need tensorboardX: pip install 'hector-jax[tensorboard]'"
+        ) from None
+    lines = read_metrics(folder)
+    folders = {name: out / name for name in dict.fromkeys(line["set"] for line in lines)}
+    for name, place in folders.items():
+        place.mkdir(parents=True, exist_ok=True)
+        for old in place.glob("events.out.tfevents.*"):
+            old.unlink()
+        with SummaryWriter(str(place)) as writer:
+            for line in lines:
+                if line["set"] == name:
+                    for tag, value in _scalars(line).items():
+                        writer.add_scalar(tag, value, line["iteration"])
+    return list(folders.values())
+
+
+def _scalars(line: dict) -> dict[str, float]:
+    """Numbers of an iteration by tag; those that were not finite are left out."""
+    rooms = {
+        "loss": ("L", "L_Eul", "L_pos", "L_ctrl"),
+        "step": ("step", "accepted", "residual"),
+    }
+    found = {f"{room}/{name}": line.get(name) for room, names in rooms.items() for name in names}
+    for room in ("weights", "gradient_log"):
+        found |= {f"{room}/{name}": value for name, value in line.get(room, {}).items()}
+    return {tag: float(value) for tag, value in found.items() if value is not None}

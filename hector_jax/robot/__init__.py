@@ -1,0 +1,1 @@
+"""The robot: its model file, kinematics and single rigid body."""

@@ -1,0 +1,207 @@
+"""Robot descriptions from anywhere, looked at before MuJoCo opens them.
+
+A description is one MJCF file of at most 1 MB that says everything itself, meshes and pictures
+apart, which lie in its folder or below. What would reach outside of it (includes, other files),
+make much of little (entities, replicated and composed bodies, huge textures and memories) or let a
+number pass that no robot has (NaN, negative masses, empty ranges) is refused by file, element,
+attribute and value. Which bodies and joints a robot has to have is no matter of this module.
+"""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from hector_jax.core.inputs import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    InputError,
+    Interval,
+    did_you_mean,
+    one_line,
+    read_text,
+    shown,
+)
+
+TIME_STEP = 0.001  # [s] of plant, joint control and samples, whatever the robot
+_MOST_BYTES = 1_000_000
+_MOST_MESH_BYTES = 20_000_000
+_DEEPEST = 100
+_MOST_BODIES = 200
+_PARTS_FROM_ELSEWHERE = (
+    "include",
+    "attach",
+    "model",
+    "replicate",
+    "composite",
+    "flexcomp",
+    "plugin",
+)
+_FOLDERS = ("assetdir", "meshdir", "texturedir")
+
+_COUNT = Interval(-1, 1_000_000)  # -1: as many as it takes
+_PIXELS = Interval(0, 8192)
+_RANGES: Mapping[str, Interval] = {
+    "mass": NOT_NEGATIVE,
+    "density": NOT_NEGATIVE,
+    "diaginertia": POSITIVE,
+    "armature": NOT_NEGATIVE,
+    "damping": NOT_NEGATIVE,
+    "frictionloss": NOT_NEGATIVE,
+    "friction": NOT_NEGATIVE,
+    "margin": NOT_NEGATIVE,
+    "size": NOT_NEGATIVE,
+    "iterations": Interval(1, 1000),
+    "ls_iterations": Interval(1, 1000),
+    "width": _PIXELS,
+    "height": _PIXELS,
+    "offwidth": _PIXELS,
+    "offheight": _PIXELS,
+    "nrow": _PIXELS,
+    "ncol": _PIXELS,
+    "shadowsize": _PIXELS,
+    "offsamples": Interval(0, 64),
+    **dict.fromkeys(("njmax", "nconmax", "nkey", "nstack", "nuserdata"), _COUNT),
+    **dict.fromkeys((f"nuser_{x}" for x in ("body", "jnt", "geom", "site", "actuator")), _COUNT),
+}
+_RANGES_OF = {("inertial", "mass"): POSITIVE, ("numeric", "size"): _COUNT}
+_PAIRS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange")
+_MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
+_MOST_MEMORY = 2**30
+
+
+def read_mjcf(path: Path) -> ElementTree.Element:
+    """The elements of a description that MuJoCo may open, see the module.
+
+    Raises:
+        InputError: one line naming the file and what is wrong in it.
+    """
+    text = read_text(path, "the robot description", _MOST_BYTES)
+    found = re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE)
+    if found:
+        raise InputError(f"{path}: {found[1].upper()} is not accepted, expected plain MJCF")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
+    if root.tag != "mujoco":
+        raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco>")
+    bodies = 0
+    for element, label in _labelled(path, root):
+        if element.tag in _PARTS_FROM_ELSEWHERE:
+            of = f" of {shown(element.get('file'))}" if "file" in element.attrib else ""
+            raise InputError(
+                f"{path}: <{element.tag}>{of} is not accepted, expected one self-contained file"
+            )
+        bodies += element.tag == "body"
+        for name, value in element.attrib.items():
+            told = _problem(element.tag, name, value)
+            if told:
+                raise InputError(f"{path}: {label}: {name} is {shown(value)}, expected {told}")
+    if bodies > _MOST_BODIES:
+        raise InputError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
+    _check_files(path, root)
+    return root
+
+
+def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception) -> InputError:
+    """What MuJoCo says of a description, on one line, with the nearest name that it would know.
+
+    Args:
+        path: the file.
+        root: its elements.
+        schema: words of MJCF.
+        error: MuJoCo's.
+    """
+    told = one_line(error)
+    names = {element.get("name", "") for element in root.iter()} | set(re.findall(r"\w+", schema))
+    # MuJoCo quotes what it does not know and what the matter is about: the first unknown one counts
+    unknown = [word for word in re.findall(r"'([^']*)'", told) if word not in names]
+    hint = did_you_mean(unknown[0], names) if unknown else ""
+    return InputError(f"{path}: MuJoCo refuses it: {told}{hint}")
+
+
+def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:
+    """Each element with what a message calls it."""
+    depth = {root: 1}
+    yield root, "<mujoco>"
+    for parent in root.iter():
+        if depth[parent] > _DEEPEST:
+            raise InputError(f"{path}: elements are nested deeper than {_DEEPEST}")
+        for child in parent:
+            depth[child] = depth[parent] + 1
+            name, of = child.get("name"), parent.get("name") or parent.get("class")
+            label = f"<{child.tag}>"
+            if name:
+                label += f" {shown(name)}"
+            elif of:
+                label += f" of {shown(of)}"
+            yield child, label
+
+
+def _problem(tag: str, name: str, value: str) -> str | None:
+    """What is expected of an attribute that is not so."""
+    if name == "name":
+        return None
+    numbers = _numbers(value)
+    if name == "timestep" and numbers != [TIME_STEP]:
+        return f"{TIME_STEP}, the step of all walks [s], or nothing"
+    if name == "memory":
+        size = re.fullmatch(r"(\d{1,12})([KMG]?)", value)
+        fine = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)
+        return None if fine else "at most 1G"
+    allowed = _RANGES_OF.get((tag, name)) or _RANGES.get(name)
+    if allowed and (numbers is None or not all(number in allowed for number in numbers)):
+        return f"numbers {allowed}"
+    if numbers and not all(number in Interval() for number in numbers):
+        return "finite numbers"
+    paired = name in _PAIRS and tag != "light"  # whose range is a length
+    if paired and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
+        return "two numbers, the lower one first"
+    return None
+
+
+def _numbers(text: str) -> list[float] | None:
+    """The numbers in a text; None where it is something else."""
+    try:
+        return [float(word) for word in text.split()]
+    except ValueError:
+        return None
+
+
+def _check_files(path: Path, root: ElementTree.Element) -> None:
+    """Check that meshes and pictures lie in the file's folder or below, and are there."""
+    home = path.parent.resolve()
+    places = [home]
+    for compiler in root.iter("compiler"):
+        for name in _FOLDERS:
+            if name in compiler.attrib:
+                places.append(_inside(path, home, home, name, compiler.attrib[name]))
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            if not name.startswith("file"):
+                continue
+            label = f"<{element.tag}> {name}"
+            candidates = [_inside(path, home, place, label, value) for place in places]
+            there = [candidate for candidate in candidates if candidate.is_file()]
+            if not there:
+                near = [p.name for place in places if place.is_dir() for p in place.iterdir()]
+                hint = did_you_mean(Path(value).name, near)
+                raise InputError(f"{path}: {label}: no file {shown(value)}{hint}")
+            if (size := there[0].stat().st_size) > _MOST_MESH_BYTES:
+                raise InputError(
+                    f"{path}: {label}: {value} has {size / 1e6:.1f} MB, "
+                    f"expected at most {_MOST_MESH_BYTES / 1e6:.0f} MB"
+                )
+
+
+def _inside(path: Path, home: Path, place: Path, label: str, value: str) -> Path:
+    try:
+        found = (place / value).resolve()
+    except (OSError, ValueError):  # too long, or a loop of links
+        found = Path("/")
+    if not found.is_relative_to(home):
+        raise InputError(
+            f"{path}: {label} refers to {shown(value)}, expected a file in its own folder"
+        )
+    return found

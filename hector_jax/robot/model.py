@@ -1,0 +1,305 @@
+"""The robot as numbers: mass, lengths and limits, read from its MJCF and stated nowhere else.
+
+`compile_model` compiles the MJCF of a description and checks that it is a biped this package can
+walk: a free trunk, two mirrored legs with hip yaw, hip roll, hip pitch, knee and ankle, one motor
+per joint, and line feet that touch at a toe and a heel. `load_robot` reads a `Robot` off the
+compiled model; which names the parts have, the description says.
+
+Frames: the trunk's is at the trunk body's origin, x ahead, y left, z up; a link's frame sits in the
+joint that moves it, parallel to the trunk's when all joints are zero.
+"""
+
+import difflib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.description import (
+    DESCRIPTION_PATH,
+    HECTOR_AXES,
+    Description,
+    read_description,
+)
+from hector_jax.robot.mjcf import read_mjcf, refusal
+
+# HECTOR's
+MODEL_PATH, STANDING = Description.model, Description.standing
+JOINT_NAMES, FOOT_POINTS = Description.joints, Description.foot_points
+
+_AXES = dict(zip("xyz", np.eye(3), strict=True))
+_SAME = 1e-6  # [m], [-]: numbers in a description that should agree
+
+
+@contextmanager
+def quiet_mujoco() -> Iterator[None]:
+    """Keep MuJoCo from writing its warnings into a file of the working directory.
+
+    The counters in MjData, which every walk reads, tell the same.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+class Robot(NamedTuple):
+    """The robot's constants: a pytree of 64-bit host arrays, an argument of jitted functions."""
+
+    mass: Float[np.ndarray, ""]  # whole robot [kg]
+    inertia: Float[
+        np.ndarray, "3 3"
+    ]  # composite, about the CoM in the standing pose, trunk axes [kg m^2]
+    com_offset: Float[np.ndarray, "3"]  # CoM in the trunk frame, standing pose [m]
+    gravity: Float[np.ndarray, "3"]  # pointing up as in the paper [m/s^2]
+    joint_origin: Float[np.ndarray, "2 5 3"]  # joint frame in its parent's frame [m]
+    joint_axis: Float[np.ndarray, "5 3"]  # in the joint's own frame, the same for both legs
+    foot_point: Float[
+        np.ndarray, "2 3"
+    ]  # on the sole under the ankle axis, in the foot's frame [m]
+    link_mass: Float[np.ndarray, "2 5"]  # of the link that each joint moves [kg]
+    link_com: Float[np.ndarray, "2 5 3"]  # its CoM in its own frame [m]
+    toe: Float[np.ndarray, ""]  # contact length ahead of the foot point [m]
+    heel: Float[np.ndarray, ""]  # contact length behind it [m]
+    joint_lower: Float[np.ndarray, "10"]  # [rad], left leg then right
+    joint_upper: Float[np.ndarray, "10"]  # [rad]
+    torque_limit: Float[np.ndarray, "10"]  # [N m]
+    standing_joints: Float[np.ndarray, "10"]  # [rad]
+    standing_height: Float[np.ndarray, ""]  # CoM above the floor when standing [m]
+    trunk_height: Float[np.ndarray, ""]  # trunk origin above the floor when standing [m]
+    description: Description  # its names and what else its TOML says; static, no array
+
+
+def describe(path: Path | None = None) -> Description:
+    """The description of a robot.
+
+    Args:
+        path: TOML file; an MJCF file with HECTOR's names, which is then described as HECTOR is;
+            None takes the packaged hector.toml.
+
+    Raises:
+        InputError: as `read_description`.
+    """
+    path = DESCRIPTION_PATH if path is None else Path(path)
+    if path.suffix == ".toml":
+        return read_description(path)
+    return replace(read_description(DESCRIPTION_PATH), model=path)
+
+
+@quiet_mujoco()
+def load_robot(path: Path | None = None) -> Robot:
+    """The robot of a file, see `describe`.
+
+    Raises:
+        InputError: as `describe` and `compile_model`.
+    """
+    description = describe(path)
+    model = compile_model(description)
+    data = mujoco.MjData(model)
+    key = model.key(description.standing)
+    mujoco.mj_resetDataKeyframe(model, data, key.id)
+    mujoco.mj_forward(model, data)
+
+    trunk = _trunk(model)
+    R_wb = data.xmat[trunk].reshape(3, 3)
+    com = data.subtree_com[trunk]
+    # The legs' joints, links and actuators in the package's order, whatever the file's.
+    joint = np.array([model.joint(name).id for name in description.joints])
+    link = model.jnt_bodyid[joint]
+    site = [model.site(name).id for name in description.foot_points]
+    foot_point = model.site_pos[site]
+    return Robot(
+        mass=model.body_subtreemass[trunk].copy(),
+        inertia=R_wb.T @ _composite_inertia(model, data, com) @ R_wb,
+        com_offset=R_wb.T @ (com - data.xpos[trunk]),
+        gravity=0.0 - model.opt.gravity,
+        joint_origin=model.body_pos[link].reshape(2, 5, 3),
+        joint_axis=model.jnt_axis[joint[:5]],
+        foot_point=foot_point,
+        link_mass=model.body_mass[link].reshape(2, 5),
+        link_com=model.body_ipos[link].reshape(2, 5, 3),
+        toe=model.geom(description.toes[0]).pos[0] - foot_point[0, 0],
+        heel=foot_point[0, 0] - model.geom(description.heels[0]).pos[0],
+        joint_lower=model.jnt_range[joint, 0],
+        joint_upper=model.jnt_range[joint, 1],
+        torque_limit=model.actuator_ctrlrange[:, 1].copy(),
+        standing_joints=key.qpos[model.jnt_qposadr[joint]],
+        standing_height=com[2].copy(),
+        trunk_height=data.xpos[trunk][2].copy(),
+        description=description,
+    )
+
+
+def load_model(path: Path | None = None) -> mujoco.MjModel:
+    """The compiled and checked model of a file, see `describe` and `compile_model`."""
+    return compile_model(describe(path))
+
+
+@quiet_mujoco()
+def compile_model(description: Description) -> mujoco.MjModel:
+    """The compiled and checked model of a description.
+
+    Raises:
+        InputError: one line saying what came, what was expected and what there is. The MJCF must be
+            one that `mjcf.read_mjcf` lets pass and that compiles to the biped of this module's
+            docstring.
+    """
+    path = description.model
+    root = read_mjcf(path)
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
+    _check_base(path, model)
+    _check_joints(description, model)
+    _check_motors(description, model)
+    _check_feet(description, model)
+    return model
+
+
+def _check_base(path: Path, model: mujoco.MjModel) -> None:
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    if len(free) != 1 or free[0] != 0:
+        raise InputError(
+            f"{path}: {len(free)} free joints, expected exactly one, the first; "
+            f"joints: {_listed(_joints(model))}"
+        )
+
+
+def _check_joints(description: Description, model: mujoco.MjModel) -> None:
+    path, joints = description.model, description.joints
+    names = _joints(model)
+    for name in joints:
+        _require(path, "joint", name, names)
+    got = [name for name in names if name in joints]
+    if got != list(joints) or len(names) != 1 + len(joints):
+        raise InputError(
+            f"{path}: joints are {_listed(names)}; expected a free joint, then {_listed(joints)}"
+        )
+    for index, name in enumerate(joints):
+        joint = model.joint(name)
+        which = index % 5
+        if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
+            raise InputError(f"{path}: joint {name!r} is not a hinge")
+        axis = _AXES[description.axes[which]]
+        if not np.allclose(joint.axis, axis, atol=_SAME):
+            raise InputError(f"{path}: axis of joint {name!r} is {joint.axis}, expected {axis}")
+        if not joint.limited[0]:
+            raise InputError(f"{path}: joint {name!r} has no range, expected limits in radians")
+        body = joint.bodyid[0]
+        parent = model.body_parentid[body]
+        expected = _trunk(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
+        if parent != expected:
+            raise InputError(
+                f"{path}: joint {name!r} is on body {model.body(parent).name!r}, "
+                f"expected {model.body(expected).name!r}"
+            )
+        if np.abs(joint.pos).max() > _SAME or abs(model.body_quat[body][0]) < 1 - _SAME:
+            raise InputError(
+                f"{path}: joint {name!r} is off its body's origin or its body is turned, "
+                "expected neither pos on the joint nor an orientation on the body"
+            )
+        # Two parallel links in one plane: what the closed-form inverse kinematics solves.
+        closed = description.axes == HECTOR_AXES and which >= 3
+        if closed and (model.body_pos[body][0] != 0.0 or model.body_pos[body][2] >= 0.0):
+            raise InputError(
+                f"{path}: body of joint {name!r} is at {model.body_pos[body]}, "
+                "expected x = 0 and z < 0"
+            )
+
+
+def _check_motors(description: Description, model: mujoco.MjModel) -> None:
+    path, joints = description.model, description.joints
+    if model.nu != len(joints):
+        raise InputError(
+            f"{path}: {model.nu} actuators, expected {len(joints)}, "
+            f"one per joint: {_listed(joints)}"
+        )
+    for index, name in enumerate(joints):
+        motor = model.actuator(index)
+        driven = model.joint(motor.trnid[0]).name
+        if driven != name:
+            raise InputError(f"{path}: actuator {index} drives joint {driven!r}, expected {name!r}")
+        if not motor.ctrllimited[0] or motor.ctrlrange[1] <= 0 or motor.gear[0] != 1.0:
+            raise InputError(
+                f"{path}: actuator of joint {name!r} has ctrlrange {motor.ctrlrange} and gear "
+                f"{motor.gear[0]}, expected a torque range and gear 1"
+            )
+
+
+def _check_feet(description: Description, model: mujoco.MjModel) -> None:
+    path, toes, heels = description.model, description.toes, description.heels
+    if description.standing not in (keys := [model.key(i).name for i in range(model.nkey)]):
+        raise InputError(f"{path}: {_missing('keyframe', description.standing, keys)}")
+    sites = [model.site(i).name for i in range(model.nsite)]
+    geoms = [model.geom(i).name for i in range(model.ngeom)]
+    for side, foot in enumerate(description.foot_points):
+        _require(path, "site", foot, sites)
+        body = model.joint(description.joints[5 * side + 4]).bodyid[0]
+        point = model.site(foot).pos
+        if model.site(foot).bodyid[0] != body:
+            raise InputError(
+                f"{path}: site {foot!r} is not on the foot, body {model.body(body).name!r}"
+            )
+        for name, ahead in ((toes[side], 1), (heels[side], -1)):
+            _require(path, "geom", name, geoms)
+            geom = model.geom(name)
+            if geom.bodyid[0] != body or geom.type[0] != mujoco.mjtGeom.mjGEOM_SPHERE:
+                raise InputError(
+                    f"{path}: geom {name!r} is not a sphere on body {model.body(body).name!r}"
+                )
+            reach = geom.pos - [0, 0, geom.size[0]] - point
+            if ahead * reach[0] <= 0 or np.abs(reach[1:]).max() > 1e-3:
+                raise InputError(
+                    f"{path}: lowest point of geom {name!r} is {reach} from site {foot!r}, "
+                    f"expected it {'ahead' if ahead > 0 else 'behind'} on the same sole"
+                )
+    for names in (toes, heels):
+        left, right = (model.geom(name).pos[0] for name in names)
+        if abs(left - right) > _SAME:
+            raise InputError(
+                f"{path}: {names[0]} at x = {left}, {names[1]} at x = {right}, expected the same"
+            )
+
+
+def _composite_inertia(
+    model: mujoco.MjModel, data: mujoco.MjData, com: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Inertia of the whole robot about `com`, joints frozen, world axes."""
+    R = data.ximat.reshape(-1, 3, 3)
+    own = np.einsum("bij,bj,bkj->bik", R, model.body_inertia, R)
+    arm = data.xipos - com
+    square = np.einsum("bi,bi->b", arm, arm)[:, None, None] * np.eye(3)
+    steiner = model.body_mass[:, None, None] * (square - arm[:, :, None] * arm[:, None, :])
+    return (own + steiner).sum(axis=0)
+
+
+def _trunk(model: mujoco.MjModel) -> int:
+    return int(model.jnt_bodyid[0])
+
+
+def _joints(model: mujoco.MjModel) -> list[str]:
+    return [model.joint(i).name for i in range(model.njnt)]
+
+
+def _require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
+    if name not in names:
+        raise InputError(f"{path}: {_missing(kind, name, names)}")
+
+
+def _missing(kind: str, name: str, names: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    return f"no {kind} {name!r}{hint}; {kind}s: {_listed(names)}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(name for name in names if name) or "none"

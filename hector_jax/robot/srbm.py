@@ -1,0 +1,147 @@
+"""The single rigid body: what wrenches on the feet do to the base (Eq. 2), exactly and linearised.
+
+The body turns with the constant composite inertia of the standing robot. The linearisation is
+forward Euler and drops the gyroscopic term, as the public controllers of this robot do; the
+simulated body keeps it.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hector_jax.core.geometry import euler_rates, rotation_from_euler, skew
+from hector_jax.core.trajectory import Load, State, Wrench
+from hector_jax.robot.model import Robot
+
+
+def centroidal_rates(
+    robot: Robot, wrench: Wrench, lever: Float[Array, "2 3"]
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Linear acceleration [m/s^2] and rate of angular momentum [N m], world frame.
+
+    Args:
+        robot: mass [kg] and gravity [m/s^2], the latter pointing up as in the paper.
+        wrench: force [N] and moment [N m] of the ground on each foot.
+        lever: centre of mass to foot point [m].
+
+    Source: Eq. 2.
+    """
+    torque = jnp.cross(lever, wrench.force) + wrench.moment
+    return wrench.force.sum(axis=0) / robot.mass - robot.gravity, torque.sum(axis=0)
+
+
+@jax.jit  # traced once for the four stages of a step
+def rates(
+    robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], load: Load | None = None
+) -> State:
+    """Time derivative of the state; `feet` are the foot points in the world [m]. Source: Eq. 2."""
+    acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
+    if load is not None:
+        acceleration, torque = acceleration + load.force / robot.mass, torque + load.torque
+    R_wb = rotation_from_euler(state.euler)
+    momentum = R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
+    torque = torque - jnp.cross(state.ang_velocity, momentum)
+    ang_acceleration = R_wb @ jnp.linalg.solve(robot.inertia, R_wb.T @ torque)
+    return State(
+        euler=euler_rates(state.euler) @ state.ang_velocity,
+        position=state.velocity,
+        ang_velocity=ang_acceleration,
+        velocity=acceleration,
+    )
+
+
+def step(
+    robot: Robot,
+    state: State,
+    wrench: Wrench,
+    feet: Float[Array, "2 3"],
+    dt: float,
+    load: Load | None = None,
+) -> State:
+    """State after `dt` [s] of constant wrench and load, world frame (4th-order Runge-Kutta)."""
+
+    def ahead(slope: State, h: float) -> State:
+        return jax.tree.map(lambda x, dx: x + h * dx, state, slope)
+
+    k1 = rates(robot, state, wrench, feet, load)
+    k2 = rates(robot, ahead(k1, dt / 2), wrench, feet, load)
+    k3 = rates(robot, ahead(k2, dt / 2), wrench, feet, load)
+    k4 = rates(robot, ahead(k3, dt), wrench, feet, load)
+    return jax.tree.map(
+        lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), state, k1, k2, k3, k4
+    )
+
+
+def unexplained(
+    robot: Robot,
+    before: State,
+    after: State,
+    wrench: Wrench,
+    feet: Float[Array, "2 3"],
+    dt: float,
+) -> Load:
+    """The load that the motion from one state to the next owes to something beside the wrench.
+
+    Args:
+        robot: mass, gravity and inertia.
+        before: state at the start.
+        after: state `dt` [s] later.
+        wrench: mean of the wrench of the ground in between.
+        feet: foot points halfway [m].
+        dt: time between the states [s].
+
+    Source: Eq. 2, solved for the forces; the inverse of `step` but for terms of second order.
+    """
+
+    def momentum(state: State) -> Float[Array, "3"]:
+        R_wb = rotation_from_euler(state.euler)
+        return R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
+
+    lever = feet - 0.5 * (before.position + after.position)
+    acceleration, torque = centroidal_rates(robot, wrench, lever)
+    return Load(
+        force=robot.mass * ((after.velocity - before.velocity) / dt - acceleration),
+        torque=(momentum(after) - momentum(before)) / dt - torque,
+    )
+
+
+@partial(jax.jit, static_argnums=3)  # traced once for all that ask
+def linearise(
+    robot: Robot, euler: Float[Array, "3"], lever: Float[Array, "2 3"], dt: float
+) -> tuple[Float[Array, "15 15"], Float[Array, "15 12"]]:
+    """A and B of x' = A x + B u, with x = [e; p; omega; v; g] and u = [F_0; F_1; M_0; M_1].
+
+    Args:
+        robot: mass and inertia.
+        euler: attitude to linearise about [rad].
+        lever: centre of mass to each foot point [m].
+        dt: step [s], forward Euler.
+
+    Source: Eq. 4a.
+    """
+    R_wb = rotation_from_euler(euler)
+    inverse_inertia = R_wb @ jnp.linalg.inv(robot.inertia) @ R_wb.T
+    eye, none = jnp.eye(3, dtype=R_wb.dtype), jnp.zeros((3, 3), R_wb.dtype)
+    A = jnp.block(
+        [
+            [eye, none, dt * euler_rates(euler), none, none],
+            [none, eye, none, dt * eye, none],
+            [none, none, eye, none, none],
+            [none, none, none, eye, -dt * eye],
+            [none, none, none, none, eye],
+        ]
+    )
+    turn = dt * inverse_inertia
+    push = dt / robot.mass * eye
+    B = jnp.block(
+        [
+            [none, none, none, none],
+            [none, none, none, none],
+            [turn @ skew(lever[0]), turn @ skew(lever[1]), turn, turn],
+            [push, push, none, none],
+            [none, none, none, none],
+        ]
+    )
+    return A, B

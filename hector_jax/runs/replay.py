@@ -1,0 +1,228 @@
+"""Evaluations that a tuning refused, kept so that they can be done again.
+
+A step of a tuning is refused where the walk falls, a QP is not solved or a number is not finite. A
+dump of it holds all that the evaluation followed from (body, weights, command, anchor, net and
+settings) and what it came to; `again` does it once more and says whether the same comes out.
+"""
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hector_jax.core.console import say
+from hector_jax.control.reference import Anchor, Command
+from hector_jax.control.weights import Weights, nominal
+from hector_jax.robot.description import as_table, from_card
+from hector_jax.storage import environment
+from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
+from hector_jax.core.inputs import InputError, from_table
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.storage import WriteError, load_tree, read_card, save_tree
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.tuning.difftune import (
+    Evaluation,
+    Iteration,
+    Reason,
+    TuneConfig,
+    believed,
+    refusal,
+    tune_step,
+)
+from hector_jax.tuning.loss import Losses
+from hector_jax.tuning.rollout import rollout
+
+MOST = 3
+"""Dumps of a tuning for one reason: a bad night must not fill a disk."""
+
+_KIND = "refused evaluation"
+
+
+class Dump(NamedTuple):
+    """What an evaluation follows from, beside its settings, and what it came to."""
+
+    robot: Robot
+    weights: Weights
+    command: Command
+    anchor: Anchor
+    params: Params | None  # of the net; None: the plain rigid body
+    seen: Evaluation
+
+
+class Replayed(NamedTuple):
+    """A dump, done again."""
+
+    name: str  # of the tuning
+    iteration: int
+    recorded: dict[str, Any]  # reason and numbers
+    again: dict[str, Any]  # likewise
+    first: dict[str, int | None]  # tick, now, that is the first not finite, fallen or unsolved
+    same: bool  # to the last bit, the gradient included
+    changed: dict[str, list[str | None]]  # versions and machine: then and now, where they differ
+
+
+def keep(
+    folder: Path,
+    name: str,
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    anchor: Anchor,
+    params: Params | None,
+    iteration: Iteration,
+) -> Path | None:
+    """Write a dump of an iteration whose evaluation is not to be believed.
+
+    The first `MOST` of a tuning are kept for each reason. A folder that cannot be written costs one
+    line on stderr, not the tuning.
+
+    Args:
+        folder: of the dumps.
+        name: of the tuning.
+        config, robot, command, anchor, params: what it tunes.
+        iteration: any of it; of those to be believed nothing is kept.
+
+    Returns:
+        Where it was written, if it was.
+    """
+    code = Reason(int(believed(config, iteration.evaluation)))
+    kind = code.name.lower().replace("_", "-")
+    if code is Reason.ACCEPTED or len(list(folder.glob(f"{name}-*-{kind}.npz"))) >= MOST:
+        return None
+    path = folder / f"{name}-{iteration.iteration:03d}-{kind}.npz"
+    dump = Dump(robot, iteration.weights, command, anchor, params, iteration.evaluation)
+    about = {
+        "name": name,
+        "iteration": iteration.iteration,
+        "reason": iteration.reason,
+        "net": None
+        if params is None
+        else {
+            "variant": "paper" if isinstance(params, NetParams) else "residual",
+            "hidden": widths(params.force),
+        },
+        "config": asdict(config),
+        "description": as_table(robot.description),
+        "environment": environment(),
+    }
+    try:
+        save_tree(path, dump, kind=_KIND, robot=robot, about=about)
+    except WriteError as error:
+        say(f"a refused step was not recorded: {error}")
+        return None
+    say(f"{name}, iteration {iteration.iteration}: {iteration.reason}; see hector replay {path}")
+    return path
+
+
+def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
+    """A dump with its settings and the notes on its card.
+
+    Raises:
+        InputError: one line naming the file that is damaged, no dump or of another version.
+    """
+    about = read_card(path)["about"]
+    net, none = about.get("net"), np.zeros(())
+    try:
+        params = None if net is None else layout(net["variant"], tuple(net["hidden"]))
+        description = from_card(about.get("description", {}))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: settings that this version does not know: {error}") from error
+    like = Dump(
+        load_robot()._replace(description=description),
+        nominal(),
+        Command(np.zeros(0), np.zeros((0, 2)), np.zeros(0)),
+        Anchor(np.zeros(3), none, none),
+        params,
+        Evaluation(none, Losses(none, none, none), nominal(), none, none),
+    )
+    dump, _ = load_tree(path, like, kind=_KIND)
+    return dump, from_table(f"{path}: config", TuneConfig, about.get("config")), about
+
+
+_walk = jax.jit(rollout, static_argnums=0)
+
+
+def _on_cpu() -> AbstractContextManager[Any]:
+    if jax.default_backend() == "cpu":
+        return nullcontext()  # naming the device would compile a tuning's program once more
+    return jax.default_device(jax.local_devices(backend="cpu")[0])
+
+
+def again(path: Path) -> Replayed:
+    """Do the evaluation of a dump again, on the CPU, where tunings run.
+
+    Raises:
+        InputError: see `load`.
+    """
+    dump, config, about = load(path)
+    effect = effect_of(dump.params, config.rollout.walk.gait)
+    problem = dump.robot, dump.weights, dump.command, dump.anchor, effect
+    with _on_cpu():
+        found = jax.device_get(tune_step(config, *problem))
+        walked = jax.device_get(_walk(config.rollout, *problem))
+    same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, found)
+    then, now = about["environment"], environment()
+    return Replayed(
+        name=about["name"],
+        iteration=about["iteration"],
+        recorded=_summary(about["reason"], dump.seen),
+        again=_summary(refusal(config, found), found),
+        first=_first(config, walked),
+        same=all(jax.tree.leaves(same)),
+        changed={
+            name: [then.get(name), now.get(name)]
+            for name in sorted(then.keys() | now.keys())
+            if then.get(name) != now.get(name)
+        },
+    )
+
+
+def _summary(reason: str, evaluation: Evaluation) -> dict[str, Any]:
+    gradient = np.max([np.max(np.abs(g)) for g in jax.tree.leaves(evaluation.gradient)])
+    numbers = {
+        "loss": evaluation.loss,
+        "L_Eul": evaluation.parts.euler,
+        "L_pos": evaluation.parts.position,
+        "L_ctrl": evaluation.parts.control,
+        "gradient": gradient,  # its largest entry
+        "fallen": evaluation.fallen,
+        "residual": evaluation.residual,
+    }
+    return {"reason": reason, **{name: float(x) for name, x in numbers.items()}}
+
+
+def _first(config: TuneConfig, walked: Trajectory) -> dict[str, int | None]:
+    rows = [np.reshape(x, (len(walked.fallen), -1)) for x in (*walked.state, *walked.command)]
+    wrong = {
+        "not finite": ~np.isfinite(np.concatenate(rows, axis=1)).all(axis=1),
+        "fallen": walked.fallen,
+        "unsolved": ~(walked.residual <= config.residual),
+    }
+    return {name: int(np.argmax(at)) if at.any() else None for name, at in wrong.items()}
+
+
+def in_words(found: Replayed) -> str:
+    """A table of what was recorded and what came out, and the verdict."""
+    labels = {"gradient": "largest gradient", "fallen": "share fallen", "residual": "QP residual"}
+    cell = lambda x: x if isinstance(x, str) else f"{x:.17g}"  # noqa: E731
+    lines = [f"{found.name}, iteration {found.iteration}", f"{'':18s}{'recorded':32s}again"]
+    for name, value in found.recorded.items():
+        lines.append(f"{labels.get(name, name):18s}{cell(value):32s}{cell(found.again[name])}")
+    for name, tick in found.first.items():
+        lines.append(f"{f'first {name}':18s}{'':32s}{'never' if tick is None else f'tick {tick}'}")
+    return "\n".join([*lines, verdict(found)])
+
+
+def verdict(found: Replayed) -> str:
+    """Whether it is the same, and which versions or machines are not."""
+    if found.same:
+        return "the same to the last bit"
+    then, now = found.recorded["reason"], found.again["reason"]
+    what = "the same reason, other numbers" if then == now else f"now {now or 'not refused'}"
+    changed = [f"{name} {old or '-'} -> {new or '-'}" for name, (old, new) in found.changed.items()]
+    made = f"changed since: {', '.join(changed)}" if changed else "same versions, same machine"
+    return f"not reproduced: {what}; {made}"
