@@ -37,12 +37,19 @@ from filelock import FileLock, Timeout
 
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import Broken, say
-from hector_jax.core.inputs import InputError, Interval, one_line, problem, read_json, shown
+from hector_jax.core.inputs import (
+    InputError,
+    Range,
+    one_line,
+    read_json,
+    short_repr,
+    validation_error,
+)
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.model import Robot
 
 FORMAT = 1
-WEIGHTS = Interval(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
+WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
 _MOST_WEIGHTS = 1_000_000  # bytes
 _PART = ".hector_jax-part"  # ends the name of a file that is being written, and of no other
 _DIGEST = 64  # hexadecimal digits of a sha256
@@ -364,7 +371,7 @@ def load_tree(
     """
     arrays, card = _read(path)
     if card["kind"] != kind:
-        raise InputError(f"{path}: holds {shown(card['kind'])[1:-1]}, expected {kind}")
+        raise InputError(f"{path}: holds {short_repr(card['kind'])[1:-1]}, expected {kind}")
     if robot is not None and card["robot"] != (expected := fingerprint(robot)):
         raise InputError(
             f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
@@ -414,16 +421,16 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def _check_card(path: Path, card: Any) -> None:
     if not isinstance(card, dict):
-        raise InputError(f"{path}: card must be an object, got {shown(card)}")
+        raise InputError(f"{path}: card must be an object, got {short_repr(card)}")
     if card.get("format") != FORMAT:
         raise InputError(
-            f"{path}: file format {shown(card.get('format'))}, this version reads {FORMAT}"
+            f"{path}: file format {short_repr(card.get('format'))}, this version reads {FORMAT}"
         )
     kinds = {"kind": str, "robot": str | None, "about": dict, "versions": dict}
     for name, kind in kinds.items():
         if name not in card:
             raise InputError(f"{path}: card.{name} is missing")
-        if told := problem(card[name], kind):
+        if told := validation_error(card[name], kind):
             raise InputError(f"{path}: card.{name} {told}")
 
 
@@ -451,7 +458,7 @@ def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, A
         before, now = made.get(name), expected.get(name)
         if before == now:
             continue
-        what = f"with {name} {shown(before)}, this command expects {shown(now)}"
+        what = f"with {name} {short_repr(before)}, this command expects {short_repr(now)}"
         if name == "code":
             what = f"by other code or other versions of {', '.join(_NUMERIC)}"
         raise InputError(f"{path}: made {what}; remove it, or name another folder")
@@ -613,7 +620,7 @@ def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.n
     if array.shape != shape:
         raise InputError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
     for index, value in np.ndenumerate(array):
-        if told := problem(value, float, WEIGHTS):
+        if told := validation_error(value, float, WEIGHTS):
             place = "".join(f"[{i}]" for i in index)
             raise InputError(f"{path}: {name}{place} {told}")
     return array.astype(float)

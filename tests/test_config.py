@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hector_jax.cli import flags
 from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Command, Configured, Evaluate, Table, Tune, from_file, settings
-from hector_jax.core.inputs import InputError, problem
+from hector_jax.core.inputs import InputError, validation_error
 from hector_jax.report.report import PAPER_ITERATIONS
 
 FILES = [kind for kind in get_args(Command) if issubclass(kind, Configured)]
@@ -228,7 +228,7 @@ def test_any_table_makes_flags_in_range_or_one_line_with_the_file(tmp_path_facto
     try:
         found = from_file(kind, path)
         hints = flags._hints(kind).items()
-        assert not [name for name, hint in hints if problem(getattr(found, name), hint)]
+        assert not [name for name, hint in hints if validation_error(getattr(found, name), hint)]
     except InputError as error:
         told = str(error)
     assert told.startswith(f"{path}: ")

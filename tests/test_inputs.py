@@ -23,7 +23,7 @@ from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.trajectories import load_course
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
-from hector_jax.core.inputs import Interval, did_you_mean, problem, shown
+from hector_jax.core.inputs import Range, did_you_mean, short_repr, validation_error
 from hector_jax.grfm import dataset, network
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp.solve import QpConfig
@@ -117,9 +117,9 @@ def test_settings_are_taken_or_refused_by_field_and_value(place, value):
         assert message.startswith(f"{kind.__name__}.")
         assert field.name in message
         assert "must " in message
-        assert shown(value) in message or repr(value)[:20] in message
+        assert short_repr(value) in message or repr(value)[:20] in message
     else:
-        assert problem(value, field.type) is None
+        assert validation_error(value, field.type) is None
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_no_setting_takes_a_nan_a_word_or_a_number_below_its_range(kind, field):
         if name in SIGNED and value == -1e9:
             continue
         value = (value,) * 5 if get_origin(field.type) is tuple else value
-        if problem(value, field.type) is None and field.type is bool:
+        if validation_error(value, field.type) is None and field.type is bool:
             continue
         with pytest.raises(ValueError, match=name):
             made(kind, **{field.name: value})
@@ -146,17 +146,17 @@ def test_defaults_and_numpy_numbers_are_taken():
 
 
 def test_ranges_and_hints_are_told_in_words():
-    assert problem(3, int, Interval(5, 9)) == ("must be a whole number from 5 to 9, got 3")
-    assert problem(True, float) == "must be a number that is finite, got True"
-    assert problem(0.0, float | None, Interval(0.0, above=True)).startswith(
+    assert validation_error(3, int, Range(5, 9)) == ("must be a whole number from 5 to 9, got 3")
+    assert validation_error(True, float) == "must be a number that is finite, got True"
+    assert validation_error(0.0, float | None, Range(0.0, above=True)).startswith(
         "must be a number above"
     )
-    assert problem(None, float | None) is None
-    assert problem("wieght", str, ("zero", "weight")) == (
+    assert validation_error(None, float | None) is None
+    assert validation_error("wieght", str, ("zero", "weight")) == (
         "must be 'zero' or 'weight', got 'wieght'; did you mean 'weight'?"
     )
     assert did_you_mean("xyz", ["zero", "weight"]) == ""
-    assert len(shown("x" * 1000)) == 60
+    assert len(short_repr("x" * 1000)) == 60
 
 
 # Files

@@ -16,15 +16,15 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_t
 from hector_jax.core.inputs import (
     SEED,
     InputError,
-    Interval,
+    Range,
     check_file,
     did_you_mean,
     one_line,
     plural,
-    problem,
     read_json,
     read_toml,
-    shown,
+    short_repr,
+    validation_error,
 )
 
 NAMED_WEIGHTS = ("nominal", "expert")
@@ -43,13 +43,11 @@ class Source(Enum):
     ROBOT = "a TOML file that names an MJCF (docs/howto/robot.md)"
 
 
-Processes = Annotated[int, Interval(1, 1024)]
-Plants = Annotated[int, Interval(1, 10_000)]
+Processes = Annotated[int, Range(1, 1024)]
+Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]
-Iterations = Annotated[
-    int, Interval(10, 10_000)
-]  # at least the ten of the paper, of which it tells
-Seconds = Annotated[float, Interval(0.01, 600)]  # at least one tick
+Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper, of which it tells
+Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Variant = Literal["residual", "paper"]
 Engine = Literal["auto", "c", "mjx"]
 Robot = Annotated[Path | None, Source.ROBOT]
@@ -74,8 +72,8 @@ class Collect(Configured):
     """
 
     out: Folder = Path("data/walks")  # folder for the walks; those already in it are kept
-    walks: Annotated[int, Interval(1, 100_000)] = 64  # number of walks
-    seconds: Annotated[float, Interval(0, 600, above=True)] = 4.0  # length of each walk [s]
+    walks: Annotated[int, Range(1, 100_000)] = 64  # number of walks
+    seconds: Annotated[float, Range(0, 600, above=True)] = 4.0  # length of each walk [s]
     seed: Seed = 0  # seed of all random numbers: commands, weights, plants, pushes
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     processes: Processes = 2  # worker processes, one core each
@@ -92,7 +90,7 @@ class Train(Configured):
     data: Folder = Path("data/walks")  # folder of the walks
     out: Path | None = None  # file for the net; by default grfm.npz or grfm-paper.npz beside DATA
     variant: Variant = "residual"  # architecture of the net
-    epochs: Annotated[int, Interval(1, 100_000)] = 200  # passes over the samples
+    epochs: Annotated[int, Range(1, 100_000)] = 200  # passes over the samples
     seed: Seed = 0  # seed of the initial parameters and of the order of the samples
     json: bool = False  # print JSON instead of text
     robot: Robot = None  # TOML file of another biped; HECTOR by default
@@ -107,7 +105,7 @@ class Grfm(Configured):
 
     data: Folder = Path("data")  # folder of the walks and nets, which are made if they are missing
     out: Folder = Path("runs/grfm")  # folder for the report
-    seeds: Annotated[int, Interval(0, 10_000)] = 2  # stand-in plants, for information; 0: none
+    seeds: Annotated[int, Range(0, 10_000)] = 2  # stand-in plants, for information; 0: none
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of text
 
@@ -124,7 +122,7 @@ class Tune(Configured):
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
-    refresh: Annotated[int, Interval(0, 100)] = 0  # times to collect at the new weights and repeat
+    refresh: Annotated[int, Range(0, 100)] = 0  # times to collect at the new weights and repeat
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, Source.FILE] = None  # file of another net, instead of that in DATA
     runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
@@ -144,11 +142,11 @@ class Search(Configured):
     """
 
     traj: Trajectory = "straight"  # straight, c, s, all or a TOML file
-    budget: Annotated[int, Interval(1, 1_000_000)] = 200  # most walks per trajectory
-    population: Annotated[int, Interval(1, 10_000)] = 10  # walks in a generation
+    budget: Annotated[int, Range(1, 1_000_000)] = 200  # most walks per trajectory
+    population: Annotated[int, Range(1, 10_000)] = 10  # walks in a generation
     seed: Seed = 0  # seed of the search
     # initial standard deviation of each log-weight
-    spread: Annotated[float, Interval(0, 10, above=True)] = 1.0
+    spread: Annotated[float, Range(0, 10, above=True)] = 1.0
     start: Weights = "nominal"  # nominal, expert or a weights file
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     out: Folder = Path("runs/search")  # folder for the best weights, each with a card
@@ -168,10 +166,10 @@ class Table(Configured):
     trajectories: tuple[str, ...] = ("straight", "c", "s")  # some of these three
     seeds: Plants = 32  # stand-in plants
     first_seed: Seed = 0  # first plant: 0 in development, 1000 for the final evaluation
-    rollouts: Annotated[int, Interval(1, 1_000_000)] = 200  # walks of the search, row `searched`
+    rollouts: Annotated[int, Range(1, 1_000_000)] = 200  # walks of the search, row `searched`
     iterations: Iterations = 100  # largest number of iterations of each tuning
-    steps: Annotated[int, Interval(0, 10_000)] = 30  # steps of row `with_walks`; 0: no such row
-    step_plants: Annotated[int, Interval(1, 1000)] = 8  # simulator plants for each of these steps
+    steps: Annotated[int, Range(0, 10_000)] = 30  # steps of row `with_walks`; 0: no such row
+    step_plants: Annotated[int, Range(1, 1000)] = 8  # simulator plants for each of these steps
     extra: tuple[str, ...] = ()  # more rows, NAME=FOLDER of straight.json, c.json and s.json
     ceiling: Path = Path("docs/results/ceiling")  # folder of row `ceiling`, if it exists
     earlier: Path | None = None  # table.json of other plants, to compare the order of the sets
@@ -257,10 +255,10 @@ class View:
     sets: tuple[str, str] = ("nominal", "with")  # weight sets of the run: before and after
     world: Literal["srbm", "ideal", "hfs", "hfs-varied", "standin"] = "hfs"  # where both walk
     seed: Seed = 0  # seed of the plant and of the estimator's noise
-    seconds: Annotated[float, Interval(0.1, 600)] = 4.0  # length of each walk [s]
+    seconds: Annotated[float, Range(0.1, 600)] = 4.0  # length of each walk [s]
     data: Path | None = None  # folder of the net that predicts the ground; by default the run's
     host: str = "127.0.0.1"  # address to listen on; the default admits only this machine
-    port: Annotated[int, Interval(0, 65535)] = 8080  # port; if it is in use, a free one is taken
+    port: Annotated[int, Range(0, 65535)] = 8080  # port; if it is in use, a free one is taken
     headless: bool = False  # write a film and pictures instead of opening a page
     out: Path | None = None  # folder for them (implies --headless); by default `view` in the run
 
@@ -357,14 +355,14 @@ def check(flags: Any) -> None:
     defaults = {field.name: field.default for field in fields(flags)}
     for name, hint in _hints(type(flags)).items():
         value, label = getattr(flags, name), _label(type(flags), name)
-        if told := problem(value, hint):
+        if told := validation_error(value, hint):
             raise InputError(f"{label} {told}")
         if value == () != defaults[name]:
             raise InputError(f"{label} expects a value, got none")
         each = value if isinstance(value, tuple) else (value,)
         for i, one in enumerate(each):
             if one in each[:i]:
-                raise InputError(f"{label} names {shown(str(one))} twice")
+                raise InputError(f"{label} names {short_repr(str(one))} twice")
             if one is not None and (source := _source(hint)):
                 _look(label, one, source)
     if hasattr(flags, "first_seed") and flags.first_seed + flags.seeds - 1 not in SEED:
@@ -444,7 +442,7 @@ def from_line(words: Sequence[str]) -> Any:
     given = _words_by_flag(kind, hints, words[1:])
     values = {name: _from_words(hints[name], texts) for name, texts in given.items()}
     for name, value in values.items():
-        if told := problem(value, hints[name]):
+        if told := validation_error(value, hints[name]):
             raise InputError(f"{_label(kind, name)} {told}")
     for name in _positional(kind):
         if name not in values:
@@ -463,7 +461,9 @@ def command(word: str) -> type[Any]:
     kinds = {command_name(kind): kind for kind in get_args(Command)}
     if word not in kinds:
         hint = did_you_mean(word, kinds) or f"; the commands are {', '.join(kinds)}"
-        raise InputError(f"unknown command {shown(word)}{hint}" if word else f"no command{hint}")
+        raise InputError(
+            f"unknown command {short_repr(word)}{hint}" if word else f"no command{hint}"
+        )
     return kinds[word]
 
 
@@ -487,17 +487,21 @@ def _words_by_flag(kind: type, hints: dict[str, Any], words: Sequence[str]) -> d
                 names = [_spelt(x) for x in (*hints, *switched_off) if x != positional]
                 hint = did_you_mean(_spelt(name), names).replace("mean '", "mean '--")
                 hint = hint or f"; {help_line}"
-                raise InputError(f"{command_name(kind)} has no flag {shown(f'--{flag}')}{hint}")
+                raise InputError(
+                    f"{command_name(kind)} has no flag {short_repr(f'--{flag}')}{hint}"
+                )
             if taking in given:
                 raise InputError(f"--{_spelt(taking)} is given twice")
             if hints[taking] is bool and equals:
-                raise InputError(f"--{flag} takes no value, got {shown(value)}")
+                raise InputError(f"--{flag} takes no value, got {short_repr(value)}")
             is_on = hints[taking] is bool and name == taking
             given[taking] = [value] if equals else ["yes"] * is_on
         else:
             taking = positional if is_full(taking) else taking
             if taking is None or is_full(taking):
-                raise InputError(f"{command_name(kind)} does not expect {shown(word)}; {help_line}")
+                raise InputError(
+                    f"{command_name(kind)} does not expect {short_repr(word)}; {help_line}"
+                )
             given.setdefault(taking, []).append(word)
     for name, texts in given.items():
         least = _words_of(hints[name])[0]
@@ -559,11 +563,11 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         if name not in hints:
             known = sorted(map(_spelt, hints))
             hint = did_you_mean(_spelt(name), known) or f"; known: {', '.join(known)}"
-            raise InputError(f"{path}: unknown key {shown(key)}{hint}")
+            raise InputError(f"{path}: unknown key {short_repr(key)}{hint}")
         if name in values:
             raise InputError(f"{path}: {key} is given twice")
         values[name] = _value(hints[name], value)
-        if told := problem(values[name], hints[name]):
+        if told := validation_error(values[name], hints[name]):
             told = told.replace("a tuple", "a list")
             raise InputError(f"{path}: {key} {told}")
     return kind(**values)

@@ -19,7 +19,7 @@ from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import Course
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import say
-from hector_jax.core.inputs import InputError, plural, shown
+from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.runtime import workers
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
@@ -124,7 +124,7 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
     config, made_with = read_json(path), read_json(folder / "versions.json")
     for name in ("robot", "code", "directory"):
         if not isinstance(config.get(name), str):
-            raise InputError(f"{path}: {name} must be text, got {shown(config.get(name))}")
+            raise InputError(f"{path}: {name} must be text, got {short_repr(config.get(name))}")
     begun = from_file(Tune, path)
     if config["code"] != code_hash(*_CODE):
         commit = made_with.get("commit", "no commit is noted")

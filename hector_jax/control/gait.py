@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.core.inputs import NOT_NEGATIVE, POSITIVE, SOME, InputError, check
+from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, InputError, check
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class GaitConfig:
     cycles: int = 2  # gait cycles in place before t = 0 (MuJoCo worlds)
 
     def __post_init__(self) -> None:
-        rules = {"tick": POSITIVE, "stance": SOME, "swing": SOME}
+        rules = {"tick": POSITIVE, "stance": AT_LEAST_ONE, "swing": AT_LEAST_ONE}
         check(self, **rules, stand=NOT_NEGATIVE, cycles=NOT_NEGATIVE)
         if self.stance < self.swing or (self.stance + self.swing) % 2:
             raise InputError(

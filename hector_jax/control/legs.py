@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
-from hector_jax.core.inputs import NOT_NEGATIVE, InputError, check, shown
+from hector_jax.core.inputs import NOT_NEGATIVE, InputError, check, short_repr
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_jacobians, inverse_legs, leg_gravity
 from hector_jax.robot.model import Robot
@@ -40,7 +40,7 @@ class LegConfig:
         check(self, height=NOT_NEGATIVE, kp=NOT_NEGATIVE, kd=NOT_NEGATIVE)
         for name in ("kp", "kd"):
             if len(gains := getattr(self, name)) != 5:
-                raise InputError(f"LegConfig.{name} must be five gains, got {shown(gains)}")
+                raise InputError(f"LegConfig.{name} must be five gains, got {short_repr(gains)}")
 
 
 def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:

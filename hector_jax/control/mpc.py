@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rot_z
-from hector_jax.core.inputs import POSITIVE, SOME, check
+from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp.solve import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.robot import srbm
@@ -56,8 +56,8 @@ class MpcConfig:
     def __post_init__(self) -> None:
         check(
             self,
-            horizon=SOME,
-            step_ticks=SOME,
+            horizon=AT_LEAST_ONE,
+            step_ticks=AT_LEAST_ONE,
             friction=POSITIVE,
             max_force=POSITIVE,
             effort_about=("zero", "weight"),

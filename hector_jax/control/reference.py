@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
-from hector_jax.core.inputs import InputError, did_you_mean, shown
+from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot
 
@@ -80,7 +80,7 @@ def named_command(name: str) -> Command:
     """
     if name not in _PIECES:
         raise InputError(
-            f"unknown trajectory {shown(name)}{did_you_mean(name, _PIECES)}; "
+            f"unknown trajectory {short_repr(name)}{did_you_mean(name, _PIECES)}; "
             f"known: {', '.join(_PIECES)}"
         )
     seconds, velocity, rates = _PIECES[name]

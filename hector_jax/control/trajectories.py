@@ -22,7 +22,7 @@ import numpy as np
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
-from hector_jax.core.inputs import InputError, Interval, check, from_table, read_toml, shown
+from hector_jax.core.inputs import InputError, Range, check, from_table, read_toml, short_repr
 from hector_jax.robot.model import Robot
 
 _MOST_SECONDS = 600.0
@@ -50,15 +50,15 @@ class Segment:
     yaw_rate: float = 0.0  # [rad/s]
 
     RULES: ClassVar = {
-        "seconds": Interval(_GRID, _MOST_SECONDS),
-        **dict.fromkeys(("v_x", "v_y", "yaw_rate"), Interval(-_FASTEST, _FASTEST)),
+        "seconds": Range(_GRID, _MOST_SECONDS),
+        **dict.fromkeys(("v_x", "v_y", "yaw_rate"), Range(-_FASTEST, _FASTEST)),
     }
 
     def __post_init__(self) -> None:
         check(self, **self.RULES)
         if abs(self.seconds / _GRID - round(self.seconds / _GRID)) > 1e-6:
             raise InputError(
-                f"Segment.seconds must be a multiple of {_GRID} s, got {shown(self.seconds)}"
+                f"Segment.seconds must be a multiple of {_GRID} s, got {short_repr(self.seconds)}"
             )
 
 
@@ -72,7 +72,7 @@ class _File:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}", self.name):
             raise InputError(
                 "name must be 1 to 40 letters, digits, - or _, the first neither - nor _, "
-                f"got {shown(self.name)}"
+                f"got {short_repr(self.name)}"
             )
         if self.name in (*COMMANDS, *UNSEEN, "all"):
             raise InputError(f"name must not be that of a built-in trajectory, got {self.name!r}")

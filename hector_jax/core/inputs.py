@@ -31,7 +31,7 @@ class InputError(ValueError):
 
 
 @dataclass(frozen=True)
-class Interval:
+class Range:
     """Finite numbers from `low` to `high`, both allowed."""
 
     low: int | float = -math.inf
@@ -52,14 +52,14 @@ class Interval:
         return " and ".join(parts) or "that is finite"
 
 
-POSITIVE = Interval(0.0, above=True)
-NOT_NEGATIVE = Interval(0.0)
-SHARE = Interval(0.0, 1.0)
-SOME = Interval(1)  # a number of things, at least one
-SEED = Interval(0, 2**32 - 1)
+POSITIVE = Range(0.0, above=True)
+NOT_NEGATIVE = Range(0.0)
+SHARE = Range(0.0, 1.0)
+AT_LEAST_ONE = Range(1)  # a number of things, at least one
+SEED = Range(0, 2**32 - 1)
 
 
-Rule = Interval | tuple[str, ...] | Enum
+Rule = Range | tuple[str, ...] | Enum
 """What is allowed beyond a type: numbers, or words; a member of an `Enum` is for the caller."""
 
 
@@ -69,7 +69,7 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """A value as it came, on one line and not longer than a line."""
     try:
         text = " ".join(repr(value).split())
@@ -102,7 +102,7 @@ def _words(choices: Iterable[str]) -> str:
     return f"{', '.join(others)} or {last}" if others else last
 
 
-def problem(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
+def validation_error(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
     """What is wrong with a value, `must be ..., got ...`; None where nothing is.
 
     Args:
@@ -112,39 +112,43 @@ def problem(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
         rule: what is allowed of numbers or words; without one, numbers have to be finite.
     """
     if typing.get_origin(kind) is typing.Annotated:
-        return problem(value, *typing.get_args(kind)[:2])
+        return validation_error(value, *typing.get_args(kind)[:2])
     if typing.get_origin(kind) is typing.Literal:
-        return problem(value, str, typing.get_args(kind))
+        return validation_error(value, str, typing.get_args(kind))
     if isinstance(kind, types.UnionType):
         kinds = typing.get_args(kind)
-        found = [problem(value, one, rule) for one in kinds if one is not types.NoneType]
+        found = [validation_error(value, one, rule) for one in kinds if one is not types.NoneType]
         missing = value is None and types.NoneType in kinds
         return None if missing or None in found else found[0]
     if typing.get_origin(kind) is tuple:
         if not isinstance(value, tuple):
-            return f"must be a tuple, got {shown(value)}"
+            return f"must be a tuple, got {short_repr(value)}"
         of = typing.get_args(kind)[0]
-        found = [told for one in value if (told := problem(one, of, rule))]
-        return f"{found[0]} in {shown(value)}" if found else None
+        found = [told for one in value if (told := validation_error(one, of, rule))]
+        return f"{found[0]} in {short_repr(value)}" if found else None
     return _simple_problem(value, kind, rule)
 
 
 def _simple_problem(value: Any, kind: Any, rule: Rule | None) -> str | None:
     if kind is bool:
-        return None if isinstance(value, bool) else f"must be true or false, got {shown(value)}"
+        return (
+            None if isinstance(value, bool) else f"must be true or false, got {short_repr(value)}"
+        )
     if kind in (int, float):
         number, name = (Integral, "a whole number") if kind is int else (Real, "a number")
-        allowed = rule if isinstance(rule, Interval) else Interval()
+        allowed = rule if isinstance(rule, Range) else Range()
         try:
             fine = isinstance(value, number) and not isinstance(value, bool) and value in allowed
         except OverflowError:  # an integer that no float holds
             fine = False
-        return None if fine else f"must be {name} {allowed}, got {shown(value)}"
+        return None if fine else f"must be {name} {allowed}, got {short_repr(value)}"
     if kind is str and isinstance(rule, tuple):
         hint = did_you_mean(value, rule) if isinstance(value, str) else ""
-        return None if value in rule else f"must be {_words(rule)}, got {shown(value)}{hint}"
+        return None if value in rule else f"must be {_words(rule)}, got {short_repr(value)}{hint}"
     if isinstance(kind, type) and not isinstance(value, kind):
-        return f"must be {'words' if kind is str else f'a {kind.__name__}'}, got {shown(value)}"
+        return (
+            f"must be {'words' if kind is str else f'a {kind.__name__}'}, got {short_repr(value)}"
+        )
     return None
 
 
@@ -155,7 +159,7 @@ def check(settings: Any, /, **rules: Rule) -> None:
         InputError: `CLASS.FIELD must be ..., got ...`.
     """
     for field in dataclasses.fields(settings):
-        told = problem(getattr(settings, field.name), field.type, rules.get(field.name))
+        told = validation_error(getattr(settings, field.name), field.type, rules.get(field.name))
         if told:
             raise InputError(f"{type(settings).__name__}.{field.name} {told}")
 
@@ -166,7 +170,7 @@ def choose(name: str, word: str, choices: Iterable[str]) -> str:
     Raises:
         InputError: `NAME must be ..., got ...`.
     """
-    if told := problem(word, str, tuple(choices)):
+    if told := validation_error(word, str, tuple(choices)):
         raise InputError(f"{name} {told}")
     return word
 
@@ -258,11 +262,11 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
     """
     fields = {field.name: field for field in dataclasses.fields(kind)}
     if not isinstance(table, Mapping):
-        raise InputError(f"{where} must be a table of {', '.join(fields)}, got {shown(table)}")
+        raise InputError(f"{where} must be a table of {', '.join(fields)}, got {short_repr(table)}")
     for name in table:
         if name not in fields:
             raise InputError(
-                f"{where}: unknown field {shown(name)}{did_you_mean(name, fields)}; "
+                f"{where}: unknown field {short_repr(name)}{did_you_mean(name, fields)}; "
                 f"known: {', '.join(fields)}"
             )
     for name, field in fields.items():
@@ -271,7 +275,7 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
     values = {name: _value(f"{where}: {name}", fields[name].type, x) for name, x in table.items()}
     rules = getattr(kind, "RULES", {})
     for name, value in values.items():
-        if told := problem(value, fields[name].type, rules.get(name)):
+        if told := validation_error(value, fields[name].type, rules.get(name)):
             raise InputError(f"{where}: {name} {told}")
     try:
         return kind(**values)

@@ -28,7 +28,7 @@ from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.core.console import say
-from hector_jax.core.inputs import InputError, shown
+from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import srbm
@@ -350,7 +350,7 @@ def _read_collection(folder: Path) -> dict[str, Any]:
         card = json.loads(path.read_text())
         shards, settings = card["shards"], dict(card["settings"])
         if not shards or not all(re.fullmatch(r"shard-\d+\.npz", name) for name in shards):
-            raise ValueError(f"shards are {shown(shards)}")
+            raise ValueError(f"shards are {short_repr(shards)}")
     except FileNotFoundError:
         raise InputError(
             f"{folder}: no finished collection (no card.json); collect first"

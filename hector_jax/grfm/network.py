@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hector_jax.control.gait import GaitConfig, since_switch
-from hector_jax.core.inputs import InputError, Interval, problem, shown
+from hector_jax.core.inputs import InputError, Range, short_repr, validation_error
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import HISTORY, Effect, Window, sure
@@ -368,14 +368,14 @@ def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str
     card = read_card(path)
     kinds = {f"grfm-{name}": name for name in ([variant] if variant else VARIANTS)}
     if card["kind"] not in kinds:
-        held = shown(card["kind"])[1:-1]
+        held = short_repr(card["kind"])[1:-1]
         raise InputError(f"{path}: holds {held}, expected {' or '.join(kinds)}")
     hidden = card["about"].get("hidden")
     sizes = hidden if isinstance(hidden, list) and 1 <= len(hidden) <= _DEEPEST else [None]
-    if any(problem(size, int, Interval(1, _WIDEST)) for size in sizes):
+    if any(validation_error(size, int, Range(1, _WIDEST)) for size in sizes):
         raise InputError(
             f"{path}: about.hidden must be 1 to {_DEEPEST} whole numbers from 1 to {_WIDEST}, "
-            f"got {shown(hidden)}"
+            f"got {short_repr(hidden)}"
         )
     return kinds[card["kind"]], card
 

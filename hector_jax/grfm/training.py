@@ -21,7 +21,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Key
 
-from hector_jax.core.inputs import NOT_NEGATIVE, POSITIVE, SEED, SOME, InputError, check
+from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED, InputError, check
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import Dataset, with_mirror
 from hector_jax.grfm.effect import Window
@@ -59,8 +59,8 @@ class TrainConfig:
         check(
             self,
             variant=VARIANTS,
-            epochs=SOME,
-            batch=SOME,
+            epochs=AT_LEAST_ONE,
+            batch=AT_LEAST_ONE,
             learning_rate=POSITIVE,
             l2=NOT_NEGATIVE,
             seed=SEED,

@@ -65,7 +65,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Float, Int
 
-from hector_jax.core.inputs import POSITIVE, SOME, check
+from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.qp import pivot
 
 SAVED = "qp"
@@ -175,8 +175,8 @@ class QpConfig:
             self,
             solver=("interior_point", "jaxopt"),
             tolerance=POSITIVE,
-            active_set_tries=SOME,
-            max_iterations=SOME,
+            active_set_tries=AT_LEAST_ONE,
+            max_iterations=AT_LEAST_ONE,
             ratio_cap=POSITIVE,
         )
 

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, vector_to_weights
 from hector_jax.core import inputs
-from hector_jax.core.inputs import InputError, shown
+from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.report.report import VOID, change_text
 from hector_jax.robot.model import Robot
 from hector_jax.runs.metrics import BASELINES, Interval
@@ -174,7 +174,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """
     found = inputs.read_json(path, "a file of a run of `hector tune`", _MOST_BYTES)
     if not isinstance(found, dict):
-        raise InputError(f"{path}: expected a JSON object, got {shown(found)}")
+        raise InputError(f"{path}: expected a JSON object, got {short_repr(found)}")
     return found
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
 from hector_jax.control.weights import Weights
-from hector_jax.core.inputs import POSITIVE, SOME, InputError, check, shown
+from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, InputError, check, short_repr
 from hector_jax.report.report import markdown_table
 from hector_jax.runs.metrics import FALL_MARGIN, Interval, Score, bootstrap
 from hector_jax.sim.changes import Change
@@ -77,12 +77,12 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         trajectories = (*COMMANDS, *UNSEEN)
-        check(self, traj=trajectories, forces=POSITIVE, frictions=POSITIVE, phases=SOME)
+        check(self, traj=trajectories, forces=POSITIVE, frictions=POSITIVE, phases=AT_LEAST_ONE)
         for name in ("forces", "frictions"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise InputError(
-                    f"SceneConfig.{name} must differ, at least one, got {shown(values)}"
+                    f"SceneConfig.{name} must differ, at least one, got {short_repr(values)}"
                 )
 
 

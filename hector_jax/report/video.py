@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.console import Broken
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import SOME, InputError, Interval, check, choose
+from hector_jax.core.inputs import AT_LEAST_ONE, InputError, Range, check, choose
 from hector_jax.core.trajectory import State, Trajectory, from_start
 from hector_jax.report.plots import distances, named
 from hector_jax.robot.model import Robot
@@ -61,8 +61,8 @@ class VideoConfig:
     tiles: int = 6  # pictures in a row of the strip
 
     def __post_init__(self) -> None:
-        size = Interval(64, 8192)
-        check(self, width=size, height=size, rate=SOME, tiles=SOME)
+        size = Range(64, 8192)
+        check(self, width=size, height=size, rate=AT_LEAST_ONE, tiles=AT_LEAST_ONE)
         for name in ("width", "height"):
             if getattr(self, name) % 4:
                 raise InputError(

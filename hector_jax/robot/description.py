@@ -24,7 +24,14 @@ from typing import Any
 
 import jax
 
-from hector_jax.core.inputs import POSITIVE, InputError, did_you_mean, problem, read_toml, shown
+from hector_jax.core.inputs import (
+    POSITIVE,
+    InputError,
+    did_you_mean,
+    read_toml,
+    short_repr,
+    validation_error,
+)
 from hector_jax.core.trajectory import MAX_TILT, MIN_HEIGHT
 
 _PACKAGE = Path(__file__).parents[1]
@@ -110,7 +117,7 @@ def read_description(path: Path) -> Description:
     axes = _text(path, joints, "axes", "joints.", HECTOR_AXES)
     if sorted(axes) != sorted(HECTOR_AXES):
         raise InputError(
-            f"{path}: joints.axes is {shown(axes)}, expected {HECTOR_AXES!r} in the "
+            f"{path}: joints.axes is {short_repr(axes)}, expected {HECTOR_AXES!r} in the "
             "order of the leg"
         )
     limits, weights = _table(path, told, "limits"), _table(path, told, "weights")
@@ -158,13 +165,13 @@ def _known(path: Path, table: Mapping[str, Any], names: tuple[str, ...], prefix:
     for key in table:
         if key not in names:
             raise InputError(
-                f"{path}: unknown key {shown(prefix + key)}{did_you_mean(key, names)}; "
+                f"{path}: unknown key {short_repr(prefix + key)}{did_you_mean(key, names)}; "
                 f"known: {', '.join(names)}"
             )
 
 
 def _wrong(path: Path, name: str, got: Any, expected: str) -> InputError:
-    return InputError(f"{path}: {name} is {shown(got)}, expected {expected}")
+    return InputError(f"{path}: {name} is {short_repr(got)}, expected {expected}")
 
 
 def _table(path: Path, told: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -220,7 +227,7 @@ def _feet(path: Path, feet: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
 
 
 def _positive(value: Any) -> bool:
-    return problem(value, float, POSITIVE) is None
+    return validation_error(value, float, POSITIVE) is None
 
 
 def _limit(path: Path, table: Mapping[str, Any], key: str, default: float) -> float:

@@ -16,11 +16,11 @@ from hector_jax.core.inputs import (
     NOT_NEGATIVE,
     POSITIVE,
     InputError,
-    Interval,
+    Range,
     did_you_mean,
     one_line,
     read_text,
-    shown,
+    short_repr,
 )
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples, whatever the robot
@@ -39,9 +39,9 @@ _PARTS_FROM_ELSEWHERE = (
 )
 _FOLDERS = ("assetdir", "meshdir", "texturedir")
 
-_COUNT = Interval(-1, 1_000_000)  # -1: as many as it takes
-_PIXELS = Interval(0, 8192)
-_RANGES: Mapping[str, Interval] = {
+_COUNT = Range(-1, 1_000_000)  # -1: as many as it takes
+_PIXELS = Range(0, 8192)
+_RANGES: Mapping[str, Range] = {
     "mass": NOT_NEGATIVE,
     "density": NOT_NEGATIVE,
     "diaginertia": POSITIVE,
@@ -51,8 +51,8 @@ _RANGES: Mapping[str, Interval] = {
     "friction": NOT_NEGATIVE,
     "margin": NOT_NEGATIVE,
     "size": NOT_NEGATIVE,
-    "iterations": Interval(1, 1000),
-    "ls_iterations": Interval(1, 1000),
+    "iterations": Range(1, 1000),
+    "ls_iterations": Range(1, 1000),
     "width": _PIXELS,
     "height": _PIXELS,
     "offwidth": _PIXELS,
@@ -60,7 +60,7 @@ _RANGES: Mapping[str, Interval] = {
     "nrow": _PIXELS,
     "ncol": _PIXELS,
     "shadowsize": _PIXELS,
-    "offsamples": Interval(0, 64),
+    "offsamples": Range(0, 64),
     **dict.fromkeys(("njmax", "nconmax", "nkey", "nstack", "nuserdata"), _COUNT),
     **dict.fromkeys((f"nuser_{x}" for x in ("body", "jnt", "geom", "site", "actuator")), _COUNT),
 }
@@ -89,7 +89,7 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     bodies = 0
     for element, label in _labelled(path, root):
         if element.tag in _PARTS_FROM_ELSEWHERE:
-            of = f" of {shown(element.get('file'))}" if "file" in element.attrib else ""
+            of = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
             raise InputError(
                 f"{path}: <{element.tag}>{of} is not accepted, expected one self-contained file"
             )
@@ -97,7 +97,7 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         for name, value in element.attrib.items():
             told = _problem(element.tag, name, value)
             if told:
-                raise InputError(f"{path}: {label}: {name} is {shown(value)}, expected {told}")
+                raise InputError(f"{path}: {label}: {name} is {short_repr(value)}, expected {told}")
     if bodies > _MOST_BODIES:
         raise InputError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
     _check_files(path, root)
@@ -133,9 +133,9 @@ def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTr
             name, of = child.get("name"), parent.get("name") or parent.get("class")
             label = f"<{child.tag}>"
             if name:
-                label += f" {shown(name)}"
+                label += f" {short_repr(name)}"
             elif of:
-                label += f" of {shown(of)}"
+                label += f" of {short_repr(of)}"
             yield child, label
 
 
@@ -153,7 +153,7 @@ def _problem(tag: str, name: str, value: str) -> str | None:
     allowed = _RANGES_OF.get((tag, name)) or _RANGES.get(name)
     if allowed and (numbers is None or not all(number in allowed for number in numbers)):
         return f"numbers {allowed}"
-    if numbers and not all(number in Interval() for number in numbers):
+    if numbers and not all(number in Range() for number in numbers):
         return "finite numbers"
     paired = name in _PAIRS and tag != "light"  # whose range is a length
     if paired and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
@@ -187,7 +187,7 @@ def _check_files(path: Path, root: ElementTree.Element) -> None:
             if not there:
                 near = [p.name for place in places if place.is_dir() for p in place.iterdir()]
                 hint = did_you_mean(Path(value).name, near)
-                raise InputError(f"{path}: {label}: no file {shown(value)}{hint}")
+                raise InputError(f"{path}: {label}: no file {short_repr(value)}{hint}")
             if (size := there[0].stat().st_size) > _MOST_MESH_BYTES:
                 raise InputError(
                     f"{path}: {label}: {value} has {size / 1e6:.1f} MB, "
@@ -202,6 +202,6 @@ def _inside(path: Path, home: Path, place: Path, label: str, value: str) -> Path
         found = Path("/")
     if not found.is_relative_to(home):
         raise InputError(
-            f"{path}: {label} refers to {shown(value)}, expected a file in its own folder"
+            f"{path}: {label} refers to {short_repr(value)}, expected a file in its own folder"
         )
     return found

@@ -31,13 +31,13 @@ from hector_jax.grfm.training import History, TrainConfig
 from hector_jax.core.inputs import (
     POSITIVE,
     SEED,
-    SOME,
+    AT_LEAST_ONE,
     InputError,
     check,
     choose,
     from_table,
     plural,
-    shown,
+    short_repr,
 )
 from hector_jax.grfm.effect import HISTORY, last_command
 from hector_jax.robot.model import Robot
@@ -102,7 +102,7 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         # devices stay unasked: their number may not be set up yet
-        check(self, walks=SOME, seconds=POSITIVE, seed=SEED, engine=ENGINES)
+        check(self, walks=AT_LEAST_ONE, seconds=POSITIVE, seed=SEED, engine=ENGINES)
         if self.walks < 3:
             raise InputError(
                 "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
@@ -112,7 +112,7 @@ class CollectConfig:
         if self.seconds < least:
             raise InputError(
                 f"CollectConfig.seconds must be at least {least:g} s, the {HISTORY} ticks of one "
-                f"sample, got {shown(self.seconds)}"
+                f"sample, got {short_repr(self.seconds)}"
             )
 
 

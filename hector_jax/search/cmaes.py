@@ -33,7 +33,7 @@ from hector_jax.control.weights import (
     moved,
     weights_to_vector,
 )
-from hector_jax.core.inputs import POSITIVE, SEED, SOME, InputError, Interval, check
+from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, SEED, InputError, Range, check
 from hector_jax.storage import append_file, write_file
 
 FORMAT = 1
@@ -49,7 +49,7 @@ class SearchConfig:
     spread: float = 1.0  # first standard deviation of each log-weight
 
     def __post_init__(self) -> None:
-        check(self, budget=SOME, population=Interval(4), seed=SEED, spread=POSITIVE)
+        check(self, budget=AT_LEAST_ONE, population=Range(4), seed=SEED, spread=POSITIVE)
         if self.budget < self.population:
             raise InputError(
                 f"SearchConfig.budget must be at least the population, {self.population} walks, "

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, did_you_mean, shown
+from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import compile_model, quiet_mujoco
@@ -174,7 +174,8 @@ def named_world(name: str, seed: int = 0) -> Imperfections:
     """
     if name not in WORLDS:
         raise InputError(
-            f"unknown world {shown(name)}{did_you_mean(name, WORLDS)}; known: {', '.join(WORLDS)}"
+            f"unknown world {short_repr(name)}{did_you_mean(name, WORLDS)}; "
+            f"known: {', '.join(WORLDS)}"
         )
     return {"ideal": ideal, "hfs": hfs, "hfs-varied": lambda: hfs_varied(seed)}[name]()
 

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds, weights_to_vector
-from hector_jax.core.inputs import NOT_NEGATIVE, POSITIVE, SOME, InputError, check
+from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, InputError, check
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import LossConfig, Losses, LossWeights, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -57,8 +57,8 @@ class TuneConfig:
             beta_q=POSITIVE,
             beta_r=POSITIVE,
             update=("relative", "literal"),
-            iterations=SOME,
-            patience=SOME,
+            iterations=AT_LEAST_ONE,
+            patience=AT_LEAST_ONE,
             gain=NOT_NEGATIVE,
             smallest_step=POSITIVE,
             residual=POSITIVE,

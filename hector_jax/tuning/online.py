@@ -25,7 +25,7 @@ from jaxtyping import Array, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.walking import Feet, Measurement, Retune, measured_feet
 from hector_jax.control.weights import Weights
-from hector_jax.core.inputs import NOT_NEGATIVE, SHARE, InputError, Interval, check
+from hector_jax.core.inputs import NOT_NEGATIVE, SHARE, InputError, Range, check
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.grfm.effect import HISTORY
 from hector_jax.robot.model import Robot
@@ -49,7 +49,7 @@ class OnlineConfig:
     estimator: str = "carried"  # along measured states; "cut": begun anew in each window; "model"
 
     def __post_init__(self) -> None:
-        check(self, window=Interval(2), late=NOT_NEGATIVE, step=SHARE, estimator=ESTIMATORS)
+        check(self, window=Range(2), late=NOT_NEGATIVE, step=SHARE, estimator=ESTIMATORS)
         if self.late >= self.window:
             raise InputError(f"OnlineConfig.late must be below window, got {self.late}")
 

@@ -22,7 +22,7 @@ from hector_jax.control.reference import Anchor, Command, anchor_at, reference_a
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler
-from hector_jax.core.inputs import NOT_NEGATIVE, SOME, InputError, Interval, check
+from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, InputError, Range, check
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench, has_fallen
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.qp import solve as qp
@@ -41,7 +41,7 @@ class RolloutConfig:
     block: int = 500  # most ticks whose solves are stored; longer rollouts are computed twice
 
     def __post_init__(self) -> None:
-        check(self, ticks=Interval(2), lead=NOT_NEGATIVE, block=SOME)
+        check(self, ticks=Range(2), lead=NOT_NEGATIVE, block=AT_LEAST_ONE)
         if self.lead > -self.walk.gait.first_tick:
             raise InputError(
                 "RolloutConfig.lead must not reach back before the gait starts "
