@@ -192,10 +192,7 @@ def judged(
     seeds = range(first_seed, first_seed + len(plants))
     walks = pipeline.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title)
     score = partial(metrics.score, LossConfig())
-    return {
-        name: jax.tree.map(lambda *rows: np.stack(rows), *map(score, each))
-        for name, each in walks.items()
-    }
+    return {name: metrics.stack_scores([*map(score, each)]) for name, each in walks.items()}
 
 
 def million(x: Any) -> str:
@@ -389,7 +386,8 @@ def front(flags: Front) -> None:
     parts = final_parts(found)
     model = np.stack([tracking(parts.euler, parts.position), parts.control], axis=1)
     there = {
-        n: (float(tracking(s.L_Eul, s.L_pos)[0]), float(s.L_ctrl[0])) for n, s in scores.items()
+        n: (float(tracking(s.losses["L_Eul"], s.losses["L_pos"])[0]), float(s.losses["L_ctrl"][0]))
+        for n, s in scores.items()
     }
     rows = []
     for name, (track, control) in there.items():

@@ -144,13 +144,12 @@ def main() -> None:
         for key in groups
     }
     config, loss = WalkConfig(), LossConfig()
-    one, three = np.zeros(0), np.zeros((0, 3))
     with workers(flags.processes) as pool:
         walked = kept.walk_groups(
             {named[key]: group for key, group in groups.items()},
             partial(walk_many, pool, config, robot),
             partial(metrics.score, loss),
-            Score(one, one, one, one, one, three, three, one, one, one),
+            metrics.score_like(0),
             "robustness",
             robot,
             flags.out / "scores",
@@ -158,9 +157,7 @@ def main() -> None:
             "",
         )
     scores = {
-        (level, name): jax.tree.map(
-            lambda *rows: np.stack(rows), *(walked[named[level, name, seed]] for seed in seeds)
-        )
+        (level, name): metrics.stack_scores([walked[named[level, name, seed]] for seed in seeds])
         for level in asked
         for name in sets
     }

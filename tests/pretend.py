@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.runs.metrics import Score, Verdict
+from hector_jax.runs.metrics import Score, Verdict, stack_scores
 from hector_jax.tuning.difftune import Evaluation, Iteration
 from hector_jax.tuning.loss import LossConfig, Losses
 
@@ -91,8 +91,10 @@ def elsewhere(walk, place, yaw):
 
 def pretend_score(loss, fallen=False):
     """A score whose total is `loss`."""
+    losses = {"L_Eul": 4e-6 * loss, "L_pos": 2e-6 * loss, "L_ctrl": 0.2 * loss, "L": loss}
     return Score(
-        *(np.array(x) for x in (loss, 4e-6 * loss, 2e-6 * loss, 0.2 * loss, 0.15 * loss)),
+        losses={name: np.array(x) for name, x in losses.items()},
+        switching=np.array(0.15 * loss),
         rms_euler=np.array([0.02, 0.03, 0.01]),
         rms_position=np.array([0.02, 0.01, 0.005]),
         fallen=np.array(fallen),
@@ -112,7 +114,7 @@ def pretend_verdict(seeds=8, fallen=()):
             pretend_score(level[name] * plant[i] * np.exp(0.05 * row[i]), (name, i) in fallen)
             for i in range(seeds)
         ]
-        scores[name] = Score(*(np.stack(x) for x in zip(*rows, strict=True)))
+        scores[name] = stack_scores(rows)
     return Verdict(np.arange(seeds), scores, LossConfig())
 
 

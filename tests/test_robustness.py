@@ -24,7 +24,7 @@ from hector_jax.report.robustness import (
     scenes,
     table,
 )
-from hector_jax.runs.metrics import Score
+from hector_jax.runs.metrics import stack_scores
 from hector_jax.sim.world import hfs
 from hector_jax.storage import as_json
 
@@ -38,8 +38,7 @@ def scores(losses, fallen=()):
         [pretend_score(loss, (i, j) in fallen) for j, loss in enumerate(row)]
         for i, row in enumerate(losses)
     ]
-    stacked = [Score(*(np.stack(x) for x in zip(*row, strict=True))) for row in rows]
-    return Score(*(np.stack(x) for x in zip(*stacked, strict=True)))
+    return stack_scores([stack_scores(row) for row in rows])
 
 
 def test_pushes_come_from_eight_sides_at_all_phases_of_a_cycle():

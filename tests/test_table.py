@@ -25,7 +25,11 @@ def judged(seeds=4, fell=(), **levels):
         name: [pretend_score(level * w, (name, i) in fell) for i, w in enumerate(wobble)]
         for name, level in levels.items()
     }
-    return metrics.judge(LossConfig(), range(seeds), scores)
+    return metrics.make_verdict(LossConfig(), range(seeds), scores)
+
+
+def with_losses(score, **losses):
+    return score._replace(losses=score.losses | losses)
 
 
 GOOD = {"nominal": 5e6, "expert": 4e6, "searched": 2e6, "without": 3e6, "with": 1.5e6}
@@ -74,7 +78,7 @@ def test_the_bars_hold_where_the_losses_are_low_enough_and_fall_short_where_not(
     poor = judged(**GOOD | {"with": 3.2e6}, ceiling=1.4e6)
     for words in ("60 % below", "40 % below", "below `without`", "above `ceiling`"):
         assert holds(poor, words) is False, words
-    smooth = good.scores | {"with": good.scores["with"]._replace(L_ctrl=np.full(4, 9e5))}
+    smooth = good.scores | {"with": with_losses(good.scores["with"], L_ctrl=np.full(4, 9e5))}
     assert holds(good._replace(scores=smooth), "L_ctrl") is False
     assert holds(good, "L_ctrl") is True
 
@@ -86,7 +90,7 @@ def test_a_bar_is_open_where_its_set_was_not_walked():
 def test_below_without_needs_an_interval_clear_of_zero():
     verdict = judged(seeds=8, **GOOD)
     losses = verdict.scores["without"].L * np.array([0.5, 0.6, 0.7, 1.3, 0.8, 1.2, 0.9, 1.4])
-    scores = verdict.scores | {"with": verdict.scores["with"]._replace(L=losses)}
+    scores = verdict.scores | {"with": with_losses(verdict.scores["with"], L=losses)}
     found = lines({"s": verdict._replace(scores=scores)})["s", "with"].against["without"]
     change = found.change["L"]
     assert change.value < 0 < change.high
@@ -193,8 +197,7 @@ def test_every_fall_is_shown_and_the_comparison_marked(tmp_path):
 
 def test_a_set_that_falls_at_once_leaves_files_that_can_be_read(tmp_path):
     verdict = judged(fell={("with", i) for i in range(4)}, **GOOD)
-    lost = verdict.scores["with"]._replace(
-        L_ctrl=np.zeros(4),
+    lost = with_losses(verdict.scores["with"], L_ctrl=np.zeros(4))._replace(
         rms_euler=np.full((4, 3), np.nan),
         rms_position=np.full((4, 3), np.nan),
     )

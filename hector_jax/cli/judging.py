@@ -50,8 +50,8 @@ def evaluate(args: Evaluate) -> None:
 def verdict_of(
     loss: LossConfig, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
 ) -> Verdict:
-    """`metrics.judge`; says where a QP of the walks was not solved."""
-    verdict = metrics.judge(loss, seeds, scores)
+    """`metrics.make_verdict`; says where a QP of the walks was not solved."""
+    verdict = metrics.make_verdict(loss, seeds, scores)
     for name, score in verdict.scores.items():
         if score.residual.max() > SOLVED:
             worst = f"{score.residual.max():.0e}"
@@ -80,17 +80,18 @@ def walk(args: Walk) -> None:
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=settings(args))
     if args.json:
-        losses = {part: float(getattr(found, part)) for part in metrics.PARTS}
+        losses = {part: float(loss) for part, loss in found.losses.items()}
         errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}
         solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(found.residual)}
         # a walk that falls at once has no errors
         print(as_json({"seconds": upright, "fell": fell, **losses, **errors, **solved}))
     else:
+        units = metrics.UNITS.items()
+        parts = ", ".join(f"{part} {found.losses[part]:.4g} {unit}" for part, unit in units)
         end = "fell after" if fell else "ended after" if found.fallen else "walked"
         print(
             f"{wanted.name} in {args.world}, {printable(args.weights)} weights: {end} "
-            f"{upright:.2f} s; L {found.L / 1e6:.3f}e6 (L_Eul {found.L_Eul:.2f} rad^2, "
-            f"L_pos {found.L_pos:.2f} m^2, L_ctrl {found.L_ctrl / 1e6:.3f}e6)"
+            f"{upright:.2f} s; L {found.L / 1e6:.3f}e6 ({parts})"
         )
         cm, degrees = 100 * found.rms_position, np.degrees(found.rms_euler)
         print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")

@@ -269,7 +269,7 @@ def _walk_sets(
 
 def _verdict(plan: _Plan, judged: Judged) -> Verdict:
     scores = {name: [walk.score for walk in walks] for name, walks in judged.walks.items()}
-    return metrics.judge(plan.tune.loss, plan.seeds, scores)
+    return metrics.make_verdict(plan.tune.loss, plan.seeds, scores)
 
 
 def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:

@@ -27,7 +27,6 @@ from hector_jax.runs.metrics import (
     Interval,
     Verdict,
     compare,
-    falls,
     mean,
     rms,
 )
@@ -199,7 +198,10 @@ def _terminal_table(verdict: Verdict, padding: int) -> Table:
         table.add_column(f"against {baseline}\n[%]", justify="right", no_wrap=True)
     for name in verdict.scores:
         means = [columns[part][1](mean(verdict, name, part).value) for part in order]
-        fell = Text(str(falls(verdict, name)), style="red" if falls(verdict, name) else "")
+        fell = Text(
+            str(int(verdict.scores[name].fallen.sum())),
+            style="red" if int(verdict.scores[name].fallen.sum()) else "",
+        )
         changes = [_terminal_change(_compared(verdict, name, b)) for b in _baselines(verdict)]
         table.add_row(name, *means, fell, *changes)
     return table
@@ -356,7 +358,8 @@ def _summary(verdict: Verdict) -> str:
             for baseline in BASELINES
             if (comparison := _compared(verdict, name, baseline)) is not None
         ]
-        fell = f"the robot fell on {falls(verdict, name)} of {plural(len(verdict.seeds), 'plant')}"
+        count = int(verdict.scores[name].fallen.sum())
+        fell = f"the robot fell on {count} of {plural(len(verdict.seeds), 'plant')}"
         told.append(f"Tuned {how[name]} (`{name}`), the loss is {' and '.join(clauses)}; {fell}.")
     return " ".join(told)
 
@@ -385,7 +388,7 @@ def verdict_table(verdict: Verdict) -> str:
             row.append(columns[part][1](mean(verdict, name, part).value))
         row += [
             mean(verdict, name).text(columns["L"][1]),
-            f"{falls(verdict, name)} / {len(verdict.seeds)}",
+            f"{int(verdict.scores[name].fallen.sum())} / {len(verdict.seeds)}",
         ]
         for baseline in _baselines(verdict):
             row += _verdict_cells(_compared(verdict, name, baseline), len(verdict.seeds))
@@ -432,7 +435,7 @@ def _switching(verdict: Verdict) -> str:
     head = [f"L_ctrl{f' x1e{power}' if power else ''}", "whole", "at switches", "between them"]
     rows = []
     for name, score in verdict.scores.items():
-        whole, owed = float(score.L_ctrl.mean()), float(score.switching.mean())
+        whole, owed = float(score.losses["L_ctrl"].mean()), float(score.switching.mean())
         rows.append([name, write(whole), write(owed), write(whole - owed)])
     return (
         markdown_table(head, rows)

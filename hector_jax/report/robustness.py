@@ -20,7 +20,7 @@ from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_comman
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, InputError, check, short_repr
 from hector_jax.report.report import markdown_table
-from hector_jax.runs.metrics import FALL_MARGIN, Interval, Score, bootstrap
+from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
 from hector_jax.sim.changes import Change
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push
@@ -155,13 +155,12 @@ def judge(scores: Score, baseline: Score) -> Cell:
     """
     stood, ratio = ~scores.fallen, scores.L / baseline.L
 
-    gap = abs(scores.fallen.mean() - baseline.fallen.mean())
     return Cell(
         survived=bootstrap(partial(np.mean, axis=(-2, -1)), stood),
         ratio=bootstrap(partial(np.median, axis=(-2, -1)), ratio),
         falls=int(scores.fallen.sum()),
         walks=scores.fallen.size,
-        counts=bool(gap < FALL_MARGIN - 1e-12),
+        counts=falls_comparable(scores.fallen, baseline.fallen),
     )
 
 

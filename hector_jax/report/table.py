@@ -154,7 +154,7 @@ def lines(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Line]:
             others += ["with", "ceiling"] if name == "with_walks" else []
             found[trajectory, name] = Line(
                 {part: metrics.mean(verdict, name, part) for part in _ORDER},
-                metrics.falls(verdict, name),
+                int(verdict.scores[name].fallen.sum()),
                 len(verdict.seeds),
                 {
                     other: metrics.compare(verdict, name, other)
@@ -507,7 +507,7 @@ def _result(table: Table, found: Mapping[tuple[str, str], Line]) -> dict[str, An
     for trajectory, verdict in table.verdicts.items():
         one = metrics.as_result(verdict)
         for name, score in verdict.scores.items():
-            by_seed = {part: getattr(score, part).tolist() for part in PARTS}
+            by_seed = {part: score.losses[part].tolist() for part in PARTS}
             by_seed["fallen"] = score.fallen.astype(bool).tolist()
             one["sets"][name]["standin"]["by_seed"] = by_seed
         one["against"] = {

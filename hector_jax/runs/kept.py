@@ -169,8 +169,7 @@ def _walked(config: LossConfig, walk: Trajectory, commit: str) -> Walked:
 
 def _walked_like() -> tuple[Score, np.ndarray, State]:
     one, three = np.zeros(()), np.zeros(3)
-    score = Score(one, one, one, one, one, three, three, one, one, one)
-    return score, one, State(three, three, three, three)
+    return metrics.score_like(), one, State(three, three, three, three)
 
 
 def _trajectory_like() -> Trajectory:

@@ -1,10 +1,10 @@
-"""Who walks better, and how sure are we: scores of walks, paired over seeds.
+"""Which weight set walks better, and how sure that is: scores of walks, paired over seeds.
 
-A walk becomes a `Score`, the scores of one weight set over the seeds of a world are stacked, and a
-`Verdict` holds those of all sets. The headline is the median over seeds of the ratio of two sets'
-losses on the same seed (the same plant), told as a change in %; means stand beside it. Intervals
-are percentile bootstraps over seeds: plants are redrawn, both sets with them; fewer than four have
-none.
+Each walk has a `Score`. The scores of one weight set over the seeds of a world are stacked, and a
+`Verdict` holds those of all sets. The headline is the median over seeds of the ratio of the losses
+of two sets on the same seed (the same plant), as a change in %; means stand beside it. Intervals
+are percentile bootstraps over seeds: plants are redrawn, each with the walks of both sets. Fewer
+than four plants have no interval.
 
 A fall stays in the numbers, charged as the loss charges it. A comparison counts only where neither
 set falls more often than the other by 2 of 32 seeds or the same share of fewer.
@@ -22,28 +22,31 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning.loss import LossConfig, losses, switch_loss, total
 
 BASELINES = ("nominal", "expert")
-PARTS = ("L", "L_Eul", "L_pos", "L_ctrl")
+UNITS = {"L_Eul": "rad^2", "L_pos": "m^2", "L_ctrl": "N^2, (N m)^2"}
+"""Units of the parts of the loss, by their names, in the order of `Losses`."""
+PARTS = (*UNITS, "L")
 
-COVERAGE = 0.95
-RESAMPLES, FEWEST = 10_000, 4  # draws; samples that have an interval
+COVERAGE = 0.95  # of an interval
+RESAMPLES, FEWEST = 10_000, 4  # resamples of a bootstrap; samples that have an interval
 FALL_MARGIN = 2 / 32  # a difference in the share of falls from here on makes losses incomparable
 
 _TINY = 1e-9
 
 
 class Score(NamedTuple):
-    """What one walk, or with a first axis each of several, is worth; losses of parts unweighted."""
+    """Losses and errors of one walk or, with a first axis, of several."""
 
-    L: Float[np.ndarray, "*seeds"]  # with the loss weights
-    L_Eul: Float[np.ndarray, "*seeds"]  # [rad^2]
-    L_pos: Float[np.ndarray, "*seeds"]  # [m^2]
-    L_ctrl: Float[np.ndarray, "*seeds"]  # [N^2 and (N m)^2]
-    switching: Float[np.ndarray, "*seeds"]  # the share of L_ctrl owed at changes of stance
+    losses: dict[str, Float[np.ndarray, "*seeds"]]  # L and its parts, these without their weights
+    switching: Float[np.ndarray, "*seeds"]  # the share of L_ctrl due to changes of stance
     rms_euler: Float[np.ndarray, "*seeds 3"]  # roll, pitch, yaw [rad], up to a fall
     rms_position: Float[np.ndarray, "*seeds 3"]  # x, y, z [m], up to a fall
     fallen: Bool[np.ndarray, "*seeds"]
     legs_touch: Float[np.ndarray, "*seeds"]  # [s] one leg touches the other, up to a fall
-    residual: Float[np.ndarray, "*seeds"]  # worst relative KKT residual of a plan
+    residual: Float[np.ndarray, "*seeds"]  # largest relative KKT residual of a plan
+
+    @property
+    def L(self) -> Float[np.ndarray, "*seeds"]:  # noqa: D102
+        return self.losses["L"]
 
 
 class Interval(NamedTuple):
@@ -54,16 +57,16 @@ class Interval(NamedTuple):
     high: float
 
     def text(self, write: Callable[[float], str]) -> str:
-        """`value [low, high]`, each as `write` has it; the value alone without an interval."""
+        """`value [low, high]`, each formatted by `write`; without an interval the value alone."""
         ends = f" [{write(self.low)}, {write(self.high)}]" if np.isfinite(self.low) else ""
         return write(self.value) + ends
 
 
 class Comparison(NamedTuple):
-    """One set against a baseline on the same seeds."""
+    """One set against another on the same seeds."""
 
     change: dict[str, Interval]  # by part: median of the paired ratio, as a change in %
-    wins: float  # share of seeds on which the set's L is below the baseline's
+    wins: float  # share of seeds on which the set's L is below the other's
     counts: bool  # neither falls more often than the other allows
 
 
@@ -75,8 +78,16 @@ class Verdict(NamedTuple):
     alpha: LossConfig
 
 
+class Summary(NamedTuple):
+    """One set of a verdict."""
+
+    means: dict[str, Interval]  # over seeds, by part
+    falls: int  # seeds on which it falls
+    against: dict[str, Comparison]  # by the other set
+
+
 def score(config: LossConfig, walk: Trajectory) -> Score:
-    """Losses, falls and tracking errors of one walk of any world.
+    """Compute losses, falls and tracking errors of one walk of any world.
 
     Args:
         config: weights of the loss.
@@ -86,25 +97,37 @@ def score(config: LossConfig, walk: Trajectory) -> Score:
     """
     parts = losses(walk)
     fallen = np.asarray(walk.fallen)
-    whole = jax.tree.map(lambda x: np.asarray(x, float), (total(config, parts), parts))
+    named = dict(zip(PARTS, (*parts, total(config, parts)), strict=True))
     return Score(
-        whole[0],
-        *whole[1],
+        losses={part: np.asarray(loss, float) for part, loss in named.items()},
         switching=np.asarray(switch_loss(walk), float),
-        rms_euler=_rms(np.asarray(walk.state.euler) - walk.reference.euler, fallen),
-        rms_position=_rms(np.asarray(walk.state.position) - walk.reference.position, fallen),
+        rms_euler=_rms(np.asarray(walk.state.euler) - walk.reference.euler, ~fallen),
+        rms_position=_rms(np.asarray(walk.state.position) - walk.reference.position, ~fallen),
         fallen=np.asarray(fallen.any()),
         legs_touch=np.asarray(float(walk.period) * np.sum(np.asarray(walk.legs_touch) & ~fallen)),
         residual=np.asarray(walk.residual, float).max(),
     )
 
 
-def _rms(error: Float[np.ndarray, "T 3"], fallen: Bool[np.ndarray, " T"]) -> np.ndarray:
-    walked = error[~fallen]
-    return np.sqrt(np.mean(walked**2, axis=0)) if len(walked) else np.full(3, np.nan)
+def score_like(*axes: int) -> Score:
+    """Return a score of zeros with some first axes, for `storage.load_tree`."""
+    one, three = np.zeros(axes), np.zeros((*axes, 3))
+    return Score(dict.fromkeys(PARTS, one), one, three, three, one.astype(bool), one, one)
 
 
-def judge(
+def stack_scores(scores: Sequence[Score]) -> Score:
+    """Stack scores along a new first axis."""
+    return jax.tree.map(lambda *rows: np.stack(rows), *scores)
+
+
+def _rms(
+    error: Float[np.ndarray, "T 3"], rows: Bool[np.ndarray, " T"]
+) -> Float[np.ndarray, "3"]:
+    """Root mean square over some rows; NaN where there are none."""
+    return np.sqrt(np.mean(error[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
+
+
+def make_verdict(
     config: LossConfig, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
 ) -> Verdict:
     """Put the walks of all sets together.
@@ -115,7 +138,7 @@ def judge(
         scores: by set, one score per seed.
 
     Raises:
-        ValueError: no seeds, a set with another number of walks, a loss that is not a number.
+        ValueError: no seeds, a set with another number of walks, a loss that is not finite.
     """
     if not len(seeds):
         raise ValueError("a verdict needs at least one seed, got none")
@@ -123,7 +146,7 @@ def judge(
     for name, walks in scores.items():
         if len(walks) != len(seeds):
             raise ValueError(f"set '{name}' has {len(walks)} walks for {len(seeds)} seeds")
-        stacked[name] = Score(*(np.stack(rows) for rows in zip(*walks, strict=True)))
+        stacked[name] = stack_scores(walks)
         wrong = [s for s, loss in zip(seeds, stacked[name].L, strict=True) if not np.isfinite(loss)]
         if wrong:
             raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")
@@ -131,7 +154,7 @@ def judge(
 
 
 def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:
-    """A statistic with its percentile bootstrap interval, the same each time.
+    """Compute a statistic with its percentile bootstrap interval, the same each time.
 
     Args:
         statistic: of arrays like `samples`, with any axes before theirs.
@@ -140,48 +163,64 @@ def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ...
     Returns:
         NaN as the ends of the interval of fewer than `FEWEST` samples.
 
-    >>> found = bootstrap(lambda x: np.median(x, axis=-1), np.array([1.0, 2.0, 3.0, 10.0]))
-    >>> found.low <= found.value == 2.5 <= found.high
+    >>> interval = bootstrap(lambda x: np.median(x, axis=-1), np.array([1.0, 2.0, 3.0, 10.0]))
+    >>> interval.low <= interval.value == 2.5 <= interval.high
     True
     """
     value, count = float(statistic(*samples)), len(samples[0])
     if count < FEWEST:
         return Interval(value, np.nan, np.nan)
-    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
-    tail = 50 * (1 - COVERAGE)
-    low, high = np.percentile(statistic(*(x[draws] for x in samples)), [tail, 100 - tail])
-    return Interval(value, float(low), float(high))
+    from scipy import stats  # takes most of a second to import
+
+    ends = stats.bootstrap(
+        (np.arange(count),),  # rows, so that all samples are redrawn in the same way
+        lambda rows, axis: statistic(*(x[rows] for x in samples)),
+        n_resamples=RESAMPLES,
+        confidence_level=COVERAGE,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return Interval(value, float(ends.low), float(ends.high))
 
 
-@lru_cache(maxsize=4096)  # a report tells the same interval in many places
-def _of_bytes(values: bytes, statistic: Callable[..., Any]) -> Interval:
+@lru_cache(maxsize=4096)  # table, report and JSON need the same intervals
+def _cached_bootstrap(values: bytes, statistic: Callable[..., Any]) -> Interval:
     return bootstrap(partial(statistic, axis=-1), np.frombuffer(values))
-
-
-def _over_seeds(values: Float[np.ndarray, " seeds"], statistic: Callable[..., Any]) -> Interval:
-    return _of_bytes(np.asarray(values, float).tobytes(), statistic)
 
 
 def mean(verdict: Verdict, name: str, part: str = "L") -> Interval:
     """Mean of a part of the loss over seeds."""
-    return _over_seeds(getattr(verdict.scores[name], part), np.mean)
+    return _cached_bootstrap(verdict.scores[name].losses[part].tobytes(), np.mean)
 
 
-def falls(verdict: Verdict, name: str) -> int:
-    """Number of seeds on which the set falls."""
-    return int(verdict.scores[name].fallen.sum())
+def falls_comparable(
+    ours: Bool[np.ndarray, "*walks"], others: Bool[np.ndarray, "*walks"]
+) -> bool:
+    """Whether neither of two sets falls so much more often that their losses do not compare."""
+    return bool(abs(ours.mean() - others.mean()) < FALL_MARGIN - 1e-12)
 
 
 def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
-    """A set against a baseline, seed by seed."""
+    """Compare a set with a baseline, seed by seed."""
     ours, theirs = verdict.scores[name], verdict.scores[baseline]
     change = {}
     for part in PARTS:
         # a walk that falls at once has no L_ctrl: keep its ratio a number
-        ratio = (getattr(ours, part) + _TINY) / (getattr(theirs, part) + _TINY)
-        change[part] = Interval(*(100.0 * (r - 1.0) for r in _over_seeds(ratio, np.median)))
-    gap = abs(ours.fallen.mean() - theirs.fallen.mean())
-    return Comparison(change, float(np.mean(ours.L < theirs.L)), bool(gap < FALL_MARGIN - 1e-12))
+        ratio = (ours.losses[part] + _TINY) / (theirs.losses[part] + _TINY)
+        median = _cached_bootstrap(ratio.tobytes(), np.median)
+        change[part] = Interval(*(100.0 * (r - 1.0) for r in median))
+    wins = float(np.mean(ours.L < theirs.L))
+    return Comparison(change, wins, falls_comparable(ours.fallen, theirs.fallen))
+
+
+def summarize(verdict: Verdict, name: str, others: Sequence[str] = BASELINES) -> Summary:
+    """Means and falls of a set, compared with those of some others that are in the verdict."""
+    against = [other for other in others if other in verdict.scores and other != name]
+    return Summary(
+        {part: mean(verdict, name, part) for part in PARTS},
+        int(verdict.scores[name].fallen.sum()),
+        {other: compare(verdict, name, other) for other in against},
+    )
 
 
 def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
@@ -199,41 +238,35 @@ def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
 
 
 def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        part: dict(zip(("mean", "low", "high"), mean(verdict, name, part), strict=True))
-        for part in PARTS
+    scores, summary = verdict.scores[name], summarize(verdict, name)
+    named_rms = zip(("euler", "position"), rms(verdict, name), strict=True)
+    return {
+        **{
+            part: dict(zip(("mean", "low", "high"), value, strict=True))
+            for part, value in summary.means.items()
+        },
+        "falls": summary.falls,
+        "seeds": verdict.seeds.tolist(),
+        "legs_touch": float(scores.legs_touch.sum()),
+        "residual": float(scores.residual.max()),
+        "L_ctrl_switching": float(scores.switching.mean()),
+        "rms": {key: values.tolist() for key, values in named_rms},
+        "change": {other: change_result(one) for other, one in summary.against.items()},
     }
-    one = verdict.scores[name]
-    found["falls"] = falls(verdict, name)
-    found["seeds"] = verdict.seeds.tolist()
-    found["legs_touch"] = float(one.legs_touch.sum())
-    found["residual"] = float(one.residual.max())
-    found["L_ctrl_switching"] = float(one.switching.mean())
-    found["rms"] = {
-        key: [x if np.isfinite(x) else None for x in values.tolist()]
-        for key, values in zip(("euler", "position"), rms(verdict, name), strict=True)
-    }
-    found["change"] = {}
-    for baseline in BASELINES:
-        if baseline in verdict.scores and baseline != name:
-            found["change"][baseline] = change_result(compare(verdict, name, baseline))
-    return found
 
 
 def change_result(comparison: Comparison) -> dict[str, Any]:
-    """A comparison as JSON values: the change of L, wins, counts, and the parts' changes."""
+    """A comparison as JSON values: the change of L, wins, counts, and the changes of the parts."""
     keys = ("median", "low", "high")
     rows = {p: dict(zip(keys, c, strict=True)) for p, c in comparison.change.items()}
     return rows.pop("L") | {"wins": comparison.wins, "counts": comparison.counts, "parts": rows}
 
 
-def _quadratic_mean(rms: Float[np.ndarray, "seeds 3"]) -> Float[np.ndarray, "3"]:
-    """RMS over the walks of all seeds but those that fell at once, which have none."""
-    known = rms[np.isfinite(rms).all(axis=-1)]
-    return np.sqrt(np.mean(known**2, axis=0)) if len(known) else np.full(3, np.nan)
-
-
 def rms(verdict: Verdict, name: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """RMS error over all seeds: roll, pitch, yaw [rad], and x, y, z [m]."""
-    one = verdict.scores[name]
-    return _quadratic_mean(one.rms_euler), _quadratic_mean(one.rms_position)
+    scores = verdict.scores[name]
+    # walks that fell at once have no errors
+    euler, position = (
+        _rms(x, np.isfinite(x).all(axis=-1)) for x in (scores.rms_euler, scores.rms_position)
+    )
+    return euler, position
