@@ -198,7 +198,7 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
     environment = os.environ | {"MUJOCO_GL": back_end, "PYTHONPATH": os.pathsep.join(places)}
     environment.pop("PYOPENGL_PLATFORM", None)
     # MuJoCo first, with this back end; the package would load it without any
-    program = "import mujoco; from hector_jax.evaluation import video; video.main()"
+    program = "import mujoco; from hector_jax.report import video; video.main()"
     command = [sys.executable, "-c", program, "request.npz"]
     try:
         done = subprocess.run(
