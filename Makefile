@@ -9,7 +9,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	>/dev/null 2>&1 && echo $$p && break; done)
 
 QUICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,footstep gait legs reference trajectories weights mpc walking \
-	qp pivot loss difftune rollout measured))
+	qp gpu_kernel loss difftune rollout measured))
 
 .PHONY: help setup tune table grfm ceiling test quick test-all bench check format docs lock
 

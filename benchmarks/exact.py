@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from benchmarks.problems import INPUTS, Ready
-from hector_jax.qp.solve import QP
+from hector_jax.qp import QP
 
 STEP = 1e-5  # of log-weights, rad, m, rad/s and m/s
 

@@ -39,7 +39,7 @@ from hector_jax.grfm import dataset, training
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.qp.solve import QpConfig, solve_qp
+from hector_jax.qp import QpConfig, solve_qp
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.export import controller, export_controller, load_controller
 from hector_jax.sim.parallel import walk_batch

@@ -30,7 +30,11 @@ PARTS = {
         " control/trajectories control/walking control/weights",
         "gait footstep legs reference trajectories weights config mpc walking rollout export",
     ),
-    "qp": ("qp/solve qp/pivot", "qp pivot mpc"),
+    "qp": (
+        "qp/problem qp/active_set qp/interior_point qp/certificates qp/method qp/derivative"
+        " qp/gpu_kernel",
+        "qp gpu_kernel mpc",
+    ),
     "tuning": (
         "tuning/batch tuning/difftune tuning/loss tuning/measured tuning/online tuning/rollout"
         " tuning/sensitivity search/cmaes",

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 
-from hector_jax.qp.solve import QP
+from hector_jax.qp import QP
 
 Compiled = Callable[[QP], np.ndarray]
 Traced = Callable[[QP], tuple[jax.Array, jax.Array]]

@@ -16,7 +16,7 @@ from hector_jax.control.mpc import Horizon, write_qp
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import Weights, expert, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State
-from hector_jax.qp.solve import QP
+from hector_jax.qp import QP
 from hector_jax.robot.model import Robot
 
 SLOTS = 1  # one foot stands at a time

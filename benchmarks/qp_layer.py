@@ -39,7 +39,7 @@ from benchmarks.problems import (
 from hector_jax.control.walking import WalkConfig
 from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State
-from hector_jax.qp.solve import QP, Status, solve_qp
+from hector_jax.qp import QP, Status, solve_qp
 from hector_jax.robot.model import Robot, load_robot
 
 BLOCKS = (slice(0, 12), slice(12, 24), slice(24, 36))  # Q, R, x_0 in `parameters`

@@ -7,7 +7,7 @@ import scipy.linalg
 from scipy.optimize import linprog
 
 from hector_jax.core.geometry import rot_z, skew
-from hector_jax.qp.solve import QP
+from hector_jax.qp import QP
 
 
 def dense_rows(A: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ DOORS = {
     "trimesh": ("report.view",),
     "flax": ("grfm.network",),
     "optax": ("grfm.training", "tuning.difftune", "search.rivals"),
-    "jaxopt": ("qp.solve",),
+    "jaxopt": ("qp.jaxopt_solver",),
     "cmaes": ("search.cmaes",),
     "sklearn": ("search.rivals",),
     "matplotlib": ("report.plots",),

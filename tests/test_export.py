@@ -25,7 +25,7 @@ from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, pack_wrench
-from hector_jax.qp.solve import QP, Status
+from hector_jax.qp import QP, Status
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import export
 from hector_jax.runs.export import (

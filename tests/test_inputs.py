@@ -26,7 +26,7 @@ from hector_jax.control.weights import expert
 from hector_jax.core.inputs import Range, did_you_mean, short_repr, validation_error
 from hector_jax.grfm import dataset, network
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.qp.solve import QpConfig
+from hector_jax.qp import QpConfig
 from hector_jax.report.robustness import SceneConfig
 from hector_jax.report.video import VideoConfig
 from hector_jax.robot.model import load_robot

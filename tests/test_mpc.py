@@ -18,7 +18,7 @@ from hector_jax.control.weights import (
 )
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
-from hector_jax.qp.solve import QP, Status
+from hector_jax.qp import QP, Status
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 

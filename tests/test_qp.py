@@ -18,8 +18,12 @@ from oracles import (
     walking_qp,
 )
 
-from hector_jax.qp import solve as qp_door
-from hector_jax.qp.solve import QP, QpConfig, Status, check_solved, solve_qp
+from hector_jax.qp import QP, QpConfig, Solver, Status, check_solved, gpu_kernel, solve_qp
+from hector_jax.qp.active_set import active_set
+from hector_jax.qp.active_set import first_guess as guess_from
+from hector_jax.qp.interior_point import approach, interior_point
+from hector_jax.qp.method import JAXOPT
+from hector_jax.qp.problem import Point, normalise
 
 WALKING = 500
 SHAPES = [(1, 4), (2, 6), (5, 12), (12, 30), (30, 40), (60, 90), (120, 100)]
@@ -431,6 +435,23 @@ def test_the_problem_may_be_measured_in_any_unit(walking):
     np.testing.assert_allclose(unit * solve(scaled).x, plain.x, atol=1e-6)
 
 
+def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking):
+    assert QpConfig(solver="jaxopt") == QpConfig(solver=JAXOPT)
+    assert hash(QpConfig(solver="jaxopt")) == hash(QpConfig(solver=JAXOPT))
+    called = []
+
+    def counted(*args, max_iterations):
+        called.append(max_iterations)
+        return approach(*args, max_iterations=max_iterations)
+
+    cold = Solver("interior_point", approach=counted, guess=None)
+    assert QpConfig(solver=cold) != QpConfig()  # of one name, but other functions: another program
+    some = stack(walking[:4])
+    found = solve_all(some, QpConfig(solver=cold, max_iterations=59))
+    assert set(called) == {59}
+    np.testing.assert_allclose(found.x, solve_all(some).x, atol=1e-6)
+
+
 def test_jaxopt_is_a_second_solver_behind_the_door(walking):
     config = QpConfig(solver="jaxopt")
     some = stack(walking[:4])
@@ -482,7 +503,7 @@ def test_forward_and_reverse_are_one_derivative(walking):
             assert abs(float(moved @ cotangent) - reverse) <= 1e-9 * scale
 
 
-FLOORS = qp_door._floors(QpConfig(), jnp.dtype(np.float64))
+TOLERANCES = QpConfig().tolerances(jnp.dtype(np.float64))
 
 
 def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
@@ -490,15 +511,15 @@ def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
     made = [general_qp(seed, 5, 12)[0] for seed in (16, 52, 104)]
 
     def evidence(qp):
-        normal, wanted = qp_door._normalise(FLOORS, qp), jnp.ones((), bool)
-        once, *_ = qp_door._interior_point(QpConfig(), FLOORS, normal, wanted)
-        again = qp_door._approach(QpConfig(), FLOORS, normal, wanted)
-        return jnp.max(qp_door._evidence(normal, once)), jnp.max(again.proof)
+        normal, always = normalise(TOLERANCES, qp), jnp.ones((), bool)
+        once, *_ = interior_point(TOLERANCES, normal, always, max_iterations=60)
+        again = approach(TOLERANCES, normal, always, max_iterations=60)
+        return jnp.max(normal.residuals(once)), jnp.max(again.residuals)
 
     far = stack([qp._replace(q=1e6 * qp.q) for qp in made])
     once, again = jax.jit(partial(jax.lax.map, evidence))(far)
     assert (np.asarray(once) > 1e-2).all()
-    assert (np.asarray(again) <= FLOORS.target).all()
+    assert (np.asarray(again) <= TOLERANCES.target).all()
 
 
 @pytest.mark.parametrize("times", [1e3, 1e6])
@@ -514,15 +535,15 @@ def as_on_a_gpu(monkeypatch):
     """Programs traced here take the branch of a GPU, its kernel interpreted."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
-    monkeypatch.setattr(qp_door.pivot, "guess", partial(qp_door.pivot.guess, interpret=True))
+    monkeypatch.setattr(gpu_kernel, "guess", partial(gpu_kernel.guess, interpret=True))
 
 
 def first_guess(qp):
     """The normalised problem, where its active set starts from, and with which rows."""
     qp = jax.tree.map(jnp.asarray, qp)
-    normal = qp_door._normalise(FLOORS, qp)
-    loose = qp_door._Point(-jnp.linalg.solve(normal.P, normal.q), jnp.zeros(normal.side.shape))
-    return normal, *qp_door._first_guess(normal, loose)
+    normal = normalise(TOLERANCES, qp)
+    loose = Point(-jnp.linalg.solve(normal.P, normal.q), jnp.zeros(normal.side.shape))
+    return normal, *guess_from(normal, loose)
 
 
 def test_on_a_gpu_the_kernels_guess_is_proved_at_once(walking, as_on_a_gpu):
@@ -530,21 +551,23 @@ def test_on_a_gpu_the_kernels_guess_is_proved_at_once(walking, as_on_a_gpu):
     @jax.vmap
     def tries(qp):
         normal, start, active = first_guess(qp)
-        wanted = jnp.ones((), bool)
-        _, proof, count = qp_door._active_set(FLOORS, normal, start, active, wanted, jnp.array(15))
-        return jnp.max(proof), count
+        every, most = jnp.ones((), bool), jnp.array(15)
+        _, residuals, count = active_set(
+            TOLERANCES, normal, start, active=active, enabled=every, limit=most
+        )
+        return jnp.max(residuals), count
 
     proof, count = tries(stack(walking[:8]))
-    assert (proof <= FLOORS.target).all()
+    assert (proof <= TOLERANCES.target).all()
     assert (count <= 2).all()
 
 
 def test_on_a_gpu_a_guess_that_did_not_settle_is_not_taken(walking, as_on_a_gpu, monkeypatch):
     def lost(P, q, A, lower, upper):
         side = jnp.ones(len(lower), jnp.int32)
-        return qp_door.pivot.Guess(jnp.full_like(q, jnp.nan), lower, side, jnp.int32(0))
+        return gpu_kernel.Guess(jnp.full_like(q, jnp.nan), lower, side, jnp.int32(0))
 
-    monkeypatch.setattr(qp_door.pivot, "guess", lost)
+    monkeypatch.setattr(gpu_kernel, "guess", lost)
     found = first_guess(walking[3])
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     for one, other in zip(*map(jax.tree.leaves, (found, first_guess(walking[3]))), strict=True):

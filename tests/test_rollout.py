@@ -182,7 +182,7 @@ def test_the_way_back_solves_no_qp_again(robot, anchor):
         PLAIN,
     )
     functions = lowered.as_text().split("func.func")
-    solving = [f for f in functions if "_solve_normal" in f.splitlines()[0] and ".while" in f]
+    solving = [f for f in functions if "solve_normal" in f.splitlines()[0] and ".while" in f]
     assert len(solving) == 1
 
 

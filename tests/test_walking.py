@@ -25,7 +25,7 @@ from hector_jax.control.walking import (
 from hector_jax.control.weights import expert
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State
-from hector_jax.qp.solve import Status
+from hector_jax.qp import Status
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import load_robot
 

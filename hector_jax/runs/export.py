@@ -36,7 +36,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from hector_jax.core.console import Broken
-from hector_jax.qp.solve import Status
+from hector_jax.qp import Status
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import (
     Feet,

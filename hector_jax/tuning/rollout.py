@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hector_jax import qp
 from hector_jax.control import gait
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
@@ -25,7 +26,6 @@ from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, InputError, Range, check
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench, has_fallen
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
-from hector_jax.qp import solve as qp
 from hector_jax.robot import srbm
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot

@@ -1,4 +1,4 @@
-"""A guess at the active set of a small QP, in one GPU kernel; `control.qp` proves or mends it.
+"""A guess at the active set of a small QP, in one GPU kernel; `active_set` proves or mends it.
 
 A batched factorisation per try keeps a GPU waiting: the slowest problem of the batch decides how
 often all are factorised. Here a problem is one program with registers of its own and stops alone.
@@ -10,8 +10,9 @@ complementarity problem one of a positive definite matrix).
 Rows are soft here (c = `stiffness`) and the inverse drifts, so nothing of this is believed.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -77,10 +78,9 @@ def guess(
         jnp.pad(lower, (0, spare), constant_values=-jnp.inf),
         jnp.pad(upper, (0, spare), constant_values=jnp.inf),
     )
-    wide = jax.ShapeDtypeStruct((VARIABLES,), dtype)
-    tall = jax.ShapeDtypeStruct((ROWS,), dtype)
-    sides = jax.ShapeDtypeStruct((ROWS,), jnp.int32)
-    flag = jax.ShapeDtypeStruct((), jnp.int32)
+    shapes = {"x": (VARIABLES,), "y": (ROWS,), "side": (ROWS,), "settled": ()}
+    kinds = {"x": dtype, "y": dtype, "side": jnp.int32, "settled": jnp.int32}
+    out: Any = {name: jax.ShapeDtypeStruct(shapes[name], kinds[name]) for name in shapes}
     options = {}
     if not interpret:
         from jax.experimental.pallas import triton
@@ -88,26 +88,39 @@ def guess(
         options["compiler_params"] = triton.CompilerParams(num_warps=4, num_stages=1)
     found = pl.pallas_call(
         partial(_kernel, n, _softness(dtype)),
-        out_shape=Guess(wide, tall, sides, flag),
+        out_shape=Guess(**out),
         interpret=interpret,
         **options,
     )(*tiles)
     return Guess(found.x[:n], found.y[:m], found.side[:m], found.settled)
 
 
-def _kernel(n: int, soft: _Softness, P_ref, q_ref, A_ref, lower_ref, upper_ref, *refs) -> None:
-    out = Guess(*refs)
-    P, q, A = P_ref[...], q_ref[...], A_ref[...]
-    lower, upper = lower_ref[...], upper_ref[...]
-    c, proximal, tolerance, one, zero = (np.asarray(v, P.dtype) for v in (*soft[:3], 1.0, 0.0))
+class _Problem(NamedTuple):
+    """The QP in a program's registers, and what its dtype allows."""
+
+    P: Array
+    q: Array
+    A: Array
+    lower: Array
+    upper: Array
+    number: Array  # of each row
+    c: np.ndarray
+    tolerance: np.ndarray
+    one: np.ndarray
+    zero: np.ndarray
+    passes: int
+
+
+def _times(M: Array, v: Array) -> Array:
+    return jnp.sum(M * v[None, :], axis=1)
+
+
+def _inverse(n: int, P: Array, proximal: np.ndarray, one: np.ndarray, zero: np.ndarray) -> Array:
+    """Inverse of P with `proximal` on its diagonal, by sweeps."""
     index = lax.broadcasted_iota(jnp.int32, (VARIABLES,), 0)
-    number = lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
     across = lax.broadcasted_iota(jnp.int32, P.shape, 0)
     down = lax.broadcasted_iota(jnp.int32, P.shape, 1)
     eye = jnp.where(across == down, one, zero)
-
-    def times(M: Array, v: Array) -> Array:
-        return jnp.sum(M * v[None, :], axis=1)
 
     def sweep(k: Array, M: Array) -> Array:
         column = jnp.sum(jnp.where(down == k, M, zero), axis=1)
@@ -117,44 +130,59 @@ def _kernel(n: int, soft: _Softness, P_ref, q_ref, A_ref, lower_ref, upper_ref, 
         return M - (column * (one / pivot))[:, None] * column[None, :]
 
     swept = lax.fori_loop(0, n, sweep, P + proximal * eye)
-    inverse = jnp.where((across < n) & (down < n), (one + one) * eye - swept, eye)
+    return jnp.where((across < n) & (down < n), (one + one) * eye - swept, eye)
+
+
+def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tuple:
+    """Solve with the active rows, then take up the worst row and let the worst go."""
+    c, one, zero, number = qp.c, qp.one, qp.zero, qp.number
 
     def change(M: Array, row: Array, weight: Array) -> Array:
         """The inverse with a weight on one more row."""
-        a = A_ref[row, :]
-        v = times(M, a)
+        a = read_row(row)
+        v = _times(M, a)
         return M - (weight / (one + weight * jnp.sum(a * v))) * v[:, None] * v[None, :]
 
-    def pivot(state: tuple) -> tuple:
-        x, rows, y, side, M, count, _ = state
-        active = side != 0
-        bound = jnp.where(side > 0, upper, lower)
-        for _ in range(soft.passes):
-            y = jnp.where(active, y + c * (rows - bound), zero)
-            dx = -times(M, times(P, x) + q + jnp.sum(A * y[:, None], axis=0))
-            moved = times(A, dx)
-            x, rows, y = x + dx, rows + moved, jnp.where(active, y + c * moved, zero)
-        over, under = rows - upper, lower - rows
-        leaves = jnp.where(active, -one, jnp.maximum(over, under))
-        pulls = jnp.where(active, jnp.where(side > 0, -y, y), -one)
-        wrong = jnp.maximum(leaves, pulls) > tolerance
-        first = jnp.min(jnp.where(wrong, number, ROWS))
-        chosen = wrong & ((count < _LIMIT // 2) | (number == first))
-        leaves, pulls = jnp.where(chosen, leaves, -one), jnp.where(chosen, pulls, -one)
-        enter, leave = jnp.max(leaves) > tolerance, jnp.max(pulls) > tolerance
-        entering, leaving = lax.argmax(leaves, 0, jnp.int32), lax.argmax(pulls, 0, jnp.int32)
-        M = change(M, entering, jnp.where(enter, c, zero))
-        M = change(M, leaving, jnp.where(leave, -c, zero))
-        side = jnp.where(enter & (number == entering), jnp.where(over > under, 1, -1), side)
-        side = jnp.where(leave & (number == leaving), 0, side)
-        return x, rows, y, side, M, count + 1, enter | leave
+    x, rows, y, side, M, count, _ = state
+    active = side != 0
+    bound = jnp.where(side > 0, qp.upper, qp.lower)
+    for _ in range(qp.passes):
+        y = jnp.where(active, y + c * (rows - bound), zero)
+        dx = -_times(M, _times(qp.P, x) + qp.q + jnp.sum(qp.A * y[:, None], axis=0))
+        moved = _times(qp.A, dx)
+        x, rows, y = x + dx, rows + moved, jnp.where(active, y + c * moved, zero)
+    over, under = rows - qp.upper, qp.lower - rows
+    leaves = jnp.where(active, -one, jnp.maximum(over, under))
+    pulls = jnp.where(active, jnp.where(side > 0, -y, y), -one)
+    wrong = jnp.maximum(leaves, pulls) > qp.tolerance
+    first = jnp.min(jnp.where(wrong, number, ROWS))
+    chosen = wrong & ((count < _LIMIT // 2) | (number == first))
+    leaves, pulls = jnp.where(chosen, leaves, -one), jnp.where(chosen, pulls, -one)
+    enter, leave = jnp.max(leaves) > qp.tolerance, jnp.max(pulls) > qp.tolerance
+    entering, leaving = lax.argmax(leaves, 0, jnp.int32), lax.argmax(pulls, 0, jnp.int32)
+    M = change(M, entering, jnp.where(enter, c, zero))
+    M = change(M, leaving, jnp.where(leave, -c, zero))
+    side = jnp.where(enter & (number == entering), jnp.where(over > under, 1, -1), side)
+    side = jnp.where(leave & (number == leaving), 0, side)
+    return x, rows, y, side, M, count + 1, enter | leave
 
-    x = -times(inverse, q)
+
+def _kernel(n: int, soft: _Softness, P_ref, q_ref, A_ref, lower_ref, upper_ref, *refs) -> None:
+    out: Any = Guess(*refs)
+    P, q, A = P_ref[...], q_ref[...], A_ref[...]
+    lower, upper = lower_ref[...], upper_ref[...]
+    c, proximal, tolerance, one, zero = (np.asarray(v, P.dtype) for v in (*soft[:3], 1.0, 0.0))
+    inverse = _inverse(n, P, proximal, one, zero)
+    number = lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
+    qp = _Problem(P, q, A, lower, upper, number, c, tolerance, one, zero, soft.passes)
+    x = -_times(inverse, q)
     none = jnp.zeros((ROWS,), P.dtype)
     nowhere = jnp.zeros((ROWS,), jnp.int32)
-    state = (x, times(A, x), none, nowhere, inverse, jnp.int32(0), jnp.asarray(True))
+    state = (x, _times(A, x), none, nowhere, inverse, jnp.int32(0), jnp.asarray(True))
     x, _, y, side, _, _, going = lax.while_loop(
-        lambda state: state[-1] & (state[-2] < _LIMIT), pivot, state
+        lambda state: state[-1] & (state[-2] < _LIMIT),
+        partial(_pivot, qp, lambda row: A_ref[row, :]),
+        state,
     )
     out.x[...], out.y[...], out.side[...] = x, y, side.astype(jnp.int32)
     out.settled[...] = jnp.where(going, 0, 1).astype(jnp.int32)

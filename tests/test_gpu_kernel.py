@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles import dense_rows, exact_solution, walking_qp
 
-from hector_jax.qp import pivot
+from hector_jax.qp import gpu_kernel
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -28,7 +28,7 @@ def test_the_guess_is_the_active_set_of_the_solution(dtype):
         cases.append([np.asarray(part, dtype) for part in normal])
         y = exact_solution(qp)[1]
         truth.append(np.where(np.abs(y) > 1e-9 * np.abs(y).max(initial=1.0), np.sign(y), 0))
-    run = jax.jit(jax.vmap(lambda *qp: pivot.guess(*qp, interpret=True)))
+    run = jax.jit(jax.vmap(lambda *qp: gpu_kernel.guess(*qp, interpret=True)))
     found = run(*(jnp.stack(parts) for parts in zip(*cases, strict=True)))
     assert found.settled.all()
     right = (np.asarray(found.side) == np.array(truth)).all(axis=1)
@@ -37,6 +37,6 @@ def test_the_guess_is_the_active_set_of_the_solution(dtype):
 
 
 def test_only_small_problems_fit():
-    assert pivot.fits(50, 110)
-    assert not pivot.fits(100, 110)
-    assert not pivot.fits(50, 220)
+    assert gpu_kernel.fits(50, 110)
+    assert not gpu_kernel.fits(100, 110)
+    assert not gpu_kernel.fits(50, 220)

@@ -1,0 +1,54 @@
+"""Parts of a config that are functions: a file holds the name, a program calls the functions.
+
+A kind of part is a subclass that annotates its functions, a part one value of it:
+
+    class Solver(Part):
+        approach: Callable[[Normal], Approach]
+
+    JAXOPT = Solver("jaxopt", approach=box_osqp)
+
+A part is a `str` so that configs stay what they were in TOML, JSON, hashes and messages. Two parts
+are equal where name and functions are: a jitted function that has one in its static config is
+compiled anew for another of the same name.
+"""
+
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+from hector_jax.core.inputs import InputError, choose
+
+
+class Part(str):
+    """A named value of one or two pure functions."""
+
+    def __new__(cls, name: str, **functions: Any):
+        """The part of this name."""
+        part = super().__new__(cls, name)
+        part.__dict__.update(functions)
+        return part
+
+    def __eq__(self, other: object) -> bool:
+        same = str.__eq__(self, other)
+        return same and (not isinstance(other, Part) or self.__dict__ == other.__dict__)
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    __hash__ = str.__hash__
+
+
+P = TypeVar("P", bound=Part)
+
+
+def choose_part(what: str, chosen: str, kind: type[P], known: Iterable[P]) -> P:
+    """The part itself, or the known one of that name.
+
+    Raises:
+        InputError: `WHAT must be ..., got ...`.
+    """
+    if isinstance(chosen, kind):
+        return chosen
+    by_name = {str(part): part for part in known}
+    if isinstance(chosen, Part):
+        raise InputError(f"{what} must be a {kind.__name__}, got {chosen!r}")
+    return by_name[choose(what, chosen, by_name)]

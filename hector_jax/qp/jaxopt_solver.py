@@ -1,0 +1,40 @@
+"""BoxOSQP of jaxopt, as a second way to get near a solution; its derivative is not used."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from hector_jax.qp.certificates import certificates
+from hector_jax.qp.linear import block_diagonal
+from hector_jax.qp.problem import SIGN, Approach, Normal, Point, Tolerances
+
+
+def box_osqp(
+    tolerances: Tolerances, qp: Normal, enabled: Array, *, max_iterations: int
+) -> Approach:
+    """Run BoxOSQP, a hundred iterations for each of `max_iterations`, as they are cheaper.
+
+    It runs for every problem, whether `enabled` or not.
+    """
+    from jaxopt import BoxOSQP
+
+    held = qp.side | qp.equality
+    bound = jnp.where(held, qp.bound, jnp.asarray(SIGN, qp.q.dtype) * jnp.inf)
+    solver = BoxOSQP(
+        eq_qp_solve="lu",
+        tol=max(1e-5, tolerances.target),
+        maxiter=100 * max_iterations,
+        termination_check_frequency=25,
+        implicit_diff=False,
+    )
+    A = qp.A if qp.A.ndim == 2 else block_diagonal(qp.A)
+    params, state = solver.run(None, (qp.P, qp.q), A, (bound[1], bound[0]))
+    finite = jnp.isfinite(jnp.sum(params.primal[0]) + jnp.sum(params.dual_eq))
+    x = jnp.where(finite, params.primal[0], 0.0)
+    y = jnp.where(finite, params.dual_eq, 0.0)
+    z = jnp.maximum(jnp.asarray(SIGN, y.dtype) * y, 0.0)
+    z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(held, z, 0.0))
+    point = Point(x, z)
+    certified = certificates(tolerances, qp, jax.tree.map(jnp.zeros_like, point), point)
+    slack = jnp.maximum(-qp.violation(x), 0.0)
+    return Approach(point, slack, qp.residuals(point), certified, state.iter_num.astype(jnp.int32))

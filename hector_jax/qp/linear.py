@@ -1,0 +1,59 @@
+"""Products with rows that may be block-diagonal by step, and what else the methods share."""
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+T = TypeVar("T")
+
+
+def matvec(A: Array, x: Array) -> Array:
+    """A x."""
+    if A.ndim == 2:
+        return A @ x
+    return jnp.einsum("krb,kb->kr", A, x.reshape(A.shape[0], A.shape[2])).ravel()
+
+
+def rmatvec(A: Array, y: Array) -> Array:
+    """A'y."""
+    if A.ndim == 2:
+        return y @ A
+    return jnp.einsum("krb,kr->kb", A, y.reshape(A.shape[:2])).ravel()
+
+
+def block_diagonal(blocks: Float[Array, "N r b"]) -> Float[Array, "m n"]:
+    """Matrix (N r, N b) with these blocks on its diagonal."""
+    N, r, b = blocks.shape
+    wide = blocks[:, :, None, :] * jnp.eye(N, dtype=blocks.dtype)[:, None, :, None]
+    return wide.reshape(N * r, N * b)
+
+
+def plus_gram(P: Array, A: Array, w: Array) -> Array:
+    """P + A' diag(w) A."""
+    if A.ndim == 2:
+        return P + (w[:, None] * A).T @ A
+    weighted = w.reshape(*A.shape[:2], 1) * A
+    return P + block_diagonal(jnp.einsum("krb,krc->kbc", weighted, A))
+
+
+def cholesky(matrix: Array) -> Array:
+    """Lower factor of a symmetric matrix; NaN where it is not positive definite."""
+    return lax.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+def largest(v: Array) -> Array:
+    """Largest magnitude; zero of nothing."""
+    return jnp.max(jnp.abs(v), initial=0.0)
+
+
+def multiplier(z: Array) -> Array:
+    """Vector y (m,) of the multipliers of the sides (2, m)."""
+    return z[0] - z[1]
+
+
+def choose(first: Array, a: T, b: T) -> T:
+    """`a` where `first` holds, else `b`, leaf by leaf."""
+    return jax.tree.map(lambda v, w: jnp.where(first, v, w), a, b)
