@@ -21,12 +21,11 @@ import numpy as np
 
 from benchmarks.measuring import Check, Report, show
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import Weights, nominal
+from hector_jax.control.weights import Weights, nominal, sample_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net
-from hector_jax.report.transfer import disturbed
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.batch import Problem, Scenario, lanes_of, stack, tune_batch
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Stop, TuneConfig, tune
@@ -75,7 +74,7 @@ def measure(
     robot, command = load_robot(), named_command(NAME)
     anchor = standing_anchor(robot)
     effect = last_command if net is None else as_effect(load_net(net, robot)[0])
-    starts = disturbed(nominal(), 1.5, min(DRAWN, max(singles, many, 1)))
+    starts = sample_weights(nominal(), 1.5, min(DRAWN, max(singles, many, 1)))
     alpha = config.loss.as_arrays()
     scenario = Scenario(command, anchor, np.asarray(0), alpha, np.asarray(1.0))
 

@@ -24,7 +24,7 @@ import numpy as np
 import tyro
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights import Weights, expert, nominal, sample_weights
 from hector_jax.core.console import bar, exit_code, made_at
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
@@ -32,7 +32,6 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net, member_effects
 from hector_jax.report import plots
 from hector_jax.report.report import markdown_table
-from hector_jax.report.transfer import disturbed
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, pipeline
 from hector_jax.runs.metrics import Score
@@ -426,7 +425,7 @@ def front(flags: Front) -> None:
 def starts(flags: Starts) -> None:
     """(d) How far the end depends on the start."""
     robot, command = load_robot(), named_command(flags.traj)
-    begin = [nominal(), *disturbed(nominal(), flags.factor, flags.starts - 1)]
+    begin = [nominal(), *sample_weights(nominal(), flags.factor, flags.starts - 1)]
     asked = [problem(w, [scenario(robot, command)]) for w in begin]
     found = tuned(flags, robot, whole_net(flags, robot), asked, "starts")
     if not first_host():

@@ -1,13 +1,13 @@
-"""What do weight sets bear that they were not tuned for?
+"""How much disturbance do weight sets survive that they were not tuned for?
 
 Pushes from eight sides in three gait phases with growing force, a floor that turns slippery, slopes
 of 3 degrees, a payload of 2 kg, and commands that no tuning saw; nominal, expert and the sets that
-are named. The controller learns of none of it.
+are named. The controller is told of none of it.
 
     python experiments/robustness.py --set with=runs/straight/TIME/weights/with.json
 
 `hfs-varied` is the world to choose by; `--world standin` is for verdicts on what was chosen. The
-scores of finished walks are kept under OUT/scores and taken up again.
+scores of finished walks are stored under OUT/scores, and a later call uses them.
 """
 
 import re
@@ -21,33 +21,33 @@ from typing import Annotated, NamedTuple
 import jax
 import numpy as np
 import tyro
+from lib import write_report
+from scenes import (
+    Cell,
+    Level,
+    SceneConfig,
+    as_result,
+    evaluate_level,
+    largest_pushes,
+    make_scenes,
+    table,
+)
 
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.core.console import exit_code, made_at
+from hector_jax.core.console import exit_code
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report import plots
 from hector_jax.report.report import WORLDS
-from hector_jax.report.robustness import (
-    Cell,
-    Level,
-    SceneConfig,
-    as_job,
-    as_result,
-    endured,
-    judge,
-    scenes,
-    table,
-)
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, metrics
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk_many
+from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import named_world
-from hector_jax.storage import environment, fingerprint, load_weights, write_file, write_json
+from hector_jax.storage import fingerprint, load_weights, make_folder
 from hector_jax.tuning.loss import LossConfig
 
 BASELINE = "nominal"
@@ -72,13 +72,13 @@ class Flags:
                 raise InputError(f"--{name} must be at least 1, got {getattr(self, name)}")
 
 
-class Found(NamedTuple):
-    """All that the report tells."""
+class Result(NamedTuple):
+    """All numbers of the report."""
 
     cells: dict[Level, dict[str, Cell]]  # by level and set, the baseline first
     losses: dict[Level, float]  # median of the baseline's L
-    endured: dict[str, np.ndarray]  # [N] by direction
-    residual: float  # worst of a plan
+    pushes: dict[str, np.ndarray]  # [N] largest survived, by direction
+    residual: float  # largest of a plan
 
 
 def weight_sets(named: Sequence[str]) -> dict[str, Weights]:
@@ -101,23 +101,20 @@ def weight_sets(named: Sequence[str]) -> dict[str, Weights]:
 
 def compare(
     levels: Sequence[Level], sets: Sequence[str], scores: Mapping[tuple[Level, str], Score]
-) -> Found:
-    """Judge all sets at all levels.
+) -> Result:
+    """Compare all sets with the baseline at all levels.
 
     Args:
         levels: in the order of the report.
         sets: the baseline first.
         scores: (plants, scenes) each.
     """
-    cells = {
-        level: {name: judge(scores[level, name], scores[level, BASELINE]) for name in sets}
-        for level in levels
-    }
+    base = {level: scores[level, BASELINE] for level in levels}
     pushes = [level for level in levels if level.kind == "push"]
-    return Found(
-        cells,
-        {level: float(np.median(scores[level, BASELINE].L)) for level in levels},
-        {name: endured({p.size: scores[p, name].fallen for p in pushes}) for name in sets},
+    return Result(
+        {level: {n: evaluate_level(scores[level, n], base[level]) for n in sets} for level in base},
+        {level: float(np.median(score.L)) for level, score in base.items()},
+        {name: largest_pushes({p.size: scores[p, name].fallen for p in pushes}) for name in sets},
         max(float(score.residual.max()) for score in scores.values()),
     )
 
@@ -131,22 +128,25 @@ def main() -> None:
         flags = replace(flags, scenes=short)
     robot, sets = jax.tree.map(np.asarray, load_robot()), weight_sets(flags.set)
     seeds = range(flags.first_seed, flags.first_seed + flags.seeds)
-    plant = standin if flags.world == "standin" else lambda seed: named_world(flags.world, seed)
-    asked, plants = scenes(flags.scenes), {seed: plant(seed) for seed in seeds}
+    plant = standin if flags.world == "standin" else partial(named_world, flags.world)
+    scenes, plants = make_scenes(flags.scenes), {seed: plant(seed) for seed in seeds}
+
+    def group(level: Level, name: str, seed: int) -> str:
+        return f"{level.name}-{name}-{seed}".replace(" ", "-").replace("/", "-")
+
     groups = {
-        (level, name, seed): [as_job(scene, sets[name], plants[seed], seed) for scene in of_level]
+        group(level, name, seed): [
+            Job(sets[name], imperfections=plants[seed], seed=seed, **scene._asdict())
+            for scene in at_level
+        ]
         for seed in seeds
-        for level, of_level in asked.items()
+        for level, at_level in scenes.items()
         for name in sets
-    }
-    named = {
-        key: f"{key[0].name}-{key[1]}-{key[2]}".replace(" ", "-").replace("/", "-")
-        for key in groups
     }
     config, loss = WalkConfig(), LossConfig()
     with workers(flags.processes) as pool:
         walked = kept.walk_groups(
-            {named[key]: group for key, group in groups.items()},
+            groups,
             partial(walk_many, pool, config, robot),
             partial(metrics.score, loss),
             metrics.score_like(0),
@@ -157,62 +157,58 @@ def main() -> None:
             "",
         )
     scores = {
-        (level, name): metrics.stack_scores([walked[named[level, name, seed]] for seed in seeds])
-        for level in asked
+        (level, name): metrics.stack_scores([walked[group(level, name, seed)] for seed in seeds])
+        for level in scenes
         for name in sets
     }
-    print(report(flags, compare(list(asked), list(sets), scores), flags.out))
+    print(report(flags, sets, compare(list(scenes), list(sets), scores), flags.out))
 
 
-def report(flags: Flags, found: Found, folder: Path) -> Path:
+def report(flags: Flags, sets: Mapping[str, Weights], result: Result, folder: Path) -> Path:
     """Write the report with its pictures and its numbers as JSON; returns its path."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     world, count = WORLDS.get(flags.world, flags.world), flags.scenes.phases
-    rows = {level.name: row for level, row in found.cells.items()}
-    captions = {
-        "levels.png": plots.survival(folder / "levels.png", rows),
-        "directions.png": plots.push_directions(folder / "directions.png", found.endured),
-    }
+    rows = {level.name: row for level, row in result.cells.items()}
     last = flags.first_seed + flags.seeds - 1
     phases = "one phase of the gait" if count == 1 else f"{count} phases of the gait"
-    about = environment()
-    text = [
-        "# What the weight sets bear",
-        made_at(about),
+    solved = "." if result.residual <= SOLVED else ": **not solved**."
+    paragraphs = [
         f"Trajectory {flags.scenes.traj}, world {world}, plants {flags.first_seed} to {last}. "
         f"Pushes of 0.1 s on the trunk from eight sides, floors that turn slippery for 2 s, both "
-        f"begun at {phases}; slopes of 3 degrees that rise towards "
-        "the named side; 2 kg on top of the trunk; commands that no tuning saw. The controller "
-        f"learns of none of it. Worst relative KKT residual of a plan {found.residual:.0e}"
-        + ("." if found.residual <= SOLVED else ": **not solved**."),
-        table(found.cells, found.losses),
+        f"begun at {phases}; slopes of 3 degrees that rise towards the named side; 2 kg on top of "
+        "the trunk; commands that no tuning saw. The controller is told of none of it. Largest "
+        f"relative KKT residual of a plan {result.residual:.0e}{solved}",
+        table(result.cells, result.losses),
         f"L / {BASELINE} is the median of the ratio in the same scene on the same plant, falls "
         "charged as the loss charges them; in brackets its 95 % interval from redrawing the "
         f"plants, rough where they are few ({flags.seeds} here). A star marks a ratio that is no "
         "comparison, because one of the two falls more often by 2 of 32 or more.",
-        *(f"![{name}]({name})\n\n{caption}" for name, caption in captions.items()),
     ]
-    told = {
-        "flags": {
-            name: value
-            for name, value in asdict(flags).items()
-            if name in ("world", "seeds", "first_seed", "scenes")
-        },
-        "weights": {name: fingerprint(w) for name, w in weight_sets(flags.set).items()},
-        "environment": about,
-        "residual": found.residual,
+    named = ("world", "seeds", "first_seed", "scenes")
+    numbers = {
+        "flags": {name: value for name, value in asdict(flags).items() if name in named},
+        "weights": {name: fingerprint(w) for name, w in sets.items()},
+        "residual": result.residual,
         "levels": {
             level.name: {
-                f"L_{BASELINE}": found.losses[level],
+                f"L_{BASELINE}": result.losses[level],
                 "sets": {name: as_result(cell) for name, cell in row.items()},
             }
-            for level, row in found.cells.items()
+            for level, row in result.cells.items()
         },
-        "endured": {name: force.tolist() for name, force in found.endured.items()},
+        "endured": {name: force.tolist() for name, force in result.pushes.items()},
     }
-    write_json(folder / "robustness.json", told)
-    write_file(folder / "report.md", ("\n\n".join(text) + "\n").encode())
-    return folder / "report.md"
+    return write_report(
+        folder / "report.md",
+        "How much the weight sets survive",
+        paragraphs,
+        numbers=numbers,
+        json_name="robustness.json",
+        pictures={
+            "levels.png": plots.survival(folder / "levels.png", rows),
+            "directions.png": plots.push_directions(folder / "directions.png", result.pushes),
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Shared set-up of the tests, before the first array: 64 bits, compiling that is quick and kept."""
 
 import os
+import sys
 import tempfile
 from contextlib import nullcontext
 from importlib.metadata import version
@@ -22,6 +23,7 @@ from hypothesis import configuration  # noqa: E402
 from hector_jax.core.runtime import setup_jax  # noqa: E402
 
 setup_jax()
+sys.path.append(str(Path(__file__).parents[1] / "experiments"))  # scripts import their helpers so
 # what it notes about the code names the machine's paths: not into the checkout
 configuration.set_hypothesis_home_dir(Path(tempfile.gettempdir()) / "hypothesis")
 

@@ -100,3 +100,24 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
     }
     experiments = {f"experiments.{name}" for name in ("robustness", "online", "batch")}
     assert knowing == experiments | {"benchmarks.golden"}
+
+
+def test_scripts_use_nothing_private_of_the_package():
+    wrong = []
+    for path in sorted((ROOT.parent / "experiments").glob("*.py")):
+        tree = ast.parse(path.read_text())
+        names = {}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("hector_jax"):
+                names |= {alias.asname or alias.name: alias.name for alias in node.names}
+                wrong += [(path.name, part) for part in node.module.split(".") if part[0] == "_"]
+        wrong += [(path.name, name) for name in names.values() if name.startswith("_")]
+        wrong += [
+            (path.name, f"{node.value.id}.{node.attr}")
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)
+            # the public methods of a NamedTuple begin with an underscore
+            if node.value.id in names and node.attr.startswith("_")
+            if node.attr not in ("_asdict", "_fields", "_make", "_replace")
+        ]
+    assert not wrong

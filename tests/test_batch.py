@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import nominal, sample_weights, vector_to_weights, weights_to_vector
 from hector_jax.grfm.effect import last_command
-from hector_jax.report.transfer import disturbed
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning import difftune
 from hector_jax.tuning.batch import (
@@ -32,7 +31,7 @@ from hector_jax.tuning.rollout import RolloutConfig, no_variation
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
-STARTS = [disturbed(nominal(), factor, 1)[0] for factor in (1.05, 1.2, 1.5, 2.0, 3.0)]
+STARTS = [sample_weights(nominal(), factor, 1)[0] for factor in (1.05, 1.2, 1.5, 2.0, 3.0)]
 TOY = TuneConfig(iterations=40, patience=5)
 NOMINAL = np.asarray(weights_to_vector(nominal()))
 PAPER = LossConfig().as_arrays()

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from scenes import SceneConfig
 
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
@@ -27,7 +28,6 @@ from hector_jax.core.inputs import Range, did_you_mean, short_repr, validation_e
 from hector_jax.grfm import dataset, network
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
-from hector_jax.report.robustness import SceneConfig
 from hector_jax.report.video import VideoConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.pipeline import CollectConfig

@@ -9,22 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pretend import pretend_score
+from scenes import (
+    DIRECTIONS,
+    Level,
+    SceneConfig,
+    as_result,
+    evaluate_level,
+    largest_pushes,
+    make_scenes,
+    table,
+)
 
 from hector_jax.control.reference import UNSEEN
 from hector_jax.control.weights import nominal
 from hector_jax.report import plots
-from hector_jax.report.robustness import (
-    DIRECTIONS,
-    Level,
-    SceneConfig,
-    as_job,
-    as_result,
-    endured,
-    judge,
-    scenes,
-    table,
-)
 from hector_jax.runs.metrics import stack_scores
+from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs
 from hector_jax.storage import as_json
 
@@ -42,7 +42,7 @@ def scores(losses, fallen=()):
 
 
 def test_pushes_come_from_eight_sides_at_all_phases_of_a_cycle():
-    found = scenes(SMALL)[Level("push", 50.0)]
+    found = make_scenes(SMALL)[Level("push", 50.0)]
     force = np.stack([scene.push.force[0] for scene in found])
     angles = np.rad2deg(np.arctan2(force[:, 1], force[:, 0])) % 360
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), 50.0)
@@ -53,7 +53,7 @@ def test_pushes_come_from_eight_sides_at_all_phases_of_a_cycle():
 
 
 def test_scenes_hold_all_that_may_be_in_the_way():
-    found = scenes(SMALL)
+    found = make_scenes(SMALL)
     sizes = {kind: [level.size for level in found if level.kind == kind] for kind, _ in found}
     assert sizes["calm"] == ["straight"]
     assert sizes["friction"] == [0.4, 0.2]
@@ -68,8 +68,8 @@ def test_scenes_hold_all_that_may_be_in_the_way():
 
 
 def test_a_scene_becomes_the_walk_of_a_set_on_a_plant():
-    scene = scenes(SMALL)[Level("slope", "up")][0]
-    job = as_job(scene, nominal(), hfs(), 7)
+    scene = make_scenes(SMALL)[Level("slope", "up")][0]
+    job = Job(nominal(), imperfections=hfs(), seed=7, **scene._asdict())
     assert (job.seed, job.seconds, job.changes) == (7, scene.seconds, scene.changes)
 
 
@@ -88,7 +88,7 @@ def test_scenes_that_make_no_sense_are_refused(wrong, message):
 
 def test_a_set_is_judged_by_the_median_of_paired_ratios():
     base = np.array([[2e6, 4e6, 8e6], [1e6, 3e6, 9e6]])
-    half = judge(scores(0.5 * base), scores(base))
+    half = evaluate_level(scores(0.5 * base), scores(base))
     assert half.ratio.value == pytest.approx(0.5)
     assert half.survived.value == 1.0
     assert (half.falls, half.walks, half.counts) == (0, 6, True)
@@ -96,12 +96,12 @@ def test_a_set_is_judged_by_the_median_of_paired_ratios():
 
 def test_the_interval_redraws_plants_with_all_their_scenes():
     base, fell = np.full((4, 3), 1e6), {(i, k) for i in (2, 3) for k in range(3)}
-    found = judge(scores(base * [[0.5], [0.5], [2.0], [2.0]], fell), scores(base))
+    found = evaluate_level(scores(base * [[0.5], [0.5], [2.0], [2.0]], fell), scores(base))
     assert found.ratio == pytest.approx((1.25, 0.5, 2.0))
     assert found.survived == pytest.approx((0.5, 0.0, 1.0))
     assert found.falls == 6
     assert not found.counts
-    alone = judge(scores(base[:1]), scores(base[:1]))
+    alone = evaluate_level(scores(base[:1]), scores(base[:1]))
     assert np.isnan(alone.ratio.low)
 
 
@@ -111,7 +111,7 @@ def test_a_force_is_endured_with_all_smaller_ones():
     weak[0, 2] = True  # falls at the smallest, stands at the next by luck
     strong = stands.copy()
     strong[0, 0] = True
-    found = endured({50.0: stands, 25.0: weak, 100.0: strong})
+    found = largest_pushes({50.0: stands, 25.0: weak, 100.0: strong})
     np.testing.assert_array_equal(found, [50.0, 100.0, 0.0, *[100.0] * 5])
 
 
@@ -119,7 +119,8 @@ def test_the_table_has_a_row_per_level_and_marks_what_does_not_count():
     base, levels = np.full((2, 4), 2e6), (Level("push", 50.0), Level("slope", "up"))
     sets = {"nominal": scores(base), "with": scores(0.5 * base, {(0, 0)})}
     cells = {
-        level: {name: judge(one, sets["nominal"]) for name, one in sets.items()} for level in levels
+        level: {name: evaluate_level(one, sets["nominal"]) for name, one in sets.items()}
+        for level in levels
     }
     text = table(cells, dict.fromkeys(levels, 2e6)).splitlines()
     assert len(text) == 4
@@ -132,7 +133,9 @@ def test_pictures_show_survival_ratio_and_newtons_of_sets_of_any_name(tmp_path, 
     names, rng = ("nominal", "expert", "with", "mine", "yours"), np.random.default_rng(0)
     base = scores(np.exp(rng.normal(size=(2, 4))) * 1e6)
     others = [scores(np.exp(rng.normal(size=(2, 4))) * 1e6, {(0, i)}) for i in range(4)]
-    row = {name: judge(one, base) for name, one in zip(names, (base, *others), strict=True)}
+    row = {
+        name: evaluate_level(one, base) for name, one in zip(names, (base, *others), strict=True)
+    }
     plots.survival(tmp_path / "a.png", {"push 25 N": row, "push 50 N": row})
     endured = {name: 100 * rng.random(8) for name in names}
     plots.push_directions(tmp_path / "b.png", endured)
@@ -166,4 +169,4 @@ def test_the_report_is_written_and_walks_are_taken_up_again(tmp_path):
     assert len(told["endured"]["nominal"]) == 8
     text = (tmp_path / "report.md").read_text()
     assert "hardware" not in text
-    assert all((tmp_path / name).exists() for name in ("curves.png", "directions.png"))
+    assert all((tmp_path / name).exists() for name in ("levels.png", "directions.png"))

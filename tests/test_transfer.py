@@ -1,14 +1,21 @@
-"""Gradients and orders compared: the pure part of the report on transfer."""
+"""Gradients and orders compared: the pure part of the report on alignment."""
 
 import json
 
+import alignment
 import numpy as np
 import pytest
+from alignment import BEYOND_SAG, SAG
 
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
-from hector_jax.control.weights import directions, moved, nominal, weights_to_vector
-from hector_jax.report import plots, transfer
-from hector_jax.report.transfer import BEYOND_SAG, SAG
+from hector_jax.control.weights import (
+    directions,
+    moved,
+    nominal,
+    sample_weights,
+    weights_to_vector,
+)
+from hector_jax.report import plots
 from hector_jax.storage import as_json
 
 RNG = np.random.default_rng(1)
@@ -27,10 +34,10 @@ def test_central_differences_are_the_gradient_in_the_directions():
         weights = moved(nominal(), logs)
         return slope @ directions() @ np.log(np.asarray(weights_to_vector(weights)))
 
-    step = transfer.STEP * np.eye(18)
+    step = alignment.STEP * np.eye(18)
     losses = np.array([[[loss(row), loss(-row)] for row in step]])
     both = 1.0 + np.array([0.0] * 12 + [1.0] * 6)  # two feet move
-    np.testing.assert_allclose(transfer.slopes(losses)[0], slope * both, rtol=1e-9)
+    np.testing.assert_allclose(alignment.slopes(losses)[0], slope * both, rtol=1e-9)
 
 
 def test_a_gradient_in_weights_becomes_one_in_log_weights_of_both_feet():
@@ -39,12 +46,12 @@ def test_a_gradient_in_weights_becomes_one_in_log_weights_of_both_feet():
         Q=type(ones.Q)(*(1.0 / q for q in ones.Q)), R=type(ones.R)(*(1.0 / r for r in ones.R))
     )
     np.testing.assert_allclose(
-        transfer.as_directions(ones, gradient), [1.0] * 12 + [2.0] * 6, rtol=1e-12
+        alignment.as_directions(ones, gradient), [1.0] * 12 + [2.0] * 6, rtol=1e-12
     )
 
 
-def test_disturbed_weights_stay_within_their_factor():
-    vectors = [np.asarray(weights_to_vector(w)) for w in transfer.disturbed(nominal(), 1.5, 8)]
+def test_sampled_weights_stay_within_their_factor():
+    vectors = [np.asarray(weights_to_vector(w)) for w in sample_weights(nominal(), 1.5, 8)]
     ratios = np.array(vectors) / np.asarray(weights_to_vector(nominal()))
     assert ratios.max() < 1.5
     assert ratios.min() > 1 / 1.5
@@ -53,7 +60,7 @@ def test_disturbed_weights_stay_within_their_factor():
 
 
 def test_a_gradient_is_aligned_with_itself_whatever_its_length():
-    row = transfer.compare(3.0 * TRUTH, None, TRUTH)
+    row = alignment.compare(3.0 * TRUTH, None, TRUTH)
     assert row is not None
     assert row.cosine == pytest.approx((1.0, 1.0, 1.0))
     assert row.gain is None
@@ -63,19 +70,19 @@ def test_a_gradient_is_aligned_with_itself_whatever_its_length():
 def test_the_weight_that_is_most_wrong_is_named():
     wrong = TRUTH.copy()
     wrong[:, NAMES.index("Q_z")] += 20.0
-    row = transfer.compare(wrong, None, TRUTH)
+    row = alignment.compare(wrong, None, TRUTH)
     assert row is not None
     assert row.wrong == "Q_z"
     assert row.share > 0.4
     assert row.beyond_sag.value == pytest.approx(1.0)
-    sentence = transfer.wrong_sentence("straight", "command", row)
+    sentence = alignment.wrong_sentence("straight", "command", row)
     assert "most wrong is Q_z" in sentence
 
 
 def test_the_gain_over_the_command_is_the_difference_of_cosines_on_the_same_phases():
     command = TRUTH + 2.0 * RNG.normal(size=TRUTH.shape)
-    row = transfer.compare(TRUTH, command, TRUTH)
-    alone = transfer.compare(command, None, TRUTH)
+    row = alignment.compare(TRUTH, command, TRUTH)
+    alone = alignment.compare(command, None, TRUTH)
     assert row is not None
     assert alone is not None
     assert row.gain is not None
@@ -87,46 +94,46 @@ def test_the_gain_over_the_command_is_the_difference_of_cosines_on_the_same_phas
 def test_a_phase_with_a_fall_is_left_out_for_all():
     fell = TRUTH.copy()
     fell[1] = np.nan
-    row = transfer.compare(TRUTH, 2.0 * TRUTH, fell)
+    row = alignment.compare(TRUTH, 2.0 * TRUTH, fell)
     assert row is not None
     assert row.phases == 3
     assert row.cosine.value == pytest.approx(1.0)
-    assert transfer.compare(TRUTH, None, np.full_like(TRUTH, np.nan)) is None
+    assert alignment.compare(TRUTH, None, np.full_like(TRUTH, np.nan)) is None
 
 
 def test_few_phases_have_no_interval():
-    row = transfer.compare(TRUTH[:1], -TRUTH[:1], TRUTH[:1])
+    row = alignment.compare(TRUTH[:1], -TRUTH[:1], TRUTH[:1])
     assert row is not None
     assert row.gain is not None
     assert np.isnan(row.gain.low)
-    assert "[" not in transfer.gradient_table({("c", "net"): row})
-    assert "above zero on 0 of 1" in transfer.verdict({("c", "net"): row}, "net")
-    told = json.loads(as_json(transfer.as_result(row)))
+    assert "[" not in alignment.gradient_table({("c", "net"): row})
+    assert "above zero on 0 of 1" in alignment.summary({("c", "net"): row}, "net")
+    told = json.loads(as_json(alignment.as_result(row)))
     assert told["gain"]["low"] is None
     assert told["gain"]["value"] == pytest.approx(2.0)
 
 
 def test_rank_correlation_sees_order_alone():
     x = np.arange(10.0)
-    assert transfer.rank_correlation(np.exp(x), x) == pytest.approx(1.0)
-    assert transfer.rank_correlation(-x, np.where(x == 3.0, np.nan, x)) == pytest.approx(-1.0)
-    assert np.isnan(transfer.rank_correlation(x[:2], x[:2]))
+    assert alignment.rank_correlation(np.exp(x), x) == pytest.approx(1.0)
+    assert alignment.rank_correlation(-x, np.where(x == 3.0, np.nan, x)) == pytest.approx(-1.0)
+    assert np.isnan(alignment.rank_correlation(x[:2], x[:2]))
 
 
 def test_tables_hold_every_row_and_are_rectangular():
     rows = {
-        ("straight", "command"): transfer.compare(TRUTH, None, TRUTH),
-        ("straight", "net"): transfer.compare(TRUTH, -TRUTH, TRUTH),
+        ("straight", "command"): alignment.compare(TRUTH, None, TRUTH),
+        ("straight", "net"): alignment.compare(TRUTH, -TRUTH, TRUTH),
         ("c", "net"): None,
     }
-    text = transfer.gradient_table(rows)
+    text = alignment.gradient_table(rows)
     assert len(text.splitlines()) == 5
     assert "no phase to compare" in text
     ranks = {("c", "net"): {"1.5": 0.9, "3": 0.5}}
-    for table in (text, transfer.rank_table(ranks)):
+    for table in (text, alignment.rank_table(ranks)):
         assert len({line.count("|") for line in table.splitlines()}) == 1
-    assert "above zero on 1 of 1" in transfer.verdict(rows, "net")
-    assert "could be made" in transfer.verdict(rows, "paper")
+    assert "above zero on 1 of 1" in alignment.summary(rows, "net")
+    assert "could be made" in alignment.summary(rows, "paper")
 
 
 def test_pictures_show_gradients_of_unit_length_and_the_losses_of_both(tmp_path, drawn):

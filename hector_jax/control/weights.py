@@ -112,3 +112,9 @@ def moved(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
     """
     vector = weights_to_vector(weights) * jnp.exp(logs @ directions())
     return jax.tree.map(np.asarray, vector_to_weights(vector))
+
+
+def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:
+    """Draw weight sets log-uniformly within x/factor of some weights, always the same ones."""
+    draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(DIRECTION_NAMES)))
+    return [moved(weights, np.log(factor) * row) for row in draws]

@@ -2,14 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from hector_jax.report.plots.style import drawing, legend, log_axis, looks_of, named
-from hector_jax.report.robustness import DIRECTIONS, Cell
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
+
+DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 
 
 def changes(
@@ -77,7 +79,7 @@ def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline:
     panel.grid(visible=False, axis="y")
 
 
-def survival(path: Path, rows: Mapping[str, Mapping[str, Cell]]) -> str:
+def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
     """Loss against the baseline and share of walks without a fall, one row per disturbance.
 
     Args:

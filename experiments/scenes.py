@@ -1,10 +1,9 @@
-"""What a weight set bears: scenes with something in the way, and what is left of their walks.
+"""Walks with something in the way, and what they tell of a weight set.
 
 Scenes have a kind and a level: a push of 50 N, a floor of friction 0.4. The scenes of one level
-differ in direction and gait phase and are walked by every set on every plant. Two numbers tell of a
-level: the share of its walks without a fall, and the median of the paired ratios of L to the
-baseline's. Their intervals redraw the plants, each with all of its scenes; fewer than four plants
-have none.
+differ in direction and gait phase; every set walks all of them on every plant. Two numbers describe
+a level: the share of its walks without a fall, and the median of the paired ratios of L to the
+baseline's. Their intervals redraw the plants, each with all of its scenes.
 """
 
 from collections.abc import Mapping
@@ -17,25 +16,23 @@ from jaxtyping import Bool, Float
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
-from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, InputError, check, short_repr
 from hector_jax.report.report import markdown_table
 from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
 from hector_jax.sim.changes import Change
-from hector_jax.sim.walk import Job
-from hector_jax.sim.world import NO_PUSH, Imperfections, Push
+from hector_jax.sim.world import NO_PUSH, Push
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk goes on until the robot has settled
-STEP_START, STEP_END = 1.0, 3.0  # [s] of a slippery floor
-PAYLOAD, PAYLOAD_LATE = 2.0, 2.0  # [kg], [s] when it is put on in the midst of a walk
+SLIPPERY = 1.0, 3.0  # [s] from when to when a floor is slippery
+PAYLOAD, PAYLOAD_LATE = 2.0, 2.0  # [kg], [s] when it is put on during a walk
 SLOPE = np.deg2rad(3.0)
 SLOPES = {"up": (SLOPE, 0.0), "down": (-SLOPE, 0.0), "left": (0.0, SLOPE), "right": (0.0, -SLOPE)}
 """Where the floor rises, seen from the walk's start."""
 
 
 class Scene(NamedTuple):
-    """A walk's circumstances, whoever walks and on whatever plant."""
+    """Circumstances of a walk: fields of `Job`, for any weights on any plant."""
 
     command: Command
     seconds: float = 4.0
@@ -51,7 +48,7 @@ class Level(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What a table calls it."""
+        """Row name in a table."""
         size = self.size if isinstance(self.size, str) else f"{self.size:g}"
         return f"{self.kind} {size}" + (" N" if self.kind == "push" else "")
 
@@ -86,95 +83,69 @@ class SceneConfig:
                 )
 
 
-def scenes(config: SceneConfig) -> dict[Level, list[Scene]]:
+def make_scenes(config: SceneConfig) -> dict[Level, list[Scene]]:
     """All scenes by level; those of a push are ordered by direction, then by phase."""
-    command = named_command(config.traj)
-    cycle = GaitConfig().tick * GaitConfig().cycle
-    later = cycle * np.arange(config.phases) / config.phases  # t = 0 is a beginning of a cycle
+    command, gait = named_command(config.traj), GaitConfig()
+    # t = 0 begins a cycle
+    later = gait.tick * gait.cycle * np.arange(config.phases) / config.phases
     angles = np.deg2rad(DIRECTIONS)
     ways = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
-    once = lambda x: np.array([x])  # noqa: E731
-    pushes = {
-        Level("push", force): [
-            Scene(
-                command, PUSH_WALK, Push(once(force * way), once(PUSH_START + t), once(PUSH_TIME))
-            )
-            for way in ways
-            for t in later
+    start, end = SLIPPERY
+
+    def pushed(force: np.ndarray, t: float) -> Scene:
+        push = Push(*(np.array([x]) for x in (force, PUSH_START + t, PUSH_TIME)))
+        return Scene(command, PUSH_WALK, push)
+
+    def changed(change: Change) -> Scene:
+        return Scene(command, changes=(change,))
+
+    scenes = {Level("calm", config.traj): [Scene(command)]}
+    for force in config.forces:
+        scenes[Level("push", force)] = [pushed(force * way, t) for way in ways for t in later]
+    for friction in config.frictions:
+        scenes[Level("friction", friction)] = [
+            changed(Change(start + t, end + t, floor_friction=friction)) for t in later
         ]
-        for force in config.forces
-    }
-    slippery = {
-        Level("friction", friction): [
-            Scene(command, changes=(Change(STEP_START + t, STEP_END + t, floor_friction=friction),))
-            for t in later
-        ]
-        for friction in config.frictions
-    }
-    slopes = {
-        Level("slope", side): [Scene(command, changes=(Change(slope=rise),))]
-        for side, rise in SLOPES.items()
-    }
-    loads = {
-        "2 kg from the start": Change(payload=PAYLOAD),
-        "2 kg put on at 2 s": Change(start=PAYLOAD_LATE, payload=PAYLOAD),
-    }
-    unseen = {name: named_command(name) for name in UNSEEN}
-    return {
-        Level("calm", config.traj): [Scene(command)],
-        **pushes,
-        **slippery,
-        **slopes,
-        **{Level("payload", name): [Scene(command, changes=(c,))] for name, c in loads.items()},
-        **{
-            Level("command", name): [Scene(one, max(4.0, float(one.duration.sum())))]
-            for name, one in unseen.items()
-        },
-    }
+    for side, rise in SLOPES.items():
+        scenes[Level("slope", side)] = [changed(Change(slope=rise))]
+    early, late = Change(payload=PAYLOAD), Change(start=PAYLOAD_LATE, payload=PAYLOAD)
+    scenes[Level("payload", "2 kg from the start")] = [changed(early)]
+    scenes[Level("payload", "2 kg put on at 2 s")] = [changed(late)]
+    for name in UNSEEN:
+        unseen = named_command(name)
+        scenes[Level("command", name)] = [Scene(unseen, max(4.0, float(unseen.duration.sum())))]
+    return scenes
 
 
-def as_job(scene: Scene, weights: Weights, plant: Imperfections, seed: int) -> Job:
-    """The scene as somebody's walk."""
-    return Job(
-        weights,
-        scene.command,
-        plant,
-        seconds=scene.seconds,
-        seed=seed,
-        push=scene.push,
-        changes=scene.changes,
-    )
-
-
-def judge(scores: Score, baseline: Score) -> Cell:
-    """A weight set against a baseline in the scenes of one level.
+def evaluate_level(scores: Score, baseline: Score) -> Cell:
+    """Compare a weight set with a baseline in the scenes of one level.
 
     Args:
         scores: (plants, scenes) each.
-        baseline: likewise, of the same plants and scenes; may be the same.
+        baseline: the same of the baseline, on the same plants and scenes; may be the same set.
     """
-    stood, ratio = ~scores.fallen, scores.L / baseline.L
-
     return Cell(
-        survived=bootstrap(partial(np.mean, axis=(-2, -1)), stood),
-        ratio=bootstrap(partial(np.median, axis=(-2, -1)), ratio),
+        survived=bootstrap(partial(np.mean, axis=(-2, -1)), ~scores.fallen),
+        ratio=bootstrap(partial(np.median, axis=(-2, -1)), scores.L / baseline.L),
         falls=int(scores.fallen.sum()),
         walks=scores.fallen.size,
         counts=falls_comparable(scores.fallen, baseline.fallen),
     )
 
 
-def endured(fallen: Mapping[float, Bool[np.ndarray, "plants scenes"]]) -> Float[np.ndarray, "8"]:
+def largest_pushes(
+    fallen: Mapping[float, Bool[np.ndarray, "plants scenes"]],
+) -> Float[np.ndarray, "8"]:
     """Largest force [N] survived by direction, all smaller ones too; mean over plants and phases.
 
     Args:
-        fallen: by force, in the order of `scenes`.
+        fallen: by force, in the order of `make_scenes`.
     """
     forces = np.array(sorted(fallen))
     stood = np.stack([~fallen[force] for force in forces])
-    held = np.logical_and.accumulate(stood, axis=0).sum(axis=0)  # how many of the forces
-    each = np.append(0.0, forces)[held].reshape(held.shape[0], len(DIRECTIONS), -1)
-    return each.mean(axis=(0, 2))
+    count = np.logical_and.accumulate(stood, axis=0).sum(axis=0)  # of the forces
+    largest = np.append(0.0, forces)[count].reshape(count.shape[0], len(DIRECTIONS), -1)
+    return largest.mean(axis=(0, 2))
 
 
 def table(cells: Mapping[Level, Mapping[str, Cell]], losses: Mapping[Level, float]) -> str:
@@ -188,20 +159,14 @@ def table(cells: Mapping[Level, Mapping[str, Cell]], losses: Mapping[Level, floa
     head = ["", f"{baseline}: falls", "L [1e6]"]
     head += [text for name in others for text in (f"{name}: falls", f"L / {baseline}")]
     rows = []
-    for level, found in cells.items():
-        row = [level.name, _falls(found[baseline]), f"{losses[level] / 1e6:.2f}"]
+    for level, by_set in cells.items():
+        falls = {name: f"{cell.falls} of {cell.walks}" for name, cell in by_set.items()}
+        row = [level.name, falls[baseline], f"{losses[level] / 1e6:.2f}"]
         for name in others:
-            row += [_falls(found[name]), _ratio(found[name])]
+            cell = by_set[name]
+            row += [falls[name], cell.ratio.text("{:.2f}".format) + " *" * (not cell.counts)]
         rows.append(row)
     return markdown_table(head, rows)
-
-
-def _falls(cell: Cell) -> str:
-    return f"{cell.falls} of {cell.walks}"
-
-
-def _ratio(cell: Cell) -> str:
-    return cell.ratio.text("{:.2f}".format) + ("" if cell.counts else " *")
 
 
 def as_result(cell: Cell) -> dict[str, Any]:

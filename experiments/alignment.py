@@ -1,26 +1,26 @@
-"""Does the model's gradient point where the better simulator's does? The pure part of the report.
+"""How well a model's gradient agrees with the simulator's: numbers and tables of transfer.py.
 
 All gradients are those of L in the logarithms of 18 weights: each of Q, and each of R, which the
 two feet share. Rows of a matrix are start phases. Two gradients are compared by the cosine between
 their means over phases; intervals redraw the phases, the same ones for model and simulator. With a
-handful of phases such an interval is narrow rather than wide, and it tells nothing of other
+handful of phases such an interval is narrow rather than wide, and it says nothing of other
 commands.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.stats import spearmanr
 
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
-from hector_jax.control.weights import Weights, directions, moved, weights_to_vector
+from hector_jax.control.weights import Weights, directions, weights_to_vector
 from hector_jax.report.report import markdown_table
 from hector_jax.runs.metrics import Interval, bootstrap
 
 SAG = ("Q_z", "Q_vz", "R_Fz")
-"""What a rigid body that sinks, or a robot that floats, pulls at."""
+"""The weights that a rigid body that sinks, or a robot that floats, depends on most."""
 
 BEYOND_SAG = np.array([name not in SAG for name in NAMES])
 STEP = float(np.log(1.05))  # of the central differences, in log-weights
@@ -34,25 +34,22 @@ class Row(NamedTuple):
     gain: Interval | None  # cosine less that of the command itself; None for the command
     gain_beyond_sag: Interval | None
     wrong: str  # the weight whose entry differs most between the unit gradients
-    share: float  # of the squared distance between the unit gradients, that it makes
+    share: float  # of the squared distance between the unit gradients, due to that weight
     entries: tuple[float, float]  # of that weight, in the unit gradients of model and simulator
     sizes: tuple[float, float]  # norms of the mean gradients of model and simulator
-    phases: int  # in which all that is compared could be believed
+    phases: int  # with finite gradients of all that is compared
+
+
+Rows = Mapping[tuple[str, str], Row | None]  # by trajectory and phi, of one weight set
 
 
 def as_directions(weights: Weights, gradient: Weights) -> Float[np.ndarray, "18"]:
-    """A gradient in weights as one in the 18 directions."""
+    """Turn a gradient in weights into one in the 18 directions."""
     logs = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
     return directions() @ logs
 
 
-def disturbed(weights: Weights, factor: float, count: int) -> list[Weights]:
-    """Weight sets drawn log-uniformly within x/factor, the same ones every time."""
-    draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(NAMES)))
-    return [moved(weights, np.log(factor) * row) for row in draws]
-
-
-def slopes(losses: Float[np.ndarray, "P 18 2"]) -> Float[np.ndarray, "P 18"]:
+def slopes(losses: Float[np.ndarray, "*batch 18 2"]) -> Float[np.ndarray, "*batch 18"]:
     """Central differences of losses a STEP up and a STEP down."""
     return (losses[..., 0] - losses[..., 1]) / (2.0 * STEP)
 
@@ -60,15 +57,8 @@ def slopes(losses: Float[np.ndarray, "P 18 2"]) -> Float[np.ndarray, "P 18"]:
 def cosine(
     a: Float[np.ndarray, "*batch n"], b: Float[np.ndarray, "*batch n"]
 ) -> np.ndarray | float:
-    """Of the angle between vectors."""
+    """Cosine of the angle between vectors."""
     return np.sum(a * b, axis=-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1))
-
-
-def over_phases(
-    statistic: Callable[..., np.ndarray | float], *gradients: Float[np.ndarray, "P n"]
-) -> Interval:
-    """A statistic of mean gradients, with its percentile interval when the phases are redrawn."""
-    return bootstrap(lambda *drawn: statistic(*(g.mean(axis=-2) for g in drawn)), *gradients)
 
 
 def compare(
@@ -76,7 +66,7 @@ def compare(
     command: Float[np.ndarray, "P 18"] | None,
     simulator: Float[np.ndarray, "P 18"],
 ) -> Row | None:
-    """A model's gradients against the simulator's, and against those of the command itself.
+    """Compare a model's gradients with the simulator's, and with those of the command itself.
 
     Phases with a number that is not finite are left out for all.
 
@@ -89,35 +79,35 @@ def compare(
         The row, or None where no phase is left.
     """
     base = model if command is None else command
-    kept = np.isfinite(model + base + simulator).all(axis=1)
-    if not kept.any():
+    finite = np.isfinite(model + base + simulator).all(axis=1)
+    if not finite.any():
         return None
-    model, base, simulator = model[kept], base[kept], simulator[kept]
+    model, base, simulator = model[finite], base[finite], simulator[finite]
 
-    def gain(model: np.ndarray, base: np.ndarray, simulator: np.ndarray) -> np.ndarray | float:
-        return cosine(model, simulator) - cosine(base, simulator)
+    def agreement(m: np.ndarray, s: np.ndarray) -> np.ndarray | float:
+        return cosine(m.mean(axis=-2), s.mean(axis=-2))
 
-    def told(chosen: Bool[np.ndarray, "18"]) -> tuple[Interval, Interval | None]:
+    def gain(m: np.ndarray, b: np.ndarray, s: np.ndarray) -> np.ndarray | float:
+        return agreement(m, s) - agreement(b, s)
+
+    cosines, gains = [], []
+    for chosen in (np.ones(len(NAMES), bool), BEYOND_SAG):
         m, b, s = model[:, chosen], base[:, chosen], simulator[:, chosen]
-        both = over_phases(cosine, m, s)
-        return both, None if command is None else over_phases(gain, m, b, s)
-
-    (whole, more), (rest, more_rest) = told(np.ones(len(NAMES), bool)), told(BEYOND_SAG)
+        cosines.append(bootstrap(agreement, m, s))
+        gains.append(None if command is None else bootstrap(gain, m, b, s))
     means = model.mean(axis=0), simulator.mean(axis=0)
     sizes = tuple(float(np.linalg.norm(mean)) for mean in means)
     a, b = (mean / size for mean, size in zip(means, sizes, strict=True))
     apart = (a - b) ** 2  # sums to 2 (1 - cosine)
     worst = int(np.argmax(apart))
     return Row(
-        cosine=whole,
-        beyond_sag=rest,
-        gain=more,
-        gain_beyond_sag=more_rest,
+        *cosines,
+        *gains,
         wrong=NAMES[worst],
         share=float(apart[worst] / max(apart.sum(), 1e-12)),
         entries=(float(a[worst]), float(b[worst])),
         sizes=sizes,
-        phases=int(kept.sum()),
+        phases=int(finite.sum()),
     )
 
 
@@ -125,27 +115,27 @@ def rank_correlation(
     model: Float[np.ndarray, " sets"], simulator: Float[np.ndarray, " sets"]
 ) -> float:
     """Spearman's, over the weight sets with a finite loss in both; NaN for fewer than three."""
-    kept = np.isfinite(model + simulator)
-    if kept.sum() < 3:
+    finite = np.isfinite(model + simulator)
+    if finite.sum() < 3:
         return float("nan")
-    return float(spearmanr(model[kept], simulator[kept]).statistic)
+    return float(spearmanr(model[finite], simulator[finite]).statistic)
 
 
-def _told(value: Interval | None) -> str:
+def _text(value: Interval | None) -> str:
     return "" if value is None else value.text("{:.2f}".format)
 
 
-def gradient_table(rows: Mapping[tuple[str, str], Row | None]) -> str:
+def gradient_table(rows: Rows) -> str:
     """The rows of one weight set, by trajectory and phi."""
     head = ("trajectory", "phi", "cosine", "without z, R_Fz", "more than command")
     head += ("more, without z, R_Fz", "most wrong")
     lines = []
-    for (trajectory, kind), row in rows.items():
-        if row is None:
-            lines.append((trajectory, kind, "no phase to compare", "", "", "", ""))
-            continue
-        cells = (row.cosine, row.beyond_sag, row.gain, row.gain_beyond_sag)
-        lines.append((trajectory, kind, *map(_told, cells), f"{row.wrong}, {row.share:.0%}"))
+    for key, row in rows.items():
+        cells = ("no phase to compare", *[""] * 4)
+        if row is not None:
+            values = (row.cosine, row.beyond_sag, row.gain, row.gain_beyond_sag)
+            cells = (*map(_text, values), f"{row.wrong}, {row.share:.0%}")
+        lines.append((*key, *cells))
     return markdown_table(head, lines, words=2)
 
 
@@ -164,24 +154,24 @@ def wrong_sentence(trajectory: str, kind: str, row: Row) -> str:
 
 
 def rank_table(ranks: Mapping[tuple[str, str], Mapping[str, float]]) -> str:
-    """Rank correlations by trajectory and phi, and by how far the weights were disturbed."""
+    """Rank correlations by trajectory and phi, and by the factor within which sets were drawn."""
     factors = next(iter(ranks.values()), {})
     rows = [(*key, *(f"{value:.3f}" for value in row.values())) for key, row in ranks.items()]
     head = ("trajectory", "phi", *(f"within x/{factor}" for factor in factors))
     return markdown_table(head, rows, words=2)
 
 
-def verdict(rows: Mapping[tuple[str, str], Row | None], kind: str) -> str:
-    """Whether a phi makes the gradients of one weight set point better than the command does."""
-    found = {t: row for (t, k), row in rows.items() if k == kind and row is not None and row.gain}
-    if not found:
+def summary(rows: Rows, kind: str) -> str:
+    """Whether the gradients through a phi point better than those through the command."""
+    gains = {t: row for (t, k), row in rows.items() if k == kind and row is not None and row.gain}
+    if not gains:
         return f"No comparison of {kind} with the command could be made."
-    better = sum(row.gain is not None and row.gain.low > 0.0 for row in found.values())
-    least = min(row.cosine.value for row in found.values())
-    each = "; ".join(f"{t} {_told(row.gain)}" for t, row in found.items())
+    better = sum(row.gain is not None and row.gain.low > 0.0 for row in gains.values())
+    least = min(row.cosine.value for row in gains.values())
+    each = "; ".join(f"{t} {_text(row.gain)}" for t, row in gains.items())
     return (
         f"Cosine with the {kind} less that with the command itself: {each}. The interval is above "
-        f"zero on {better} of {len(found)}; the least cosine is {least:.2f} (asked for: 0.7)."
+        f"zero on {better} of {len(gains)}; the least cosine is {least:.2f}."
     )
 
 
