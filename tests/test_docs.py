@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 from typing import get_args
 
@@ -131,6 +132,30 @@ def test_targets_of_make_in_pages_are_there(path):
 def test_files_that_pages_name_are_there(path):
     named = re.findall(r"\b(?:experiments|examples|assets)/[\w/.-]+\.\w+", path.read_text())
     assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize("kind", get_args(flags.Command), ids=flags.command_name)
+def test_every_flag_has_a_row_among_the_commands(kind):
+    text = (DOCS / "commands.md").read_text()
+    section = text.split(f"\n### hector {flags.command_name(kind)}\n")[1].split("\n#")[0]
+    added = text.split("## Added since e1557c7")[1].split("\n## ")[0]
+    for field in fields(kind):
+        name = field.name.replace("_", "-")
+        new = f"| `hector {flags.command_name(kind)} --{name}`"
+        assert f"| `--{name}` |" in section or f"| `{name.upper()}` |" in section or new in added
+
+
+def test_tests_that_pages_name_are_there():
+    text = "\n".join(path.read_text() for path in PAGES)
+    named = set(re.findall(r"(test_\w+\.py)::(test_\w+)", text))
+    assert len(named) > 40
+    for file, name in sorted(named):  # `test_a_name...` stands for the tests that begin so
+        assert f"\ndef {name}" in (ROOT / "tests" / file).read_text(), f"{file}::{name}"
+
+
+def test_pages_have_titles_of_their_own():
+    titles = [re.search(r"^# (.+)$", path.read_text(), re.MULTILINE).group(1) for path in PAGES]
+    assert sorted(titles) == sorted(set(titles))
 
 
 def test_equations_carry_the_papers_numbers():
