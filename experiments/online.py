@@ -40,7 +40,8 @@ from hector_jax.grfm.network import as_effect
 from hector_jax.report import plots
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import kept, pipeline
+from hector_jax.runs import pipeline
+from hector_jax.runs.cache import cached
 from hector_jax.sim.changes import Change
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
@@ -231,15 +232,16 @@ def walk_cases(
         ending = digest(how, robot, job, (effect,), moment, arm, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
-    def walked(missing: Sequence[Case]) -> Iterator[Walked]:
+    def walked(missing: Sequence[Case], _: Mapping[Case, Walked]) -> Iterator[tuple[Case, Walked]]:
         running = {case: pool.submit(_walk_case, *cases[case]) for case in missing}
         with bar("walks on plants that change") as tell:
             for done, (case, future) in enumerate(running.items(), 1):
-                yield future.result()
+                yield case, future.result()
                 tell(done, len(running), " ".join(case))
 
     like = Walked(*(np.zeros((0,) * n) for n in (1, 2, 1, 1, 0, 2, 1, 1)))
-    return kept.trees({case: path(case) for case in cases}, walked, like, "online", robot)
+    paths = {case: path(case) for case in cases}
+    return cached(paths, walked, like=lambda _: like, kind="online", robot=robot)
 
 
 def main() -> None:

@@ -169,7 +169,7 @@ def tuned_sets(
     }
     commit = environment().get("commit", "")
     title = "tuning, ten iterations"
-    found = kept.tune(pool, config, robot, problems, flags.out, commit, title)
+    found = pipeline.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
     return {**given, **{name: tuned.tuning.ten for name, tuned in found.items()}}
 
 

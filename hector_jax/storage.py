@@ -6,9 +6,6 @@ versions, and `about`, which belongs to whoever wrote it. The archive's comment 
 bytes before it, so a file that was cut or changed anywhere is refused as a whole. The robot is
 known by the hash of its numbers: what was learned on one body is not loaded for another. Files
 appear by rename, so a reader finds the old one or the new one and never a part.
-
-Whatever is computed for longer than a moment keeps how far it came as a `Checkpoint` of such files,
-in a folder that `locked` gives to one process.
 """
 
 import ast
@@ -24,7 +21,7 @@ import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -218,13 +215,12 @@ def _bits(tree: Any) -> str:
     return found.hexdigest()
 
 
-def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
+def write_file(path: Path, data: bytes) -> None:
     """Put `data` under `path`, whole or not at all; missing folders are made.
 
     Args:
         path: the file, replaced if it is there.
         data: all of it.
-        before: file for what is replaced.
 
     Raises:
         WriteError: one line with the path, where the folder or the disk refuses.
@@ -237,8 +233,6 @@ def write_file(path: Path, data: bytes, before: Path | None = None) -> None:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        if before is not None and path.exists():
-            write_file(before, path.read_bytes())
         os.replace(part, path)
         _sync(path.parent)
     except BaseException as error:
@@ -327,10 +321,6 @@ def save_tree(
     Raises:
         WriteError: where the file cannot be written.
     """
-    write_file(path, _packed(tree, kind, robot, about))
-
-
-def _packed(tree: Any, kind: str, robot: Any, about: Mapping[str, Any] | None) -> bytes:
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     card = {
         "format": FORMAT,
@@ -347,7 +337,7 @@ def _packed(tree: Any, kind: str, robot: Any, about: Mapping[str, Any] | None) -
                 np.lib.format.write_array(entry, array, allow_pickle=False)
         archive.comment = b"0" * _DIGEST  # makes room; a zip file ends with its comment
     content = buffer.getvalue()[:-_DIGEST]
-    return content + hashlib.sha256(content).hexdigest().encode()
+    write_file(path, content + hashlib.sha256(content).hexdigest().encode())
 
 
 def load_tree(
@@ -382,8 +372,10 @@ def load_tree(
         told = one_line(", ".join(odd))
         raise InputError(f"{path}: another layout of {kind}; fields that differ: {told}")
     for name, leaf in wanted.items():
-        if (dtype := arrays[name].dtype).kind not in "biuf":
-            raise InputError(f"{path}: {name} has type {dtype}, expected numbers")
+        is_text = np.asarray(leaf).dtype.kind == "U"
+        if (dtype := arrays[name].dtype).kind not in ("U" if is_text else "biuf"):
+            what = "text" if is_text else "numbers"
+            raise InputError(f"{path}: {name} has type {dtype}, expected {what}")
         shape, got = np.shape(leaf), arrays[name].shape
         if len(shape) != len(got) or any(s not in (0, g) for s, g in zip(shape, got, strict=True)):
             text = ", ".join("any" if s == 0 else str(s) for s in shape)
@@ -462,59 +454,6 @@ def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, A
         if name == "code":
             what = f"by other code or other versions of {', '.join(_NUMERIC)}"
         raise InputError(f"{path}: made {what}; remove it, or name another folder")
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """How far something came, on disk: the newest state and the one before it.
-
-    A file that is cut, changed, of another robot or layout is named, not taken up, and put aside as
-    `.refused`. Of what else a state follows from, the code included, the file's name is to hold a
-    `digest`.
-    """
-
-    path: Path  # of the newest state
-    kind: str  # see save_tree
-    robot: Any = None
-    about: Mapping[str, Any] = field(default_factory=dict)  # JSON values for every card
-
-    @property
-    def before(self) -> Path:
-        """The file of the state before the newest."""
-        return self._beside("before")
-
-    def _beside(self, word: str) -> Path:
-        return self.path.with_name(f"{self.path.stem}.{word}{self.path.suffix}")
-
-    def save(self, tree: Any, about: Mapping[str, Any] | None = None) -> None:
-        """Keep a state, with more notes for its card.
-
-        Raises:
-            WriteError: where the file cannot be written; what was kept stays.
-        """
-        data = _packed(tree, self.kind, self.robot, {**self.about, **(about or {})})
-        write_file(self.path, data, self.before)
-
-    def load(self, like: Tree) -> tuple[Tree, dict[str, Any]] | None:
-        """The newest sound state, with the notes of its card; None where there is none."""
-        for path in (self.path, self.before):
-            if not path.exists():
-                continue
-            try:
-                tree, card = load_tree(path, like, kind=self.kind, robot=self.robot)
-            except InputError as error:
-                say(f"not taken up: {error}")
-                if path == self.path:
-                    # out of the way: the next save must not put it in the place of a sound one
-                    os.replace(path, self._beside("refused"))
-                continue
-            return tree, card["about"]
-        return None
-
-    def remove(self) -> None:
-        """Forget both states."""
-        for path in (self.path, self.before):
-            path.unlink(missing_ok=True)
 
 
 def as_json(value: Any, indent: int | None = None) -> str:

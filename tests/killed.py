@@ -1,9 +1,11 @@
 """Four jobs, kept as the program keeps them, and a killer: `python killed.py JOB FOLDER KILLS`.
 
-The job is begun again and again and killed after a few saves more, at a moment drawn evenly from
-the time between two saves, so that some kills fall inside a save. The last one is left alone.
-Models are toys: what is tried here is what is kept. FOLDER/done has a line for each piece of work
-that was done, whether it was kept or not.
+A job of many artefacts (collection, table) is begun again and again and killed after a few saves
+more, at a moment drawn evenly from the time between two saves, so that some kills fall inside a
+save. A job that is one artefact (tuning, training) begins anew each time, and is killed at a moment
+drawn evenly from the time that it takes. The last one is left alone. Models are toys: what is tried
+here is what is kept. FOLDER.done has a line for each piece of work that was done, whether it was
+kept or not.
 """
 
 import os
@@ -26,11 +28,10 @@ from hector_jax.grfm import dataset
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, pipeline
-from hector_jax.runs.course import save_tuning
-from hector_jax.runs.kept import Journal
+from hector_jax.runs.pipeline import Journal
 from hector_jax.sim.world import hfs
 from hector_jax.storage import locked
-from hector_jax.tuning.difftune import Evaluation, TuneConfig, Tuning, descend
+from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
 from hector_jax.tuning.loss import Losses
 
 ROBOT, S = load_robot(), named_command("s")
@@ -54,21 +55,23 @@ def look(folder: Path, weights) -> Evaluation:
     return Evaluation(loss, Losses(loss, loss, loss), gradient, none, none)
 
 
+def tune_toys(folder: Path, pool, config, robot, problems, title, on_iteration):
+    """In the place of `pipeline._tunings`."""
+    for name in problems:
+        yield name, descend(config, nominal(), partial(look, folder), partial(on_iteration, name))
+
+
 def tuning(folder: Path) -> None:
-    config = TuneConfig(iterations=60)
-    with locked(folder):
-        (record,) = pipeline.records_in(folder, config, ROBOT, {"toy": (S, None)}).values()
-        journal = Journal(folder / "metrics.jsonl")
-        journal.write({"toy": record.past.history if record.past else ()})
-        found = descend(
-            config,
-            nominal(),
-            partial(look, folder),
-            partial(journal.add, "toy"),
-            past=record.past.history if record.past else (),
-            keep=partial(save_tuning, record.kept),
-        )
-        journal.write({"toy": found.history})
+    pipeline._tunings = partial(tune_toys, folder)
+    pipeline.tune(
+        ThreadPoolExecutor(1),
+        TuneConfig(iterations=60),
+        ROBOT,
+        {"toy": (S, None)},
+        folder,
+        title="",
+        journal=Journal(folder / "metrics.jsonl"),
+    )
 
 
 def walk_jobs(folder: Path, jobs):
@@ -99,18 +102,11 @@ def table(folder: Path) -> None:
             done(folder, f"{job.seed} {float(job.weights.Q.euler[0])}")
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
-    def tune_many(pool, config, robot, problems, title, records, dumps):
-        (record,) = records.values()
-        past = record.past.history if record.past else ()
-        keep = partial(save_tuning, record.kept)
-        found: Tuning = descend(config, nominal(), partial(look, folder), past=past, keep=keep)
-        return dict.fromkeys(problems, found)
-
-    pipeline.walks_of, pipeline.tune_many = walks_of, tune_many
+    pipeline.walks_of, pipeline._tunings = walks_of, partial(tune_toys, folder)
     config, pool = TuneConfig(iterations=20), ThreadPoolExecutor(1)
     problems = {"without": (S, None)}
     with locked(folder):
-        tuned = kept.tune(pool, config, ROBOT, problems, folder / "s", "abc", "")["without"]
+        tuned = pipeline.tune(pool, config, ROBOT, problems, folder / "s", title="")["without"]
         sets = {"nominal": nominal(), "expert": expert(), "without": tuned.tuning.converged}
         seeds = range(WALKS // 2)
         plants = [hfs()] * len(seeds)
@@ -123,6 +119,9 @@ JOBS = {job.__name__: job for job in (tuning, collection, training, table)}
 def newest(folder: Path) -> tuple[int, ...]:
     """Times of the last change of all folders below: each save changes one."""
     return tuple(sorted(f.stat().st_mtime_ns for f in (folder, *folder.glob("*/")) if f.is_dir()))
+
+
+ONE = ("tuning", "training")  # jobs that are one artefact
 
 
 def killed(start, folder: Path, saves: int, wait: float) -> bool:
@@ -143,7 +142,7 @@ def killed(start, folder: Path, saves: int, wait: float) -> bool:
 
 
 def main(name: str, folder: Path, kills: int) -> None:
-    def start() -> int:
+    def start(folder: Path = folder) -> int:
         child = os.fork()  # before JAX has threads; spares importing all again
         if child == 0:
             setup_jax()
@@ -152,9 +151,15 @@ def main(name: str, folder: Path, kills: int) -> None:
         return child
 
     folder.mkdir(parents=True)
-    rng, hits = np.random.default_rng(len(name)), 0
+    rng, hits, seconds = np.random.default_rng(len(name)), 0, 0.03
+    if name in ONE and kills:
+        for trial in ("compiled", "timed"):
+            begin = time.monotonic()
+            os.waitpid(start(folder.parent / trial / name), 0)
+            seconds = time.monotonic() - begin
     for _ in range(kills):
-        hits += killed(start, folder, int(rng.integers(1, 4)), rng.uniform(0.0, 0.03))
+        saves = 0 if name in ONE else int(rng.integers(1, 4))
+        hits += killed(start, folder, saves, rng.uniform(0.0, seconds))
     code = os.waitpid(start(), 0)[1]
     print(f"{name}: {hits} kills", flush=True)
     sys.exit(code != 0)

@@ -7,6 +7,8 @@ import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import jax
 import jax.numpy as jnp
@@ -113,18 +115,19 @@ def params():
 
 def tune(folder, command, params, config=CONFIG, robot=ROBOT):
     """The tuning as a run does it; with the lines that it left."""
-    lines = []
-    with ThreadPoolExecutor(1) as pool:
-        found = pipeline.tune_many(
+    with ThreadPoolExecutor(1) as pool, TemporaryDirectory() as kept:
+        found = pipeline.tune(
             pool,
             config,
             robot,
             {"with": (command, params)},
-            "tuning",
-            lambda name, iteration: lines.append(pipeline.as_line(name, iteration)),
+            Path(kept),
+            title="tuning",
+            journal=pipeline.Journal(Path(kept) / "metrics.jsonl"),
             dumps=folder,
         )
-    return found["with"], [json.loads(line) for line in lines]
+        lines = (Path(kept) / "metrics.jsonl").read_text().splitlines()
+    return found["with"].tuning, [json.loads(line) for line in lines]
 
 
 def call(monkeypatch, *arguments):
@@ -229,8 +232,10 @@ def test_a_dump_of_a_worker_is_reproduced_by_the_console_script(tmp_path, params
     config = TuneConfig(rollout=RolloutConfig(ticks=80), iterations=10)
     with workers(2) as pool:
         problems = {"with": (command, params)}
-        found = pipeline.tune_many(pool, config, ROBOT, problems, "", dumps=tmp_path)["with"]
-    path = min(tmp_path.iterdir())
+        kept, dumps = tmp_path / "kept", tmp_path / "dumps"
+        told = pipeline.tune(pool, config, ROBOT, problems, kept, title="", dumps=dumps)
+        found = told["with"].tuning
+    path = min(dumps.iterdir())
     number = min(i.iteration for i in found.history if i.reason == "the robot fell")
     assert path.name == f"with-{number:03d}-fell.npz"
     shown = subprocess.run(

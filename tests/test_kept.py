@@ -12,10 +12,9 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import bounds, expert, nominal
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, metrics, pipeline
-from hector_jax.runs.course import KIND, load_tuning, save_tuning
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs, ideal
-from hector_jax.storage import Checkpoint, digest
+from hector_jax.storage import digest
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
@@ -32,14 +31,14 @@ def tuned(monkeypatch):
     """Names of the problems that are really tuned."""
     names = []
 
-    def tune_many(pool, config, robot, problems, title, records, dumps):
-        for name, record in records.items():
-            if not record.is_finished:
-                names.append(name)
-                save_tuning(record.kept, TUNING)
-        return dict.fromkeys(problems, TUNING)
+    def tunings(pool, config, robot, problems, title, on_iteration):
+        for name in problems:
+            names.append(name)
+            for iteration in TUNING.history:
+                on_iteration(name, iteration)
+            yield name, TUNING
 
-    monkeypatch.setattr(pipeline, "tune_many", tune_many)
+    monkeypatch.setattr(pipeline, "_tunings", tunings)
     return names
 
 
@@ -63,7 +62,7 @@ def walked(monkeypatch):
 
 def tune(folder, config=CONFIG, command=S):
     problems = {"without": (command, None)}
-    return kept.tune(POOL, config, ROBOT, problems, folder, "abc", "")["without"]
+    return pipeline.tune(POOL, config, ROBOT, problems, folder, title="", commit="abc")["without"]
 
 
 def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
@@ -71,21 +70,41 @@ def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
     return kept.judge(POOL, CONFIG, ROBOT, sets, S, plants, seeds, folder, commit, "")
 
 
-def test_a_tuning_comes_back_as_it_was(tmp_path):
-    path = tmp_path / "tuning.npz"
-    record = Checkpoint(path, KIND, ROBOT, {"commit": "abc"})
-    save_tuning(record, TUNING)
-    back = load_tuning(record)
-    assert back.is_finished
-    assert back.notes["commit"] == "abc"
-    assert back.past.stop == TUNING.stop
-    assert [i.reason for i in back.past.history] == [i.reason for i in TUNING.history]
-    assert [i.accepted for i in back.past.history] == [i.accepted for i in TUNING.history]
-    same(back.past._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
-    for one, other in zip(back.past.history, TUNING.history, strict=True):
-        assert one.iteration == other.iteration
-        assert one.step == other.step
-        same((one.weights, one.evaluation), (other.weights, other.evaluation))
+def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
+    for _ in range(2):  # as tuned, and as kept
+        back, commit = tune(tmp_path)
+        assert commit == "abc"
+        assert back.stop == TUNING.stop
+        assert [i.reason for i in back.history] == [i.reason for i in TUNING.history]
+        assert [i.accepted for i in back.history] == [i.accepted for i in TUNING.history]
+        same(back._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
+        for one, other in zip(back.history, TUNING.history, strict=True):
+            assert one.iteration == other.iteration
+            assert one.step == other.step
+            same((one.weights, one.evaluation), (other.weights, other.evaluation))
+        assert [pipeline.as_line("a", i) for i in back.history] == [
+            pipeline.as_line("a", i) for i in TUNING.history
+        ]
+    assert tuned == ["without"]
+
+
+def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned):
+    """Of two tunings one had ended; the lines that the other had written come once."""
+    problems = {"without": (S, None), "with": (named_command("c"), None)}
+
+    def lines(folder, problems):
+        folder.mkdir(exist_ok=True)
+        journal = pipeline.Journal(folder / "metrics.jsonl")
+        pipeline.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=journal)
+        return (folder / "metrics.jsonl").read_text()
+
+    whole = lines(tmp_path / "whole", problems)
+    half = lines(tmp_path / "cut", {"with": problems["with"]})
+    with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
+        file.write(pipeline.as_line("without", TUNING.history[0]))
+    assert lines(tmp_path / "cut", problems) == whole
+    assert whole.endswith(half)
+    assert tuned == ["without", "with", "with", "without"]
 
 
 def test_a_tuning_is_made_once_and_again_for_other_settings(tmp_path, tuned):

@@ -214,8 +214,8 @@ def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
     assert isinstance(ground(tmp_path, robot, "paper").params, NetParams)
 
 
-def test_a_tuning_that_fails_is_told_while_others_go_on(monkeypatch, robot):
-    def job(config, robot, command, params, name, tell, record):
+def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
+    def job(config, robot, command, params, name, heard):
         if name == "with":
             raise InputError("the starting weights fall")
         time.sleep(30.0)
@@ -224,7 +224,7 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(monkeypatch, robot):
     problems = dict.fromkeys(("without", "with"), (named_command("s"), None))
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
-        pipeline.tune_many(pool, TuneConfig(), robot, problems, "tuning")
+        pipeline.tune(pool, TuneConfig(), robot, problems, tmp_path, title="tuning")
     assert time.monotonic() - begin < 15.0
     pool.shutdown(wait=False)
 

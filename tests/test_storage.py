@@ -149,21 +149,29 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
     assert [p.name for p in saved.parent.iterdir()] == ["tree.npz"]
 
 
-def test_the_newest_state_is_there_under_its_name_at_any_moment(tmp_path, monkeypatch):
-    state = storage.Checkpoint(tmp_path / "state.npz", "thing")
-    replace, there = storage.os.replace, []
+def test_text_comes_back_where_text_is_expected_and_nowhere_else(tmp_path):
+    path = tmp_path / "tree.npz"
+    save_tree(path, {"words": np.array(["a", "longer"]), "x": np.zeros(2)}, kind="thing")
+    like = {"words": np.zeros(0, "U1"), "x": np.zeros(0)}
+    assert load_tree(path, like, kind="thing")[0]["words"].tolist() == ["a", "longer"]
+    with pytest.raises(InputError, match="tree.npz: words has type <U6, expected numbers"):
+        load_tree(path, {"words": np.zeros(0), "x": np.zeros(0)}, kind="thing")
+    with pytest.raises(InputError, match="tree.npz: x has type float64, expected text"):
+        load_tree(path, {"words": np.zeros(0, "U1"), "x": np.zeros(0, "U1")}, kind="thing")
+
+
+def test_a_file_is_there_under_its_name_at_any_moment(tmp_path, monkeypatch):
+    path, replace, there = tmp_path / "file", storage.os.replace, []
 
     def watched(*paths):
-        there.append(state.path.exists())
+        there.append(path.exists())
         replace(*paths)
-        there.append(state.path.exists())
+        there.append(path.exists())
 
-    state.save({"x": np.zeros(3)})
+    storage.write_file(path, b"old")
     monkeypatch.setattr(storage.os, "replace", watched)
-    state.save({"x": np.ones(3)})
-    assert len(there) == 4
-    assert all(there)
-    assert load_tree(state.before, {"x": np.zeros(3)}, kind="thing")[0]["x"].tolist() == [0, 0, 0]
+    storage.write_file(path, b"new")
+    assert there == [True, True]
 
 
 @pytest.mark.parametrize("mask", [0o022, 0o077])

@@ -11,8 +11,8 @@ from hector_jax.cli import flags, study, tuning
 from hector_jax.cli.flags import Table, as_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.report.video import VideoUnavailable
-from hector_jax.runs import kept, pipeline
-from hector_jax.runs.course import Record
+from hector_jax.runs import pipeline
+from hector_jax.runs.pipeline import Tuned
 from hector_jax.search.cmaes import Found, Generation
 from hector_jax.sim.world import hfs
 from hector_jax.storage import save_weights
@@ -34,9 +34,10 @@ def asked(monkeypatch):
         one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(starts, one)
 
-    def tune_many(pool, config, robot, problems, title, records, dumps):
+    def tunings(pool, config, robot, problems, title, on_iteration):
         told["tunings"].append((config.iterations, *problems))
-        return dict.fromkeys(problems, Tuning(pretend_history(12), nominal(), expert(), "done"))
+        for name in problems:
+            yield name, Tuning(pretend_history(12), nominal(), expert(), "done")
 
     def walks_of(pool, config, robot, jobs, title):
         for job in jobs:
@@ -46,19 +47,18 @@ def asked(monkeypatch):
     def write_strip(*args):
         raise VideoUnavailable("no film: none here")
 
-    def tune_measured(pool, config, robot, weights, command, params, plants, title, record):
+    def tune_measured(pool, config, robot, weights, command, params, plants, folder, **notes):
         told["steps"] = config.iterations - 10, len(plants)
-        return Tuning(pretend_history(3), nominal(), expert(), "done")
+        return Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), "")
 
     class Net:
         params = None
 
     monkeypatch.setattr(pipeline, "ground", lambda *args: Net)
     monkeypatch.setattr(pipeline, "search", search)
-    monkeypatch.setattr(pipeline, "tune_many", tune_many)
+    monkeypatch.setattr(pipeline, "_tunings", tunings)
     monkeypatch.setattr(pipeline, "tune_measured", tune_measured)
     monkeypatch.setattr(pipeline, "walks_of", walks_of)
-    monkeypatch.setattr(kept, "load_tuning", Record)
     monkeypatch.setattr(study, "write_strip", write_strip)
     return told
 

@@ -25,8 +25,9 @@ from hector_jax.report.table import PAPER, Earlier, Fall, Search, Table
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, metrics, pipeline
-from hector_jax.runs.kept import Judged, Tuned
+from hector_jax.runs.kept import Judged
 from hector_jax.runs.metrics import BASELINES, Verdict
+from hector_jax.runs.pipeline import Tuned
 from hector_jax.search.cmaes import Found, SearchConfig
 from hector_jax.sim.world import Imperfections, hfs
 from hector_jax.storage import digest, environment, load_weights, locked, make_folder
@@ -221,10 +222,10 @@ def _tune(
     command = plan.commands[name]
     problems = {"without": (command, None), "with": (command, params)}
     title = f"tuning {name} without and with GRFM-Net"
-    tuned = kept.tune(pool, plan.tune, robot, problems, folder, commit, title)
+    tuned = pipeline.tune(pool, plan.tune, robot, problems, folder, title=title, commit=commit)
     if plan.walks is not None:
         try:
-            tuned[WALKS] = kept.tune_measured(
+            tuned[WALKS] = pipeline.tune_measured(
                 pool,
                 plan.walks,
                 robot,
@@ -233,8 +234,8 @@ def _tune(
                 params,
                 pipeline.measured_plants(plan.plants),
                 folder,
-                commit,
-                f"tuning {name} further, along walks on the simulator",
+                title=f"tuning {name} further, along walks on the simulator",
+                commit=commit,
             )
         except InputError as error:  # a walk with the tuned weights falls
             say(f"{name}: no row {WALKS}: {error}")

@@ -29,7 +29,7 @@ from hector_jax.report.report import Picture, Report, print_table, write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, metrics, pipeline
-from hector_jax.runs.kept import Journal, Judged
+from hector_jax.runs.kept import Judged
 from hector_jax.runs.metrics import Score
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim.world import hfs
@@ -211,10 +211,11 @@ def _tune_in(folder: Path, args: Tune) -> None:
         resolved = {**begun, **now}
         write_json(folder / "config.json", resolved)
         shifts: list[dict[str, Any]] = []
-        journal, dumps = Journal(folder / "metrics.jsonl"), folder / "dumps"
+        journal, dumps = pipeline.Journal(folder / "metrics.jsonl"), folder / "dumps"
         known = (pool, config, robot)
         title = f"tuning {wanted.name} without and with GRFM-Net"
-        tunings = kept.tune(*known, problems, shelf, commit, title, journal, dumps)
+        notes = {"commit": commit, "journal": journal, "dumps": dumps}
+        tunings = pipeline.tune(*known, problems, shelf, title=title, **notes)
         newest, tuning = net, tunings["with"].tuning
         for count in range(1, args.refresh + 1):
             newest, shift = pipeline.refresh(
@@ -231,7 +232,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             name = "with_refreshed" + (str(count) if count > 1 else "")
             again = {name: (command, newest.params)}
             title = f"tuning {wanted.name} with the net refreshed"
-            tunings |= kept.tune(*known, again, shelf, commit, title, journal, dumps)
+            tunings |= pipeline.tune(*known, again, shelf, title=title, **notes)
             tuning = tunings[name].tuning
 
         sets = {

@@ -38,9 +38,6 @@ from hector_jax.grfm.network import (
     residual_inputs,
     standardised,
 )
-from hector_jax.storage import Checkpoint
-
-KIND = "training"  # of a checkpoint
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,6 @@ def train(
     training: Dataset,
     validation: Dataset,
     progress: Callable[[int, History], None] = lambda epoch, history: None,
-    kept: Checkpoint | None = None,
 ) -> tuple[Params, History]:
     """Train both nets in 32 bits.
 
@@ -122,7 +118,6 @@ def train(
         training: samples to learn from; their statistics become part of the parameters.
         validation: samples of other walks, which choose the epoch.
         progress: called after each epoch with its number, from 1, and the errors so far.
-        kept: where each epoch is kept, and from where a training that was cut is taken up.
 
     Returns:
         Parameters and the course of the errors.
@@ -147,16 +142,11 @@ def train(
     carry = _Carry(nets, _optimiser(rates).init(nets), nets, infinite)
     seen, unseen = _prepare(params, training), _prepare(params, validation)
     rows, scale = [], _output_scale(params)
-    if kept and (taken := kept.load((carry, np.zeros((0, 4))))):
-        carry, rows = taken[0][0], list(taken[0][1])
-    keys = jax.random.split(key_shuffle, config.epochs)
-    for epoch, key in enumerate(keys[len(rows) :], start=len(rows) + 1):
+    for epoch, key in enumerate(jax.random.split(key_shuffle, config.epochs), start=1):
         carry, row = _train_epoch(
             config.variant, config.batch, rates, scale, seen, unseen, carry, key
         )
         rows.append(jax.device_get(row))
-        if kept:
-            kept.save((carry, np.array(rows)))
         progress(epoch, History(*np.array(rows).T))
     if not all(np.isfinite(leaf).all() for leaf in carry.least):
         raise InputError("training diverged: no epoch has a finite validation error")

@@ -1,10 +1,4 @@
-"""Results on disk, taken up again where the same is asked: tunings and the scores of walks.
-
-The name of a file ends in a digest of all that its content follows from: settings, body, command,
-net, weights, plant, seed, loss, and the code and packages that compute it (`storage.code_hash`).
-Other inputs make another file, so that nothing is taken for something else and nothing is
-overwritten. A damaged file is named and made anew; of a tuning, from the iteration before.
-"""
+"""Scores of walks, each an artefact (cache.py): weight sets on plants, and groups of walks."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -20,6 +14,7 @@ from hector_jax.core.console import bar
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
 from hector_jax.runs import metrics
+from hector_jax.runs.cache import cached
 from hector_jax.runs.metrics import Score
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import Params
@@ -28,23 +23,12 @@ from hector_jax.runs.pipeline import as_line
 from hector_jax.robot.model import Robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import Imperfections
-from hector_jax.storage import Checkpoint, append_file, digest, locked, write_file
+from hector_jax.storage import digest
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.runs.course import KIND, Record, load_tuning
-from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import LossConfig
 
-_KINDS = {"score": "score", "walk": "trajectory"}  # of files, by the beginning of their names
-
-Key = TypeVar("Key")
 Tree = TypeVar("Tree")
-
-
-class Tuned(NamedTuple):
-    """A tuning with its history."""
-
-    tuning: Tuning
-    commit: str  # at which it was made; empty where that is not known
 
 
 class Walked(NamedTuple):
@@ -63,113 +47,16 @@ class Judged(NamedTuple):
     shown: dict[str, Trajectory]  # by set, the walk on the first plant, at the plan interval
 
 
-class Journal:
-    """metrics.jsonl, a line for each iteration: as they come, and in order once tunings are over.
-
-    The truth is in the records of the tunings; the file is made from them.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._known: dict[str, Sequence[Iteration]] = {}
-
-    def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
-        """Write the file anew, with these tunings after or instead of those written before.
-
-        Raises:
-            WriteError: where the file cannot be written; the old one stays.
-        """
-        self._known.update(histories)
-        lines = (as_line(name, i) for name, history in self._known.items() for i in history)
-        write_file(self.path, "".join(lines).encode())
-
-    def add(self, name: str, iteration: Iteration) -> None:
-        """Write one line more.
-
-        Raises:
-            WriteError: where the file cannot be written.
-        """
-        append_file(self.path, as_line(name, iteration).encode())
-
-
-def tune(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
-    problems: Mapping[str, tuple[Command, Params | None]],
-    folder: Path,
-    commit: str,
-    title: str,
-    journal: Journal | None = None,
-    dumps: Path | None = None,
-) -> dict[str, Tuned]:
-    """`pipeline.tune_many`, taking up what is in `folder`.
-
-    Args:
-        pool, config, robot, problems, title: see there.
-        folder: of the tunings, a file for each.
-        commit: to note with what is made now.
-        journal: to write the iterations to.
-        dumps: folder for what was refused; that of the tunings' own by default.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
-    with locked(folder):
-        records = pipeline.records_in(folder, config, robot, problems, {"commit": commit})
-        known = (pool, config, robot, problems, title)
-        kept_in = {"records": records, "dumps": dumps or folder / "dumps"}
-        if journal is None:
-            tunings = pipeline.tune_many(*known, **kept_in)
-        else:
-            journal.write({n: r.past.history if r.past else () for n, r in records.items()})
-            tunings = pipeline.tune_many(*known, journal.add, **kept_in)
-            journal.write({name: tuning.history for name, tuning in tunings.items()})
-    return {name: _tuned(tuning, records[name], commit) for name, tuning in tunings.items()}
-
-
-def _tuned(tuning: Tuning, record: Record, commit: str) -> Tuned:
-    return Tuned(tuning, record.notes["commit"] if record.is_finished else commit)
-
-
-def tune_measured(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    params: Params | None,
-    plants: Sequence[Imperfections],
-    folder: Path,
-    commit: str,
-    title: str,
-) -> Tuned:
-    """`pipeline.tune_measured`, taking up what is in `folder`.
-
-    Raises:
-        InputError: a walk with the starting weights falls or cannot be believed.
-        InputError: the folder cannot be written.
-    """
-    code = (*pipeline.TUNING_CODE, "tuning.measured", "sim.walk")
-    key = digest(config, robot, weights, command, params, *plants, code=code)
-    with locked(folder):
-        path = folder / f"tuning-walks-{key}.npz"
-        record = load_tuning(Checkpoint(path, KIND, robot, {"commit": commit}))
-        known = (config, robot, weights, command, params, plants, title)
-        if record.past is not None and record.is_finished:
-            return _tuned(record.past, record, commit)
-        return Tuned(pipeline.tune_measured(pool, *known, record), commit)
-
-
 def _walked(config: LossConfig, walk: Trajectory, commit: str) -> Walked:
     up = int(np.sum(~np.asarray(walk.fallen)))
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
     return Walked(metrics.score(config, walk), np.asarray(up * float(walk.period)), last, commit)
 
 
-def _walked_like() -> tuple[Score, np.ndarray, State]:
+def _walked_like() -> Walked:
     one, three = np.zeros(()), np.zeros(3)
-    return metrics.score_like(), one, State(three, three, three, three)
+    state = State(three, three, three, three)
+    return Walked(metrics.score_like(), one, state, np.array(""))  # pyright: ignore
 
 
 def _trajectory_like() -> Trajectory:
@@ -227,8 +114,7 @@ def judge(
         for plant, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
-    with locked(folder):
-        scored, shown = _scored(pool, config, robot, jobs, seeds[0], folder, commit, title)
+    scored, shown = _scored(pool, config, robot, jobs, seeds[0], folder, commit, title)
     return Judged(
         {name: [scored[name, seed] for seed in seeds] for name in sets},
         {name: shown[name] for name in sets},
@@ -248,70 +134,29 @@ def _scored(
     """What is kept of jobs by set and seed, and of those of the first seed the walks."""
     walk_config = config.rollout.walk
     code = ("sim.walk", "runs.metrics")
-    endings = {
-        (name, seed): f"{name}-{seed}-{digest(walk_config, config.loss, robot, job, code=code)}.npz"
-        for (name, seed), job in jobs.items()
-    }
-    scored: dict[tuple[str, int], Walked] = {}
-    shown: dict[str, Trajectory] = {}
 
-    def kept(what: str, key: tuple[str, int]) -> Checkpoint:
-        about = {"commit": commit}
-        return Checkpoint(folder / f"{what}-{endings[key]}", _KINDS[what], robot, about)
+    def path(key: tuple[str, int]) -> Path:
+        (name, seed), what = key, "walk" if key[1] == first else "score"
+        ending = digest(walk_config, config.loss, robot, jobs[key], code=code)
+        return folder / f"{what}-{name}-{seed}-{ending}.npz"
 
-    for name, seed in endings:
-        taken = kept("score", (name, seed)).load(_walked_like())
-        if taken is None:
-            continue
-        if seed == first:
-            walk = kept("walk", (name, seed)).load(_trajectory_like())
-            if walk is None:
-                continue
-            shown[name] = walk[0]
-        scored[name, seed] = Walked(*taken[0], commit=taken[1]["commit"])
-    missing = [key for key in jobs if key not in scored]
-    if missing:
-        title = (
-            f"{title}; {len(scored)} of {plural(len(jobs), 'walk')} are there" if scored else title
-        )
-        walks = pipeline.walks_of(pool, config, robot, [jobs[key] for key in missing], title)
-        for (name, seed), walk in zip(missing, walks, strict=True):
-            found = _walked(config.loss, walk, commit)
-            if seed == first:
-                shown[name] = at_interval(walk, walk_config.gait.tick)
-                kept("walk", (name, seed)).save(shown[name])
-            kept("score", (name, seed)).save(tuple(found[:3]))
-            scored[name, seed] = found
-    return scored, shown
+    def make(missing: list[tuple[str, int]], found: Mapping[Any, Any]) -> Iterator[Any]:
+        there = f"; {len(found)} of {plural(len(jobs), 'walk')} are there" if found else ""
+        asked = [jobs[key] for key in missing]
+        walks = pipeline.walks_of(pool, config, robot, asked, title + there)
+        for key, walk in zip(missing, walks, strict=True):
+            one = _walked(config.loss, walk, commit)
+            yield key, (one, at_interval(walk, walk_config.gait.tick) if key[1] == first else None)
 
-
-def trees(
-    paths: Mapping[Key, Path],
-    make: Callable[[Sequence[Key]], Iterable[Tree]],
-    like: Tree,
-    kind: str,
-    robot: Robot,
-    about: Mapping[str, Any] | None = None,
-) -> dict[Key, Tree]:
-    """Trees of arrays by key: those on disk are taken, the others made and saved as they come.
-
-    Args:
-        paths: a file for each, its name with a `digest` of all that the tree follows from.
-        make: yields the trees of the keys that it is given, in their order.
-        like: a tree of the same form.
-        kind: of the files.
-        robot: the body that the trees are of.
-        about: to note with what is made now.
-    """
-    kept = {key: Checkpoint(path, kind, robot, about or {}) for key, path in paths.items()}
-    taken = {key: one.load(like) for key, one in kept.items()}
-    found = {key: one[0] for key, one in taken.items() if one is not None}
-    missing = [key for key in paths if key not in found]
-    if missing:
-        for key, tree in zip(missing, make(missing), strict=True):
-            kept[key].save(tree)
-            found[key] = tree
-    return {key: found[key] for key in paths}
+    taken = cached(
+        {key: path(key) for key in jobs},
+        make,
+        like=lambda key: (_walked_like(), _trajectory_like() if key[1] == first else None),
+        kind="walk",
+        robot=robot,
+    )
+    walked = {key: one._replace(commit=str(one.commit)) for key, (one, _) in taken.items()}
+    return walked, {name: walk for (name, seed), (_, walk) in taken.items() if seed == first}
 
 
 def walk_groups(
@@ -344,7 +189,7 @@ def walk_groups(
         for name, jobs in groups.items()
     }
 
-    def make(missing: Sequence[str]) -> Iterator[Tree]:
+    def make(missing: Sequence[str], _: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
         jobs = [job for name in missing for job in groups[name]]
         with bar(f"{plural(len(jobs), 'walk')}{title}") as on:
             on(0, len(jobs), "compiling")
@@ -355,7 +200,7 @@ def walk_groups(
                     rows.append(tell(next(walks)))
                     done += 1
                     on(done, len(jobs), name)
-                yield jax.tree.map(lambda *x: np.stack(x), *rows)
+                yield name, jax.tree.map(lambda *x: np.stack(x), *rows)
 
     about = {"settings": [repr(part) for part in key]}
-    return trees(paths, make, like, kind, robot, about)
+    return cached(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)

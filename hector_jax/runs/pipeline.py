@@ -6,7 +6,7 @@ one long chain of small operations. A step that finds its result on disk takes i
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.runs import replay
+from hector_jax.runs.cache import cached
 from hector_jax.core.console import bar, say_if_slow
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
@@ -45,7 +46,7 @@ from hector_jax.core.runtime import letters
 from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.storage import (
-    Checkpoint,
+    append_file,
     as_json,
     check_settings,
     code_hash,
@@ -53,11 +54,11 @@ from hector_jax.storage import (
     fingerprint,
     identity,
     locked,
+    write_file,
 )
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning import difftune, measured
 from hector_jax.search import cmaes as searching
-from hector_jax.runs.course import KIND, Record, load_tuning, save_tuning
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
@@ -65,6 +66,7 @@ from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.search.cmaes import Found, Generation, SearchConfig, best
 
 ENGINES = ("auto", "c", "mjx")
+TUNING = "tuning"  # kind of a file
 # modules that decide the numbers, for `storage.digest`
 TUNING_CODE = ("tuning.difftune", "grfm.network")
 TRAINING_CODE = ("grfm.training",)
@@ -131,16 +133,74 @@ class Learned(NamedTuple):
     held_out: list[int]  # numbers of the walks that no training saw
 
 
+class Tuned(NamedTuple):
+    """A tuning with its history."""
+
+    tuning: Tuning
+    commit: str  # at which it was made; empty where that is not known
+
+
+class Journal:
+    """metrics.jsonl, a line for each iteration: as they come, and in order once tunings are over."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._histories: dict[str, Sequence[Iteration]] = {}
+
+    def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
+        """Write the file anew, with these tunings after or instead of those written before.
+
+        Raises:
+            WriteError: where the file cannot be written; the old one stays.
+        """
+        self._histories.update(histories)
+        lines = (as_line(name, i) for name, history in self._histories.items() for i in history)
+        write_file(self.path, "".join(lines).encode())
+
+    def add(self, name: str, iteration: Iteration) -> None:
+        """Write one line more.
+
+        Raises:
+            WriteError: where the file cannot be written.
+        """
+        append_file(self.path, as_line(name, iteration).encode())
+
+
+def _stored(tuned: Tuned) -> Any:
+    """A tuning as arrays, iterations stacked, as `_stored_like`."""
+    history = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *tuned.tuning.history)
+    return Tuned(tuned.tuning._replace(history=history), tuned.commit)
+
+
+def _stored_like(_: Any) -> Any:
+    none, text = np.zeros(0), np.array("")
+    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), nominal())
+    seen = Evaluation(none, Losses(none, none, none), rows, none, none)
+    history: Any = Iteration(none, rows, seen, none, np.zeros(0, "U1"), none)  # pyright: ignore
+    return Tuned(Tuning(history, nominal(), nominal(), text), text)  # pyright: ignore
+
+
+def _restored(stored: Any) -> Tuned:
+    """What `_stored` was given."""
+    tuning, rows = stored.tuning, stored.tuning.history
+    history = [
+        Iteration(
+            int(rows.iteration[i]),
+            *jax.tree.map(lambda x, i=i: np.asarray(x[i]), (rows.weights, rows.evaluation)),
+            accepted=bool(rows.accepted[i]),
+            reason=str(rows.reason[i]),
+            step=float(rows.step[i]),
+        )
+        for i in range(len(rows.iteration))
+    ]
+    tuning = Tuning(history, tuning.ten, tuning.converged, str(tuning.stop))
+    return Tuned(tuning, str(stored.commit))
+
+
 def _tune_job(
-    config: TuneConfig,
-    robot: Robot,
-    command: Command,
-    params: Params | None,
-    name: str,
-    tell: Any,
-    record: Record | None,
+    config: TuneConfig, robot: Robot, command: Command, params: Params | None, name: str, heard: Any
 ) -> Tuning:
-    """One tuning in a worker, kept as it goes; the queue `tell` hears of each iteration."""
+    """One tuning in a worker; the queue `heard` is told of each iteration."""
     return difftune.tune(
         config,
         robot,
@@ -148,76 +208,93 @@ def _tune_job(
         command,
         standing_anchor(robot),
         network.effect_of(params, config.rollout.walk.gait),
-        lambda iteration: tell.put((name, iteration)),
-        **_kept_in(record),
+        lambda iteration: heard.put((name, iteration)),
     )
 
 
-def _kept_in(record: Record | None) -> dict[str, Any]:
-    """Arguments of a tuning that is taken up from its record and kept in it."""
-    if record is None:
-        return {}
-    past = record.past.history if record.past else ()
-    return {"past": past, "keep": partial(save_tuning, record.kept)}
-
-
-def tune_many(
+def _tunings(
     pool: Executor,
     config: TuneConfig,
     robot: Robot,
     problems: Mapping[str, tuple[Command, Params | None]],
     title: str,
-    on_iteration: Callable[[str, Iteration], None] = lambda name, iteration: None,
-    records: Mapping[str, Record] | None = None,
+    on_iteration: Callable[[str, Iteration], None],
+) -> Iterator[tuple[str, Tuning]]:
+    """Tune several problems side by side; yields each tuning with its name when it has ended."""
+    done, total = 0, config.iterations * len(problems)
+    with letters() as heard, bar(title) as tell:
+        running: dict[Future[Tuning], str] = {
+            pool.submit(_tune_job, config, robot, command, params, name, heard): name
+            for name, (command, params) in problems.items()
+        }
+        tell(done, total, "compiling")
+        while running:
+            ended = wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done
+            while not heard.empty():  # also all that those told which have ended
+                name, iteration = heard.get()
+                done += iteration.iteration > 0
+                tell(done, total, f"{name}: L {float(iteration.evaluation.loss) / 1e6:.3f}e6")
+                on_iteration(name, iteration)
+            for future in ended:
+                yield running.pop(future), future.result()
+
+
+def tune(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    problems: Mapping[str, tuple[Command, Params | None]],
+    folder: Path,
+    *,
+    title: str,
+    commit: str = "",
+    journal: Journal | None = None,
     dumps: Path | None = None,
-) -> dict[str, Tuning]:
-    """Tune several problems side by side from the nominal weights.
+) -> dict[str, Tuned]:
+    """Tune several problems side by side from the nominal weights; `folder` keeps those that ended.
 
     Args:
         pool: worker processes.
         config: how.
         robot: the body.
         problems: by name, the command and the net to tune through (None: the plain rigid body).
+        folder: of the tunings, a file for each; a tuning that is there is not tuned again.
         title: for the person who waits.
-        on_iteration: called with name and iteration as they happen.
-        records: by name, where the tunings are kept, iteration by iteration; they are taken up
-            from there, and a finished one is not tuned again.
+        commit: to note with what is tuned now.
+        journal: of the iterations.
         dumps: folder for what was refused, see `replay.keep`; None: nothing is kept.
 
     Raises:
-        InputError: the starting weights fall or cannot be solved on the model.
+        InputError: the starting weights fall or cannot be solved on the model; the folder cannot be
+            written.
     """
-    records = records or {}
-    found = {n: r.past for n, r in records.items() if n in problems and r.is_finished and r.past}
-    if len(found) == len(problems):
-        return {name: found[name] for name in problems}
-    done = sum(len(r.past.history) - 1 for r in records.values() if r.past)
-    with letters() as heard, bar(title) as tell:
-        running: dict[str, Future[Tuning]] = {
-            name: pool.submit(
-                _tune_job, config, robot, command, params, name, heard, records.get(name)
-            )
-            for name, (command, params) in problems.items()
-            if name not in found
-        }
-        tell(done, config.iterations * len(problems), "compiling")
-        while not all(future.done() for future in running.values()) or not heard.empty():
-            failed = [future for future in running.values() if future.done() and future.exception()]
-            if heard.empty():
-                for future in failed:
-                    future.result()  # raises now, not when the others have ended
-                wait(running.values(), timeout=0.1)
-                continue
-            name, iteration = heard.get()
-            done += iteration.iteration > 0
-            loss = float(iteration.evaluation.loss) / 1e6
-            tell(done, config.iterations * len(problems), f"{name}: L {loss:.3f}e6")
-            on_iteration(name, iteration)
-            if dumps is not None:
-                command, params = problems[name]
-                anchor = standing_anchor(robot)
-                replay.keep(dumps, name, config, robot, command, anchor, params, iteration)
-        return {name: found.get(name) or running[name].result() for name in problems}
+    paths = {
+        name: folder
+        / f"tuning-{name}-{digest(config, robot, nominal(robot), *each, code=TUNING_CODE)}.npz"
+        for name, each in problems.items()
+    }
+
+    def on_iteration(name: str, iteration: Iteration) -> None:
+        if journal is not None:
+            journal.add(name, iteration)
+        if dumps is not None:
+            command, params = problems[name]
+            anchor = standing_anchor(robot)
+            replay.keep(dumps, name, config, robot, command, anchor, params, iteration)
+
+    def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+        if journal is not None:
+            there = {name: _restored(one).tuning.history for name, one in found.items()}
+            journal.write({name: there.get(name, ()) for name in problems})  # in their order
+        asked = {name: problems[name] for name in missing}
+        for name, tuning in _tunings(pool, config, robot, asked, title, on_iteration):
+            yield name, _stored(Tuned(tuning, commit))
+
+    stored = cached(paths, make, like=_stored_like, kind=TUNING, robot=robot)
+    tuned = {name: _restored(one) for name, one in stored.items()}
+    if journal is not None:
+        journal.write({name: one.tuning.history for name, one in tuned.items()})
+    return tuned
 
 
 def measured_plants(count: int) -> list[Imperfections]:
@@ -247,9 +324,11 @@ def tune_measured(
     command: Command,
     params: Params | None,
     plants: Sequence[Imperfections],
+    folder: Path,
+    *,
     title: str,
-    record: Record | None = None,
-) -> Tuning:
+    commit: str = "",
+) -> Tuned:
     """Tune on along walks on the high-fidelity simulator, one on each plant for every step.
 
     Args:
@@ -260,24 +339,35 @@ def tune_measured(
         command: what to walk.
         params: the net whose Jacobian is used; None: the plain rigid body.
         plants: see `measured_plants`.
+        folder: of the tuning; one that is there is not tuned again.
         title: for the person who waits.
-        record: where it is kept, iteration by iteration, and taken up from.
+        commit: to note with what is tuned now.
 
     Raises:
-        InputError: a walk with the starting weights falls or cannot be believed.
+        InputError: a walk with the starting weights falls or cannot be believed; the folder cannot
+            be written.
     """
+    code = (*TUNING_CODE, "tuning.measured", "sim.walk")
+    key = digest(config, robot, weights, command, params, *plants, code=code)
     job = partial(_measured_job, config, robot, command, params)
-    with bar(title) as tell:
-        tell(0, config.iterations, "compiling")
 
-        def note(iteration: Iteration) -> None:
-            loss = float(iteration.evaluation.loss) / 1e6
-            tell(iteration.iteration, config.iterations, f"L {loss:.3f}e6")
+    def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+        with bar(title) as tell:
+            tell(0, config.iterations, "compiling")
+            tuning = measured.tune_measured(
+                config,
+                weights,
+                lambda trial: list(pool.map(job, repeat(trial), plants)),
+                lambda iteration: tell(
+                    iteration.iteration,
+                    config.iterations,
+                    f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6",
+                ),
+            )
+        yield "walks", _stored(Tuned(tuning, commit))
 
-        def look(trial: Weights) -> list[Evaluation]:
-            return list(pool.map(job, repeat(trial), plants))
-
-        return measured.tune_measured(config, weights, look, note, **_kept_in(record))
+    paths = {"walks": folder / f"tuning-walks-{key}.npz"}
+    return _restored(cached(paths, make, like=_stored_like, kind=TUNING, robot=robot)["walks"])
 
 
 def _norms_job(config: TuneConfig, robot: Robot, command: Command, params: Params | None) -> Losses:
@@ -302,32 +392,6 @@ def gradient_norms(
         return {name: future.result() for name, future in running.items()}
 
 
-def records_in(
-    folder: Path,
-    config: TuneConfig,
-    robot: Robot,
-    problems: Mapping[str, tuple[Command, Params | None]],
-    about: Mapping[str, Any] | None = None,
-) -> dict[str, Record]:
-    """Records of tunings in a folder, by the names of the problems; see `tune_many`.
-
-    Args:
-        folder: where.
-        config, robot, problems: see `tune_many`; others have other records.
-        about: JSON values to note with what is made now.
-    """
-    endings = {
-        n: digest(config, robot, nominal(robot), *each, code=TUNING_CODE)
-        for n, each in problems.items()
-    }
-    return {
-        name: load_tuning(
-            Checkpoint(folder / f"tuning-{name}-{ending}.npz", KIND, robot, about or {})
-        )
-        for name, ending in endings.items()
-    }
-
-
 def path_config(robot: Robot) -> TuneConfig:
     """Settings of the tunings whose weights the data cover: the same whatever is tuned later."""
     return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)))
@@ -341,11 +405,10 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     config = path_config(robot)
     problems = {name: (named_command(name), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
-    records = records_in(folder, config, robot, problems)
-    tunings = tune_many(pool, config, robot, problems, title, records=records)
+    tuned = tune(pool, config, robot, problems, folder, title=title)
     stacked = []
     for name in COMMANDS:
-        passed = [i.weights for i in tunings[name].history if i.accepted]
+        passed = [i.weights for i in tuned[name].tuning.history if i.accepted]
         stacked.append(jax.tree.map(lambda *w: np.stack(w), *passed))
     return stacked
 
@@ -507,8 +570,7 @@ def train(
 ) -> Learned:
     """Train a GRFM-Net on the walks under `folder`, and under `more`, and keep it at `path`.
 
-    Its card tells the walks and the controller that it belongs to. A training that was cut is taken
-    up from the epoch that it kept beside `path`.
+    Its card tells the walks and the controller that it belongs to.
 
     Raises:
         InputError: the folder cannot be written; there are no walks, or damaged ones.
@@ -521,8 +583,6 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
     with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
         parts = samples(robot, *folders)
     made_of = [dataset.walked_with(each) for each in folders]
-    ending = digest(config, robot, made_of, code=TRAINING_CODE)
-    kept = Checkpoint(path.with_name(f"training-{ending}.npz"), training.KIND, robot)
     with bar(
         f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
     ) as tell:
@@ -532,7 +592,6 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
             parts.training,
             parts.validation,
             lambda epoch, _: tell(epoch, config.epochs, ""),
-            kept,
         )
     with say_if_slow("computing the errors on held-out walks"):
         linear = network.fit_linear(parts.training)
@@ -555,7 +614,6 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
         "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
-    kept.remove()
     return Learned(params, linear, about["errors"], course, config, folders, held_out)
 
 

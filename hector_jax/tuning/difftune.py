@@ -13,7 +13,7 @@ The rule by which all that is decided is `init` and `update`, functions of array
 from Python, one iteration after the other; `batch` compiles them into its loop on the device.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -32,7 +32,6 @@ from hector_jax.tuning.loss import LossConfig, Losses, LossWeights, losses, tota
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 
 PAPER_ITERATIONS = 10
-NOT_ENDED = "not ended"  # the stop of a tuning that goes on
 
 
 @dataclass(frozen=True)
@@ -323,7 +322,7 @@ def refusal(config: TuneConfig, evaluation: Evaluation) -> str:
 def stopped(config: TuneConfig, stop: Stop) -> str:
     """Why a tuning ended, in words."""
     return {
-        Stop.GOING: NOT_ENDED,
+        Stop.GOING: "not ended",
         Stop.LIMIT: f"{config.iterations} iterations",
         Stop.SMALL_STEP: "the step became too small to gain",
         Stop.NO_GAIN: (
@@ -341,8 +340,6 @@ def tune(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
-    past: Sequence[Iteration] = (),
-    keep: Callable[[Tuning], None] = lambda tuning: None,
 ) -> Tuning:
     """Tune the weights on the model.
 
@@ -351,7 +348,6 @@ def tune(
         robot, command, anchor, effect: the model, see `rollout`.
         weights: where to start.
         on_iteration: called after each iteration, the start being iteration 0.
-        past, keep: see `descend`.
 
     Raises:
         InputError: the starting weights fall or cannot be solved on the model.
@@ -363,8 +359,6 @@ def tune(
         weights,
         lambda trial: tune_step(config, robot, trial, command, anchor, effect),
         on_iteration,
-        past=past,
-        keep=keep,
     )
 
 
@@ -374,8 +368,6 @@ def descend(
     look: Callable[[Weights], Evaluation],
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
     first: int = 0,
-    past: Sequence[Iteration] = (),
-    keep: Callable[[Tuning], None] = lambda tuning: None,
 ) -> Tuning:
     """The rule, driven from Python: whatever `look` finds of weights is stepped down.
 
@@ -383,10 +375,8 @@ def descend(
         config: how.
         weights: where to start.
         look: loss and gradient of weights.
-        on_iteration: called after each iteration, but not for those of `past`.
+        on_iteration: called after each iteration.
         first: number of the first one; from the paper's ten on every step has to lower the loss.
-        past: iterations that an earlier call made, which are not looked at again.
-        keep: given the tuning so far, before `on_iteration` and likewise.
 
     Raises:
         InputError: the evaluation of the starting weights is not to be believed; `on_iteration` has
@@ -397,32 +387,20 @@ def descend(
     while progress.stop == Stop.GOING:
         # copies, because a view would keep the device's array for as long as the history
         trial = jax.tree.map(np.array, progress.trial)
-        known = _known(past[len(history) :], trial)
-        found = jax.tree.map(np.array, look(trial) if known is None else known)
+        found = jax.tree.map(np.array, look(trial))
         step = float(progress.share) if history else 0.0
         progress, code = update(config, progress, found)
         reason = _in_words(config, Reason(int(code)), found)
         history.append(Iteration(first + len(history), trial, found, not reason, reason, step))
-        stop = Stop(int(progress.stop))
-        if stop == Stop.BAD_START:
-            on_iteration(history[-1])
+        on_iteration(history[-1])
+        if progress.stop == Stop.BAD_START:
             raise InputError(f"the starting weights cannot be tuned from: {reason}")
-        told = stopped(config, stop)
-        if stop == Stop.SMALL_STEP and refusal(config, found):
-            told = f"{told}, the last refused: {reason}"
-        ten, converged = jax.tree.map(np.asarray, (progress.ten, progress.best))
-        tuning = Tuning(history, ten, converged, told)
-        if known is None:
-            keep(tuning)
-            on_iteration(history[-1])
-    return tuning
-
-
-def _known(past: Sequence[Iteration], trial: Weights) -> Evaluation | None:
-    """What the first of the past found, if it was of exactly this trial."""
-    if past and all(jax.tree.leaves(jax.tree.map(np.array_equal, past[0].weights, trial))):
-        return past[0].evaluation
-    return None
+    stop = Stop(int(progress.stop))
+    words = stopped(config, stop)
+    if stop == Stop.SMALL_STEP and refusal(config, found):
+        words = f"{words}, the last refused: {reason}"
+    ten, converged = jax.tree.map(np.asarray, (progress.ten, progress.best))
+    return Tuning(history, ten, converged, words)
 
 
 def gradient_norms(

@@ -89,8 +89,6 @@ def tune_measured(
     weights: Weights,
     look: Callable[[Weights], Sequence[Evaluation]],
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
-    past: Sequence[Iteration] = (),
-    keep: Callable[[Tuning], None] = lambda tuning: None,
 ) -> Tuning:
     """Tune on measured walks, from weights that have been tuned on the model.
 
@@ -102,7 +100,6 @@ def tune_measured(
         weights: where to start.
         look: walks with weights on each plant and differentiates, see `evaluate_walk`.
         on_iteration: called after each iteration.
-        past, keep: see `descend`.
 
     Raises:
         InputError: a walk with the starting weights falls or cannot be believed.
@@ -113,4 +110,4 @@ def tune_measured(
         both = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
         return both._replace(residual=np.max([one.residual for one in found]))
 
-    return descend(config, weights, mean, on_iteration, PAPER_ITERATIONS, past, keep)
+    return descend(config, weights, mean, on_iteration, PAPER_ITERATIONS)
