@@ -2,13 +2,14 @@
 
 A job of many artefacts (collection, table) is begun again and again and killed after a few saves
 more, at a moment drawn evenly from the time between two saves, so that some kills fall inside a
-save. A job that is one artefact (tuning, training) begins anew each time, and is killed at a moment
-drawn evenly from the time that it takes. The last one is left alone. Models are toys: what is tried
-here is what is kept. FOLDER.done has a line for each piece of work that was done, whether it was
-kept or not.
+save. A job that is one artefact (tuning, training) begins anew each time, also where it had ended,
+and is killed at a moment drawn evenly from the time that it takes. The last one is left alone.
+Models are toys: what is tried here is what is kept. FOLDER.done has a line for each piece of work
+that was done, whether it was kept or not.
 """
 
 import os
+import shutil
 import signal
 import sys
 import time
@@ -159,7 +160,10 @@ def main(name: str, folder: Path, kills: int) -> None:
             seconds = time.monotonic() - begin
     for _ in range(kills):
         saves = 0 if name in ONE else int(rng.integers(1, 4))
-        hits += killed(start, folder, saves, rng.uniform(0.0, seconds))
+        hit = killed(start, folder, saves, rng.uniform(0.0, seconds))
+        hits += hit
+        if name in ONE and not hit:  # it had ended
+            shutil.rmtree(folder, ignore_errors=True)
     code = os.waitpid(start(), 0)[1]
     print(f"{name}: {hits} kills", flush=True)
     sys.exit(code != 0)

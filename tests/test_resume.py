@@ -378,7 +378,8 @@ def test_killed_25_times_on_all_cores_it_ends_in_the_bytes_of_an_unbroken_run_on
 
     run("whole", 0, {min(cores)})
     hits = run("cut", 25, cores)
-    assert hits >= 20  # the last ones may find the job done
+    # the last ones may find the job done, as does one in a few of a job that is one artefact
+    assert hits >= (20 if job in ("collection", "table") else 8)
     assert files(tmp_path / "cut" / job) == files(tmp_path / "whole" / job)
     if job == "collection":
         more = len(looks(tmp_path / "cut" / job)) - len(looks(tmp_path / "whole" / job))
