@@ -25,7 +25,10 @@ import tyro
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, expert, nominal, sample_weights
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import bar, exit_code, made_at
+from hector_jax.core.environment import environment
+from hector_jax.core.files import make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
 from hector_jax.grfm.effect import last_command
@@ -37,14 +40,6 @@ from hector_jax.runs import metrics, pipeline
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
-from hector_jax.storage import (
-    environment,
-    load_weights,
-    make_folder,
-    save_weights,
-    write_file,
-    write_json,
-)
 from hector_jax.tuning.batch import Problem, Scenario, Tunings, stack, tail_weights, tune_batch
 from hector_jax.tuning.difftune import Reason, Stop, TuneConfig, stopped
 from hector_jax.tuning.loss import LossConfig, Losses

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from hector_jax.core.console import made_at
-from hector_jax.storage import environment, write_file, write_json
+from hector_jax.core.environment import environment
+from hector_jax.core.files import write_file, write_json
 
 
 def write_report(

@@ -31,7 +31,10 @@ import tyro
 
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import bar, exit_code, made_at
+from hector_jax.core.environment import environment
+from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.trajectory import Trajectory
@@ -41,12 +44,11 @@ from hector_jax.report import plots
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
-from hector_jax.runs.cache import cached
+from hector_jax.runs.cache import cached, content_key
 from hector_jax.sim.changes import Change
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import digest, environment, load_weights, write_file, write_json
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
 from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner
@@ -229,7 +231,7 @@ def walk_cases(
     def path(case: Case) -> Path:
         how, _, job, effect, moment, arm = cases[case]
         name = "-".join(case).replace(" ", "")
-        ending = digest(how, robot, job, (effect,), moment, arm, code=CODE)
+        ending = content_key(how, robot, job, (effect,), moment, arm, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
     def walked(missing: Sequence[Case], _: Mapping[Case, Walked]) -> Iterator[tuple[Case, Walked]]:

@@ -30,14 +30,18 @@ import tyro
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar, exit_code, made_at, say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.report import plots
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
+from hector_jax.runs.cache import content_key, robot_hash
 from hector_jax.search.cmaes import Generation, SearchConfig
 from hector_jax.search.race import Raced, Turn, lowest, race, walks
 from hector_jax.search.rivals import (
@@ -53,7 +57,6 @@ from hector_jax.search.rivals import (
 )
 from hector_jax.sim.walk import Job, walk_job
 from hector_jax.sim.world import hfs
-from hector_jax.storage import digest, environment, fingerprint, make_folder, write_file, write_json
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
@@ -175,7 +178,7 @@ def on_model(
     """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
     # seconds are kept too: they are of this code and so many at once
     made = flags.processes, environment().get("commit")
-    key = digest(config, RATE, command, params, robot, repr(made), code=CODE)
+    key = content_key(config, RATE, command, params, robot, repr(made), code=CODE)
     path = flags.out / f"model-{key}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
@@ -230,11 +233,11 @@ def run(
         "ticks": config.rollout.ticks,
         "controller": repr(config.rollout.walk),
         "loss": repr(config.loss),
-        "robot": fingerprint(robot),
-        "plant": fingerprint(hfs()),
-        "command": fingerprint(command),
-        "start": fingerprint(nominal()),
-        "settings": digest(sorted(rivals.items()), code=CODE),
+        "robot": robot_hash(robot),
+        "plant": tree_hash(hfs()),
+        "command": tree_hash(command),
+        "start": tree_hash(nominal()),
+        "settings": content_key(sorted(rivals.items()), code=CODE),
     }
 
     def think(

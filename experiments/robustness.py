@@ -35,9 +35,12 @@ from scenes import (
 
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import exit_code
+from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report import plots
 from hector_jax.report.report import WORLDS
@@ -47,7 +50,6 @@ from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import named_world
-from hector_jax.storage import fingerprint, load_weights, make_folder
 from hector_jax.tuning.loss import LossConfig
 
 BASELINE = "nominal"
@@ -187,7 +189,7 @@ def report(flags: Flags, sets: Mapping[str, Weights], result: Result, folder: Pa
     named = ("world", "seeds", "first_seed", "scenes")
     numbers = {
         "flags": {name: value for name, value in asdict(flags).items() if name in named},
-        "weights": {name: fingerprint(w) for name, w in sets.items()},
+        "weights": {name: tree_hash(w) for name, w in sets.items()},
         "residual": result.residual,
         "levels": {
             level.name: {

@@ -42,7 +42,10 @@ from hector_jax.control.weights import (
     nominal,
     sample_weights,
 )
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import bar, exit_code, say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.trajectory import Load, Trajectory
@@ -54,7 +57,6 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, pipeline
 from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import hfs
-from hector_jax.storage import environment, load_weights, make_folder
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tune_step
 from hector_jax.tuning.loss import LossConfig, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout

@@ -24,6 +24,7 @@ from synthetic import synthetic_walk
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.core.files import locked
 from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm import dataset
 from hector_jax.grfm.training import TrainConfig
@@ -31,7 +32,6 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, pipeline
 from hector_jax.runs.pipeline import Journal
 from hector_jax.sim.world import hfs
-from hector_jax.storage import locked
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
 from hector_jax.tuning.loss import Losses
 

@@ -11,7 +11,6 @@ FLOORS = [
     ["robot"],
     ["qp"],
     ["control"],
-    ["storage"],
     ["sim"],
     ["grfm"],
     ["tuning"],

@@ -17,6 +17,8 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.trajectories import limits
 from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import save_weights
+from hector_jax.core.files import write_json
 from hector_jax.core.trajectory import State, has_fallen
 from hector_jax.grfm.dataset import load_walks
 from hector_jax.report import folder as runs
@@ -29,7 +31,6 @@ from hector_jax.runs.pipeline import CollectConfig
 from hector_jax.sim.parallel import _places, batched_model
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
-from hector_jax.storage import save_weights, write_json
 from hector_jax.tuning.difftune import TuneConfig
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"

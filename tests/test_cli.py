@@ -19,13 +19,14 @@ from hector_jax.cli import asked, doctor, judging, study
 from hector_jax.cli.flags import Command, Tune, command_name, from_file
 from hector_jax.cli.main import main
 from hector_jax.control.weights import expert
+from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core.tree_file import read_card
 from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
 from hector_jax.robot.model import MODEL_PATH, load_robot
 from hector_jax.runs import pipeline
 from hector_jax.runs.pipeline import CollectConfig
-from hector_jax.storage import load_weights, read_card, save_weights
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 

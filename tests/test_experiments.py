@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from hector_jax.control.weights import nominal
+from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import exit_code, made_at
+from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError
-from hector_jax.storage import WriteError, save_weights
 
 FOLDER = Path(__file__).parents[1] / "experiments"
 

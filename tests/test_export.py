@@ -23,6 +23,7 @@ from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.qp import QP, Status
@@ -42,7 +43,6 @@ from hector_jax.runs.export import (
     weights_cpp,
     weights_schema,
 )
-from hector_jax.storage import load_weights, save_weights, weights_tree
 
 ROBOT, CONFIG = load_robot(), WalkConfig()
 EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"

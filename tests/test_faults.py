@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax import storage
 from hector_jax.cli.main import main
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import bounds, nominal, weights_to_vector
+from hector_jax.core import tree_file
 from hector_jax.core.runtime import workers
 from hector_jax.report.report import tuning_section
 from hector_jax.robot.model import load_robot
@@ -267,7 +267,7 @@ def rewritten(path, dump, change):
     change(about)
     loss = np.nextafter(kept.seen.loss, np.inf)
     kept = kept._replace(seen=kept.seen._replace(loss=loss))
-    storage.save_tree(path, kept, kind="refused evaluation", about=about)
+    tree_file.save_tree(path, kept, kind="refused evaluation", about=about)
     return path
 
 
@@ -311,7 +311,7 @@ def test_settings_of_another_version_are_refused_by_name(monkeypatch, capsys, tm
 def test_what_is_no_dump_is_refused(monkeypatch, capsys, tmp_path, dump):
     cut, other = tmp_path / "cut.npz", tmp_path / "other.npz"
     cut.write_bytes(dump.read_bytes()[:-100])
-    storage.save_tree(other, nominal(), kind="weights")
+    tree_file.save_tree(other, nominal(), kind="weights")
     for path, expected in (
         (cut, "cut or changed"),
         (other, "holds weights, expected refused evaluation"),

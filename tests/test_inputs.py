@@ -24,7 +24,9 @@ from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.trajectories import load_course
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import Range, did_you_mean, short_repr, validation_error
+from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import dataset, network
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
@@ -32,7 +34,6 @@ from hector_jax.report.video import VideoConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.pipeline import CollectConfig
 from hector_jax.search.cmaes import SearchConfig
-from hector_jax.storage import load_weights, save_tree, save_weights
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.online import OnlineConfig

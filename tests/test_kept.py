@@ -12,9 +12,9 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import bounds, expert, nominal
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, metrics, pipeline
+from hector_jax.runs.cache import content_key
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs, ideal
-from hector_jax.storage import digest
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 ROBOT, CONFIG, S = load_robot(), TuneConfig(), named_command("s")
@@ -172,11 +172,11 @@ CODE = ("tuning.difftune",)
 
 def test_the_digest_tells_settings_trees_and_seeds_apart():
     found = {
-        digest(CONFIG, ROBOT, nominal(), code=CODE),
-        digest(CONFIG, ROBOT, expert(), code=CODE),
-        digest(TuneConfig(iterations=20), ROBOT, nominal(), code=CODE),
-        digest(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal(), code=CODE),
-        digest(CONFIG, ROBOT, nominal(), None, code=CODE),
+        content_key(CONFIG, ROBOT, nominal(), code=CODE),
+        content_key(CONFIG, ROBOT, expert(), code=CODE),
+        content_key(TuneConfig(iterations=20), ROBOT, nominal(), code=CODE),
+        content_key(CONFIG, ROBOT._replace(mass=np.asarray(13.0)), nominal(), code=CODE),
+        content_key(CONFIG, ROBOT, nominal(), None, code=CODE),
     }
     assert len(found) == 5
 

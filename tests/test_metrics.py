@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pretend import SETS, pretend_score, pretend_verdict, pretend_walk
 
+from hector_jax.core.files import as_json
 from hector_jax.runs import metrics
-from hector_jax.storage import as_json
 from hector_jax.tuning.loss import LossConfig
 
 

@@ -15,6 +15,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
+from hector_jax.core.tree_file import read_card
 from hector_jax.grfm import dataset
 from hector_jax.grfm.dataset import collect, draw_jobs, draw_jobs_near
 from hector_jax.grfm.network import NetParams
@@ -25,7 +26,6 @@ from hector_jax.runs.metrics import score
 from hector_jax.runs.pipeline import CollectConfig
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.storage import read_card
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.rollout import RolloutConfig
 

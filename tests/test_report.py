@@ -9,10 +9,10 @@ from pretend import SETS, pretend_history, pretend_verdict
 from rich.console import Console
 
 from hector_jax.control.weights import bounds
+from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, Report, print_table, write_report
 from hector_jax.runs.metrics import Verdict
-from hector_jax.storage import environment
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import LossConfig, Losses
 

@@ -14,15 +14,16 @@ import numpy as np
 import pytest
 from killed import look
 
-from hector_jax import storage
 from hector_jax.cli import flags, tuning
 from hector_jax.control.weights import nominal
+from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
+from hector_jax.core.files import WriteError, locked, write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
+from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.cache import cached
-from hector_jax.storage import WriteError, load_tree, locked, save_tree, write_file
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
@@ -75,7 +76,7 @@ def test_a_tuning_cut_at_any_step_of_a_save_ends_in_the_same_bytes(
         return getattr(os, step)(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(storage, "os", SimpleNamespace(**{**vars(os), step: cut}))
+        patch.setattr(core_files, "os", SimpleNamespace(**{**vars(os), step: cut}))
         patch.setattr(Path, "unlink", lambda *args, **kwargs: None)  # nor does SIGKILL clean up
         with pytest.raises(Cut):
             tune(folder)

@@ -22,11 +22,11 @@ from scenes import (
 
 from hector_jax.control.reference import UNSEEN
 from hector_jax.control.weights import nominal
+from hector_jax.core.files import as_json
 from hector_jax.report import plots
 from hector_jax.runs.metrics import stack_scores
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import hfs
-from hector_jax.storage import as_json
 
 ROOT = Path(__file__).parents[1]
 SMALL = SceneConfig(forces=(50.0, 100.0), frictions=(0.4, 0.2), phases=3)

@@ -9,17 +9,13 @@ import jax
 import numpy as np
 import pytest
 
-from hector_jax import storage
 from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core import environment, files, tree_file
+from hector_jax.core.environment import code_hash
+from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError
-from hector_jax.storage import (
-    WriteError,
-    load_tree,
-    load_weights,
-    read_card,
-    save_tree,
-    save_weights,
-)
+from hector_jax.core.tree_file import load_tree, read_card, save_tree, tree_hash
 
 
 class Leaf(NamedTuple):
@@ -115,7 +111,7 @@ def test_another_kind_robot_format_layout_or_shape_is_refused(saved, monkeypatch
     narrow = TREE._replace(leaf=TREE.leaf._replace(force=np.zeros((2, 4))))
     with pytest.raises(ValueError, match=r"tree.npz: leaf.force has shape \(2, 3\)"):
         load_tree(saved, narrow, kind="thing")
-    monkeypatch.setattr(storage, "FORMAT", 2)
+    monkeypatch.setattr(tree_file, "FORMAT", 2)
     with pytest.raises(ValueError, match="tree.npz: file format 1, this version reads 2"):
         load_tree(saved, TREE, kind="thing")
 
@@ -142,7 +138,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(saved, monkeypa
     def full_disk(handle):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(storage.os, "fsync", full_disk)
+    monkeypatch.setattr(files.os, "fsync", full_disk)
     with pytest.raises(WriteError, match="cannot write .*tree.npz: No space left"):
         save_tree(saved, TREE, kind="other")
     assert saved.read_bytes() == before
@@ -161,16 +157,16 @@ def test_text_comes_back_where_text_is_expected_and_nowhere_else(tmp_path):
 
 
 def test_a_file_is_there_under_its_name_at_any_moment(tmp_path, monkeypatch):
-    path, replace, there = tmp_path / "file", storage.os.replace, []
+    path, replace, there = tmp_path / "file", files.os.replace, []
 
     def watched(*paths):
         there.append(path.exists())
         replace(*paths)
         there.append(path.exists())
 
-    storage.write_file(path, b"old")
-    monkeypatch.setattr(storage.os, "replace", watched)
-    storage.write_file(path, b"new")
+    files.write_file(path, b"old")
+    monkeypatch.setattr(files.os, "replace", watched)
+    files.write_file(path, b"new")
     assert there == [True, True]
 
 
@@ -178,7 +174,7 @@ def test_a_file_is_there_under_its_name_at_any_moment(tmp_path, monkeypatch):
 def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
     before = os.umask(mask)
     try:
-        storage.write_file(tmp_path / "file", b"data")
+        files.write_file(tmp_path / "file", b"data")
     finally:
         os.umask(before)
     assert (tmp_path / "file").stat().st_mode & 0o777 == 0o666 & ~mask
@@ -186,7 +182,7 @@ def test_files_have_the_rights_that_the_umask_leaves(tmp_path, mask):
 
 def test_a_card_without_versions_is_refused_by_name(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(storage, "versions", lambda: None)
+        patch.setattr(tree_file, "versions", lambda: None)
         save_tree(tmp_path / "tree.npz", TREE, kind="thing")
     with pytest.raises(InputError, match="tree.npz: card.versions must be a dict, got None"):
         load_tree(tmp_path / "tree.npz", TREE, kind="thing")
@@ -205,16 +201,20 @@ def test_a_card_without_an_entry_is_refused_by_its_name(tmp_path, monkeypatch, n
 def test_a_robot_is_known_by_its_numbers():
     same = jax.tree.map(lambda x: np.array(x, copy=True), ROBOT)
     other = ROBOT._replace(flag=np.array(0.2501))
-    assert storage.fingerprint(ROBOT) == storage.fingerprint(same)
-    assert storage.fingerprint(ROBOT) != storage.fingerprint(other)
+    assert tree_hash(ROBOT) == tree_hash(same)
+    assert tree_hash(ROBOT) != tree_hash(other)
+    near = ROBOT._replace(flag=np.array(0.25 + 1e-15))
+    assert tree_hash(ROBOT) != tree_hash(near)
+    assert tree_hash(ROBOT, 9) == tree_hash(near, 9)
+    assert tree_hash(ROBOT, 9) != tree_hash(other, 9)
 
 
 def test_json_has_null_for_what_is_no_number(tmp_path):
     odd = {"a": (1.0, np.nan), "b": [{"c": -np.inf}], "d": "nan", "e": np.float64("nan")}
-    storage.write_json(tmp_path / "odd.json", odd)
+    files.write_json(tmp_path / "odd.json", odd)
     told = json.loads((tmp_path / "odd.json").read_text())
     assert told == {"a": [1.0, None], "b": [{"c": None}], "d": "nan", "e": None}
-    assert "\n" not in storage.as_json(odd)
+    assert "\n" not in files.as_json(odd)
 
 
 def test_weights_come_back_as_they_were_written(tmp_path):
@@ -295,19 +295,19 @@ def test_weights_that_are_no_json_object_are_refused(tmp_path, text):
 @pytest.fixture
 def edited(tmp_path, monkeypatch):
     """Changes the text of a module of the package, as far as `code_hash` can see."""
-    source = storage._source
+    source = environment._source
 
     def edit(module, before, after):
         text = source(module).read_text()
         assert before in text
         (tmp_path / "edited.py").write_text(text.replace(before, after))
         other = lambda name: tmp_path / "edited.py" if name == module else source(name)  # noqa: E731
-        monkeypatch.setattr(storage, "_source", other)
-        storage.code_hash.cache_clear()
+        monkeypatch.setattr(environment, "_source", other)
+        environment.code_hash.cache_clear()
 
     yield edit
     monkeypatch.undo()
-    storage.code_hash.cache_clear()
+    environment.code_hash.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -321,25 +321,31 @@ def edited(tmp_path, monkeypatch):
     ],
 )
 def test_a_result_holds_for_the_code_that_computes_it(edited, module, before, after, same):
-    hashes = storage.code_hash("sim.walk"), storage.code_hash("tuning.difftune", "grfm.network")
+    hashes = (
+        environment.code_hash("sim.walk"),
+        code_hash("tuning.difftune", "grfm.network"),
+    )
     edited(module, before, after)
-    again = storage.code_hash("sim.walk"), storage.code_hash("tuning.difftune", "grfm.network")
+    again = (
+        environment.code_hash("sim.walk"),
+        code_hash("tuning.difftune", "grfm.network"),
+    )
     assert [a == b for a, b in zip(hashes, again, strict=True)] == [same, same]
 
 
 @pytest.mark.parametrize(("package", "same"), [("jax", False), ("numpy", False), ("flax", True)])
 def test_a_result_holds_for_the_packages_that_compute_it(monkeypatch, package, same):
-    before = storage.code_hash("sim.walk")
-    installed = storage.version
+    before = environment.code_hash("sim.walk")
+    installed = environment.version
     others = lambda name: "0.0.1" if name == package else installed(name)  # noqa: E731
-    storage.code_hash.cache_clear()
-    monkeypatch.setattr(storage, "version", others)
-    assert (storage.code_hash("sim.walk") == before) is same
-    storage.code_hash.cache_clear()
+    environment.code_hash.cache_clear()
+    monkeypatch.setattr(environment, "version", others)
+    assert (environment.code_hash("sim.walk") == before) is same
+    environment.code_hash.cache_clear()
 
 
 def test_the_environment_is_plain_words_without_folders():
-    found = storage.environment()
+    found = environment.environment()
     assert json.loads(json.dumps(found)) == found
     assert {"python", "jax", "mujoco", "platform", "device"} <= found.keys()
     assert found["precision"] == "float64"
@@ -347,6 +353,6 @@ def test_the_environment_is_plain_words_without_folders():
 
 
 def test_a_folder_that_is_no_checkout_has_no_commit(tmp_path):
-    assert storage._commit(tmp_path) == ""
+    assert environment._commit(tmp_path) == ""
     (tmp_path / ".git").mkdir()
-    assert storage._commit(tmp_path) == ""
+    assert environment._commit(tmp_path) == ""

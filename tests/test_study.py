@@ -10,12 +10,12 @@ from pretend import pretend_history, pretend_walk
 from hector_jax.cli import flags, study, tuning
 from hector_jax.cli.flags import Table, as_command
 from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import save_weights
 from hector_jax.report.video import VideoUnavailable
 from hector_jax.runs import pipeline
 from hector_jax.runs.pipeline import Tuned
 from hector_jax.search.cmaes import Found, Generation
 from hector_jax.sim.world import hfs
-from hector_jax.storage import save_weights
 from hector_jax.tuning.difftune import Tuning
 
 

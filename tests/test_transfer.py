@@ -15,8 +15,8 @@ from hector_jax.control.weights import (
     sample_weights,
     weights_to_vector,
 )
+from hector_jax.core.files import as_json
 from hector_jax.report import plots
-from hector_jax.storage import as_json
 
 RNG = np.random.default_rng(1)
 TRUTH = RNG.normal(size=18) + 0.1 * RNG.normal(size=(4, 18))

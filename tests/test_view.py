@@ -14,13 +14,14 @@ from pretend import elsewhere, pretend_history, pretend_walk
 from hector_jax.cli import asked
 from hector_jax.cli.main import main
 from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.control.weights_file import save_weights
+from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.report import folder as runs
 from hector_jax.report import pictures, view
 from hector_jax.report.view import Shown, motion
 from hector_jax.robot.model import load_model, load_robot
 from hector_jax.runs import pipeline
-from hector_jax.storage import save_weights, write_json
 
 
 @pytest.fixture(scope="module")

@@ -9,16 +9,17 @@ from hector_jax.control import trajectories
 from hector_jax.control.trajectories import Course, beyond, limits
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.folder import Asked
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
+from hector_jax.runs.cache import robot_hash
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
-from hector_jax.storage import identity, load_weights
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -50,7 +51,7 @@ def robot_of(run: Path, begun: Asked) -> Robot:
         InputError: its files say something else now.
     """
     robot = load_robot(begun.robot)
-    if begun.body not in (None, identity(robot)):
+    if begun.body not in (None, robot_hash(robot)):
         path = robot.description.path
         raise InputError(f"{run} was tuned for another robot: {path} or its MJCF has changed")
     return robot

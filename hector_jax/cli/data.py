@@ -12,6 +12,7 @@ from hector_jax.cli.flags import Collect, Grfm, Train
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import bar, say, say_if_slow
+from hector_jax.core.files import as_json, make_folder
 from hector_jax.core.inputs import plural
 from hector_jax.core.runtime import workers
 from hector_jax.grfm import training
@@ -25,7 +26,6 @@ from hector_jax.report.report import write_fidelity
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
 from hector_jax.sim.walk import Job
-from hector_jax.storage import as_json, make_folder
 from hector_jax.tuning.difftune import TuneConfig
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
+from hector_jax.core.environment import environment
 from hector_jax.core.inputs import one_line
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import Trajectory
@@ -21,7 +22,6 @@ from hector_jax.robot.model import MODEL_PATH, Robot, load_robot
 from hector_jax.runs.pipeline import walk_rigid_body
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
-from hector_jax.storage import environment
 
 _EXTRAS = {  # by name, the package that it needs and what it is for
     "export": ("flatbuffers", "hector export"),

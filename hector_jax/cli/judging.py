@@ -11,8 +11,10 @@ from hector_jax.cli.flags import Compare, Evaluate, Table, Walk, settings
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, say
+from hector_jax.core.files import as_json
 from hector_jax.core.inputs import plural, printable
 from hector_jax.core.runtime import workers
+from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report import folder as runs
 from hector_jax.report import pictures
@@ -21,7 +23,6 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, pipeline
 from hector_jax.runs.metrics import Score, Verdict
-from hector_jax.storage import as_json, save_tree
 from hector_jax.tuning.loss import LossConfig
 
 

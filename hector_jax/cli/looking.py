@@ -10,6 +10,7 @@ from hector_jax.cli import asked
 from hector_jax.cli.flags import Replay, Tensorboard, View
 from hector_jax.control.walking import walk_config
 from hector_jax.core.console import Broken, say
+from hector_jax.core.files import as_json, make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
@@ -20,7 +21,6 @@ from hector_jax.report.tensorboard import write_events
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, compile_model
 from hector_jax.runs import metrics, pipeline, replay
-from hector_jax.storage import as_json, make_folder
 
 
 def view_run(args: View) -> None:

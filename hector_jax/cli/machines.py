@@ -3,12 +3,13 @@
 from hector_jax.cli import asked, doctor
 from hector_jax.cli.flags import Doctor, Export
 from hector_jax.control.walking import walk_config
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import Broken, say
+from hector_jax.core.files import as_json, locked
 from hector_jax.core.inputs import InputError
 from hector_jax.report import folder as runs
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import export
-from hector_jax.storage import as_json, load_weights, locked
 
 
 def export_controller(args: Export) -> None:

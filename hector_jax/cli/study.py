@@ -14,7 +14,10 @@ from pathlib import Path
 from hector_jax.cli import flags
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import locked, make_folder
 from hector_jax.core.inputs import InputError, plural, read_json
 from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import Trajectory
@@ -25,12 +28,12 @@ from hector_jax.report.table import PAPER, Earlier, Fall, Search, Table
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, metrics, pipeline
+from hector_jax.runs.cache import content_key
 from hector_jax.runs.kept import Judged
 from hector_jax.runs.metrics import BASELINES, Verdict
 from hector_jax.runs.pipeline import Tuned
 from hector_jax.search.cmaes import Found, SearchConfig
 from hector_jax.sim.world import Imperfections, hfs
-from hector_jax.storage import digest, environment, load_weights, locked, make_folder
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
 
 WALKS = "with_walks"
@@ -201,7 +204,7 @@ def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str,
     """The derivative-free baseline of all trajectories, in lock-step."""
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
     engine, model = pipeline.choose_engine("auto"), plan.tune.rollout
-    key = digest(
+    key = content_key(
         engine, model, plan.tune.loss, settings, robot, hfs(), nominal(), code=pipeline.SEARCH_CODE
     )
     starts = dict.fromkeys(plan.commands, nominal())

@@ -18,9 +18,13 @@ from hector_jax.cli.flags import Search, Tune, Walk, as_command, from_file, sett
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import Course
 from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
+from hector_jax.core.environment import code_hash, environment, versions
+from hector_jax.core.files import as_json, locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.runtime import workers
+from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import PIECES
 from hector_jax.grfm.network import as_effect, linear_effect
 from hector_jax.report import fidelity, pictures
@@ -29,22 +33,11 @@ from hector_jax.report.report import Picture, Report, print_table, write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, metrics, pipeline
+from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.kept import Judged
 from hector_jax.runs.metrics import Score
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim.world import hfs
-from hector_jax.storage import (
-    as_json,
-    code_hash,
-    environment,
-    fingerprint,
-    identity,
-    locked,
-    make_folder,
-    save_weights,
-    versions,
-    write_json,
-)
 from hector_jax.tuning.difftune import aligned
 
 _CODE = (*pipeline.COLLECTION_CODE, "grfm.training", "sim.standin", "runs.metrics")
@@ -97,7 +90,7 @@ def _begin(folder: Path, args: Tune) -> Path:
         write_json(new / "versions.json", environment())
         # without the folder, so that `--config` can ask for the same in another one
         flags = settings(replace(args, run=None, resume=None))
-        robot, here = identity(load_robot(args.robot)), str(Path.cwd())
+        robot, here = robot_hash(load_robot(args.robot)), str(Path.cwd())
         config = {"flags": flags, "directory": here, "robot": robot, "code": code_hash(*_CODE)}
         write_json(new / "config.json", config)
         while True:
@@ -132,7 +125,7 @@ def _as_begun(folder: Path, args: Tune) -> Tune:
             f"{folder}: begun with other code or other versions of its packages ({commit}); "
             "start a new run"
         )
-    _agree(folder, config, {"robot": identity(load_robot(begun.robot))})
+    _agree(folder, config, {"robot": robot_hash(load_robot(begun.robot))})
     for field in dataclasses.fields(Tune):
         name = field.name
         if name in _NEW:
@@ -203,7 +196,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         begun = read_json(folder / "config.json")
         now = {
             "tune": dataclasses.asdict(config),
-            "net": fingerprint(net.params),
+            "net": tree_hash(net.params),
             "command": {name: np.asarray(x).tolist() for name, x in command._asdict().items()},
             "seconds": lasts,
         }

@@ -28,14 +28,15 @@ from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.core.console import say
+from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench
+from hector_jax.core.tree_file import check_settings, load_tree, read_card, save_tree
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import NO_PUSH, Push, hfs, hfs_drawn
-from hector_jax.storage import check_settings, load_tree, read_card, save_tree, write_file
 
 KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre

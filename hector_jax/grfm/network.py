@@ -31,6 +31,7 @@ from jaxtyping import Array, Float, Key
 from hector_jax.control.gait import GaitConfig, since_switch
 from hector_jax.core.inputs import InputError, Range, short_repr, validation_error
 from hector_jax.core.trajectory import Wrench
+from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import HISTORY, Effect, Window, sure
 from hector_jax.grfm.gated import (
@@ -48,7 +49,6 @@ from hector_jax.grfm.gated import (
     views,
 )
 from hector_jax.robot.model import Robot
-from hector_jax.storage import load_tree, read_card, save_tree
 
 HIDDEN = {"paper": (64, 64, 64), "residual": (32, 32)}  # widths of the layers, by variant
 MEMBERS = {"paper": 1, "residual": 4}  # nets of each kind that are trained side by side

@@ -16,12 +16,12 @@ from rich.table import Table
 from rich.text import Text
 
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, vector_to_weights
+from hector_jax.control.weights_file import load_weights
 from hector_jax.core import inputs
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.report.report import VOID, change_text
 from hector_jax.robot.model import Robot
 from hector_jax.runs.metrics import BASELINES, Interval
-from hector_jax.storage import load_weights
 from hector_jax.tuning.difftune import Evaluation, Iteration
 from hector_jax.tuning.loss import LossConfig, Losses
 
@@ -64,7 +64,7 @@ class Asked(NamedTuple):
     net: Path | None  # or the net itself
     variant: str  # of the net
     robot: Path | None  # TOML of the biped; None: HECTOR
-    body: str | None  # its `storage.identity` then; None: not told
+    body: str | None  # its `robot_hash` then; None: not told
 
 
 def read_asked(folder: Path) -> Asked:

@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, bounds, weights_to_vector
+from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import plural
 from hector_jax.runs.metrics import (
     BASELINES,
@@ -30,7 +31,6 @@ from hector_jax.runs.metrics import (
     mean,
     rms,
 )
-from hector_jax.storage import write_file, write_json
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning, aligned
 from hector_jax.tuning.loss import LossConfig, Losses
 

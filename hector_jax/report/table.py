@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import InputError, plural, read_json
 from hector_jax.report.report import (
     STAND_IN,
@@ -34,7 +35,6 @@ from hector_jax.report.report import (
 )
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import BASELINES, PARTS, Comparison, Interval, Verdict
-from hector_jax.storage import write_file, write_json
 from hector_jax.tuning.difftune import Tuning
 
 PAPER = {

@@ -1,23 +1,52 @@
 """Artefacts on disk: what takes longer than a moment to compute is computed once.
 
 An artefact is a tree of arrays in one file: a tuning, the score of a walk, the scores of a group of
-walks. Its file's name ends in a `storage.digest` of all that it follows from: settings, robot,
+walks. Its file's name ends in a `content_key` of all that it follows from: settings, robot,
 command, net, weights, plant, seed, loss, and the code and packages that compute it. Other inputs
 make another file, so that nothing is taken for something else and nothing is overwritten. A process
 that is killed loses the artefacts that were not finished; a damaged file is named and made anew.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from hector_jax.core.console import say
+from hector_jax.core.environment import code_hash
+from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError
+from hector_jax.core.tree_file import ROBOT_DIGITS, load_tree, save_tree, tree_hash
 from hector_jax.robot.model import Robot
-from hector_jax.storage import load_tree, locked, save_tree
 
 Key = TypeVar("Key")
 Tree = TypeVar("Tree")
+
+
+def robot_hash(robot: Robot) -> str:
+    """Hash (16 hexadecimal digits) of a robot: its numbers, what its TOML says and its MJCF."""
+    body = robot.description
+    settings = replace(body, path=Path(), model=Path(body.model.name))
+    text = f"{tree_hash(robot, ROBOT_DIGITS)} {settings!r} ".encode() + body.model.read_bytes()
+    return hashlib.sha256(text).hexdigest()[:16]
+
+
+def content_key(*parts: Any, code: Sequence[str]) -> str:
+    """Hash (12 hexadecimal digits) of all that a result follows from, exact in every bit.
+
+    Args:
+        parts: settings (by their repr), robots and trees of numbers.
+        code: modules that compute the result, see `code_hash`.
+    """
+
+    def text(part: Any) -> str:
+        if isinstance(part, Robot):
+            return robot_hash(part)
+        return tree_hash(part) if isinstance(part, tuple) or part is None else repr(part)
+
+    key = "\n".join([*map(text, parts), code_hash(*code)])
+    return hashlib.sha256(key.encode()).hexdigest()[:12]
 
 
 def load_artefact(path: Path, like: Tree, *, kind: str, robot: Robot) -> Tree | None:

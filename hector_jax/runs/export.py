@@ -35,8 +35,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from hector_jax.core.console import Broken
-from hector_jax.qp import Status
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.walking import (
     Feet,
@@ -48,22 +46,18 @@ from hector_jax.control.walking import (
     step_plan,
 )
 from hector_jax.control.weights import Weights
+from hector_jax.control.weights_file import WEIGHTS, save_weights, weights_tree
+from hector_jax.core.console import Broken
+from hector_jax.core.environment import versions
+from hector_jax.core.files import make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError, from_table, read_json
+from hector_jax.core.trajectory import State, Wrench, pack_wrench
+from hector_jax.core.tree_file import tree_hash
+from hector_jax.qp import Status
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.walk import first_tick, substeps, walk
 from hector_jax.sim.world import build_world, ideal, standing_qpos
-from hector_jax.storage import (
-    WEIGHTS,
-    fingerprint,
-    make_folder,
-    save_weights,
-    versions,
-    weights_tree,
-    write_file,
-    write_json,
-)
-from hector_jax.core.trajectory import State, Wrench, pack_wrench
 
 SCHEMA = "weights.schema.json"
 PLATFORMS = ("cpu", "cuda")
@@ -572,7 +566,7 @@ def export(
         },
         "weights": weights_tree(weights),
         "controller": asdict(config),
-        "robot": fingerprint(robot),
+        "robot": tree_hash(robot),
         "versions": versions(),
         "check": {"milliseconds": len(walked.torque), **found._asdict()},
     }

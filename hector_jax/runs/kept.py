@@ -1,6 +1,6 @@
 """Scores of walks, each an artefact (cache.py): weight sets on plants, and groups of walks."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -9,22 +9,18 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.runs import pipeline
-from hector_jax.core.console import bar
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
-from hector_jax.runs import metrics
-from hector_jax.runs.cache import cached
-from hector_jax.runs.metrics import Score
-from hector_jax.grfm.dataset import at_interval
-from hector_jax.grfm.network import Params
+from hector_jax.core.console import bar
 from hector_jax.core.inputs import plural
-from hector_jax.runs.pipeline import as_line
+from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.model import Robot
+from hector_jax.runs import metrics, pipeline
+from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.metrics import Score
 from hector_jax.sim.walk import Job
 from hector_jax.sim.world import Imperfections
-from hector_jax.storage import digest
-from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import LossConfig
 
@@ -137,7 +133,7 @@ def _scored(
 
     def path(key: tuple[str, int]) -> Path:
         (name, seed), what = key, "walk" if key[1] == first else "score"
-        ending = digest(walk_config, config.loss, robot, jobs[key], code=code)
+        ending = content_key(walk_config, config.loss, robot, jobs[key], code=code)
         return folder / f"{what}-{name}-{seed}-{ending}.npz"
 
     def make(missing: list[tuple[str, int]], found: Mapping[Any, Any]) -> Iterator[Any]:
@@ -185,7 +181,7 @@ def walk_groups(
     """
     code = ("sim.walk", "sim.parallel", "runs.metrics")
     paths = {
-        name: folder / f"{name}-{digest(*key, robot, tuple(jobs), code=code)}.npz"
+        name: folder / f"{name}-{content_key(*key, robot, tuple(jobs), code=code)}.npz"
         for name, jobs in groups.items()
     }
 

@@ -110,7 +110,7 @@ def score(config: LossConfig, walk: Trajectory) -> Score:
 
 
 def score_like(*axes: int) -> Score:
-    """Return a score of zeros with some first axes, for `storage.load_tree`."""
+    """Return a score of zeros with some first axes, for `load_tree`."""
     one, three = np.zeros(axes), np.zeros((*axes, 3))
     return Score(dict.fromkeys(PARTS, one), one, three, three, one.astype(bool), one, one)
 
@@ -120,9 +120,7 @@ def stack_scores(scores: Sequence[Score]) -> Score:
     return jax.tree.map(lambda *rows: np.stack(rows), *scores)
 
 
-def _rms(
-    error: Float[np.ndarray, "T 3"], rows: Bool[np.ndarray, " T"]
-) -> Float[np.ndarray, "3"]:
+def _rms(error: Float[np.ndarray, "T 3"], rows: Bool[np.ndarray, " T"]) -> Float[np.ndarray, "3"]:
     """Root mean square over some rows; NaN where there are none."""
     return np.sqrt(np.mean(error[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
 
@@ -193,9 +191,7 @@ def mean(verdict: Verdict, name: str, part: str = "L") -> Interval:
     return _cached_bootstrap(verdict.scores[name].losses[part].tobytes(), np.mean)
 
 
-def falls_comparable(
-    ours: Bool[np.ndarray, "*walks"], others: Bool[np.ndarray, "*walks"]
-) -> bool:
+def falls_comparable(ours: Bool[np.ndarray, "*walks"], others: Bool[np.ndarray, "*walks"]) -> bool:
     """Whether neither of two sets falls so much more often that their losses do not compare."""
     return bool(abs(ours.mean() - others.mean()) < FALL_MARGIN - 1e-12)
 

@@ -18,21 +18,17 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.runs import replay
-from hector_jax.runs.cache import cached
-from hector_jax.core.console import bar, say_if_slow
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
-from hector_jax.grfm import dataset, network, training
-from hector_jax.grfm.dataset import Dataset, Walks
-from hector_jax.grfm.network import LinearMap, Params
-from hector_jax.grfm.training import History, TrainConfig
+from hector_jax.core.console import bar, say_if_slow
+from hector_jax.core.environment import code_hash
+from hector_jax.core.files import append_file, as_json, locked, write_file
 from hector_jax.core.inputs import (
+    AT_LEAST_ONE,
     POSITIVE,
     SEED,
-    AT_LEAST_ONE,
     InputError,
     check,
     choose,
@@ -40,34 +36,30 @@ from hector_jax.core.inputs import (
     plural,
     short_repr,
 )
-from hector_jax.grfm.effect import HISTORY, last_command
-from hector_jax.robot.model import Robot
 from hector_jax.core.runtime import letters
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree_file import check_settings, tree_hash
+from hector_jax.grfm import dataset, network, training
+from hector_jax.grfm.dataset import Dataset, Walks
+from hector_jax.grfm.effect import HISTORY, last_command
+from hector_jax.grfm.network import LinearMap, Params
+from hector_jax.grfm.training import History, TrainConfig
+from hector_jax.robot.model import Robot
+from hector_jax.runs import replay
+from hector_jax.runs.cache import cached, content_key, robot_hash
+from hector_jax.search import cmaes as searching
+from hector_jax.search.cmaes import Found, Generation, SearchConfig, best
 from hector_jax.sim.walk import Job, walk, walk_many
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.storage import (
-    append_file,
-    as_json,
-    check_settings,
-    code_hash,
-    digest,
-    fingerprint,
-    identity,
-    locked,
-    write_file,
-)
-from hector_jax.core.trajectory import Trajectory
 from hector_jax.tuning import difftune, measured
-from hector_jax.search import cmaes as searching
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.rollout import RolloutConfig, rollout
-from hector_jax.search.cmaes import Found, Generation, SearchConfig, best
 
 ENGINES = ("auto", "c", "mjx")
 TUNING = "tuning"  # kind of a file
-# modules that decide the numbers, for `storage.digest`
+# modules that decide the numbers, for `runs.cache.content_key`
 TUNING_CODE = ("tuning.difftune", "grfm.network")
 TRAINING_CODE = ("grfm.training",)
 COLLECTION_CODE = (*TUNING_CODE, "grfm.dataset", "sim.parallel")
@@ -141,7 +133,7 @@ class Tuned(NamedTuple):
 
 
 class Journal:
-    """metrics.jsonl, a line for each iteration: as they come, and in order once tunings are over."""
+    """metrics.jsonl, a line for each iteration: as they come, and in order when tunings are over."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -270,7 +262,7 @@ def tune(
     """
     paths = {
         name: folder
-        / f"tuning-{name}-{digest(config, robot, nominal(robot), *each, code=TUNING_CODE)}.npz"
+        / f"tuning-{name}-{content_key(config, robot, nominal(robot), *each, code=TUNING_CODE)}.npz"
         for name, each in problems.items()
     }
 
@@ -348,7 +340,7 @@ def tune_measured(
             be written.
     """
     code = (*TUNING_CODE, "tuning.measured", "sim.walk")
-    key = digest(config, robot, weights, command, params, *plants, code=code)
+    key = content_key(config, robot, weights, command, params, *plants, code=code)
     job = partial(_measured_job, config, robot, command, params)
 
     def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
@@ -442,8 +434,8 @@ def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
     return {
         **asdict(config),
         "controller": repr(paths.rollout.walk),
-        "paths": digest(paths, robot, nominal(robot), code=()),
-        "robot": identity(robot),
+        "paths": content_key(paths, robot, nominal(robot), code=()),
+        "robot": robot_hash(robot),
         "code": code_hash(*COLLECTION_CODE),
     }
 
@@ -757,9 +749,9 @@ def search(
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
         "controller": repr(tune.rollout.walk),
         "loss": repr(tune.loss),
-        "robot": fingerprint(robot),
-        "plant": fingerprint(hfs()),
-        "commands": {name: fingerprint(_command(name, own)) for name in (*COMMANDS, *starts)},
+        "robot": robot_hash(robot),
+        "plant": tree_hash(hfs()),
+        "commands": {name: tree_hash(_command(name, own)) for name in (*COMMANDS, *starts)},
     }
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:

@@ -14,16 +14,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from hector_jax.core.console import say
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.robot.description import as_table, from_card
-from hector_jax.storage import environment
-from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
+from hector_jax.core.console import say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError, from_table
-from hector_jax.robot.model import Robot, load_robot
-from hector_jax.storage import WriteError, load_tree, read_card, save_tree
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree_file import load_tree, read_card, save_tree
+from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
+from hector_jax.robot.description import as_table, from_card
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.tuning.difftune import (
     Evaluation,
     Iteration,

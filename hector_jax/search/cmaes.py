@@ -33,8 +33,8 @@ from hector_jax.control.weights import (
     moved,
     weights_to_vector,
 )
+from hector_jax.core.files import append_file, write_file
 from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, SEED, InputError, Range, check
-from hector_jax.storage import append_file, write_file
 
 FORMAT = 1
 

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.weights import DIRECTION_NAMES, Weights
+from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.search.cmaes import Generation, Walk, placed, read_record
 from hector_jax.search.rivals import Rival, Steps
-from hector_jax.storage import append_file, as_json, write_file
 
 FORMAT = 1
 START = "start"

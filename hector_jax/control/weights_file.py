@@ -1,0 +1,99 @@
+"""Weights to JSON and back."""
+
+import difflib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hector_jax.control.weights import Weights
+from hector_jax.core.files import write_file
+from hector_jax.core.inputs import InputError, Range, read_json, validation_error
+from hector_jax.core.trajectory import State, Wrench
+
+WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
+_MOST_WEIGHTS = 1_000_000  # bytes
+
+
+def weights_tree(weights: Weights) -> dict[str, Any]:
+    """Weights as JSON values, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`."""
+    return {
+        part: {name: np.asarray(value).tolist() for name, value in tree._asdict().items()}
+        for part, tree in weights._asdict().items()
+    }
+
+
+def save_weights(path: Path, weights: Weights, schema: str | None = None) -> None:
+    """Write weights as JSON, as `weights_tree`; with the place of a schema it names that first.
+
+    Raises:
+        WriteError: where the file cannot be written.
+    """
+    tree = {} if schema is None else {"$schema": schema}
+    write_file(path, (json.dumps(tree | weights_tree(weights), indent=2) + "\n").encode())
+
+
+def load_weights(path: Path) -> Weights:
+    """Read weights that `save_weights` or a person wrote; in `WEIGHTS`, not held to the box.
+
+    Raises:
+        InputError: one line naming the file and the entry that is missing, unknown, of the wrong
+            shape, or not a number of that range.
+    """
+    path = Path(path)
+    tree = read_json(path, "weights", _MOST_WEIGHTS, object_pairs_hook=_no_twins)
+    if isinstance(tree, dict):
+        tree.pop("$schema", None)  # for editors; what is in a file is checked here
+    shapes: dict[str, dict[str, tuple[int, ...]]] = {
+        "Q": dict.fromkeys(State._fields, (3,)),
+        "R": dict.fromkeys(Wrench._fields, (2, 3)),
+    }
+    _check_keys(path, tree, shapes.keys(), "")
+    values = {}
+    for part, entries in shapes.items():
+        _check_keys(path, tree[part], entries.keys(), f"{part}.")
+        values[part] = {
+            name: _positive(path, f"{part}.{name}", tree[part][name], shape)
+            for name, shape in entries.items()
+        }
+    return Weights(Q=State(**values["Q"]), R=Wrench(**values["R"]))
+
+
+def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    tree = dict(pairs)
+    if len(tree) < len(pairs):
+        names = [name for name, _ in pairs]
+        twin = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f'"{twin}" is given twice')
+    return tree
+
+
+def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
+    expected = f"expected {', '.join(names)}"
+    if not isinstance(tree, dict):
+        where = prefix.rstrip(".") or "the file"
+        raise InputError(f"{path}: {where} must be an object; {expected}")
+    for key in tree:
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=1)
+            hint = f'did you mean "{prefix}{near[0]}"?' if near else expected
+            raise InputError(f"{path}: unknown weight {json.dumps(prefix + key[:40])}; {hint}")
+    for name in names:
+        if name not in tree:
+            raise InputError(f'{path}: missing weight "{prefix}{name}"; {expected}')
+
+
+def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.ndarray:
+    wanted = " x ".join(str(s) for s in shape)
+    try:
+        array = np.array(entry, object)
+    except ValueError:  # rows of different lengths
+        array = np.array(None)
+    if array.shape != shape:
+        raise InputError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
+    for index, value in np.ndenumerate(array):
+        if told := validation_error(value, float, WEIGHTS):
+            place = "".join(f"[{i}]" for i in index)
+            raise InputError(f"{path}: {name}{place} {told}")
+    return array.astype(float)

@@ -1,0 +1,193 @@
+"""Trees of arrays in files, and their hash.
+
+Nothing is pickled, nothing is believed unseen. A file is a plain `.npz` (`numpy.load` opens it)
+whose entry `card` is JSON: format, kind, robot, what each array is, versions, and `about`, which
+belongs to whoever wrote it. The archive's comment is the sha256 of all bytes before it, so a file
+that was cut or changed anywhere is refused as a whole. The robot is known by the hash of its
+numbers: what was learned on one body is not loaded for another.
+"""
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from hector_jax.core.environment import NUMERIC, versions
+from hector_jax.core.files import write_file
+from hector_jax.core.inputs import InputError, one_line, short_repr, validation_error
+
+FORMAT = 1
+ROBOT_DIGITS = 9  # of a robot's numbers: two machines' last bits make the same robot
+_SHA256 = 64  # hexadecimal digits
+
+Tree = TypeVar("Tree")
+
+
+def tree_hash(tree: Any, digits: int | None = None) -> str:
+    """Hash (16 hexadecimal digits) of a tree's arrays: exact, or of so many significant digits."""
+    content = hashlib.sha256()
+    for name, leaf in _named_leaves(tree).items():
+        array = np.asarray(leaf)
+        content.update(f"{name}{array.shape}".encode())
+        if digits is None:
+            content.update(f"{array.dtype}".encode() + array.tobytes())
+        else:
+            numbers = array.ravel().astype(float) + 0.0  # no negative zero
+            content.update(" ".join(f"{x:.{digits}g}" for x in numbers).encode())
+    return content.hexdigest()[:16]
+
+
+def save_tree(
+    path: Path, tree: Any, *, kind: str, robot: Any = None, about: Mapping[str, Any] | None = None
+) -> None:
+    """Write a tree of arrays.
+
+    Args:
+        path: file, replaced if it is there.
+        tree: NamedTuples and dictionaries of arrays.
+        kind: what it is, in a word; `load_tree` asks for the same.
+        robot: the `Robot` that the numbers belong to, or None.
+        about: JSON values for the card: units, frames, seeds, settings.
+
+    Raises:
+        WriteError: where the file cannot be written.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
+    card = {
+        "format": FORMAT,
+        "kind": kind,
+        "robot": None if robot is None else tree_hash(robot, ROBOT_DIGITS),
+        "arrays": {n: {"shape": list(a.shape), "dtype": str(a.dtype)} for n, a in arrays.items()},
+        "versions": versions(),
+        "about": dict(about or {}),
+    }
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, array in {"card": np.array(json.dumps(card)), **arrays}.items():
+            with archive.open(f"{name}.npy", "w") as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+        archive.comment = b"0" * _SHA256  # makes room; a zip file ends with its comment
+    content = buffer.getvalue()[:-_SHA256]
+    write_file(path, content + hashlib.sha256(content).hexdigest().encode())
+
+
+def load_tree(
+    path: Path, like: Tree, *, kind: str, robot: Any = None
+) -> tuple[Tree, dict[str, Any]]:
+    """Read what `save_tree` wrote.
+
+    Args:
+        path: the file.
+        like: a tree of the expected structure. Shapes must agree with its leaves, where an axis of
+            length 0 stands for any length; dtypes are those of the file.
+        kind: as given to `save_tree`.
+        robot: the `Robot` in use, or None to take any.
+
+    Returns:
+        The tree, with numpy arrays, and its card.
+
+    Raises:
+        InputError: one line naming the file, for one that is missing, cut, changed, of another
+            kind, format, layout or robot.
+    """
+    arrays, card = _read(path)
+    if card["kind"] != kind:
+        raise InputError(f"{path}: holds {short_repr(card['kind'])[1:-1]}, expected {kind}")
+    if robot is not None and card["robot"] != (expected := tree_hash(robot, ROBOT_DIGITS)):
+        raise InputError(
+            f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
+        )
+    wanted = _named_leaves(like)
+    if arrays.keys() != wanted.keys():
+        odd = sorted(arrays.keys() ^ wanted.keys())
+        told = one_line(", ".join(odd))
+        raise InputError(f"{path}: another layout of {kind}; fields that differ: {told}")
+    for name, leaf in wanted.items():
+        is_text = np.asarray(leaf).dtype.kind == "U"
+        if (dtype := arrays[name].dtype).kind not in ("U" if is_text else "biuf"):
+            what = "text" if is_text else "numbers"
+            raise InputError(f"{path}: {name} has type {dtype}, expected {what}")
+        shape, got = np.shape(leaf), arrays[name].shape
+        if len(shape) != len(got) or any(s not in (0, g) for s, g in zip(shape, got, strict=True)):
+            text = ", ".join("any" if s == 0 else str(s) for s in shape)
+            raise InputError(f"{path}: {name} has shape {got}, expected ({text})")
+    leaves = [arrays[name] for name in wanted]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), card
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """The card of a file that `save_tree` wrote, once the file as a whole is found sound.
+
+    Raises:
+        InputError: one line naming the file, as `load_tree`.
+    """
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    data = _read_bytes(Path(path))
+    content, digest = data[:-_SHA256], data[-_SHA256:]
+    if hashlib.sha256(content).hexdigest().encode() != digest:
+        raise InputError(f"{path}: cut or changed since it was written, or not a hector_jax file")
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+                raise ValueError("an entry is compressed")
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        card = json.loads(str(arrays.pop("card")))
+    except Exception as error:  # whoever made the archive chose what goes wrong
+        raise InputError(f"{path}: no card or no plain arrays inside: {one_line(error)}") from error
+    _check_card(path, card)
+    return arrays, card
+
+
+def _check_card(path: Path, card: Any) -> None:
+    if not isinstance(card, dict):
+        raise InputError(f"{path}: card must be an object, got {short_repr(card)}")
+    if card.get("format") != FORMAT:
+        raise InputError(
+            f"{path}: file format {short_repr(card.get('format'))}, this version reads {FORMAT}"
+        )
+    kinds = {"kind": str, "robot": str | None, "about": dict, "versions": dict}
+    for name, kind in kinds.items():
+        if name not in card:
+            raise InputError(f"{path}: card.{name} is missing")
+        if told := validation_error(card[name], kind):
+            raise InputError(f"{path}: card.{name} {told}")
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        if path.exists() and not path.is_file():  # a pipe or a device might never end
+            raise InputError(f"cannot read {path}: not a plain file")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _named_leaves(tree: Any) -> dict[str, Any]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Hold the settings that a file was made with against those that it would be made with now.
+
+    Raises:
+        InputError: one line naming the file and the first setting that differs.
+    """
+    for name in {**expected, **made}:
+        before, now = made.get(name), expected.get(name)
+        if before == now:
+            continue
+        what = f"with {name} {short_repr(before)}, this command expects {short_repr(now)}"
+        if name == "code":
+            what = f"by other code or other versions of {', '.join(NUMERIC)}"
+        raise InputError(f"{path}: made {what}; remove it, or name another folder")
