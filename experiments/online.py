@@ -42,8 +42,9 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, pipeline
 from hector_jax.sim.changes import Change
+from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.storage import digest, environment, load_weights, write_file, write_json
 from hector_jax.tuning.difftune import Iteration, TuneConfig
@@ -156,7 +157,7 @@ def _walk_case(
         return carry, weights
 
     retune = None if arm == "fixed" else online._replace(step=step)
-    told = walk(config.tune.rollout.walk, robot, *job, retune=retune)
+    told = walk(config.tune.rollout.walk, robot, job, retune=retune)
     middle, end = round(1e3 * moment), len(told.fallen)
     found = [_loss(_cut(told, *span)) for span in ((0, middle), (middle, end))]
     spans = [(i, i + round(1e3 * WINDOW)) for i in range(0, end, round(1e3 * WINDOW))]

@@ -19,7 +19,8 @@ from hector_jax.cli import asked, doctor, judging, study
 from hector_jax.cli.flags import Command, Tune, command_name, from_file
 from hector_jax.cli.main import main
 from hector_jax.control.weights import expert
-from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
+from hector_jax.grfm.collection import load_walks, walked_with
+from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
 from hector_jax.robot.model import MODEL_PATH, load_robot

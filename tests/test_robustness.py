@@ -24,7 +24,7 @@ from hector_jax.control.reference import UNSEEN
 from hector_jax.control.weights import nominal
 from hector_jax.report import plots
 from hector_jax.runs.metrics import stack_scores
-from hector_jax.sim.walk import Job
+from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 from hector_jax.storage import as_json
 

@@ -21,8 +21,8 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.runtime import workers
-from hector_jax.grfm.dataset import PIECES
-from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.grfm.jobs import PIECES
+from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.folder import read_json
 from hector_jax.report.report import Picture, Report, print_table, write_report
@@ -32,6 +32,7 @@ from hector_jax.runs import kept, metrics, pipeline
 from hector_jax.runs.kept import Journal, Judged
 from hector_jax.runs.metrics import Score
 from hector_jax.search.cmaes import SearchConfig
+from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import hfs
 from hector_jax.storage import (
     as_json,
@@ -268,7 +269,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     write_json(folder / "versions.json", made_with | {"seconds": f"{time.monotonic() - start:.0f}"})
     histories = {name: tuned.tuning for name, tuned in tunings.items()}
     walks, sampled = judged.shown, on_hfs.shown["nominal"]
-    effects = {"linear": linear_effect(net.linear), "residual": as_effect(net.params)}
+    effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
     curves = fidelity.curves(robot, jax.tree.map(lambda x: np.asarray(x)[None], sampled), effects)
     drawn = pictures.of_run(folder, config, sets, histories, walks, curves, net.course)
     film: Picture | str = "left out (--no-video)"
@@ -313,7 +314,7 @@ def search(args: Search) -> None:
     ]
     own = {one.name: one.command for one in wanted}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
-    engine = pipeline.choose_engine(args.engine)
+    engine = choose_engine(args.engine)
     tune, start = (
         asked.lasting(asked.tune_config(robot), wanted[0]),
         asked.weights(args.start, robot),
@@ -348,7 +349,7 @@ def search(args: Search) -> None:
             "stop": one.stop,
             "search": dataclasses.asdict(config),
             "start": args.start,
-            "engine": engine,
+            "engine": engine.name,
             "rollout": dataclasses.asdict(tune.rollout),
             "loss": dataclasses.asdict(tune.loss),
             "versions": versions(),

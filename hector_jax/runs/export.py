@@ -51,7 +51,8 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError, from_table, read_json
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
-from hector_jax.sim.walk import first_tick, substeps, walk
+from hector_jax.sim.loop import Job, first_tick, substeps
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, ideal, standing_qpos
 from hector_jax.storage import (
     WEIGHTS,
@@ -391,7 +392,7 @@ def record(
         known = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(known[sensing.coordinates(world)])
 
-    walked = walk(config, robot, weights, command, plant, seconds, on_sample=keep)
+    walked = walk(config, robot, Job(weights, command, plant, seconds), on_sample=keep)
     if np.asarray(walked.fallen).any():
         raise InputError(
             f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "

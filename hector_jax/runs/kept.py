@@ -26,7 +26,7 @@ from hector_jax.grfm.network import Params
 from hector_jax.core.inputs import plural
 from hector_jax.runs.pipeline import as_line
 from hector_jax.robot.model import Robot
-from hector_jax.sim.walk import Job
+from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections
 from hector_jax.storage import Checkpoint, append_file, digest, locked, write_file
 from hector_jax.core.trajectory import State, Trajectory, Wrench

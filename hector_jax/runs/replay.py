@@ -19,7 +19,7 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.robot.description import as_table, from_card
 from hector_jax.storage import environment
-from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
+from hector_jax.grfm.network import Params, effect_of, layout, variant_of
 from hector_jax.core.inputs import InputError, from_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.storage import WriteError, load_tree, read_card, save_tree
@@ -102,8 +102,8 @@ def keep(
         "net": None
         if params is None
         else {
-            "variant": "paper" if isinstance(params, NetParams) else "residual",
-            "hidden": widths(params.force),
+            "variant": variant_of(params).name,
+            "hidden": variant_of(params).widths(params),
         },
         "config": asdict(config),
         "description": as_table(robot.description),
