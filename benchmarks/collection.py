@@ -14,10 +14,10 @@ import jax
 from benchmarks.measuring import Check, Report, show
 from hector_jax.control.walking import WalkConfig
 from hector_jax.core.runtime import setup_jax
-from hector_jax.grfm.dataset import draw_jobs
+from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.pipeline import mjx_walks
-from hector_jax.sim.walk import first_tick, substeps
+from hector_jax.sim.loop import first_tick, substeps
+from hector_jax.sim.parallel import walk_batch
 
 BAR = 0.7  # million robot-steps per second of 4096 walks at once, on one H200
 
@@ -32,7 +32,7 @@ def measure(batches: list[int], seconds: float, single: bool) -> Report:
         jobs, spent = draw_jobs(0, batch, seconds=seconds), []
         for _ in range(2):
             start = time.perf_counter()
-            walks = mjx_walks(config, robot, jobs, chunk=batch, single=single)
+            walks = walk_batch(config, robot, jobs, chunk=batch, single=single)
             built = time.perf_counter()
             falls = sum(bool(walk.fallen.any()) for walk in walks)
             spent.append(time.perf_counter() - built)

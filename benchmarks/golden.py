@@ -35,16 +35,20 @@ from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.core.console import say
 from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State, Trajectory
+from hector_jax.core.tree import stack
 from hector_jax.grfm import dataset, training
+from hector_jax.grfm.collection import Walks
 from hector_jax.grfm.effect import last_command
+from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig, solve_qp
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.export import controller, export_controller, load_controller
+from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
@@ -124,14 +128,13 @@ def tick() -> Arrays:
     return found | {f"strider, {key}": value for key, value in strider.items()}
 
 
-def _walks(robot: Robot) -> dataset.Walks:
+def _walks(robot: Robot) -> Walks:
     """Walks of a second on the hfs, for phi."""
     config = walk_config(robot)
-    jobs = dataset.draw_jobs(0, 6, seconds=1.0, robot=robot)
-    walked = [walk(config, robot, *job) for job in jobs]
+    jobs = draw_jobs(0, 6, seconds=1.0, robot=robot)
+    walked = [walk(config, robot, job) for job in jobs]
     walks = [dataset.at_interval(one, config.gait.tick) for one in walked]
-    stack = lambda trees: jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *trees)  # noqa: E731
-    return dataset.Walks(stack(jobs), stack(walks))
+    return Walks(stack(jobs), stack(walks))
 
 
 def _nets(robot: Robot) -> dict[str, Any]:
@@ -208,13 +211,13 @@ def seconds() -> Arrays:
     """A second of walking in each world and engine."""
     robot, found = load_robot(), {}
     for name, plant in {"ideal": ideal(), "hfs": hfs(), "standin": standin(0)}.items():
-        walked = walk(WalkConfig(), robot, expert(), named_command("s"), plant, 1.0, 0)
+        walked = walk(WalkConfig(), robot, Job(expert(), named_command("s"), plant, 1.0))
         found[name] = _flat([walked.state, walked.command, walked.effect])
     jobs = [Job(expert(), named_command("s"), plant, 1.0) for plant in (ideal(), ideal())]
     (batched, _) = walk_batch(WalkConfig(), robot, jobs, fine=True)
     found["mjx"] = _flat([batched.state, batched.command, batched.effect])
     other = load_robot(STRIDER)
-    walked = walk(walk_config(other), other, nominal(other), named_command("s"), ideal(), 1.0, 0)
+    walked = walk(walk_config(other), other, Job(nominal(other), named_command("s"), ideal(), 1.0))
     return found | {"strider": _flat([walked.state, walked.command, walked.effect])}
 
 
@@ -224,7 +227,7 @@ def walks() -> Arrays:
     for world, plant in {"ideal": ideal(), "hfs": hfs(), "standin": standin(0)}.items():
         for name, weights in {"nominal": nominal(), "expert": expert()}.items():
             for command in COMMANDS:
-                walked = walk(WalkConfig(), robot, weights, named_command(command), plant, 4.0, 0)
+                walked = walk(WalkConfig(), robot, Job(weights, named_command(command), plant))
                 found[f"{world}, {name}, {command}"] = _loss(walked)
     return found
 

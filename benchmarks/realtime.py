@@ -22,7 +22,8 @@ from hector_jax.control.weights import expert
 from hector_jax.core.runtime import setup_jax
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
-from hector_jax.sim.walk import substeps, walk
+from hector_jax.sim.loop import Job, substeps
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 
 SECONDS = 10.0
@@ -39,7 +40,7 @@ def measure(seconds: float = SECONDS) -> Report:
         known = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(known[sensing.coordinates(world)])
 
-    walked = walk(config, robot, weights, command, ideal(), seconds, on_sample=record)
+    walked = walk(config, robot, Job(weights, command, ideal(), seconds), on_sample=record)
     count, no_error = substeps(config), np.zeros(sensing.ERRORS)
     readings = rows[-round(seconds * 1000) - 1 :: count][: round(seconds / config.gait.tick)]
 

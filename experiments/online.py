@@ -46,8 +46,9 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
 from hector_jax.runs.cache import cached, content_key
 from hector_jax.sim.changes import Change
+from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import LossConfig, losses, total
@@ -159,7 +160,7 @@ def _walk_case(
         return carry, weights
 
     retune = None if arm == "fixed" else online._replace(step=step)
-    told = walk(config.tune.rollout.walk, robot, *job, retune=retune)
+    told = walk(config.tune.rollout.walk, robot, job, retune=retune)
     middle, end = round(1e3 * moment), len(told.fallen)
     found = [_loss(_cut(told, *span)) for span in ((0, middle), (middle, end))]
     spans = [(i, i + round(1e3 * WINDOW)) for i in range(0, end, round(1e3 * WINDOW))]

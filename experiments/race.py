@@ -55,7 +55,9 @@ from hector_jax.search.rivals import (
     adam,
     steps_to,
 )
-from hector_jax.sim.walk import Job, walk_job
+from hector_jax.sim.engine import Engine, choose_engine
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
@@ -136,10 +138,10 @@ def _price_job(config: TuneConfig, robot: Robot, command: Command) -> float:
     """Seconds of a walk, the mean of three, when all is compiled."""
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     job = Job(nominal(), command, hfs(), seconds)
-    walk_job(config.rollout.walk, robot, job)
+    walk(config.rollout.walk, robot, job)
     begin = time.monotonic()
     for _ in range(3):
-        walk_job(config.rollout.walk, robot, job)
+        walk(config.rollout.walk, robot, job)
     return (time.monotonic() - begin) / 3
 
 
@@ -222,14 +224,14 @@ def run(
     config: TuneConfig,
     robot: Robot,
     command: Command,
-    engine: str,
+    engine: Engine,
     rivals: Mapping[str, Rival],
 ) -> Raced:
     """The race, taking up its record."""
     size = sum(rival.most for rival in rivals.values())
     about = {
         "trajectory": flags.traj,
-        "engine": engine,
+        "engine": engine.name,
         "ticks": config.rollout.ticks,
         "controller": repr(config.rollout.walk),
         "loss": repr(config.loss),
@@ -252,7 +254,7 @@ def run(
         ends = np.cumsum([len(each) for each in sets.values()])
         return dict(zip(sets, np.split(told, ends[:-1]), strict=True))
 
-    with bar(f"racing on the high-fidelity simulator, engine {engine}") as tell:
+    with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as tell:
 
         def on_round(raced: Raced) -> None:
             done = sum(map(walks, raced.turns.values()))
@@ -286,7 +288,7 @@ def main() -> None:
     """Write report.md, race.json and the pictures."""
     flags = tyro.cli(Flags)
     setup_jax()
-    command, engine = named_command(flags.traj), pipeline.choose_engine(flags.engine)
+    command, engine = named_command(flags.traj), choose_engine(flags.engine)
     if not all(find_spec(package) for package in ("cmaes", "sklearn")):
         raise InputError('the race needs its extra: pip install "hector-jax[race]"')
     make_folder(flags.out)
@@ -313,7 +315,7 @@ def main() -> None:
         ]
         for method, each in methods.items()
     }
-    told = report(flags, engine, raced.start, groups, courses, prices, took)
+    told = report(flags, engine.name, raced.start, groups, courses, prices, took)
     say(f"the report is {told}")
 
 

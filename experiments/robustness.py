@@ -47,8 +47,9 @@ from hector_jax.report.report import WORLDS
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, metrics
 from hector_jax.runs.metrics import Score
+from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk_many
 from hector_jax.sim.world import named_world
 from hector_jax.tuning.loss import LossConfig
 
@@ -149,7 +150,7 @@ def main() -> None:
     with workers(flags.processes) as pool:
         walked = kept.walk_groups(
             groups,
-            partial(walk_many, pool, config, robot),
+            partial(MUJOCO_C.walk, pool, config, robot),
             partial(metrics.score, loss),
             metrics.score_like(0),
             "robustness",

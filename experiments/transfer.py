@@ -49,13 +49,14 @@ from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.trajectory import Load, Trajectory
-from hector_jax.grfm.dataset import walked_with
+from hector_jax.grfm.collection import walked_with
 from hector_jax.grfm.effect import Effect, Window, last_command
-from hector_jax.grfm.network import Params, as_effect, linear_effect
+from hector_jax.grfm.network import Params, as_effect
 from hector_jax.report import plots
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, pipeline
-from hector_jax.sim.walk import Job, walk_many
+from hector_jax.sim.engine import choose_engine
+from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tune_step
 from hector_jax.tuning.loss import LossConfig, loss_of
@@ -148,7 +149,7 @@ def phis(
     net, paper = (pipeline.ground(pool, robot, data, name) for name in (None, "paper"))
     default = as_effect(net.params)
     effects |= {
-        "linear": linear_effect(net.linear),
+        "linear": as_effect(net.linear),
         "paper": as_effect(paper.params),
         "net": default,
         "net without legs": jax.tree_util.Partial(_without_legs, default),
@@ -188,15 +189,13 @@ def walk_groups(
     folder: Path,
 ) -> tuple[dict[str, Walked], str]:
     """Walks of groups of jobs on the hfs, and their engine; a group that is on disk is taken."""
-    engine = "c" if jax.default_backend() == "cpu" else "mjx"
-    walk = {
-        "c": partial(walk_many, pool, config, robot),
-        "mjx": partial(pipeline.mjx_walks, config, robot, fine=True, single=False),
-    }[engine]
+    engine = choose_engine("auto")
+    walk = partial(engine.walk, pool, config, robot)
     like = Walked(np.zeros(0), np.zeros(0), np.zeros(0))
-    key, title = (config, LossConfig(), engine), f" on the high-fidelity simulator, engine {engine}"
+    key = config, LossConfig(), engine.name
+    title = f" on the high-fidelity simulator, engine {engine.name}"
     walked = kept.walk_groups(groups, walk, _walked, like, "transfer", robot, folder, key, title)
-    return walked, engine
+    return walked, engine.name
 
 
 def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:

@@ -26,7 +26,8 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.files import locked
 from hector_jax.core.runtime import setup_jax
-from hector_jax.grfm import dataset
+from hector_jax.grfm.collection import collect
+from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, pipeline
@@ -83,15 +84,15 @@ def walk_jobs(folder: Path, jobs):
 
 def collection(folder: Path) -> None:
     with locked(folder):
-        jobs = dataset.draw_jobs(0, WALKS)
-        dataset.collect(folder, jobs, partial(walk_jobs, folder), robot=ROBOT)
+        jobs = draw_jobs(0, WALKS)
+        collect(folder, jobs, partial(walk_jobs, folder), robot=ROBOT)
 
 
 def training(folder: Path) -> None:
     walks = folder.parent / "walks"
     with locked(walks):
-        jobs = dataset.draw_jobs(0, 5)
-        dataset.collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT)
+        jobs = draw_jobs(0, 5)
+        collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT)
     config = TrainConfig(os.environ.get("VARIANT", "paper"), epochs=60, batch=16)
     if not (folder / "net.npz").exists():
         pipeline.train(config, ROBOT, walks, folder / "net.npz")

@@ -8,7 +8,8 @@ from synthetic import synthetic_walk
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import standing_anchor
 from hector_jax.grfm.dataset import at_interval, make_dataset
-from hector_jax.grfm.network import as_effect, effect_of, init_params
+from hector_jax.grfm.network import as_effect, effect_of
+from hector_jax.grfm.residual import init, with_statistics
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
@@ -24,10 +25,10 @@ def small_net(seed=0):
     """An untrained net that adds a newton or so to what was commanded."""
     walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
     data = make_dataset(ROBOT, jax.tree.map(lambda *x: np.stack(x), *walks))[0]
-    made = init_params(jax.random.key(seed), data)
+    made = with_statistics(init(jax.random.key(seed)), data)
     quiet = jax.tree.map(jnp.zeros_like, made.linear)
     linear = quiet._replace(ticks=made.linear.ticks, gates=made.linear.gates)
-    return made._replace(linear=linear, left=jnp.ones_like(made.left))
+    return made._replace(linear=linear, residual_rms=jnp.ones_like(made.residual_rms))
 
 
 def small_effect(seed=0):

@@ -21,11 +21,11 @@ FLOORS = [
 ]
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
-    "mujoco": ("core.headless", "sim.parallel"),
+    "mujoco": ("core.headless", "sim.mjx_model"),
     "viser": ("report.view",),
     "trimesh": ("report.view",),
-    "flax": ("grfm.network",),
-    "optax": ("grfm.training", "tuning.difftune", "search.rivals"),
+    "flax": ("grfm.nets",),
+    "optax": ("grfm.nets", "tuning.difftune", "search.rivals"),
     "jaxopt": ("qp.jaxopt_solver",),
     "cmaes": ("search.cmaes",),
     "sklearn": ("search.rivals",),

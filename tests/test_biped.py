@@ -20,7 +20,7 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json
 from hector_jax.core.trajectory import State, has_fallen
-from hector_jax.grfm.dataset import load_walks
+from hector_jax.grfm.collection import load_walks
 from hector_jax.report import folder as runs
 from hector_jax.robot.description import Description, read_description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs
@@ -28,7 +28,8 @@ from hector_jax.robot.model import describe, load_model, load_robot
 from hector_jax.runs import pipeline, replay
 from hector_jax.runs.export import find_weights
 from hector_jax.runs.pipeline import CollectConfig
-from hector_jax.sim.parallel import _places, batched_model
+from hector_jax.sim.loop import Job
+from hector_jax.sim.mjx_model import batched_model, find_places
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig
@@ -133,7 +134,7 @@ def test_mjx_takes_any_robot_and_knows_what_may_not_touch_the_floor(strider):
     world = build_world(hfs(), strider.description)
     model, _ = batched_model([world])
     assert (model.nq, model.nu) == (27, 10)
-    places = _places(world)
+    places = find_places(world)
     parts = [world.model.geom(geom).name for geom in (*places.boxes, *places.capsules)]
     assert parts == ["trunk", "left_thigh", "left_shin", "right_thigh", "right_shin"]
 
@@ -293,9 +294,8 @@ def test_a_searched_leg_is_differentiable_and_finite_out_of_reach(tmp_path):
 
 
 def walked(robot, plant, seconds):
-    found = walk(
-        walk_config(robot), robot, nominal(robot), named_command("straight"), plant, seconds
-    )
+    job = Job(nominal(robot), named_command("straight"), plant, seconds)
+    found = walk(walk_config(robot), robot, job)
     assert not found.fallen.any()
     assert not found.legs_touch.any()
     return found.state.position[-1] - found.initial.position

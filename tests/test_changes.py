@@ -10,6 +10,7 @@ from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.changes import Change, changed_world, worlds_by_step
+from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos
 
@@ -40,8 +41,9 @@ def held(world, steps=400, slide=0.0):
 
 
 def short(*changes, seconds=0.3, plant=None, on_sample=None):
-    args = (CONFIG, ROBOT, expert(), named_command("straight"), plant or ideal(), seconds)
-    return walk(*args, changes=changes, on_sample=on_sample)
+    command = named_command("straight")
+    job = Job(expert(), command, plant or ideal(), seconds, changes=changes)
+    return walk(CONFIG, ROBOT, job, on_sample=on_sample)
 
 
 @pytest.mark.parametrize("plant", [ideal(), hfs()._replace(trunk_com=np.array([0.01, 0.02, 0.0]))])

@@ -21,7 +21,8 @@ from hector_jax.cli.main import main
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.tree_file import read_card
-from hector_jax.grfm.dataset import at_interval, load_walks, walked_with
+from hector_jax.grfm.collection import load_walks, walked_with
+from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
 from hector_jax.robot.model import MODEL_PATH, load_robot

@@ -15,7 +15,7 @@ from hector_jax.cli import flags
 from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Command, Configured, Evaluate, Table, Tune, from_file, settings
 from hector_jax.core.inputs import InputError, validation_error
-from hector_jax.report.report import PAPER_ITERATIONS
+from hector_jax.tuning.difftune import PAPER_ITERATIONS
 
 FILES = [kind for kind in get_args(Command) if issubclass(kind, Configured)]
 

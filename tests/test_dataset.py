@@ -10,21 +10,10 @@ from synthetic import CYCLE, synthetic_walk, turn_walk
 
 from hector_jax.control.reference import Anchor, named_command, reference_at
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.grfm.dataset import (
-    KINDS,
-    NEAR,
-    PIECES,
-    at_interval,
-    collect,
-    draw_jobs,
-    draw_jobs_near,
-    load_walks,
-    make_dataset,
-    split_by_walk,
-    walked_with,
-    with_mirror,
-)
+from hector_jax.grfm.collection import collect, load_walks, walked_with
+from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
+from hector_jax.grfm.jobs import KINDS, NEAR, PIECES, draw_jobs, draw_jobs_near
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import Push
@@ -75,8 +64,8 @@ def test_drawn_weights_lie_within_a_third_and_three_times_of_their_centres():
 def test_jobs_near_a_tuning_take_turns_about_its_path_and_its_end():
     factors = np.array([1.0, 10.0, 100.0])  # far enough apart to tell which point is meant
     path = jax.tree.map(lambda w: np.multiply.outer(factors, w), nominal())
-    jobs = draw_jobs_near(0, 24, named_command("c"), path)
-    leaves_close(draw_jobs_near(0, 8, named_command("c"), path), jobs[:8], 0.0)
+    jobs = draw_jobs_near(0, 24, named_command("c"), path=path)
+    leaves_close(draw_jobs_near(0, 8, named_command("c"), path=path), jobs[:8], 0.0)
     logs = np.log([weights_to_vector(job.weights) / weights_to_vector(nominal()) for job in jobs])
     point = np.round(logs.mean(axis=1) / np.log(10)).astype(int)
     assert np.all(np.abs(logs - point[:, None] * np.log(10)) <= np.log(NEAR) + 1e-12)
@@ -172,19 +161,18 @@ def test_a_sample_is_the_newest_commands_and_the_effect_of_its_tick(three, robot
     )
     np.testing.assert_array_equal(data.state.velocity[row], three.state.velocity[1, 6])
     np.testing.assert_array_equal(data.window.contact[row], three.contact[1, 7])
-    np.testing.assert_allclose(data.window.phase, data.tick / CYCLE % 1.0)
     np.testing.assert_allclose(data.window.since_switch, 0.01 * (data.tick % 20))
 
 
 def test_the_window_agrees_with_the_planned_contact(three, robot):
     data, _ = make_dataset(robot, three)
-    np.testing.assert_array_equal(data.window.contact[:, 0], data.window.phase < 0.5)
+    np.testing.assert_array_equal(data.window.contact[:, 0], data.tick % CYCLE < CYCLE // 2)
 
 
-def test_the_gait_s_phase_counts_from_the_start_tick(three, robot):
+def test_the_time_since_a_switch_counts_from_the_start_tick(three, robot):
     data, _ = make_dataset(robot, three, start_tick=[0, 10, 30])
     starts = np.array([0, 10, 30])[data.walk]
-    np.testing.assert_allclose(data.window.phase, (data.tick + starts) % CYCLE / CYCLE)
+    np.testing.assert_allclose(data.window.since_switch, 0.01 * ((data.tick + starts) % 20))
 
 
 def test_a_walk_on_another_heading_makes_the_same_samples(robot):
@@ -212,7 +200,7 @@ def test_a_mirror_image_has_the_other_foot_s_turn_and_is_its_own_inverse(three, 
     n = len(data.walk)
     both = with_mirror(data)
     image = jax.tree.map(lambda x: x[n:], both)
-    np.testing.assert_array_equal(image.window.contact[:, 0], image.window.phase < 0.5)
+    np.testing.assert_array_equal(image.window.contact, data.window.contact[:, ::-1])
     np.testing.assert_array_equal(image.walk, data.walk)
     np.testing.assert_allclose(image.label.force[:, 0], data.label.force[:, 1] * [1, -1, 1])
     # the moment of a mirrored force about a mirrored point
@@ -267,7 +255,7 @@ def walker(walked=None):
 def test_collected_walks_come_back_in_order_with_their_jobs(tmp_path, robot):
     jobs, steps = draw_jobs(0, 5), []
     note = lambda *done: steps.append(done)  # noqa: E731
-    collect(tmp_path / "data", jobs, walker(), robot=robot, shard=2, progress=note)
+    collect(tmp_path / "data", jobs, walker(), robot=robot, progress=note)
     assert steps == [(i, 5) for i in range(6)]
     walks = load_walks(tmp_path / "data", robot)
     np.testing.assert_array_equal(walks.job.seed, range(5))
@@ -284,41 +272,38 @@ def test_collection_takes_up_where_it_stopped(tmp_path, robot):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        collect(tmp_path, jobs, stops, robot=robot, shard=2)
+        collect(tmp_path, jobs, stops, robot=robot)
     with pytest.raises(ValueError, match="no finished collection"):
         load_walks(tmp_path, robot)
-    first = tmp_path / "shard-000.npz"
+    first = tmp_path / "walk-00001.npz"
     first.write_bytes(first.read_bytes()[:-1])  # damaged: made again
     walked.clear()
-    collect(tmp_path, jobs, walker(walked), robot=robot, shard=2)
-    assert walked == [0, 1, 5]
-    collect(tmp_path, jobs, walker(walked), robot=robot, shard=2)
-    assert len(walked) == 3
-    assert not list(tmp_path.glob("walk-*"))
+    collect(tmp_path, jobs, walker(walked), robot=robot)
+    assert walked == [1, 5]
+    collect(tmp_path, jobs, walker(walked), robot=robot)
+    assert len(walked) == 2
     assert len(load_walks(tmp_path, robot).job.seed) == 6
 
 
 def test_a_collection_of_something_else_is_not_overwritten(tmp_path, robot):
     collect(tmp_path, draw_jobs(0, 2), walker(), robot=robot, settings={"ticks": 4})
-    before = (tmp_path / "shard-000.npz").read_bytes()
+    before = (tmp_path / "walk-00000.npz").read_bytes()
     heavier = robot._replace(mass=np.asarray(robot.mass) + 1.0)
     for jobs, body, ticks, message in (
-        (draw_jobs(1, 2), robot, 4, "shard-000.npz: collected for other walks"),
-        (draw_jobs(0, 2), robot, 5, "shard-000.npz: made with ticks 4, this command expects 5"),
-        (draw_jobs(0, 2), heavier, 4, "shard-000.npz: made for robot"),
+        (draw_jobs(1, 2), robot, 4, "walk-00000.npz: collected for other walks"),
+        (draw_jobs(0, 2), robot, 5, "walk-00000.npz: made with ticks 4, this command expects 5"),
+        (draw_jobs(0, 2), heavier, 4, "walk-00000.npz: made for robot"),
     ):
         with pytest.raises(ValueError, match=message):
             collect(tmp_path, jobs, walker(), robot=body, settings={"ticks": ticks})
-    assert (tmp_path / "shard-000.npz").read_bytes() == before
-    with pytest.raises(ValueError, match="shard-000.npz: made for robot"):
+    assert (tmp_path / "walk-00000.npz").read_bytes() == before
+    with pytest.raises(ValueError, match="walk-00000.npz: made for robot"):
         load_walks(tmp_path, heavier)
 
 
 def test_a_walk_that_did_not_come_is_told(tmp_path, robot):
-    with pytest.raises(ValueError, match="shard-001.npz: 2 walks asked for, 1 came"):
-        collect(
-            tmp_path, draw_jobs(0, 4), lambda jobs: list(walker()(jobs))[:3], robot=robot, shard=2
-        )
+    with pytest.raises(ValueError, match="4 walks asked for, 3 came"):
+        collect(tmp_path, draw_jobs(0, 4), lambda jobs: list(walker()(jobs))[:3], robot=robot)
 
 
 def test_a_collection_is_identified_by_its_walks_and_settings(tmp_path, robot):

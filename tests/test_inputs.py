@@ -27,7 +27,7 @@ from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import Range, did_you_mean, short_repr, validation_error
 from hector_jax.core.tree_file import save_tree
-from hector_jax.grfm import dataset, network
+from hector_jax.grfm import collection, network
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.qp import QpConfig
 from hector_jax.report.video import VideoConfig
@@ -348,7 +348,7 @@ def walks(folder):
     """A collection of two walks in which nothing moves."""
     home = folder / "walks"
     shape = lambda x: [2, 5][: x.ndim] + list(x.shape[2:])  # noqa: E731
-    like = dataset._like()
+    like = collection._layout()
     still = jax.tree.map(
         lambda x: np.zeros([s or n for s, n in zip(x.shape, shape(x), strict=True)]), like
     )
@@ -372,7 +372,7 @@ def test_collected_walks_are_taken_or_refused_in_one_line(folder, walks, data):
         card.write_text(json.dumps(changed(data, json.loads(card.read_text()))))
     else:
         (home / "card.json").write_bytes(torn(data, walks["card.json"]))
-    found = refused_or(lambda path: dataset.load_walks(path.parent, ROBOT), home / "card.json")
+    found = refused_or(lambda path: collection.load_walks(path.parent, ROBOT), home / "card.json")
     if found is not None:
         run = found.trajectory
         assert run.state.euler.shape[:2] == run.fallen.shape == run.residual.shape

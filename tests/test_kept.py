@@ -13,7 +13,7 @@ from hector_jax.control.weights import bounds, expert, nominal
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, metrics, pipeline
 from hector_jax.runs.cache import content_key
-from hector_jax.sim.walk import Job
+from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 

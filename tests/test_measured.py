@@ -8,6 +8,7 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
+from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, TuneConfig
@@ -91,7 +92,7 @@ def test_a_walk_in_mujoco_gives_a_slope_that_leads_down(robot):
     command = named_command("straight")
 
     def look(weights):
-        walked = walk(config.rollout.walk, robot, weights, command, ideal(), 0.8)
+        walked = walk(config.rollout.walk, robot, Job(weights, command, ideal(), 0.8))
         return [evaluate_walk(config, robot, weights, command, last_command, walked)]
 
     found = tune_measured(config, nominal(), look)

@@ -11,6 +11,7 @@ from hector_jax.control.weights import bounds, nominal, vector_to_weights, weigh
 from hector_jax.core.trajectory import State, zero_wrench
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
+from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 from hector_jax.tuning import online
@@ -206,7 +207,7 @@ def same_bytes(one, other):
 
 
 def test_a_walk_with_steps_of_size_zero_is_the_plain_walk(monkeypatch):
-    args = WalkConfig(), ROBOT, nominal(), S, ideal(), 0.3
+    args = WalkConfig(), ROBOT, Job(nominal(), S, ideal(), 0.3)
     monkeypatch.setattr(online, "follow", toy())
     still, moving = (
         retuner(OnlineConfig(window=10, step=size), ROBOT, nominal(), S, last_command)
@@ -226,7 +227,7 @@ def test_the_model_commands_along_the_measured_states_what_the_walk_commanded():
         seen.append((anchor, measurement, last))
         return carry, nominal()
 
-    walk(WalkConfig(), ROBOT, nominal(), S, ideal(), 0.45, retune=Retune(None, watch))
+    walk(WalkConfig(), ROBOT, Job(nominal(), S, ideal(), 0.45), retune=Retune(None, watch))
     retune = retuner(OnlineConfig(), ROBOT, nominal(), S, last_command, told.append)
     carry = retune.init
     for tick, row in enumerate(seen):

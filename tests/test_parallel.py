@@ -14,9 +14,11 @@ from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.model import MODEL_PATH, load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.changes import Change
-from hector_jax.sim.parallel import _in_floor, _places, batched_model, mjx, mjx_contacts, walk_batch
+from hector_jax.sim.loop import Job
+from hector_jax.sim.mjx_model import batched_model, find_places, in_floor, mjx, mjx_contacts
+from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import NO_PUSH, Push, build_world, build_worlds, hfs, hfs_drawn, ideal
 
 CONFIG, ROBOT = WalkConfig(), load_robot()
@@ -37,7 +39,7 @@ def recorded():
             rows.append(dict(before, ctrl=data.ctrl.copy(), after=now["qvel"], contacts=contacts))
         before.update(now)
 
-    walk(CONFIG, ROBOT, expert(), named_command("s"), hfs(), 0.8, on_sample=record)
+    walk(CONFIG, ROBOT, Job(expert(), named_command("s"), hfs(), 0.8), on_sample=record)
     return world, rows[-800::4]
 
 
@@ -145,9 +147,9 @@ def test_a_part_whose_height_over_the_floor_is_unknown_here_is_refused_by_name(t
 
 def test_a_robot_of_feet_alone_has_nothing_that_may_not_touch_the_floor():
     world = build_world(hfs())
-    nothing_else = replace(_places(world), boxes=(), capsules=())
+    nothing_else = replace(find_places(world), boxes=(), capsules=())
     model, _ = batched_model([world])
-    assert not _in_floor(nothing_else, model, mjx.make_data(model))
+    assert not in_floor(nothing_else, model, mjx.make_data(model))
 
 
 def test_no_jobs_are_no_walks():
@@ -168,7 +170,7 @@ def three():
 def test_walks_of_a_batch_are_those_of_mujoco(three):
     """Weights, command, plant, start and push are each walk's own, in every chunk."""
     for asked, mine in zip(*three, strict=True):
-        alone = at_interval(walk(CONFIG, ROBOT, *asked), 0.01)
+        alone = at_interval(walk(CONFIG, ROBOT, asked), 0.01)
         for one, other in zip(jax.tree.leaves(mine), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-3)
             assert one.dtype == other.dtype
@@ -204,7 +206,7 @@ def test_both_engines_tell_when_the_legs_touch():
     narrow = WalkConfig(footstep=FootstepConfig(width=0.01))
     asked = job(expert(), "straight", seconds=0.4)
     mine = next(walk_batch(narrow, ROBOT, [asked]))
-    alone = at_interval(walk(narrow, ROBOT, *asked), 0.01)
+    alone = at_interval(walk(narrow, ROBOT, asked), 0.01)
     assert not alone.fallen.any()
     assert alone.legs_touch.any()
     assert not alone.legs_touch.all()
@@ -218,7 +220,7 @@ def test_a_fall_in_a_batch_is_held_and_marked():
     upright, fall = walk_batch(CONFIG, ROBOT, jobs)
     assert not upright.fallen.any()
     first = int(np.argmax(fall.fallen))
-    alone = at_interval(walk(CONFIG, ROBOT, *jobs[1]), 0.01)
+    alone = at_interval(walk(CONFIG, ROBOT, jobs[1]), 0.01)
     assert fall.fallen[-1]
     assert alone.fallen[-1]
     assert first > 0

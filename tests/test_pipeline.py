@@ -17,13 +17,16 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm import dataset
-from hector_jax.grfm.dataset import collect, draw_jobs, draw_jobs_near
-from hector_jax.grfm.network import NetParams
+from hector_jax.grfm.collection import collect
+from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
+from hector_jax.grfm.paper import PaperParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import pipeline
 from hector_jax.runs.metrics import score
 from hector_jax.runs.pipeline import CollectConfig
+from hector_jax.sim.engine import ENGINES, MUJOCO_C
+from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, Tuning
@@ -161,7 +164,7 @@ def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, rob
     tuning = Tuning(history, history[10].weights, history[-1].weights, "")
     walked, trained = [], []
 
-    def walk_many(pool, config, robot, jobs):
+    def toys(pool, config, robot, jobs, **options):
         walked.extend(jobs)
         return (synthetic_walk(100 + job.seed, 12) for job in jobs)
 
@@ -169,7 +172,7 @@ def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, rob
         trained.append((config, folder, path, *more))
         return before._replace(folders=(folder, *more))
 
-    monkeypatch.setattr(pipeline, "walk_many", walk_many)
+    monkeypatch.setitem(ENGINES, "c", MUJOCO_C._replace(walk=toys))
     monkeypatch.setattr(pipeline, "train", train)
     for _ in range(2):  # the second time takes up the walks
         after, shift = pipeline.refresh(
@@ -184,7 +187,7 @@ def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, rob
         )
     new = folder / "walks"
     path = jax.tree.map(lambda w: np.stack(4 * [w]), nominal())  # ten, 11, 13 and 14
-    jobs = draw_jobs_near(0, 5, named_command("s"), path)
+    jobs = draw_jobs_near(0, 5, named_command("s"), path=path)
     jax.tree.map(np.testing.assert_array_equal, walked, jobs)
     assert trained == 2 * [(before.config, old, folder / "refreshed.npz", new)]
     assert after.folders == (old, new)
@@ -211,7 +214,7 @@ def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
     gather(tmp_path / "walks", robot)
     pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
     monkeypatch.setattr(pipeline, "_train", None)  # nothing is to be trained again
-    assert isinstance(ground(tmp_path, robot, "paper").params, NetParams)
+    assert isinstance(ground(tmp_path, robot, "paper").params, PaperParams)
 
 
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
@@ -235,11 +238,11 @@ def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine(robot
     sets = {"c": [nominal(), expert()], "s": [nominal()]}
     pool = ThreadPoolExecutor(1)
     told = {
-        engine: pipeline.losses_on_hfs(pool, config, robot, engine, sets, at_once=3)
-        for engine in ("c", "mjx")
+        name: pipeline.losses_on_hfs(pool, config, robot, engine, sets, at_once=3)
+        for name, engine in ENGINES.items()
     }
     for name, each in sets.items():
         for weights, loss in zip(each, told["c"][name], strict=True):
-            walked = walk(WalkConfig(), robot, weights, named_command(name), hfs(), 0.04)
+            walked = walk(WalkConfig(), robot, Job(weights, named_command(name), hfs(), 0.04))
             assert loss == pytest.approx(float(score(config.loss, walked).L), rel=1e-12)
         np.testing.assert_allclose(told["mjx"][name], told["c"][name], rtol=1e-4)

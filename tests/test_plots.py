@@ -9,7 +9,7 @@ from pretend import elsewhere, pretend_history, pretend_verdict, pretend_walk
 
 from hector_jax.control.weights import WEIGHT_NAMES
 from hector_jax.core.trajectory import State
-from hector_jax.grfm.training import History
+from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.plots.style import looks_of

@@ -25,7 +25,7 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.files import as_json
 from hector_jax.report import plots
 from hector_jax.runs.metrics import stack_scores
-from hector_jax.sim.walk import Job
+from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 
 ROOT = Path(__file__).parents[1]

@@ -7,8 +7,9 @@ from synthetic import synthetic_walk
 
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk
 from hector_jax.grfm.effect import last_command
-from hector_jax.grfm.gated import fit_gated, gated_effect
-from hector_jax.grfm.network import as_effect, fit_linear, linear_effect
+from hector_jax.grfm.gated import fit_gated
+from hector_jax.grfm.network import as_effect
+from hector_jax.grfm.paper import fit_linear
 from hector_jax.grfm.training import TrainConfig, errors, report, train
 from hector_jax.robot.model import load_robot
 
@@ -38,7 +39,7 @@ def test_the_net_beats_the_raw_command_and_the_linear_map_on_walks_it_never_saw(
     told = report(
         {
             "raw": last_command,
-            "linear": linear_effect(fit_linear(parts[0])),
+            "linear": as_effect(fit_linear(parts[0])),
             "net": as_effect(trained[0]),
         },
         held_out,
@@ -54,7 +55,7 @@ def test_the_residual_net_beats_its_linear_part_on_walks_it_never_saw(parts, res
     told = report(
         {
             "raw": last_command,
-            "gated": gated_effect(fit_gated(parts[0])),
+            "gated": as_effect(fit_gated(parts[0])),
             "net": as_effect(params),
         },
         parts[1],

@@ -21,6 +21,7 @@ from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
+from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
@@ -204,7 +205,8 @@ def test_a_wrong_file_is_one_line_of_each_command(monkeypatch, capsys, tmp_path,
 def test_the_example_is_walked_on_the_simulator_within_centimetres():
     found = course(str(SLALOM))
     for weights in (nominal(), expert()):
-        walked = walk(WalkConfig(), ROBOT, weights, found.command, hfs(), found.seconds)
+        job = Job(weights, found.command, hfs(), found.seconds)
+        walked = walk(WalkConfig(), ROBOT, job)
         assert not walked.fallen.any()
         error = walked.state.position - walked.reference.position
         assert np.abs(error).max() < 0.10

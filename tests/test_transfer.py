@@ -8,13 +8,7 @@ import pytest
 from alignment import BEYOND_SAG, SAG
 
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
-from hector_jax.control.weights import (
-    directions,
-    moved,
-    nominal,
-    sample_weights,
-    weights_to_vector,
-)
+from hector_jax.control.weights import directions, moved, nominal, sample_weights, weights_to_vector
 from hector_jax.core.files import as_json
 from hector_jax.report import plots
 

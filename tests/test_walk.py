@@ -10,8 +10,9 @@ from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
+from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import Job, walk, walk_many
+from hector_jax.sim.walk import walk, walk_many
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import LossConfig, losses, total
 
@@ -21,7 +22,7 @@ CONFIG, ROBOT = WalkConfig(), load_robot()
 @pytest.fixture(scope="module")
 def short():
     """Half a second of the straight line in `ideal`."""
-    return walk(CONFIG, ROBOT, expert(), named_command("straight"), ideal(), seconds=0.5)
+    return walk(CONFIG, ROBOT, Job(expert(), named_command("straight"), ideal(), seconds=0.5))
 
 
 def rms(error):
@@ -82,7 +83,7 @@ def test_plans_were_solved(short):
 
 def test_a_seed_gives_the_same_bytes():
     plant, command = standin(1), named_command("s")
-    runs = [walk(CONFIG, ROBOT, expert(), command, plant, 0.1, seed) for seed in (5, 5, 6)]
+    runs = [walk(CONFIG, ROBOT, Job(expert(), command, plant, 0.1, seed)) for seed in (5, 5, 6)]
     first, same, other = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(r)]) for r in runs)
     assert first.tobytes() == same.tobytes()
     assert first.tobytes() != other.tobytes()
@@ -90,7 +91,7 @@ def test_a_seed_gives_the_same_bytes():
 
 def test_a_fall_is_held_and_marked():
     ice = ideal()._replace(floor_friction=np.array(0.11))
-    fall = walk(CONFIG, ROBOT, expert(), named_command("s"), ice, seconds=3.0)
+    fall = walk(CONFIG, ROBOT, Job(expert(), named_command("s"), ice, seconds=3.0))
     assert fall.fallen[-1]
     first = int(np.argmax(fall.fallen))
     assert fall.fallen[first:].all()
@@ -101,31 +102,25 @@ def test_a_fall_is_held_and_marked():
 
 def test_every_sample_can_be_watched():
     times = []
-    walk(
-        CONFIG,
-        ROBOT,
-        expert(),
-        named_command("c"),
-        ideal(),
-        seconds=0.01,
-        on_sample=lambda world, data: times.append(data.time),
-    )
+    job = Job(expert(), named_command("c"), ideal(), seconds=0.01)
+    walk(CONFIG, ROBOT, job, on_sample=lambda world, data: times.append(data.time))
     np.testing.assert_allclose(times, 0.001 * np.arange(1, len(times) + 1))
     assert len(times) == 1100 + 10
 
 
 def test_a_walk_may_start_at_another_phase():
-    late = walk(CONFIG, ROBOT, expert(), named_command("c"), ideal(), 0.2, start_tick=10)
+    job = Job(expert(), named_command("c"), ideal(), 0.2)
+    late = walk(CONFIG, ROBOT, job._replace(start_tick=10))
     np.testing.assert_array_equal(late.contact[:, 0], np.arange(200) < 100)
     start = late.reference.position[0] - 0.001 * late.reference.velocity[0]
     np.testing.assert_allclose(start[:2], late.initial.position[:2], atol=1e-6)
     with pytest.raises(ValueError, match="start_tick -110 is not later"):
-        walk(CONFIG, ROBOT, expert(), named_command("c"), ideal(), start_tick=-110)
+        walk(CONFIG, ROBOT, job._replace(start_tick=-110))
 
 
 def test_a_walk_shorter_than_a_tick_is_refused():
     with pytest.raises(ValueError, match="at least one tick"):
-        walk(CONFIG, ROBOT, expert(), named_command("c"), ideal(), seconds=0.0)
+        walk(CONFIG, ROBOT, Job(expert(), named_command("c"), ideal(), seconds=0.0))
 
 
 @pytest.mark.slow
@@ -134,7 +129,7 @@ def test_processes_walk_as_one_does():
     with workers(2) as pool:
         walked = list(walk_many(pool, CONFIG, ROBOT, jobs))
     for job, trajectory in zip(jobs, walked, strict=True):
-        alone = walk(CONFIG, ROBOT, *job)
+        alone = walk(CONFIG, ROBOT, job)
         for one, other in zip(jax.tree.leaves(trajectory), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-6)
 
@@ -143,7 +138,7 @@ def test_processes_walk_as_one_does():
 @pytest.mark.parametrize("name", COMMANDS)
 def test_expert_weights_walk_far_in_ideal(name):
     seconds = 8.0 if name == "s" else 12.0
-    walked = walk(CONFIG, ROBOT, expert(), named_command(name), ideal(), seconds)
+    walked = walk(CONFIG, ROBOT, Job(expert(), named_command(name), ideal(), seconds))
     assert not walked.fallen.any()
     assert rms(walked.state.position - walked.reference.position).max() <= 0.06
     assert np.rad2deg(rms(walked.state.euler - walked.reference.euler)).max() <= 3.0
@@ -154,14 +149,16 @@ def test_expert_weights_walk_far_in_ideal(name):
 @pytest.mark.slow
 def test_expert_weights_walk_in_hfs():
     for name in COMMANDS:
-        assert not walk(CONFIG, ROBOT, expert(), named_command(name), hfs()).fallen.any(), name
+        job = Job(expert(), named_command(name), hfs())
+        assert not walk(CONFIG, ROBOT, job).fallen.any(), name
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_expert_weights_walk_on_the_standin(name):
     for seed in range(8):
-        trajectory = walk(CONFIG, ROBOT, expert(), named_command(name), standin(seed), seed=seed)
+        job = Job(expert(), named_command(name), standin(seed), seed=seed)
+        trajectory = walk(CONFIG, ROBOT, job)
         assert not trajectory.fallen.any(), seed
 
 
@@ -174,9 +171,9 @@ def test_a_push_moves_the_robot_and_the_sensed_wrench_stays_the_grounds():
         mujoco.mj_subtreeVel(world.model, data)
         gained.append(data.subtree_linvel[0] * world.model.body_subtreemass[0])
 
-    args = (CONFIG, ROBOT, expert(), named_command("straight"), ideal(), 0.1)
-    pushed = walk(*args, push=push, on_sample=record)
-    free = walk(*args)
+    job = Job(expert(), named_command("straight"), ideal(), 0.1)
+    pushed = walk(CONFIG, ROBOT, job._replace(push=push), on_sample=record)
+    free = walk(CONFIG, ROBOT, job)
     assert (pushed.state.velocity - free.state.velocity)[70, 1] > 0.05
     # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
     sideways = np.diff(np.array(gained), axis=0)[1100:, 1] / 0.001
@@ -194,8 +191,8 @@ def test_the_ground_carries_and_moves_the_whole_robot():
         mujoco.mj_subtreeVel(world.model, data)
         momentum.append(data.subtree_linvel[0] * world.model.body_subtreemass[0])
 
-    args = (CONFIG, ROBOT, expert(), named_command("s"), hfs(), 1.0)
-    walked = walk(*args, on_sample=record)
+    job = Job(expert(), named_command("s"), hfs(), 1.0)
+    walked = walk(CONFIG, ROBOT, job, on_sample=record)
     # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
     gained = np.diff(np.array(momentum), axis=0)[1100:] / 0.001
     weight = build_world(hfs()).model.body_mass.sum() * 9.81

@@ -17,6 +17,7 @@ from hector_jax.report.folder import Asked
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
 from hector_jax.runs.cache import robot_hash
+from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
@@ -113,4 +114,5 @@ def walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) ->
     if args.world == "srbm":
         return pipeline.walk_rigid_body(robot, weights, wanted.command, lasts)
     plant = plants(args.world, range(args.seed, args.seed + 1))[0]
-    return walk(walk_config(robot), robot, weights, wanted.command, plant, lasts, args.seed)
+    job = Job(weights, wanted.command, plant, lasts, args.seed)
+    return walk(walk_config(robot), robot, job)

@@ -16,16 +16,16 @@ from hector_jax.core.files import as_json, make_folder
 from hector_jax.core.inputs import plural
 from hector_jax.core.runtime import workers
 from hector_jax.grfm import training
-from hector_jax.grfm.dataset import Walks, make_dataset
+from hector_jax.grfm.collection import Walks
+from hector_jax.grfm.dataset import make_dataset
 from hector_jax.grfm.effect import last_command
-from hector_jax.grfm.gated import gated_effect
-from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.grfm.network import as_effect
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import write_fidelity
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
-from hector_jax.sim.walk import Job
+from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import TuneConfig
 
 
@@ -70,10 +70,10 @@ def grfm(args: Grfm) -> None:
             worlds = {"hfs": pipeline.held_out(robot, net)}
         if args.seeds:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
-    effects = {"raw": last_command, "linear": linear_effect(net.linear)}
+    effects = {"raw": last_command, "linear": as_effect(net.linear)}
     effects["paper"] = as_effect(paper.params)
     effects["residual"] = as_effect(net.params)
-    effects["gated"] = gated_effect(net.params.linear)
+    effects["gated"] = as_effect(net.params.linear)
     found, drifts = {}, {}
     with bar("predicting the ground forces of the walks") as tell:
         for done, (world, walks) in enumerate(worlds.items()):

@@ -20,6 +20,7 @@ from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.model import MODEL_PATH, Robot, load_robot
 from hector_jax.runs.pipeline import walk_rigid_body
+from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
 
@@ -77,9 +78,10 @@ def examine() -> tuple[dict[str, str], list[str]]:
 def _walks(robot: Robot) -> dict[str, Trajectory]:
     """Two seconds on the rigid body; in MuJoCo the start and a little more."""
     command = named_command("straight")
+    job = Job(expert(), command, named_world("ideal"), 0.2)
     return {
         "srbm": walk_rigid_body(robot, expert(), command, 2.0),
-        "ideal": walk(WalkConfig(), robot, expert(), command, named_world("ideal", 0), 0.2),
+        "ideal": walk(WalkConfig(), robot, job),
     }
 
 

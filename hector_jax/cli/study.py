@@ -33,6 +33,7 @@ from hector_jax.runs.kept import Judged
 from hector_jax.runs.metrics import BASELINES, Verdict
 from hector_jax.runs.pipeline import Tuned
 from hector_jax.search.cmaes import Found, SearchConfig
+from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import Imperfections, hfs
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
 
@@ -203,10 +204,9 @@ def _make_table(
 def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str, Found]:
     """The derivative-free baseline of all trajectories, in lock-step."""
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
-    engine, model = pipeline.choose_engine("auto"), plan.tune.rollout
-    key = content_key(
-        engine, model, plan.tune.loss, settings, robot, hfs(), nominal(), code=pipeline.SEARCH_CODE
-    )
+    engine, model = choose_engine("auto"), plan.tune.rollout
+    follows_from = engine.name, model, plan.tune.loss, settings, robot, hfs(), nominal()
+    key = content_key(*follows_from, code=pipeline.SEARCH_CODE)
     starts = dict.fromkeys(plan.commands, nominal())
     folder = shelf / f"search-{key}"
     return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)

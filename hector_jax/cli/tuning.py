@@ -25,8 +25,8 @@ from hector_jax.core.files import as_json, locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.grfm.dataset import PIECES
-from hector_jax.grfm.network import as_effect, linear_effect
+from hector_jax.grfm.jobs import PIECES
+from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.folder import read_json
 from hector_jax.report.report import Picture, Report, print_table, write_report
@@ -37,6 +37,7 @@ from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.kept import Judged
 from hector_jax.runs.metrics import Score
 from hector_jax.search.cmaes import SearchConfig
+from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import aligned
 
@@ -262,7 +263,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     write_json(folder / "versions.json", made_with | {"seconds": f"{time.monotonic() - start:.0f}"})
     histories = {name: tuned.tuning for name, tuned in tunings.items()}
     walks, sampled = judged.shown, on_hfs.shown["nominal"]
-    effects = {"linear": linear_effect(net.linear), "residual": as_effect(net.params)}
+    effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
     curves = fidelity.curves(robot, jax.tree.map(lambda x: np.asarray(x)[None], sampled), effects)
     drawn = pictures.of_run(folder, config, sets, histories, walks, curves, net.course)
     film: Picture | str = "left out (--no-video)"
@@ -307,7 +308,7 @@ def search(args: Search) -> None:
     ]
     own = {one.name: one.command for one in wanted}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
-    engine = pipeline.choose_engine(args.engine)
+    engine = choose_engine(args.engine)
     tune, start = (
         asked.lasting(asked.tune_config(robot), wanted[0]),
         asked.weights(args.start, robot),
@@ -342,7 +343,7 @@ def search(args: Search) -> None:
             "stop": one.stop,
             "search": dataclasses.asdict(config),
             "start": args.start,
-            "engine": engine,
+            "engine": engine.name,
             "rollout": dataclasses.asdict(tune.rollout),
             "loss": dataclasses.asdict(tune.loss),
             "versions": versions(),

@@ -1,12 +1,13 @@
 """phi: what the ground really returns for what was commanded (Eq. 13).
 
 An effect is a function `Window -> Effect`, a pytree that can be called (`jax.tree_util.Partial`),
-so that a rollout takes new network parameters without a new compilation. Wrenches enter and leave
-it in the yaw frame of the robot at the tick, which makes what is learned on one heading true on all
-others.
+so that a rollout takes new parameters without a new compilation. Wrenches enter and leave it in the
+yaw frame of the robot at the tick, which makes what is learned on one heading true on all others.
+A `Phi` is a family of such functions, fitted to walks; network.VARIANTS holds them by name.
 """
 
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,6 @@ class Window(NamedTuple):
 
     commands: Wrench  # (HISTORY, 2, 3) each, newest first
     contact: Bool[Array, "*batch 2"]  # planned stance
-    phase: Float[Array, "*batch"]  # of the gait cycle, 0 to 1
     since_switch: Float[Array, "*batch"]  # [s] since the last planned change of contact
     base: State  # at the start of the tick, see `from_yaw_frame`
 
@@ -31,16 +31,31 @@ class Window(NamedTuple):
 class Effect(NamedTuple):
     """What acts on the body over the tick, in the yaw frame."""
 
-    wrench: Wrench  # that the ground returns
-    spread: Wrench  # of it, where phi knows one, else zero
-    legs: Load  # that the moving legs give the trunk, where phi knows it, else zero
+    wrench: Wrench  # of the ground on each foot
+    legs: Load  # of the moving legs on the trunk; zero where phi does not model it
+
+
+class Phi(NamedTuple):
+    """A family of effects: how its parameters are made, fitted to walks and applied.
+
+    `init` fixes the shapes of the parameters and depends on no data, so that a file can be checked
+    against it; an axis whose length the data decide has length 0 in it.
+    """
+
+    name: str  # in flags; a file of its parameters is of the kind `grfm-<name>`
+    params: type  # of the parameters, a NamedTuple that no other variant uses
+    init: Callable[..., Any]  # (key, hidden=widths of the layers) -> params
+    # (nets.FitConfig, training, validation Dataset, progress) -> (params, nets.History)
+    fit: Callable[..., tuple[Any, Any]]
+    apply: Callable[[Any, Window], Effect]
+    widths: Callable[[Any], tuple[int, ...]] = lambda params: ()  # `hidden` of given params
 
 
 Vectors = TypeVar("Vectors", Wrench, Load)
 
 
 def turn(vectors: Vectors, yaw: Float[Array, ""]) -> Vectors:
-    """Wrenches or pushes turned about z: by `yaw` from the yaw frame to the world, `-yaw` back."""
+    """Turn wrenches or loads about z: by `yaw` [rad] from the yaw frame to the world."""
     R = rot_z(yaw)
     return jax.tree.map(lambda v: v @ R.T, vectors)
 
@@ -56,14 +71,22 @@ def from_yaw_frame(state: State) -> State:
     )
 
 
-def sure(wrench: Wrench) -> Effect:
-    """The effect of a wrench without spread, and of legs that do not push."""
-    nothing = jnp.zeros_like(wrench.force[0])
-    return Effect(wrench, jax.tree.map(jnp.zeros_like, wrench), Load(nothing, nothing))
+def ground_effect(wrench: Wrench) -> Effect:
+    """The effect of a ground wrench alone: the moving legs put no load on the trunk."""
+    zero = jnp.zeros_like(wrench.force[0])
+    return Effect(wrench, Load(zero, zero))
+
+
+def in_dtype_of(window: Window, tree: Any) -> Any:
+    """A tree on the device, its floating-point leaves in the dtype of a window's commands."""
+    dtype = window.commands.force.dtype
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, dtype if jnp.issubdtype(x.dtype, jnp.floating) else None), tree
+    )
 
 
 def _last_command(window: Window) -> Effect:
-    return sure(jax.tree.map(lambda w: w[0], window.commands))
+    return ground_effect(jax.tree.map(lambda w: w[0], window.commands))
 
 
 last_command = jax.tree_util.Partial(_last_command)

@@ -16,16 +16,17 @@ Changes of the command within 20 ms are too quick for that loop.
 Each foot sees the walk as if it were the left one, so a mirrored window has the mirrored effect.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Key
 
 from hector_jax.core.trajectory import Load, Wrench
 from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset
-from hector_jax.grfm.effect import HISTORY, Effect, Window, sure
+from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, in_dtype_of
+from hector_jax.grfm.nets import NO_EPOCHS
 
 CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
 MOTION = 3  # of the base: yaw rate, forward and sideways velocity
@@ -56,11 +57,16 @@ class GatedMap(NamedTuple):
     legs: Float[Array, "gates terms 6"]  # of motion, then changes
 
 
-def in_dtype_of(window: Window, tree: Any) -> Any:
-    """A tree on the device, its floating-point leaves in the dtype of a window's commands."""
-    dtype = window.commands.force.dtype
-    return jax.tree.map(
-        lambda x: jnp.asarray(x, dtype if jnp.issubdtype(x.dtype, jnp.floating) else None), tree
+def init(key: Key[Array, ""], hidden: tuple[int, ...] = ()) -> GatedMap:
+    """A map to nothing; the axis of ticks has length 0."""
+    del key, hidden
+    return GatedMap(
+        ticks=jnp.zeros(0),
+        gates=jnp.zeros(len(GATES)),
+        bias=jnp.zeros((2, 0, 6)),
+        changes=jnp.zeros((2, CHANGES, 6)),
+        legs_bias=jnp.zeros((0, 6)),
+        legs=jnp.zeros((len(GATES), CHANGES + MOTION, 6)),
     )
 
 
@@ -105,34 +111,36 @@ def from_views(values: Float[Array, "2 6"]) -> Wrench:
     return Wrench(back[:, :3], back[:, 3:])
 
 
-def apply_gated(gated: GatedMap, window: Window, seen: View) -> tuple[Array, Load]:
-    """Ground wrench as each foot sees it (2, 6), and the push of the legs in the yaw frame."""
-    stands = seen.stands.astype(int)
+def apply_gated(gated: GatedMap, window: Window, view: View) -> tuple[Float[Array, "2 6"], Load]:
+    """Ground wrench as each foot sees it, and the load of the legs on the trunk in the yaw frame.
+
+    Args:
+        gated: fitted maps.
+        window: one window.
+        view: what the feet see of it, `views(window)`.
+    """
+    stands = view.stands.astype(int)
     tick, gate = hats(window.since_switch, gated.ticks), hats(window.since_switch, gated.gates)
     ground = (
-        seen.stands[:, None] * seen.command
+        view.stands[:, None] * view.command
         + jnp.einsum("k,fko->fo", tick, gated.bias[stands])
-        + jnp.einsum("fi,fio->fo", seen.changes, gated.changes[stands])
+        + jnp.einsum("fi,fio->fo", view.changes, gated.changes[stands])
     )
-    terms = jnp.concatenate([seen.motion, seen.changes], axis=-1)
+    terms = jnp.concatenate([view.motion, view.changes], axis=-1)
     push = tick @ gated.legs_bias + jnp.einsum("g,fi,gio->fo", gate, terms, gated.legs)
-    back = from_views(push * seen.alone[:, None])
+    back = from_views(push * view.alone[:, None])
     return ground, Load(back.force.sum(axis=0), back.moment.sum(axis=0))
 
 
-def gated_effect(gated: GatedMap) -> jax.tree_util.Partial:
-    """Phi of the linear part alone: `Window -> Effect`, with no spread."""
-    return jax.tree_util.Partial(_gated_effect, gated)
-
-
-def _gated_effect(gated: GatedMap, window: Window) -> Effect:
+def apply(gated: GatedMap, window: Window) -> Effect:
+    """Effect of the linear part alone for one window."""
     gated, window = in_dtype_of(window, gated), in_dtype_of(window, window)
     ground, legs = apply_gated(gated, window, views(window))
-    return sure(from_views(ground))._replace(legs=legs)
+    return Effect(from_views(ground), legs)
 
 
-def seen_labels(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Wrench of the ground and push of the legs (n, 2, 6) each, as each foot sees them."""
+def labels_in_view(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Wrench of the ground and load of the legs (n, 2, 6) each, as each foot sees them."""
     ground = np.concatenate([dataset.label.force, dataset.label.moment], axis=-1)
     legs = np.concatenate([dataset.legs.force, dataset.legs.torque], axis=-1)
     return ground * _SIGNS, legs[:, None] * _SIGNS
@@ -141,29 +149,29 @@ def seen_labels(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
 def fit_gated(dataset: Dataset) -> GatedMap:
     """Ridge regression of both maps; every sample is seen by both feet."""
     window = jax.tree.map(jnp.asarray, dataset.window)
-    seen = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
+    view = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
     tick, gate = (
         np.repeat(np.asarray(jax.jit(hats)(window.since_switch, knots))[:, None], 2, axis=1)
         for knots in (ticks, gates)
     )
-    ground, legs = seen_labels(dataset)
-    left = ground - seen.stands[..., None] * seen.command
-    scale = _scale(seen.changes)
-    changes = seen.changes / scale
+    ground, legs = labels_in_view(dataset)
+    residual = ground - view.stands[..., None] * view.command
+    scale = _scale(view.changes)
+    changes = view.changes / scale
     bias, slope = zip(
         *(
-            _ridge(RIDGE, tick[rows], changes[rows], left[rows])
-            for rows in (~seen.stands, seen.stands)
+            _ridge(RIDGE, tick[rows], changes[rows], residual[rows])
+            for rows in (~view.stands, view.stands)
         ),
         strict=True,
     )
-    alone = seen.alone
-    term_scale = np.concatenate([_spread(seen.motion[alone]), scale])
-    terms = np.concatenate([seen.motion, seen.changes], axis=-1)[alone] / term_scale
+    alone = view.alone
+    term_scale = np.concatenate([_spread(view.motion[alone]), scale])
+    terms = np.concatenate([view.motion, view.changes], axis=-1)[alone] / term_scale
     gated = (gate[alone][:, :, None] * terms[:, None]).reshape(len(terms), -1)
     legs_bias, legs_slope = _ridge(RIDGE_LEGS, tick[alone], gated, legs[alone])
-    found = GatedMap(
+    maps = GatedMap(
         ticks=ticks,
         gates=gates,
         bias=np.stack(bias),
@@ -171,7 +179,7 @@ def fit_gated(dataset: Dataset) -> GatedMap:
         legs_bias=legs_bias,
         legs=legs_slope.reshape(len(gates), -1, 6) / term_scale[:, None],
     )
-    return jax.tree.map(jnp.asarray, found)
+    return jax.tree.map(jnp.asarray, maps)
 
 
 def _spread(x: np.ndarray) -> np.ndarray:
@@ -196,5 +204,14 @@ def _ridge(
     columns = np.concatenate([free, terms], axis=1)
     penalties = np.r_[np.full(free.shape[1], 1e-6), np.full(terms.shape[1], penalty)]
     gram = columns.T @ columns / len(y) + np.diag(penalties)
-    found = np.linalg.solve(gram, columns.T @ y / len(y))
-    return found[: free.shape[1]], found[free.shape[1] :]
+    coefficients = np.linalg.solve(gram, columns.T @ y / len(y))
+    return coefficients[: free.shape[1]], coefficients[free.shape[1] :]
+
+
+GATED = Phi(
+    "gated",
+    GatedMap,
+    init,
+    lambda config, training, validation, progress: (fit_gated(training), NO_EPOCHS),
+    apply,
+)

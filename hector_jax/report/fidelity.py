@@ -94,7 +94,6 @@ def _ahead(
             window = Window(
                 commands=turn(jax.tree.map(lambda w: w[past], walk.command), -yaw),
                 contact=walk.contact[j],
-                phase=gait.cycle_phase(config, start_tick + j),
                 since_switch=gait.since_switch(config, start_tick + j),
                 base=from_yaw_frame(state),
             )

@@ -8,7 +8,7 @@ import numpy as np
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, weights_to_vector
 from hector_jax.core.console import say
 from hector_jax.core.trajectory import Trajectory, Wrench
-from hector_jax.grfm.training import History
+from hector_jax.grfm.nets import History
 from hector_jax.report import plots, view
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.folder import Histories

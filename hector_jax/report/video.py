@@ -30,7 +30,8 @@ from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import AT_LEAST_ONE, InputError, Range, check, choose
 from hector_jax.core.trajectory import State, Trajectory, from_start
-from hector_jax.report.plots import distances, named
+from hector_jax.report.plots.style import named
+from hector_jax.report.plots.walks import distances
 from hector_jax.robot.model import Robot
 
 BACK_ENDS = ("egl", "osmesa", "glfw")

@@ -27,7 +27,7 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench, from_start
 from hector_jax.report.folder import METRICS, RESULT, as_sentence, curves, read_histories
-from hector_jax.report.plots import named
+from hector_jax.report.plots.style import named
 from hector_jax.report.video import COLOURS, poses
 from hector_jax.robot.model import Robot
 

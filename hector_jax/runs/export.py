@@ -56,7 +56,8 @@ from hector_jax.core.tree_file import tree_hash
 from hector_jax.qp import Status
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
-from hector_jax.sim.walk import first_tick, substeps, walk
+from hector_jax.sim.loop import Job, first_tick, substeps
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, ideal, standing_qpos
 
 SCHEMA = "weights.schema.json"
@@ -385,7 +386,7 @@ def record(
         known = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(known[sensing.coordinates(world)])
 
-    walked = walk(config, robot, weights, command, plant, seconds, on_sample=keep)
+    walked = walk(config, robot, Job(weights, command, plant, seconds), on_sample=keep)
     if np.asarray(walked.fallen).any():
         raise InputError(
             f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "

@@ -19,7 +19,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics, pipeline
 from hector_jax.runs.cache import cached, content_key
 from hector_jax.runs.metrics import Score
-from hector_jax.sim.walk import Job
+from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import LossConfig

@@ -45,7 +45,7 @@ class Score(NamedTuple):
     residual: Float[np.ndarray, "*seeds"]  # largest relative KKT residual of a plan
 
     @property
-    def L(self) -> Float[np.ndarray, "*seeds"]:  # noqa: D102
+    def L(self) -> Float[np.ndarray, "*seeds"]:  # noqa: D102, N802
         return self.losses["L"]
 
 

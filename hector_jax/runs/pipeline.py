@@ -4,10 +4,8 @@ Everything that is walked or tuned runs in worker processes, one core each, beca
 one long chain of small operations. A step that finds its result on disk takes it.
 """
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import repeat
@@ -31,25 +29,31 @@ from hector_jax.core.inputs import (
     SEED,
     InputError,
     check,
-    choose,
     from_table,
     plural,
     short_repr,
 )
 from hector_jax.core.runtime import letters
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings, tree_hash
-from hector_jax.grfm import dataset, network, training
-from hector_jax.grfm.dataset import Dataset, Walks
+from hector_jax.grfm import collection, dataset, network, training
+from hector_jax.grfm.collection import Walks
+from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import HISTORY, last_command
-from hector_jax.grfm.network import LinearMap, Params
-from hector_jax.grfm.training import History, TrainConfig
+from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
+from hector_jax.grfm.nets import History
+from hector_jax.grfm.network import Params
+from hector_jax.grfm.paper import LinearMap, fit_linear
+from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
 from hector_jax.runs.cache import cached, content_key, robot_hash
 from hector_jax.search import cmaes as searching
 from hector_jax.search.cmaes import Found, Generation, SearchConfig, best
-from hector_jax.sim.walk import Job, walk, walk_many
+from hector_jax.sim.engine import ENGINES, MUJOCO_C, Engine, choose_engine
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.tuning import difftune, measured
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Iteration, TuneConfig, Tuning
@@ -57,32 +61,12 @@ from hector_jax.tuning.loss import Losses, loss_of
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-ENGINES = ("auto", "c", "mjx")
 TUNING = "tuning"  # kind of a file
 # modules that decide the numbers, for `runs.cache.content_key`
 TUNING_CODE = ("tuning.difftune", "grfm.network")
 TRAINING_CODE = ("grfm.training",)
-COLLECTION_CODE = (*TUNING_CODE, "grfm.dataset", "sim.parallel")
+COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.parallel")
 SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.parallel")
-
-
-def choose_engine(asked: str) -> str:
-    """The engine of walks in MuJoCo: `c` or `mjx`; `auto` is mjx where JAX sees an accelerator.
-
-    Raises:
-        InputError: none of the three.
-    """
-    if choose("engine", asked, ENGINES) == "auto":
-        return "c" if jax.default_backend() == "cpu" else "mjx"
-    return asked
-
-
-def mjx_walks(*args: Any, **options: Any) -> Iterator[Trajectory]:
-    """`sim.parallel.walk_batch`; MJX takes a second to import and prints what it does not find."""
-    with redirect_stdout(sys.stderr):
-        from hector_jax.sim.parallel import walk_batch
-
-    return walk_batch(*args, **options)
 
 
 @dataclass(frozen=True)
@@ -96,7 +80,7 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         # devices stay unasked: their number may not be set up yet
-        check(self, walks=AT_LEAST_ONE, seconds=POSITIVE, seed=SEED, engine=ENGINES)
+        check(self, walks=AT_LEAST_ONE, seconds=POSITIVE, seed=SEED, engine=("auto", *ENGINES))
         if self.walks < 3:
             raise InputError(
                 "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
@@ -133,7 +117,7 @@ class Tuned(NamedTuple):
 
 
 class Journal:
-    """metrics.jsonl, a line for each iteration: as they come, and in order when tunings are over."""
+    """metrics.jsonl: a line for each iteration as it comes, in order when the tunings are over."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -303,7 +287,7 @@ def _measured_job(
     plant: Imperfections,
 ) -> Evaluation:
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
-    walked = walk(config.rollout.walk, robot, weights, command, plant, seconds)
+    walked = walk(config.rollout.walk, robot, Job(weights, command, plant, seconds))
     effect = network.effect_of(params, config.rollout.walk.gait)
     return evaluate_walk(config, robot, weights, command, effect, walked)
 
@@ -411,7 +395,7 @@ def _compile_tuning(config: TuneConfig, robot: Robot) -> None:
 
 
 def _compile_walking(config: WalkConfig, robot: Robot) -> None:
-    walk(config, robot, nominal(robot), named_command("straight"), hfs(), config.gait.tick)
+    walk(config, robot, Job(nominal(robot), named_command("straight"), hfs(), config.gait.tick))
 
 
 def compile_programs(pool: Executor, robot: Robot) -> None:
@@ -450,39 +434,28 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
     with locked(folder):
         compile_programs(pool, robot)
         paths = tuning_paths(pool, robot, folder / "paths")
-        jobs = dataset.draw_jobs(config.seed, config.walks, paths, config.seconds, robot)
+        jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
         settings = collection_settings(config, robot)
-        _keep_walks(pool, config.engine, robot, jobs, folder, settings)
+        _keep_walks(pool, choose_engine(config.engine), robot, jobs, folder, settings)
 
 
 def _keep_walks(
     pool: Executor,
-    engine: str,
+    engine: Engine,
     robot: Robot,
     jobs: Sequence[Job],
     folder: Path,
     settings: Mapping[str, Any],
 ) -> None:
-    engine, walking = choose_engine(engine), walk_config(robot)
-    # On a GPU the physics is walked in 32 bits; on a CPU that gains nothing.
-    single = engine == "mjx" and jax.default_backend() != "cpu"
-
-    def walk_jobs(jobs: list[Job]) -> Iterator[Trajectory]:
-        if engine == "c":
-            return walk_many(pool, walking, robot, jobs)
-        return mjx_walks(walking, robot, jobs, single=single)
-
-    title = (
-        f"collecting {plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine}"
-    )
-    with bar(title) as tell:
-        dataset.collect(
+    what = f"{plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine.name}"
+    with bar(f"collecting {what}") as tell:
+        collection.collect(
             folder,
             jobs,
-            walk_jobs,
+            lambda missing: engine.walk(pool, walk_config(robot), robot, missing, exact=False),
             robot=robot,
             settings=settings,
-            about={"engine": engine, "physics_bits": 32 if single else 64},
+            about={"engine": engine.name, "physics_bits": engine.bits(False)},
             progress=lambda done, of: tell(done, of, "" if done else "compiling"),
         )
 
@@ -522,7 +495,7 @@ def samples(robot: Robot, *folders: Path) -> Samples:
 
 
 def _samples(robot: Robot, folder: Path) -> Samples:
-    walks = dataset.load_walks(folder, robot)
+    walks = collection.load_walks(folder, robot)
     found, dropped = dataset.make_dataset(
         robot, walks.trajectory, walks.job.start_tick, walks.job.push
     )
@@ -532,7 +505,7 @@ def _samples(robot: Robot, folder: Path) -> Samples:
 
 def held_out(robot: Robot, net: Learned) -> Walks:
     """The walks that no training of a net saw, of the folder that it was trained on."""
-    walks = dataset.load_walks(net.folders[0], robot)
+    walks = collection.load_walks(net.folders[0], robot)
     return jax.tree.map(lambda x: x[net.held_out], walks)
 
 
@@ -542,7 +515,7 @@ def walks_of(
     """The walks of jobs, in order, as they come."""
     with bar(title) as tell:
         tell(0, len(jobs), "compiling")
-        for done, found in enumerate(walk_many(pool, config.rollout.walk, robot, jobs), 1):
+        for done, found in enumerate(MUJOCO_C.walk(pool, config.rollout.walk, robot, jobs), 1):
             yield found
             tell(done, len(jobs), "")
 
@@ -553,7 +526,6 @@ def walk_all(
     """Walks of jobs whose commands are alike, at the plan interval."""
     walked = walks_of(pool, config, robot, jobs, title)
     walks = [dataset.at_interval(walk, config.rollout.walk.gait.tick) for walk in walked]
-    stack = lambda trees: jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *trees)  # noqa: E731
     return Walks(stack(jobs), stack(walks))
 
 
@@ -574,7 +546,7 @@ def train(
 def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> Learned:
     with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
         parts = samples(robot, *folders)
-    made_of = [dataset.walked_with(each) for each in folders]
+    made_of = [collection.walked_with(each) for each in folders]
     with bar(
         f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
     ) as tell:
@@ -586,10 +558,10 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
             lambda epoch, _: tell(epoch, config.epochs, ""),
         )
     with say_if_slow("computing the errors on held-out walks"):
-        linear = network.fit_linear(parts.training)
+        linear = fit_linear(parts.training)
         effects = {
             "raw": last_command,
-            "linear": network.linear_effect(linear),
+            "linear": network.as_effect(linear),
             "net": network.as_effect(params),
         }
         errors = training.report(effects, parts.held_out)
@@ -627,7 +599,9 @@ def load_learned(path: Path, robot: Robot, variant: str) -> tuple[Learned, dict[
     params, _, card = network.load_net(path, robot, variant)
     about = card["about"]
     try:
-        linear = jax.tree.unflatten(network.LINEAR, map(np.array, about["linear"]))
+        linear = jax.tree.unflatten(
+            jax.tree.structure(network.layout("linear", ())), map(np.array, about["linear"])
+        )
         held_out = list(about["held_out"])
         settings, made_of = dict(about["settings"]), dict(about["made_of"])
         trained = {k: v for k, v in settings.items() if k != "code"}
@@ -663,7 +637,7 @@ def ground(pool: Executor, robot: Robot, data: Path, variant: str | None = None)
     settings = collection_settings(CollectConfig(), robot)
     if not (walks / "card.json").exists():
         collect(pool, CollectConfig(), robot, walks)
-    made_of = dataset.walked_with(walks)
+    made_of = collection.walked_with(walks)
     check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
     with locked(data):  # a second process that begins now waits, and finds the net
         if not path.exists():
@@ -682,7 +656,7 @@ def losses_on_hfs(
     pool: Executor,
     config: TuneConfig,
     robot: Robot,
-    engine: str,
+    engine: Engine,
     sets: Mapping[str, Sequence[Weights]],
     at_once: int,
     own: Mapping[str, Command] | None = None,
@@ -690,12 +664,12 @@ def losses_on_hfs(
     """L of weight sets on the high-fidelity simulator, one walk each, as long as the rollouts.
 
     Args:
-        pool: worker processes, for the engine c.
+        pool: worker processes.
         config: controller, length and loss.
         robot: the body.
-        engine: c or mjx, in 64 bits.
+        engine: of the walks.
         sets: by the trajectory that they walk.
-        at_once: walks that MJX is compiled for; fewer are filled up to it.
+        at_once: walks that a program is compiled for; fewer are filled up to it.
         own: commands of trajectories that are not built in, by their name.
     """
     walk = config.rollout.walk
@@ -705,14 +679,8 @@ def losses_on_hfs(
         for name, each in sets.items()
         for weights in each
     ]
-    if engine == "c":
-        walks = walk_many(pool, walk, robot, jobs)
-    else:
-        filled = jobs + jobs[-1:] * (at_once - len(jobs))
-        walks = mjx_walks(walk, robot, filled, fine=True)
-    told = iter(
-        [float(loss_of(config.loss, walked)) for _, walked in zip(jobs, walks, strict=False)]
-    )
+    walks = engine.walk(pool, walk, robot, jobs, batch=at_once)
+    told = iter([float(loss_of(config.loss, walked)) for walked in walks])
     return {name: np.array([next(told) for _ in each]) for name, each in sets.items()}
 
 
@@ -722,7 +690,7 @@ def search(
     tune: TuneConfig,
     robot: Robot,
     starts: Mapping[str, Weights],
-    engine: str,
+    engine: Engine,
     folder: Path,
     own: Mapping[str, Command] | None = None,
 ) -> dict[str, Found]:
@@ -734,16 +702,15 @@ def search(
         tune: controller, length of the walks and loss, the same as those of tunings.
         robot: the body.
         starts: where to start, by the name of the trajectory; all go in lock-step.
-        engine: auto, c or mjx.
+        engine: of the walks.
         folder: of the records.
         own: commands of trajectories that are not built in, by their name.
 
     Raises:
-        InputError: see `choose_engine`, `named_command` and `tuning.search.search`.
+        InputError: see `named_command` and `tuning.search.search`.
         InputError: the folder cannot be written; told before
             anything is walked.
     """
-    engine = choose_engine(engine)
     size = config.population * len(starts)
     about = {  # not the engine: both give a loss to seven digits
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
@@ -757,7 +724,7 @@ def search(
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
         return losses_on_hfs(pool, tune, robot, engine, sets, size, own)
 
-    title = f"searching on the high-fidelity simulator, engine {engine}"
+    title = f"searching on the high-fidelity simulator, engine {engine.name}"
     with locked(folder), bar(title) as tell:
 
         def on_generation(histories: Mapping[str, list[Generation]]) -> None:
@@ -807,11 +774,11 @@ def refresh(
     walks = folder / "walks"
     late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
     path = jax.tree.map(lambda *w: np.stack(w), tuning.ten, *late)
-    jobs = dataset.draw_jobs_near(config.seed, config.walks, command, path, config.seconds)
+    jobs = draw_jobs_near(config.seed, config.walks, command, path=path, seconds=config.seconds)
     with locked(walks):
         # the jobs say the rest
         settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}
-        _keep_walks(pool, config.engine, robot, jobs, walks, settings)
+        _keep_walks(pool, choose_engine(config.engine), robot, jobs, walks, settings)
     oldest, *newer = (*before.folders, walks)
     after = train(before.config, robot, oldest, folder / "refreshed.npz", newer)
     effects = {

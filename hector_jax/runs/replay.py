@@ -22,7 +22,7 @@ from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError, from_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
-from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
+from hector_jax.grfm.network import Params, effect_of, layout, variant_of
 from hector_jax.robot.description import as_table, from_card
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.tuning.difftune import (
@@ -103,8 +103,8 @@ def keep(
         "net": None
         if params is None
         else {
-            "variant": "paper" if isinstance(params, NetParams) else "residual",
-            "hidden": widths(params.force),
+            "variant": variant_of(params).name,
+            "hidden": variant_of(params).widths(params),
         },
         "config": asdict(config),
         "description": as_table(robot.description),

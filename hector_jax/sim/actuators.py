@@ -11,8 +11,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
-from hector_jax.sim.world import MAX_DELAY, TIME_STEP, Imperfections
+from hector_jax.sim.world import MAX_DELAY, Imperfections
 
 MEMORY = round(MAX_DELAY / TIME_STEP) + 1  # commands remembered, the present one included
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.sim.world import TIME_STEP, World
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.sim.world import World
 
 TRUNK_TOP = (0.0, 0.0, 0.124)  # [m] in the trunk's frame
 STEEPEST = 0.5  # [rad]

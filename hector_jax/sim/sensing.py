@@ -17,8 +17,9 @@ from hector_jax.core.geometry import euler_from_rotation, rotation_from_quaterni
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
-from hector_jax.sim.world import TIME_STEP, Estimator, World
+from hector_jax.sim.world import Estimator, World
 
 CONTACTS = 16  # contacts kept of a millisecond in MuJoCo C
 READING = 43  # entries of a flat reading

@@ -181,7 +181,6 @@ def step_carry(
     window = Window(
         commands=turn(commands, -yaw),
         contact=decided.contact,
-        phase=gait.cycle_phase(ticks, tick),
         since_switch=gait.since_switch(ticks, tick),
         base=from_yaw_frame(state),
     )

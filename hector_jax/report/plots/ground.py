@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.trajectory import LEFT, Wrench
-from hector_jax.grfm.training import History
+from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.plots.style import (
     BLUE,

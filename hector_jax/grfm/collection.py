@@ -1,0 +1,204 @@
+"""Walks for learning phi, on disk: whole walks at the plan interval, in the world frame.
+
+A folder holds a file for each walk, with the job that asked for it, and `card.json`, which is
+written when all are there. Windows, frames and labels are made from the walks anew each time, so
+another history or another label needs no new data.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hector_jax.control.walking import walk_config
+from hector_jax.core.console import say
+from hector_jax.core.files import write_file
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.core.tree import stack
+from hector_jax.core.tree_file import check_settings, load_tree, read_card, save_tree
+from hector_jax.grfm.dataset import at_interval
+from hector_jax.grfm.jobs import draw_jobs
+from hector_jax.robot.model import Robot
+from hector_jax.sim.loop import Job
+
+_UNITS = {
+    "period": "s",
+    "euler": "rad",
+    "position": "m",
+    "ang_velocity": "rad/s",
+    "velocity": "m/s",
+    "force": "N",
+    "moment": "N m",
+    "feet": "m",
+    "joints": "rad",
+    "duration": "s",
+    "start": "s",
+}
+
+
+class Walks(NamedTuple):
+    """Walks with what was asked for, stacked; trajectories are sampled at the plan interval."""
+
+    job: Job  # arrays with a leading axis; commands of PIECES pieces
+    trajectory: Trajectory
+
+
+def collect(
+    folder: Path,
+    jobs: Sequence[Job],
+    walk_jobs: Callable[[list[Job]], Iterable[Trajectory]],
+    *,
+    robot: Robot,
+    settings: Mapping[str, Any] | None = None,
+    about: Mapping[str, Any] | None = None,
+    interval: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Walk all jobs and keep each walk in a file, taking up what an earlier call left.
+
+    A sound file of the same job is kept, a missing or damaged one is made.
+
+    Args:
+        folder: where; made if missing.
+        jobs: what to walk.
+        walk_jobs: called once, with the jobs whose walks are missing; gives the walks in their
+            order, from any world. An iterator that walks while it is asked loses least to a stop.
+        robot: the body; walks of another one are refused.
+        settings: JSON values of all that the walks follow from; walks of others are refused.
+        about: JSON values for the card, such as the engine that walked.
+        interval: the plan interval [s], that of the robot's gait by default.
+        progress: called with walks done and walks in all.
+
+    Raises:
+        InputError: a walk in the folder is of another job, robot or of other settings; or the
+            folder cannot be written.
+        ValueError: walks are missing or too short.
+    """
+    interval = walk_config(robot).gait.tick if interval is None else interval
+    # as it is read back
+    settings = json.loads(json.dumps({"interval": interval, **(settings or {})}))
+    facts = {
+        "units": _UNITS,
+        "frames": "world; wrench of the ground on the foot at its foot point, left then right",
+        "settings": settings,
+        **(about or {}),
+    }
+    paths = [Path(folder) / f"walk-{i:05d}.npz" for i in range(len(jobs))]
+    each = zip(paths, jobs, strict=True)
+    walks = [_load_sound(path, stack([job]), robot, settings) for path, job in each]
+    missing = [i for i, walk in enumerate(walks) if walk is None]
+    done = len(jobs) - len(missing)
+    progress(done, len(jobs))
+    for i, walk in zip(
+        missing, walk_jobs([jobs[i] for i in missing]) if missing else (), strict=False
+    ):
+        walks[i] = Walks(stack([jobs[i]]), stack([at_interval(walk, interval)]))
+        save_tree(paths[i], walks[i], kind="walks", robot=robot, about=facts)
+        done += 1
+        progress(done, len(jobs))
+    found = [walk for walk in walks if walk is not None]
+    if len(found) < len(jobs):
+        raise ValueError(f"{folder}: {len(jobs)} walks asked for, {len(found)} came")
+    falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in found)
+    card = {"walks": len(jobs), "falls": falls, "shards": [path.name for path in paths], **facts}
+    write_file(Path(folder) / "card.json", (json.dumps(card, indent=2) + "\n").encode())
+
+
+def load_walks(folder: Path, robot: Robot) -> Walks:
+    """All walks that `collect` left in a folder.
+
+    Raises:
+        InputError: one line naming folder or file: nothing collected, not finished, damaged, or of
+            another robot.
+    """
+    names = _read_collection(folder)["shards"]
+    parts = [_load_file(Path(folder) / name, robot) for name in names]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
+
+
+def walked_with(folder: Path) -> dict[str, Any]:
+    """What tells one collection from another: a hash of its walks, and its settings.
+
+    Raises:
+        InputError: nothing collected, not finished, or a card that is none.
+    """
+    card = _read_collection(folder)
+    digest = hashlib.sha256()
+    for name in card["shards"]:
+        digest.update((Path(folder) / name).read_bytes())
+    return {"content": digest.hexdigest()[:16], **card["settings"]}
+
+
+def _read_collection(folder: Path) -> dict[str, Any]:
+    path = Path(folder) / "card.json"
+    try:
+        card = json.loads(path.read_text())
+        shards, settings = card["shards"], dict(card["settings"])
+        if not shards or not all(re.fullmatch(r"(shard|walk)-\d+\.npz", name) for name in shards):
+            raise ValueError(f"shards are {short_repr(shards)}")
+    except FileNotFoundError:
+        raise InputError(
+            f"{folder}: no finished collection (no card.json); collect first"
+        ) from None
+    except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
+        raise InputError(f"{path}: no card of a collection; collect again") from error
+    for name in shards:
+        if not (Path(folder) / name).is_file():
+            raise InputError(f"{path}: no file {name} beside it; collect again")
+    return {"shards": shards, "settings": settings}
+
+
+def _load_file(path: Path, robot: Robot) -> Walks:
+    walks = load_tree(path, _layout(), kind="walks", robot=robot)[0]
+    count, ticks = walks.trajectory.fallen.shape
+    for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
+        if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
+            raise InputError(f"{path}: {name} is not of {count} walks, as trajectory.fallen is")
+    run = walks.trajectory._replace(initial=walks.trajectory.fallen, period=walks.trajectory.fallen)
+    if not count or any(leaf.shape[1] != ticks for leaf in jax.tree.leaves(run)):
+        raise InputError(f"{path}: its walks are not of one length, that of trajectory.fallen")
+    return walks
+
+
+def _load_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) -> Walks | None:
+    if not path.exists():
+        return None
+    try:
+        card = read_card(path)
+    except InputError as error:
+        say(f"made anew: {error}")
+        return None
+    check_settings(path, card["about"].get("settings", {}), settings)
+    walks = _load_file(path, robot)
+    if not all(jax.tree.leaves(jax.tree.map(np.array_equal, walks.job, job))):
+        raise InputError(f"{path}: collected for other walks; choose another folder or seed")
+    return walks
+
+
+def _layout() -> Walks:
+    """Shapes in a file; axes of length 0 are walks and ticks."""
+    zeros = lambda *shape: np.zeros((0, *shape))  # noqa: E731
+    state = State(*[zeros(0, 3)] * 4)
+    wrench = Wrench(zeros(0, 2, 3), zeros(0, 2, 3))
+    trajectory = Trajectory(
+        period=zeros(),
+        initial=State(*[zeros(3)] * 4),
+        state=state,
+        reference=state,
+        command=wrench,
+        effect=wrench,
+        contact=zeros(0, 2),
+        feet=zeros(0, 2, 3),
+        joints=zeros(0, 10),
+        fallen=zeros(0),
+        legs_touch=zeros(0),
+        residual=zeros(0),
+    )
+    (job,) = draw_jobs(0, 1)
+    return Walks(jax.tree.map(lambda x: zeros(*np.shape(x)), job), trajectory)

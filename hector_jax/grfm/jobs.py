@@ -1,0 +1,131 @@
+"""What to walk so that phi knows the ground that tuning will tread."""
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from hector_jax.control.reference import COMMANDS, Command, named_command
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.robot.model import Robot
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import Push, hfs_drawn
+
+KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
+SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
+NEAR = 1.5  # and within x/NEAR of what a tuning went through
+PIECES = 4  # of every command, so that jobs can be stacked
+PUSHES = 2  # of every walk, likewise; most are of no force
+PUSH_TIME = 0.1  # [s]
+
+
+def draw_jobs(
+    seed: int,
+    count: int,
+    paths: Sequence[Weights] = (),
+    *,
+    seconds: float = 4.0,
+    robot: Robot | None = None,
+) -> list[Job]:
+    """Draw walks around the nominal and expert weights, and along tuning paths.
+
+    Trajectories take turns: straight, c, s, random velocities. Weights take turns too: each of the
+    24 log-uniform around nominal, around expert and, where tuning paths are given, a point of one.
+    Each walk has a plant of its own, drawn around the hfs. A third of the walks, drawn too, is
+    pushed once or twice: 10 to 30 N for 0.1 s, from any side. Job i depends on the seed and on i
+    alone, so a longer list begins with the shorter one.
+
+    Args:
+        seed: of everything drawn.
+        count: number of walks.
+        paths: weights that tunings went through, stacked along a first axis each.
+        seconds: length of each walk.
+        robot: whose nominal and expert weights they are; HECTOR by default.
+
+    Raises:
+        ValueError: fewer than one walk.
+    """
+    if count < 1:
+        raise ValueError(f"the number of walks must be at least 1, got {count}")
+    centres = nominal(robot), expert(robot)
+
+    def draw(i: int) -> Job:
+        rng = np.random.default_rng([seed, i])
+        kind = KINDS[i % len(KINDS)]
+        command = _random_command(rng) if kind == "random" else _split_last(named_command(kind))
+        centre = (i // len(KINDS)) % (3 if paths else 2)
+        if centre == 2:
+            path = paths[int(rng.integers(len(paths)))]
+            weights = _point(path, int(rng.integers(len(path.Q.euler))))
+        else:
+            weights = _draw_weights(rng, centres[centre], SPREAD)
+        return _draw_plant(rng, i, command, weights, seconds=seconds)
+
+    return [draw(i) for i in range(count)]
+
+
+def draw_jobs_near(
+    seed: int, count: int, command: Command, *, path: Weights, seconds: float = 4.0
+) -> list[Job]:
+    """Draw walks around where one tuning went.
+
+    Commands take turns: the given one, random velocities. Weights take turns too: each of the 24
+    log-uniform within x/NEAR of a point of the path, drawn, and of its last point. Plants and
+    pushes are drawn as in `draw_jobs`, and job i depends on the seed and on i alone.
+
+    Args:
+        seed: of everything drawn.
+        count: number of walks.
+        command: what was tuned for.
+        path: weights that the tuning went through, stacked along a first axis.
+        seconds: length of each walk.
+    """
+
+    def draw(i: int) -> Job:
+        rng = np.random.default_rng([seed, i])
+        mine = _random_command(rng) if i % 2 else _split_last(command)
+        point = -1 if i // 2 % 2 else int(rng.integers(len(path.Q.euler)))
+        weights = _draw_weights(rng, _point(path, point), NEAR)
+        return _draw_plant(rng, i, mine, weights, seconds=seconds)
+
+    return [draw(i) for i in range(count)]
+
+
+def _point(path: Weights, index: int) -> Weights:
+    return jax.tree.map(lambda w: np.asarray(w)[index], path)
+
+
+def _draw_plant(
+    rng: np.random.Generator, i: int, command: Command, weights: Weights, *, seconds: float
+) -> Job:
+    plant = hfs_drawn(int(rng.integers(2**31)))
+    return Job(weights, command, plant, seconds, seed=i, push=_draw_push(rng, seconds))
+
+
+def _draw_weights(rng: np.random.Generator, centre: Weights, spread: float) -> Weights:
+    return jax.tree.map(lambda w: w * spread ** rng.uniform(-1.0, 1.0, w.shape), centre)
+
+
+def _draw_push(rng: np.random.Generator, seconds: float) -> Push:
+    number = rng.integers(1, PUSHES + 1) if rng.random() < 1.0 / 3.0 else 0
+    size = rng.uniform(10.0, 30.0, PUSHES) * (np.arange(PUSHES) < number)
+    side = rng.uniform(-np.pi, np.pi, PUSHES)
+    force = size[:, None] * np.stack([np.cos(side), np.sin(side), np.zeros(PUSHES)], axis=1)
+    start = rng.uniform(0.0, max(seconds - PUSH_TIME, 0.0), PUSHES)
+    return Push(force, start, np.full(PUSHES, PUSH_TIME))
+
+
+def _random_command(rng: np.random.Generator) -> Command:
+    return Command(
+        duration=rng.uniform(0.5, 1.5, PIECES),
+        velocity=rng.uniform([-0.2, -0.2], [0.6, 0.2], (PIECES, 2)),
+        yaw_rate=rng.uniform(-0.5 * np.pi, 0.5 * np.pi, PIECES),
+    )
+
+
+def _split_last(command: Command) -> Command:
+    """The same command in PIECES pieces: the last one is walked in parts."""
+    parts = np.ones(len(command.duration), int)
+    parts[-1] += PIECES - len(parts)
+    whole = jax.tree.map(lambda x: np.repeat(x, parts, axis=0), command)
+    return whole._replace(duration=whole.duration / np.repeat(parts, parts))

@@ -1,0 +1,227 @@
+"""The networks of GRFM-Net and their training.
+
+Minimised is, for forces and moments apart, the mean square of the standardised error plus
+l2/2 |kernels|^2, by Adam (the paper's: 1e-3, 1e-3, 200 epochs). Each axis counts alike, as each is
+divided by its own spread. Several nets of one kind are trained side by side; of each the epoch with
+the least mean square error (N^2, (N m)^2) on validation walks is kept.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int, Key
+
+from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED, InputError, check
+from hector_jax.core.trajectory import Wrench
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """How the parameters of a phi are fitted."""
+
+    epochs: int = 200
+    batch: int = 512  # samples per step
+    learning_rate: float = 1e-3
+    l2: float = 1e-3  # on kernels
+    mirror: bool = True  # the paper's variant learns from the mirror image of each sample too
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check(
+            self,
+            epochs=AT_LEAST_ONE,
+            batch=AT_LEAST_ONE,
+            learning_rate=POSITIVE,
+            l2=NOT_NEGATIVE,
+            seed=SEED,
+        )
+
+
+class History(NamedTuple):
+    """Mean square errors in physical units by epoch, mean over the members of an ensemble.
+
+    Training errors are means over the epoch. A fit in closed form has no epochs.
+    """
+
+    train_force: Float[np.ndarray, " epochs"]  # [N^2]
+    train_moment: Float[np.ndarray, " epochs"]  # [(N m)^2]
+    valid_force: Float[np.ndarray, " epochs"]
+    valid_moment: Float[np.ndarray, " epochs"]
+
+
+NO_EPOCHS = History(*np.zeros((4, 0)))
+Progress = Callable[[int, History], None]  # called after each epoch, from 1, with the errors so far
+
+
+class Samples(NamedTuple):
+    """What the nets are trained on, n samples."""
+
+    x: Wrench  # inputs of the force net and of the moment net, (n, ..., inputs) each
+    y: Wrench  # standardised labels, (n, ..., outputs) each
+    trust: Array  # (n, ..., 1) factor of what the nets add
+
+
+class Net(nn.Module):
+    """Layers of linear, layer normalisation and softsign, then a linear one."""
+
+    hidden: tuple[int, ...]
+    outputs: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
+        """Outputs for inputs, both standardised."""
+        for width in self.hidden:
+            # the two-pass variance: the fast one loses half the digits that gradient checks need
+            x = nn.soft_sign(nn.LayerNorm(use_fast_variance=False)(nn.Dense(width)(x)))
+        return nn.Dense(self.outputs)(x)
+
+
+def init_nets(
+    key: Key[Array, ""], hidden: tuple[int, ...], inputs: int, *, outputs: int, members: int
+) -> Wrench:
+    """Fresh parameters of force nets and moment nets, `members` of each stacked."""
+    net, x = Net(hidden, outputs), jnp.zeros(inputs)
+    draw = jax.jit(jax.vmap(lambda k: net.init(k, x)["params"]))
+    return Wrench(*(draw(jax.random.split(k, members)) for k in jax.random.split(key)))
+
+
+def widths(net: dict[str, Any]) -> tuple[int, ...]:
+    """Widths of the hidden layers of a net, read off its parameters."""
+    return tuple(net[f"Dense_{i}"]["kernel"].shape[-1] for i in range(len(net) // 2))
+
+
+def apply_net(params: dict[str, Any], x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
+    """Standardised outputs of one net."""
+    hidden = widths(params)
+    outputs = params[f"Dense_{len(hidden)}"]["kernel"].shape[-1]
+    return Net(hidden, outputs).apply({"params": params}, x)
+
+
+class _Rates(NamedTuple):
+    """The numbers of a training, traced: another rate needs no new compilation."""
+
+    learning: float
+    l2: float
+
+
+class _Carry(NamedTuple):
+    nets: Wrench  # parameters of force and moment nets, members stacked
+    optimiser: Any
+    best: Wrench  # of each member those of the epoch with the least validation error
+    least: Wrench  # that error, by member
+
+
+def fit_nets(
+    config: FitConfig,
+    key: Key[Array, ""],
+    nets: Wrench,
+    *,
+    training: Samples,
+    validation: Samples,
+    scale: Wrench,
+    output: Callable[[Array, Array], Array],
+    progress: Progress,
+) -> tuple[Wrench, History]:
+    """Train force nets and moment nets in 32 bits.
+
+    Args:
+        config: settings; the same ones and the same data give the same bytes on a CPU.
+        key: of the order of the samples.
+        nets: parameters to start from, members stacked along the first axis.
+        training: samples to learn from.
+        validation: samples of other walks, which choose the epoch.
+        scale: physical unit of each standardised output, in N and N m.
+        output: `(output of a net, trust) -> standardised prediction`, a module's function.
+        progress: see `Progress`.
+
+    Returns:
+        The best parameters of each member, and the errors by epoch.
+
+    Raises:
+        InputError: no epoch has a finite validation error.
+    """
+    members = len(jax.tree.leaves(nets)[0])
+    infinite = jnp.full(members, jnp.inf, jnp.float32)
+    rates, rows = _Rates(config.learning_rate, config.l2), []
+    carry = _Carry(nets, _optimiser(rates).init(nets), nets, Wrench(infinite, infinite))
+    for epoch, key_epoch in enumerate(jax.random.split(key, config.epochs), start=1):
+        carry, row = _train_epoch(
+            output, config.batch, rates, scale, training, validation, carry, key_epoch
+        )
+        rows.append(jax.device_get(row))
+        progress(epoch, History(*np.array(rows).T))
+    if not all(np.isfinite(leaf).all() for leaf in carry.least):
+        raise InputError("training diverged: no epoch has a finite validation error")
+    return carry.best, History(*np.array(rows).T)
+
+
+def _optimiser(rates: _Rates) -> optax.GradientTransformation:
+    def kernels(nets: Any) -> Any:
+        return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", nets)
+
+    return optax.chain(
+        optax.add_decayed_weights(rates.l2, mask=kernels), optax.adam(rates.learning)
+    )
+
+
+def _squares(output: Callable[[Array, Array], Array], nets: Wrench, samples: Samples) -> Wrench:
+    """Mean square of the standardised error per member and output."""
+
+    def square(net: Any, x: Array, y: Array) -> Array:
+        error = output(apply_net(net, x), samples.trust) - y
+        return jnp.mean(error**2, axis=tuple(range(y.ndim - 1)))
+
+    by_member = jax.vmap(square, in_axes=(0, None, None))
+    return Wrench(*map(by_member, nets, samples.x, samples.y))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _train_epoch(
+    output: Callable[[Array, Array], Array],
+    size: int,
+    rates: _Rates,
+    scale: Wrench,
+    training: Samples,
+    validation: Samples,
+    carry: _Carry,
+    key: Key[Array, ""],
+) -> tuple[_Carry, Float[Array, "4"]]:
+    count = len(training.x.force)
+    batch = min(size, count)
+    order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
+    optimiser = _optimiser(rates)
+
+    def loss(nets: Wrench, chosen: Samples) -> tuple[Float[Array, ""], Wrench]:
+        squares = _squares(output, nets, chosen)
+        return squares.force.mean(axis=1).sum() + squares.moment.mean(axis=1).sum(), squares
+
+    def step(
+        state: tuple[Wrench, Any], rows: Int[Array, " batch"]
+    ) -> tuple[tuple[Wrench, Any], Wrench]:
+        nets, memory = state
+        chosen = jax.tree.map(lambda a: a[rows], training)
+        gradient, squares = jax.grad(loss, has_aux=True)(nets, chosen)
+        update, memory = optimiser.update(gradient, memory, nets)
+        return (optax.apply_updates(nets, update), memory), squares
+
+    (nets, memory), squares = jax.lax.scan(step, (carry.nets, carry.optimiser), order)
+    variance = jax.tree.map(jnp.square, scale)
+    physical = partial(jax.tree.map, lambda square, v: jnp.mean(square * v, axis=-1))
+    error = physical(_squares(output, nets, validation), variance)
+    best = Wrench(
+        *(
+            jax.tree.map(partial(jax.vmap(jnp.where), now < least), new, old)
+            for now, least, new, old in zip(error, carry.least, nets, carry.best, strict=True)
+        )
+    )
+    least = jax.tree.map(jnp.fmin, error, carry.least)
+    learned = physical(jax.tree.map(lambda s: s.mean(axis=0), squares), variance)
+    row = jnp.stack([x.mean() for x in (*learned, *error)])
+    return _Carry(nets, memory, best, least), row

@@ -1,0 +1,194 @@
+"""The paper's GRFM-Net, and the linear map beside it.
+
+Each of two nets, one for forces and one for moments, reads the current and the two past commands of
+both feet (18 numbers), passes them through three layers (linear, layer normalisation, softsign; 64
+wide) and returns what the ground returns at both feet (6). Inputs and outputs are standardised by
+statistics of the training samples. The best affine map of the same inputs is what a net has to
+beat.
+
+Mirror images of the samples are our addition: with 51 training walks they lowered the held-out
+force error by 5 to 10 % and the moment error by 4 to 6 %.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from hector_jax.core.trajectory import Wrench, zero_wrench
+from hector_jax.grfm.dataset import Dataset, with_mirror
+from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, ground_effect, in_dtype_of
+from hector_jax.grfm.nets import (
+    NO_EPOCHS,
+    FitConfig,
+    History,
+    Progress,
+    Samples,
+    apply_net,
+    fit_nets,
+    init_nets,
+    widths,
+)
+
+_INPUTS = 6 * HISTORY
+_FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
+
+
+class Scaling(NamedTuple):
+    """Mean and spread of each axis of each foot over the training samples."""
+
+    mean: Wrench
+    scale: Wrench
+
+
+class PaperParams(NamedTuple):
+    """All of a GRFM-Net of the paper's variant."""
+
+    force: dict[str, Any]  # of a `Net`
+    moment: dict[str, Any]
+    inputs: Scaling  # commands; the same for each age
+    outputs: Scaling  # effects
+
+
+class LinearMap(NamedTuple):
+    """The best affine map of a net's standardised inputs to its standardised outputs."""
+
+    force: Float[Array, "n 6"]  # last row: bias
+    moment: Float[Array, "n 6"]
+    inputs: Scaling
+    outputs: Scaling
+
+
+def fit_scaling(wrench: Wrench) -> Scaling:
+    """Mean and standard deviation over all leading axes.
+
+    An axis that hardly moves, such as the commanded M_x, is scaled by a hundredth of the largest
+    spread of its kind, so that rounding errors are not taken for a signal.
+    """
+
+    def scale(w: np.ndarray) -> np.ndarray:
+        spread = w.reshape(-1, 2, 3).std(axis=0)
+        largest = spread.max()
+        return np.maximum(spread, _FLOOR * largest) if largest > 0.0 else np.ones_like(spread)
+
+    return Scaling(
+        mean=Wrench(*(np.mean(w.reshape(-1, 2, 3), axis=0) for w in wrench)),
+        scale=Wrench(*(scale(w) for w in wrench)),
+    )
+
+
+def _standardised(scaling: Scaling, wrench: Wrench) -> Wrench:
+    return jax.tree.map(lambda w, m, s: (w - m) / s, wrench, scaling.mean, scaling.scale)
+
+
+def _features(scaling: Scaling, commands: Wrench) -> Wrench:
+    """Inputs of force net and moment net, (*batch, 18) each, from the commands of windows."""
+    flat = lambda w: w.reshape(*w.shape[:-3], _INPUTS)  # noqa: E731
+    return jax.tree.map(flat, _standardised(scaling, commands))
+
+
+def _effect(scaling: Scaling, flat: Wrench) -> Effect:
+    physical = lambda w, m, s: w.reshape(*w.shape[:-1], 2, 3) * s + m  # noqa: E731
+    return ground_effect(jax.tree.map(physical, flat, scaling.mean, scaling.scale))
+
+
+def init(key: Key[Array, ""], hidden: tuple[int, ...] = (64, 64, 64)) -> PaperParams:
+    """Fresh networks without statistics, in 32 bits."""
+    nets = init_nets(key, hidden, _INPUTS, outputs=6, members=1)
+    scaling = Scaling(zero_wrench(), zero_wrench())
+    params = PaperParams(*jax.tree.map(lambda p: p[0], nets), scaling, scaling)
+    return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
+
+
+def with_statistics(params: PaperParams, dataset: Dataset) -> PaperParams:
+    """The same networks, standardised by the statistics of a training set."""
+    scalings = fit_scaling(dataset.window.commands), fit_scaling(dataset.label)
+    inputs, outputs = jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), scalings)
+    return params._replace(inputs=inputs, outputs=outputs)
+
+
+def _samples(params: PaperParams, dataset: Dataset) -> Samples:
+    label = _standardised(params.outputs, dataset.label)
+    samples = Samples(
+        x=_features(params.inputs, dataset.window.commands),
+        y=jax.tree.map(lambda w: w.reshape(-1, 6), label),
+        trust=np.ones((len(dataset.walk), 1)),
+    )
+    return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
+
+
+def _output(raw: Array, trust: Array) -> Array:
+    del trust
+    return raw
+
+
+def fit(
+    config: FitConfig, training: Dataset, validation: Dataset, progress: Progress
+) -> tuple[PaperParams, History]:
+    """Train both nets; see `nets.fit_nets`."""
+    key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
+    training = with_mirror(training) if config.mirror else training
+    params = with_statistics(init(key_init), training)
+    best, history = fit_nets(
+        config,
+        key_shuffle,
+        jax.tree.map(lambda p: p[None], Wrench(params.force, params.moment)),
+        training=_samples(params, training),
+        validation=_samples(params, validation),
+        scale=jax.tree.map(lambda w: w.reshape(6), params.outputs.scale),
+        output=_output,
+        progress=progress,
+    )
+    force, moment = jax.tree.map(lambda p: p[0], best)
+    return params._replace(force=force, moment=moment), history
+
+
+def apply(params: PaperParams, window: Window) -> Effect:
+    """Effect of a trained net for one window."""
+    params = in_dtype_of(window, params)
+    x = _features(params.inputs, window.commands)
+    flat = Wrench(apply_net(params.force, x.force), apply_net(params.moment, x.moment))
+    return _effect(params.outputs, flat)
+
+
+PAPER = Phi("paper", PaperParams, init, fit, apply, widths=lambda params: widths(params.force))
+
+
+def init_linear(key: Key[Array, ""], hidden: tuple[int, ...] = ()) -> LinearMap:
+    """A map to zero."""
+    del key, hidden
+    zeros, scaling = jnp.zeros((_INPUTS + 1, 6)), Scaling(zero_wrench(), zero_wrench())
+    return LinearMap(zeros, zeros, scaling, scaling)
+
+
+def fit_linear(dataset: Dataset) -> LinearMap:
+    """Least squares from the nets' inputs to the label."""
+    inputs, outputs = fit_scaling(dataset.window.commands), fit_scaling(dataset.label)
+    x = _features(inputs, dataset.window.commands)
+    y = _standardised(outputs, dataset.label)
+
+    def solve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        with_bias = np.concatenate([x, np.ones((len(x), 1))], axis=1)
+        return np.linalg.lstsq(with_bias, y.reshape(len(y), 6), rcond=1e-6)[0]
+
+    return LinearMap(solve(x.force, y.force), solve(x.moment, y.moment), inputs, outputs)
+
+
+def apply_linear(linear: LinearMap, window: Window) -> Effect:
+    """Effect of a linear map for one window."""
+    linear = in_dtype_of(window, linear)
+    x = _features(linear.inputs, window.commands)
+    affine = lambda x, A: x @ A[:-1] + A[-1]  # noqa: E731
+    flat = Wrench(affine(x.force, linear.force), affine(x.moment, linear.moment))
+    return _effect(linear.outputs, flat)
+
+
+LINEAR = Phi(
+    "linear",
+    LinearMap,
+    init_linear,
+    lambda config, training, validation, progress: (fit_linear(training), NO_EPOCHS),
+    apply_linear,
+)

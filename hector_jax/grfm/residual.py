@@ -1,0 +1,208 @@
+"""The default GRFM-Net: the gated linear part, and nets that learn what it leaves.
+
+Nets of two layers, 32 wide, add to the ground wrench of each foot the residual of the linear part.
+They read what it reads, as each foot sees it; what they add is bounded, and fades where the inputs
+are unlike those of the training samples: far from the data this phi is linear. Four of each kind
+are trained side by side and their mean is added. The statistics of the training samples are part of
+the parameters: a net cannot be used with another's.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from hector_jax.control.gait import GaitConfig, since_switch
+from hector_jax.core.trajectory import Wrench
+from hector_jax.grfm import gated
+from hector_jax.grfm.dataset import Dataset
+from hector_jax.grfm.effect import Effect, Phi, Window, in_dtype_of
+from hector_jax.grfm.gated import (
+    CHANGES,
+    GATES,
+    MOTION,
+    GatedMap,
+    View,
+    apply_gated,
+    fit_gated,
+    from_views,
+    hats,
+    labels_in_view,
+    views,
+)
+from hector_jax.grfm.nets import (
+    FitConfig,
+    History,
+    Progress,
+    Samples,
+    apply_net,
+    fit_nets,
+    init_nets,
+    widths,
+)
+
+HIDDEN = (32, 32)
+MEMBERS = 4  # nets of each kind
+BOUND = 0.5  # most that a net adds, in units of the residual's RMS
+FAMILIAR = 0.99  # share of the training samples that are nearer than where trust is halved
+_TERMS = CHANGES + MOTION
+
+
+class FeatureStats(NamedTuple):
+    """Statistics of what a net reads, by the tick since the switch; axes of 2: swing, stance."""
+
+    mean: Float[Array, "2 ticks terms"]
+    scale: Float[Array, "2 ticks terms"]
+    reach: Float[Array, ""]  # mean square of the standardised terms at which trust is one half
+
+
+class ResidualParams(NamedTuple):
+    """All of a GRFM-Net of the residual variant."""
+
+    linear: GatedMap
+    force: dict[str, Any]  # of MEMBERS `Net`s, stacked, for one foot
+    moment: dict[str, Any]
+    stats: FeatureStats
+    residual_rms: Float[Array, "6"]  # [N], [N m] of what the linear part leaves
+
+
+def init(key: Key[Array, ""], hidden: tuple[int, ...] = HIDDEN) -> ResidualParams:
+    """Fresh networks without statistics, in 32 bits; the axis of ticks has length 0."""
+    nets = init_nets(key, hidden, _TERMS + len(GATES) + 1, outputs=3, members=MEMBERS)
+    table = jnp.zeros((2, 0, _TERMS))
+    stats = FeatureStats(table, table, jnp.zeros(()))
+    params = ResidualParams(gated.init(key), *nets, stats, jnp.zeros(6))
+    return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
+
+
+def with_statistics(params: ResidualParams, dataset: Dataset) -> ResidualParams:
+    """The same networks with the linear part and the statistics of a training set."""
+    linear = fit_gated(dataset)
+    fitted = linear, *_fit_stats(linear, dataset)
+    linear, stats, rms = jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), fitted)
+    return params._replace(linear=linear, stats=stats, residual_rms=rms)
+
+
+def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.ndarray]:
+    """Statistics of the features, and the RMS of what the linear part leaves."""
+
+    def one(window: Window) -> tuple[View, Array, Array]:
+        view = views(window)
+        return view, hats(window.since_switch, linear.ticks), apply_gated(linear, window, view)[0]
+
+    window = jax.tree.map(jnp.asarray, dataset.window)
+    view, tick, ground = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(window))
+    terms, tick = _terms(view), np.repeat(tick[:, None], 2, axis=1)
+    mean, scale = (np.zeros((2, len(linear.ticks), terms.shape[-1])) for _ in range(2))
+    for stands in (0, 1):
+        rows = view.stands == stands
+        weight = tick[rows] / np.maximum(tick[rows].sum(axis=0), 1e-9)
+        mean[stands] = weight.T @ terms[rows]
+        scale[stands] = np.sqrt(np.maximum(weight.T @ terms[rows] ** 2 - mean[stands] ** 2, 0.0))
+    # a term that rests at some ticks only, such as the change of a swinging foot's command
+    scale = np.maximum(scale, 0.05 * np.maximum(scale.max(axis=(0, 1)), 1e-6))
+    stats = FeatureStats(mean, scale, np.asarray(1.0))
+    z = np.asarray(_standard_terms(stats, terms, view.stands.astype(int), tick))
+    reach = np.quantile(np.mean(z**2, axis=-1), FAMILIAR)
+    rms = np.sqrt(np.mean((labels_in_view(dataset)[0] - ground) ** 2, axis=(0, 1)))
+    return stats._replace(reach=np.maximum(reach, 1e-6)), np.where(rms > 0.0, rms, 1.0)
+
+
+def _terms(view: View) -> Float[Array, "*batch terms"]:
+    return jnp.concatenate([view.changes, view.motion], axis=-1)
+
+
+def _standard_terms(stats: FeatureStats, terms: Any, stands: Any, tick: Any) -> Array:
+    at = lambda table: jnp.einsum("...k,...ki->...i", tick, table[stands])  # noqa: E731
+    return (terms - at(stats.mean)) / at(stats.scale)
+
+
+def _inputs(params: ResidualParams, window: Window, view: View) -> tuple[Array, Array]:
+    """What the nets read for each foot of one window (2, n), and how far they are trusted (2,)."""
+    stands, stats = view.stands.astype(int), params.stats
+    tick, gate = (hats(window.since_switch, k) for k in (params.linear.ticks, params.linear.gates))
+    z = _standard_terms(stats, _terms(view), stands, jnp.stack([tick, tick]))
+    trust = 1.0 / (1.0 + (jnp.mean(z**2, axis=-1) / stats.reach) ** 4)
+    return jnp.concatenate([z, jnp.stack([gate, gate]), view.stands[:, None]], axis=-1), trust
+
+
+def _bounded(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """What a net adds for its raw output, both standardised."""
+    return BOUND * jnp.tanh(raw / BOUND)
+
+
+def _output(raw: Array, trust: Array) -> Array:
+    return trust * _bounded(raw)
+
+
+def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
+    def one(window: Window) -> tuple[Array, Array, Array]:
+        view = views(window)
+        ground, _ = apply_gated(params.linear, window, view)
+        return ground, *_inputs(params, window, view)
+
+    window = jax.tree.map(jnp.asarray, dataset.window)
+    ground, z, trust = jax.jit(jax.vmap(one))(window)
+    residual = (labels_in_view(dataset)[0] - ground) / params.residual_rms
+    y = Wrench(residual[..., :3], residual[..., 3:])
+    samples = Samples(Wrench(z, z), y, trust[..., None])
+    return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
+
+
+def fit(
+    config: FitConfig, training: Dataset, validation: Dataset, progress: Progress
+) -> tuple[ResidualParams, History]:
+    """Fit the linear part, then train the nets on what it leaves; see `nets.fit_nets`."""
+    key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
+    params = with_statistics(init(key_init), training)
+    best, history = fit_nets(
+        config,
+        key_shuffle,
+        Wrench(params.force, params.moment),
+        training=_samples(params, training),
+        validation=_samples(params, validation),
+        scale=Wrench(params.residual_rms[:3], params.residual_rms[3:]),
+        output=_output,
+        progress=progress,
+    )
+    return params._replace(force=best.force, moment=best.moment), history
+
+
+def apply(params: ResidualParams, window: Window) -> Effect:
+    """Effect of a trained net for one window."""
+    params, window = in_dtype_of(window, params), in_dtype_of(window, window)
+    view = views(window)
+    ground, legs = apply_gated(params.linear, window, view)
+    x, trust = _inputs(params, window, view)
+    members = jax.vmap(lambda net: _bounded(apply_net(net, x)))
+    added = jnp.concatenate([members(params.force), members(params.moment)], axis=-1)
+    added = trust[:, None] * params.residual_rms * added
+    return Effect(from_views(ground + added.mean(axis=0)), legs)
+
+
+RESIDUAL = Phi(
+    "residual", ResidualParams, init, fit, apply, widths=lambda params: widths(params.force)
+)
+
+
+def plain_net(gait: GaitConfig) -> ResidualParams:
+    """A net that returns every command as it is: the plain rigid body, in the program of the net.
+
+    Its parameters have the shapes of a net that was trained on walks of `gait`.
+    """
+    ticks = np.unique(np.asarray(since_switch(gait, jnp.arange(gait.cycle))))
+    zeros = lambda x: np.zeros([len(ticks) if n == 0 else n for n in x.shape], np.float32)  # noqa: E731
+    net = jax.tree.map(zeros, jax.eval_shape(init, jax.random.key(0)))
+    knots = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
+    one = np.ones((), np.float32)
+    return net._replace(linear=knots, stats=FeatureStats(net.stats.mean, net.stats.scale + 1, one))
+
+
+def member_params(params: ResidualParams) -> ResidualParams:
+    """The members of the ensemble alone, each an ensemble of one, stacked on a first axis."""
+    alone = lambda p: jnp.asarray(p)[:, None]  # noqa: E731
+    shared = lambda p: jnp.broadcast_to(jnp.asarray(p), (MEMBERS, *jnp.shape(p)))  # noqa: E731
+    nets = {name: jax.tree.map(alone, getattr(params, name)) for name in ("force", "moment")}
+    return jax.tree.map(shared, params)._replace(**nets)

@@ -1,0 +1,227 @@
+"""The closed loop of controller and plant, for every physics engine.
+
+A walk starts with double stance under the MPC, then gait cycles in place; at t = 0 the reference is
+anchored at the true centre of mass and yaw. Per tick `plan_tick` solves the MPC, per millisecond
+`motor_torques` turns the plan into torques, the engine steps its physics, `contact_wrench` reads
+the contacts and `sample` says what became of the robot. An engine gives its coordinates as a flat
+reading (`sensing.unpack_reading`); the continuous yaw is carried beside it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hector_jax.control.reference import Anchor, Command, reference_at
+from hector_jax.control.walking import Measurement, Memory, Plan, WalkConfig, actuate, step_plan
+from hector_jax.control.weights import Weights
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.model import Robot
+from hector_jax.sim import sensing
+from hector_jax.sim.actuators import Motors, step_actuators
+from hector_jax.sim.changes import Change
+from hector_jax.sim.sensing import Contacts, Touches
+from hector_jax.sim.world import NO_PUSH, Imperfections, Push
+
+
+class Job(NamedTuple):
+    """A walk to simulate."""
+
+    weights: Weights
+    command: Command
+    imperfections: Imperfections
+    seconds: float = 4.0  # from t = 0
+    seed: int = 0  # of the estimator's errors
+    start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
+    push: Push = NO_PUSH
+    changes: tuple[Change, ...] = ()  # of the plant
+
+
+class Sample(NamedTuple):
+    """The true values of one sample; see Trajectory."""
+
+    state: State
+    reference: State
+    effect: Wrench
+    feet: Float[Array, "*batch 2 3"]
+    joints: Float[Array, "*batch 10"]
+    fallen: Bool[Array, "*batch"]
+    legs_touch: Bool[Array, "*batch"]
+
+
+def measure(
+    robot: Robot, reading: Float[Array, "43"], yaw: Float[Array, ""], error: Float[Array, "22"]
+) -> Measurement:
+    """What the controller measures: the truth and `error`; `yaw` [rad] is that shortly before."""
+    return sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)[0]
+
+
+def plan_tick(
+    config: WalkConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    tick: Int[Array, ""],
+    memory: Memory,
+    yaw: Float[Array, ""],
+    reading: Float[Array, "43"],
+    error: Float[Array, "22"],
+    *,
+    slots: int,
+) -> tuple[Memory, Plan]:
+    """Measure and solve the MPC, once a tick.
+
+    Args:
+        config, robot, weights: the controller.
+        command, anchor: what to walk, and from where.
+        tick: gait tick now.
+        memory: of the controller.
+        yaw: a true yaw [rad] shortly before.
+        reading: coordinates now.
+        error: of the state estimate now.
+        slots: feet that may stand at once, from `slots_needed` (static).
+    """
+    measurement = measure(robot, reading, yaw, error)
+    return step_plan(
+        config, robot, weights, command, anchor, tick, memory, measurement, slots=slots
+    )
+
+
+def motor_torques(
+    config: WalkConfig,
+    robot: Robot,
+    imperfections: Imperfections,
+    memory: Memory,
+    plan: Plan,
+    motors: Motors,
+    yaw: Float[Array, ""],
+    substep: Int[Array, ""],
+    reading: Float[Array, "43"],
+    error: Float[Array, "22"],
+) -> tuple[Motors, Float[Array, ""], Float[Array, "10"]]:
+    """Motors, true yaw [rad] and the torque at the joints [N m] over the next millisecond.
+
+    Args:
+        config, robot: the controller.
+        imperfections: of the plant's motors.
+        memory, plan: of the controller.
+        motors: of the millisecond before.
+        yaw: a true yaw [rad] shortly before.
+        substep: milliseconds since the plan.
+        reading: coordinates now.
+        error: of the state estimate now.
+    """
+    measurement, yaw = sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)
+    torque = actuate(config, robot, plan, memory, substep, measurement)
+    motors, applied = step_actuators(robot, imperfections, motors, torque)
+    return motors, yaw, applied
+
+
+def contact_wrench(
+    robot: Robot,
+    before: Float[Array, "43"],
+    contacts: Contacts,
+    *,
+    floor: Int[Array, ""],
+    foot_of_geom: Int[Array, " ngeom"],
+) -> tuple[Wrench, Touches]:
+    """The ground's wrench over a millisecond, and what touches beside the feet and the floor.
+
+    Args:
+        robot: nominal body.
+        before: coordinates at its start.
+        contacts: found at its start; their forces act over it.
+        floor, foot_of_geom: from the World.
+    """
+    foot, touches = sensing.foot_contacts(contacts, floor, foot_of_geom)
+    points = sensing.foot_points(robot, sensing.unpack_reading(before))
+    return sensing.ground_wrench(contacts, foot, floor, points), touches
+
+
+def sample(
+    config: WalkConfig,
+    robot: Robot,
+    command: Command,
+    anchor: Anchor,
+    *,
+    time: Float[Array, ""],
+    yaw: Float[Array, ""],
+    after: Float[Array, "43"],
+    effect: Wrench,
+    touches: Touches,
+) -> Sample:
+    """The truth about one sample.
+
+    Args:
+        config: times.
+        robot: nominal body.
+        command, anchor: what is walked, and from where.
+        time: gait time at its end, in ticks.
+        yaw: a true yaw [rad] shortly before.
+        after: coordinates at its end.
+        effect: mean wrench of the ground over it.
+        touches: what touched in it, feet on the floor apart.
+    """
+    reading = sensing.unpack_reading(after)
+    state = sensing.base_state(robot, reading, yaw)
+    return Sample(
+        state=state,
+        reference=reference_at(config.gait.tick, command, anchor, time),
+        effect=effect,
+        feet=sensing.foot_points(robot, reading),
+        joints=reading.joints + reading.slack,
+        fallen=has_fallen(state, *robot.description.limits) | touches.floor,
+        legs_touch=touches.legs,
+    )
+
+
+def as_trajectory(
+    period: Float[Array | np.ndarray, ""], initial: State, plan: Plan, samples: Sample
+) -> Trajectory:
+    """The walk of these samples, each with the plan in force."""
+    return Trajectory(
+        period=period,
+        initial=initial,
+        command=plan.wrench,
+        contact=plan.contact,
+        residual=plan.residual,
+        **samples._asdict(),
+    )
+
+
+def substeps(config: WalkConfig) -> int:
+    """Milliseconds in a tick.
+
+    Raises:
+        InputError: a tick is no whole number of milliseconds.
+    """
+    count = round(config.gait.tick / TIME_STEP)
+    if count < 1 or abs(count * TIME_STEP - config.gait.tick) > 1e-9:
+        raise InputError(
+            f"GaitConfig.tick must be a multiple of {TIME_STEP} s, got {config.gait.tick}"
+        )
+    return count
+
+
+def first_tick(config: WalkConfig) -> int:
+    """Tick at which a walk in MuJoCo begins, standing."""
+    return config.gait.first_tick - config.gait.stand
+
+
+def walk_ticks(config: WalkConfig, seconds: float, start_tick: int) -> int:
+    """Ticks of a walk from t = 0 on.
+
+    Raises:
+        InputError: there are none, or t = 0 is not after the walk's first tick.
+    """
+    ticks = round(seconds / config.gait.tick)
+    if ticks < 1:
+        raise InputError(f"a walk needs at least one tick of {config.gait.tick} s, got {seconds} s")
+    if start_tick <= first_tick(config):
+        raise InputError(
+            f"a walk stands from tick {first_tick(config)} on; start_tick {start_tick} is not later"
+        )
+    return ticks
