@@ -27,17 +27,10 @@ from hector_jax.sim.loop import Job
 from hector_jax.storage import check_settings, load_tree, read_card, save_tree, write_file
 
 _UNITS = {
-    "period": "s",
-    "euler": "rad",
-    "position": "m",
-    "ang_velocity": "rad/s",
-    "velocity": "m/s",
-    "force": "N",
-    "moment": "N m",
-    "feet": "m",
-    "joints": "rad",
-    "duration": "s",
-    "start": "s",
+    **dict.fromkeys(("period", "duration", "start"), "s"),
+    **dict.fromkeys(("euler", "joints"), "rad"),
+    **dict.fromkeys(("position", "feet"), "m"),
+    **{"ang_velocity": "rad/s", "velocity": "m/s", "force": "N", "moment": "N m"},
 }
 
 
