@@ -64,8 +64,8 @@ class WalkBatch(NamedTuple):
     command: Command
     plant: Imperfections
     push: Push
-    start_tick: Int[Array, "*batch"]
-    model: dict[str, Array]  # leaves of the MJX model
+    start_tick: Int[Array | np.ndarray, "*batch"]
+    model: dict[str, Any]  # leaves of the MJX model
 
 
 class _Walk(NamedTuple):

@@ -126,7 +126,8 @@ def walk(
     lead = (job.start_tick - first_tick(config)) * count
     plant = _Plant(config, robot, job, -lead, length)
     ticks = list(_walk_ticks(config, robot, job, plant, length // count, on_sample, retune))
-    return _trajectory(*zip(*ticks, strict=True), count, lead, length, plant.broken)
+    plans, samples = zip(*ticks, strict=True)
+    return _trajectory(plans, samples, count, lead, length, plant.broken)
 
 
 def _walk_ticks(
