@@ -139,7 +139,9 @@ def _walks(robot: Robot) -> Walks:
 
 def _nets(robot: Robot) -> dict[str, Any]:
     walks = _walks(robot)
-    samples, _ = dataset.make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
+    samples, _ = dataset.make_dataset(
+        robot, walks.trajectory, walks.job.start_tick, push=walks.job.push
+    )
     seen, unseen = dataset.split_by_walk(samples)
     return {
         variant: training.train(TrainConfig(variant, epochs=3), seen, unseen)[0]

@@ -25,6 +25,7 @@ from hector_jax.grfm.network import (
 from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.robot.model import load_robot
+from hector_jax.storage import read_card, save_tree
 
 apply = jax.jit(lambda effect, window: effect(window))
 
@@ -206,6 +207,17 @@ def test_a_net_of_another_size_comes_back(tmp_path, data, robot):
         save_net(tmp_path / "net.npz", small, robot=robot, about={})
         again, _, _ = load_net(tmp_path / "net.npz", robot)
         jax.tree.map(np.testing.assert_array_equal, again, small)
+
+
+def test_a_net_from_a_file_of_the_old_names_comes_back(tmp_path, data, robot):
+    """The statistics were called `usual` and the residual's RMS `left`."""
+    params, path = untrained(data), tmp_path / "net.npz"
+    save_net(path, params, robot=robot, about={})
+    about = read_card(path)["about"]
+    fields = params._asdict()
+    old = {"usual": fields.pop("stats"), "left": fields.pop("residual_rms"), **fields}
+    save_tree(path, old, kind="grfm-residual", robot=robot, about=about)
+    jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], params)
 
 
 def test_a_net_of_another_variant_is_refused_by_name(tmp_path, params, robot):

@@ -1,14 +1,19 @@
 """Training GRFM-Net on walks that no simulator made."""
 
+from typing import NamedTuple
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from synthetic import synthetic_walk
 
+from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk
-from hector_jax.grfm.effect import last_command
+from hector_jax.grfm.effect import Phi, ground_effect, last_command
 from hector_jax.grfm.gated import fit_gated
-from hector_jax.grfm.network import as_effect
+from hector_jax.grfm.nets import NO_EPOCHS
+from hector_jax.grfm.network import VARIANTS, as_effect, load_net, save_net
 from hector_jax.grfm.paper import fit_linear
 from hector_jax.grfm.training import TrainConfig, errors, report, train
 from hector_jax.robot.model import load_robot
@@ -144,3 +149,47 @@ def test_no_samples_or_no_sense_are_refused(parts):
     broken = parts[0]._replace(label=jax.tree.map(lambda w: w * np.nan, parts[0].label))
     with pytest.raises(ValueError, match="training diverged"):
         train(TrainConfig(epochs=1, batch=64), broken, parts[1])
+
+
+# A variant of one's own: the ground returns a share of every command
+
+
+class Share(NamedTuple):
+    """What the ground returns of a command."""
+
+    share: jax.Array  # (2,) of the force and of the moment
+
+
+def init_share(key, hidden=()):
+    return Share(jnp.ones(2))
+
+
+def fit_share(config, training, validation, progress):
+    newest = [w[:, 0] for w in training.window.commands]
+    pairs = zip(newest, training.label, strict=True)
+    return Share(jnp.array([np.vdot(c, y) / np.vdot(c, c) for c, y in pairs])), NO_EPOCHS
+
+
+def apply_share(params, window):
+    force, moment = (w[0] for w in window.commands)
+    return ground_effect(Wrench(params.share[0] * force, params.share[1] * moment))
+
+
+SHARE = Phi("share", Share, init_share, fit_share, apply_share)
+
+
+def test_a_variant_is_added_in_one_place(parts, tmp_path, monkeypatch):
+    monkeypatch.setitem(VARIANTS, "share", SHARE)
+    params, _ = train(TrainConfig("share"), *parts)
+    assert errors(as_effect(params), parts[1]).force < errors(last_command, parts[1]).force
+    save_net(tmp_path / "net.npz", params, robot=load_robot(), about={})
+    again, variant, _ = load_net(tmp_path / "net.npz", load_robot())
+    assert variant == "share"
+    np.testing.assert_array_equal(again.share, params.share)
+
+
+@pytest.mark.parametrize(("name", "fit"), [("linear", fit_linear), ("gated", fit_gated)])
+def test_the_closed_forms_are_variants_too(parts, name, fit):
+    params, history = train(TrainConfig(name), *parts)
+    jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(fit(parts[0])))
+    assert history.valid_force.size == 0

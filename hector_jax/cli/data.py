@@ -78,7 +78,9 @@ def grfm(args: Grfm) -> None:
     with bar("predicting the ground forces of the walks") as tell:
         for done, (world, walks) in enumerate(worlds.items()):
             tell(3 * done, 3 * len(worlds), f"{world}: errors")
-            samples, _ = make_dataset(robot, walks.trajectory, walks.job.start_tick, walks.job.push)
+            samples, _ = make_dataset(
+                robot, walks.trajectory, walks.job.start_tick, push=walks.job.push
+            )
             errors = training.report(effects, samples)
             tell(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
             phases = fidelity.by_phase(effects, samples)

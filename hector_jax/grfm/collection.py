@@ -28,17 +28,10 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
 
 _UNITS = {
-    "period": "s",
-    "euler": "rad",
-    "position": "m",
-    "ang_velocity": "rad/s",
-    "velocity": "m/s",
-    "force": "N",
-    "moment": "N m",
-    "feet": "m",
-    "joints": "rad",
-    "duration": "s",
-    "start": "s",
+    **dict.fromkeys(("period", "duration", "start"), "s"),
+    **dict.fromkeys(("euler", "joints"), "rad"),
+    **dict.fromkeys(("position", "feet"), "m"),
+    **{"ang_velocity": "rad/s", "velocity": "m/s", "force": "N", "moment": "N m"},
 }
 
 

@@ -82,6 +82,7 @@ def make_dataset(
     robot: Robot,
     walks: Trajectory,
     start_tick: Any = 0,
+    *,
     push: Push = NO_PUSH,
     config: GaitConfig | None = None,
 ) -> tuple[Dataset, int]:

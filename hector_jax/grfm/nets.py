@@ -34,14 +34,8 @@ class FitConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check(
-            self,
-            epochs=AT_LEAST_ONE,
-            batch=AT_LEAST_ONE,
-            learning_rate=POSITIVE,
-            l2=NOT_NEGATIVE,
-            seed=SEED,
-        )
+        numbers = {"epochs": AT_LEAST_ONE, "batch": AT_LEAST_ONE, "seed": SEED}
+        check(self, learning_rate=POSITIVE, l2=NOT_NEGATIVE, **numbers)
 
 
 class History(NamedTuple):

@@ -18,19 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hector_jax.core.trajectory import Wrench, zero_wrench
+from hector_jax.grfm import nets
 from hector_jax.grfm.dataset import Dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, ground_effect, in_dtype_of
-from hector_jax.grfm.nets import (
-    NO_EPOCHS,
-    FitConfig,
-    History,
-    Progress,
-    Samples,
-    apply_net,
-    fit_nets,
-    init_nets,
-    widths,
-)
+from hector_jax.grfm.nets import NO_EPOCHS, FitConfig, History, Progress, Samples
 
 _INPUTS = 6 * HISTORY
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
@@ -96,9 +87,9 @@ def _effect(scaling: Scaling, flat: Wrench) -> Effect:
 
 def init(key: Key[Array, ""], hidden: tuple[int, ...] = (64, 64, 64)) -> PaperParams:
     """Fresh networks without statistics, in 32 bits."""
-    nets = init_nets(key, hidden, _INPUTS, outputs=6, members=1)
+    fresh = nets.init_nets(key, hidden, _INPUTS, outputs=6, members=1)
     scaling = Scaling(zero_wrench(), zero_wrench())
-    params = PaperParams(*jax.tree.map(lambda p: p[0], nets), scaling, scaling)
+    params = PaperParams(*jax.tree.map(lambda p: p[0], fresh), scaling, scaling)
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 
@@ -131,7 +122,7 @@ def fit(
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
     training = with_mirror(training) if config.mirror else training
     params = with_statistics(init(key_init), training)
-    best, history = fit_nets(
+    best, history = nets.fit_nets(
         config,
         key_shuffle,
         jax.tree.map(lambda p: p[None], Wrench(params.force, params.moment)),
@@ -149,11 +140,11 @@ def apply(params: PaperParams, window: Window) -> Effect:
     """Effect of a trained net for one window."""
     params = in_dtype_of(window, params)
     x = _features(params.inputs, window.commands)
-    flat = Wrench(apply_net(params.force, x.force), apply_net(params.moment, x.moment))
+    flat = Wrench(nets.apply_net(params.force, x.force), nets.apply_net(params.moment, x.moment))
     return _effect(params.outputs, flat)
 
 
-PAPER = Phi("paper", PaperParams, init, fit, apply, widths=lambda params: widths(params.force))
+PAPER = Phi("paper", PaperParams, init, fit, apply, lambda p: nets.widths(p.force))
 
 
 def init_linear(key: Key[Array, ""], hidden: tuple[int, ...] = ()) -> LinearMap:

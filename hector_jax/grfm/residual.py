@@ -16,32 +16,11 @@ from jaxtyping import Array, Float, Key
 
 from hector_jax.control.gait import GaitConfig, since_switch
 from hector_jax.core.trajectory import Wrench
-from hector_jax.grfm import gated
+from hector_jax.grfm import gated, nets
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import Effect, Phi, Window, in_dtype_of
-from hector_jax.grfm.gated import (
-    CHANGES,
-    GATES,
-    MOTION,
-    GatedMap,
-    View,
-    apply_gated,
-    fit_gated,
-    from_views,
-    hats,
-    labels_in_view,
-    views,
-)
-from hector_jax.grfm.nets import (
-    FitConfig,
-    History,
-    Progress,
-    Samples,
-    apply_net,
-    fit_nets,
-    init_nets,
-    widths,
-)
+from hector_jax.grfm.gated import CHANGES, GATES, MOTION, GatedMap, View, hats, views
+from hector_jax.grfm.nets import FitConfig, History, Progress, Samples
 
 HIDDEN = (32, 32)
 MEMBERS = 4  # nets of each kind
@@ -70,16 +49,17 @@ class ResidualParams(NamedTuple):
 
 def init(key: Key[Array, ""], hidden: tuple[int, ...] = HIDDEN) -> ResidualParams:
     """Fresh networks without statistics, in 32 bits; the axis of ticks has length 0."""
-    nets = init_nets(key, hidden, _TERMS + len(GATES) + 1, outputs=3, members=MEMBERS)
+    inputs = _TERMS + len(GATES) + 1
+    fresh = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS)
     table = jnp.zeros((2, 0, _TERMS))
     stats = FeatureStats(table, table, jnp.zeros(()))
-    params = ResidualParams(gated.init(key), *nets, stats, jnp.zeros(6))
+    params = ResidualParams(gated.init(key), *fresh, stats, jnp.zeros(6))
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 
 def with_statistics(params: ResidualParams, dataset: Dataset) -> ResidualParams:
     """The same networks with the linear part and the statistics of a training set."""
-    linear = fit_gated(dataset)
+    linear = gated.fit_gated(dataset)
     fitted = linear, *_fit_stats(linear, dataset)
     linear, stats, rms = jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), fitted)
     return params._replace(linear=linear, stats=stats, residual_rms=rms)
@@ -90,7 +70,8 @@ def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.nda
 
     def one(window: Window) -> tuple[View, Array, Array]:
         view = views(window)
-        return view, hats(window.since_switch, linear.ticks), apply_gated(linear, window, view)[0]
+        ground, _ = gated.apply_gated(linear, window, view)
+        return view, hats(window.since_switch, linear.ticks), ground
 
     window = jax.tree.map(jnp.asarray, dataset.window)
     view, tick, ground = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(window))
@@ -106,7 +87,7 @@ def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.nda
     stats = FeatureStats(mean, scale, np.asarray(1.0))
     z = np.asarray(_standard_terms(stats, terms, view.stands.astype(int), tick))
     reach = np.quantile(np.mean(z**2, axis=-1), FAMILIAR)
-    rms = np.sqrt(np.mean((labels_in_view(dataset)[0] - ground) ** 2, axis=(0, 1)))
+    rms = np.sqrt(np.mean((gated.labels_in_view(dataset)[0] - ground) ** 2, axis=(0, 1)))
     return stats._replace(reach=np.maximum(reach, 1e-6)), np.where(rms > 0.0, rms, 1.0)
 
 
@@ -140,12 +121,12 @@ def _output(raw: Array, trust: Array) -> Array:
 def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
     def one(window: Window) -> tuple[Array, Array, Array]:
         view = views(window)
-        ground, _ = apply_gated(params.linear, window, view)
+        ground, _ = gated.apply_gated(params.linear, window, view)
         return ground, *_inputs(params, window, view)
 
     window = jax.tree.map(jnp.asarray, dataset.window)
     ground, z, trust = jax.jit(jax.vmap(one))(window)
-    residual = (labels_in_view(dataset)[0] - ground) / params.residual_rms
+    residual = (gated.labels_in_view(dataset)[0] - ground) / params.residual_rms
     y = Wrench(residual[..., :3], residual[..., 3:])
     samples = Samples(Wrench(z, z), y, trust[..., None])
     return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
@@ -157,7 +138,7 @@ def fit(
     """Fit the linear part, then train the nets on what it leaves; see `nets.fit_nets`."""
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
     params = with_statistics(init(key_init), training)
-    best, history = fit_nets(
+    best, history = nets.fit_nets(
         config,
         key_shuffle,
         Wrench(params.force, params.moment),
@@ -174,17 +155,15 @@ def apply(params: ResidualParams, window: Window) -> Effect:
     """Effect of a trained net for one window."""
     params, window = in_dtype_of(window, params), in_dtype_of(window, window)
     view = views(window)
-    ground, legs = apply_gated(params.linear, window, view)
+    ground, legs = gated.apply_gated(params.linear, window, view)
     x, trust = _inputs(params, window, view)
-    members = jax.vmap(lambda net: _bounded(apply_net(net, x)))
+    members = jax.vmap(lambda net: _bounded(nets.apply_net(net, x)))
     added = jnp.concatenate([members(params.force), members(params.moment)], axis=-1)
     added = trust[:, None] * params.residual_rms * added
-    return Effect(from_views(ground + added.mean(axis=0)), legs)
+    return Effect(gated.from_views(ground + added.mean(axis=0)), legs)
 
 
-RESIDUAL = Phi(
-    "residual", ResidualParams, init, fit, apply, widths=lambda params: widths(params.force)
-)
+RESIDUAL = Phi("residual", ResidualParams, init, fit, apply, lambda p: nets.widths(p.force))
 
 
 def plain_net(gait: GaitConfig) -> ResidualParams:
@@ -204,5 +183,5 @@ def member_params(params: ResidualParams) -> ResidualParams:
     """The members of the ensemble alone, each an ensemble of one, stacked on a first axis."""
     alone = lambda p: jnp.asarray(p)[:, None]  # noqa: E731
     shared = lambda p: jnp.broadcast_to(jnp.asarray(p), (MEMBERS, *jnp.shape(p)))  # noqa: E731
-    nets = {name: jax.tree.map(alone, getattr(params, name)) for name in ("force", "moment")}
-    return jax.tree.map(shared, params)._replace(**nets)
+    own = {name: jax.tree.map(alone, getattr(params, name)) for name in ("force", "moment")}
+    return jax.tree.map(shared, params)._replace(**own)

@@ -497,7 +497,7 @@ def samples(robot: Robot, *folders: Path) -> Samples:
 def _samples(robot: Robot, folder: Path) -> Samples:
     walks = collection.load_walks(folder, robot)
     found, dropped = dataset.make_dataset(
-        robot, walks.trajectory, walks.job.start_tick, walks.job.push
+        robot, walks.trajectory, walks.job.start_tick, push=walks.job.push
     )
     rest, held_out = dataset.split_by_walk(found)
     return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)

@@ -124,7 +124,6 @@ def contact_wrench(
     robot: Robot,
     before: Float[Array, "43"],
     contacts: Contacts,
-    *,
     floor: Int[Array, ""],
     foot_of_geom: Int[Array, " ngeom"],
 ) -> tuple[Wrench, Touches]:
@@ -146,10 +145,10 @@ def sample(
     robot: Robot,
     command: Command,
     anchor: Anchor,
-    *,
     time: Float[Array, ""],
     yaw: Float[Array, ""],
     after: Float[Array, "43"],
+    *,
     effect: Wrench,
     touches: Touches,
 ) -> Sample:

@@ -31,20 +31,9 @@ STEPS, SINGLE_STEPS = (10, 10), (6, 6)
 
 # Fields of a model that a plant's numbers change.
 _VARIED = (
-    "body_inertia",
-    "body_invweight0",
-    "body_ipos",
-    "body_mass",
-    "body_subtreemass",
-    "dof_armature",
-    "dof_damping",
-    "dof_frictionloss",
-    "dof_invweight0",
-    "dof_M0",
-    "geom_friction",
-    "geom_solref",
-    "jnt_range",
-)
+    "body_inertia body_invweight0 body_ipos body_mass body_subtreemass dof_armature dof_damping "
+    "dof_frictionloss dof_invweight0 dof_M0 geom_friction geom_solref jnt_range"
+).split()
 
 
 @dataclass(frozen=True)

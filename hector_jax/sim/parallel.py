@@ -23,30 +23,10 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
 from hector_jax.core.tree import stack, where
 from hector_jax.robot.model import Robot
-from hector_jax.sim import sensing
+from hector_jax.sim import loop, mjx_model, sensing
 from hector_jax.sim.actuators import Motors, init_actuators
-from hector_jax.sim.loop import (
-    Job,
-    Sample,
-    as_trajectory,
-    contact_wrench,
-    first_tick,
-    measure,
-    motor_torques,
-    plan_tick,
-    sample,
-    substeps,
-    walk_ticks,
-)
-from hector_jax.sim.mjx_model import (
-    Places,
-    batched_model,
-    find_places,
-    in_floor,
-    mjx,
-    mjx_contacts,
-    to_single,
-)
+from hector_jax.sim.loop import Job, Sample, first_tick, substeps
+from hector_jax.sim.mjx_model import mjx
 from hector_jax.sim.sensing import Touches
 from hector_jax.sim.world import Imperfections, Push, build_worlds, push_force, standing_qpos
 
@@ -60,7 +40,7 @@ class _Program:
     """What the walks of a batch are compiled for."""
 
     config: WalkConfig
-    places: Places
+    places: mjx_model.Places
     last_start: int  # latest start tick of the batch
     ticks: int  # from t = 0
     fine: bool  # samples of 1 ms
@@ -84,8 +64,8 @@ class WalkBatch(NamedTuple):
     command: Command
     plant: Imperfections
     push: Push
-    start_tick: Int[Array, "*batch"]
-    model: dict[str, Array]  # leaves of the MJX model
+    start_tick: Int[Array | np.ndarray, "*batch"]
+    model: dict[str, Any]  # leaves of the MJX model
 
 
 class _Walk(NamedTuple):
@@ -157,22 +137,18 @@ def _millisecond(
     robot, job, places = walk.robot, walk.job, program.places
     before = _read(program, walk, carry.physics)
     held = carry.memory, carry.plan, carry.motors, carry.yaw
-    motors, yaw, torque = motor_torques(
+    motors, yaw, torque = loop.motor_torques(
         program.config, robot, job.plant, *held, substep, before, walk.error
     )
     force = push_force(job.push, (tick - job.start_tick) * program.substeps + substep)
     physics, data = _step_physics(program, walk, carry.physics, torque=torque, force=force)
     wide = lambda x: x.astype(before.dtype) if x.dtype == data.qpos.dtype else x  # noqa: E731
-    effect, touches = contact_wrench(
-        robot,
-        before,
-        jax.tree.map(wide, mjx_contacts(data)),
-        floor=jnp.asarray(places.floor),
-        foot_of_geom=jnp.asarray(places.foot_of_geom),
-    )
+    contacts = jax.tree.map(wide, mjx_model.mjx_contacts(data))
+    place = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
+    effect, touches = loop.contact_wrench(robot, before, contacts, *place)
     reading = sensing.unpack_reading(_read(program, walk, physics))
     down = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
-    fallen = carry.fallen | down | touches.floor | in_floor(places, walk.model, data)
+    fallen = carry.fallen | down | touches.floor | mjx_model.in_floor(places, walk.model, data)
     moved = carry._replace(physics=physics, motors=motors, yaw=yaw)
     return where(fallen, carry, moved)._replace(
         fallen=fallen,
@@ -186,17 +162,12 @@ def _sample(
 ) -> tuple[_Carry, Sample]:
     carry = carry._replace(effect=zero_wrench(), legs=jnp.zeros((), bool))
     carry, _ = jax.lax.scan(partial(_millisecond, program, walk), carry, when)
-    now = sample(
-        program.config,
-        walk.robot,
-        walk.job.command,
-        carry.anchor,
-        time=when[0][-1] + (when[1][-1] + 1) / program.substeps,
-        yaw=carry.yaw,
-        after=_read(program, walk, carry.physics),
-        effect=jax.tree.map(lambda w: w / program.period, carry.effect),
-        touches=Touches(carry.fallen, carry.legs),
-    )
+    time = when[0][-1] + (when[1][-1] + 1) / program.substeps
+    after = _read(program, walk, carry.physics)
+    known = walk.robot, walk.job.command, carry.anchor, time, carry.yaw, after
+    effect = jax.tree.map(lambda w: w / program.period, carry.effect)
+    touches = Touches(carry.fallen, carry.legs)
+    now = loop.sample(program.config, *known, effect=effect, touches=touches)
     carry = carry._replace(last=where(carry.fallen, carry.last, now))
     return carry, carry.last._replace(fallen=carry.fallen)
 
@@ -206,7 +177,7 @@ def _plan(
 ) -> tuple[Memory, Plan]:
     job, reading = walk.job, _read(program, walk, carry.physics)
     asked = carry.anchor, tick, carry.memory, carry.yaw, reading, walk.error
-    return plan_tick(program.config, walk.robot, job.weights, job.command, *asked, slots=slots)
+    return loop.plan_tick(program.config, walk.robot, job.weights, job.command, *asked, slots=slots)
 
 
 def _tick(
@@ -233,29 +204,21 @@ def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     yaw, never, tick = jnp.zeros(()), jnp.zeros((), bool), jnp.asarray(first_tick(config))
     reading = _read(program, walk, physics)
     anchor = standing_anchor(robot)._replace(tick=job.start_tick)
-    memory = init_memory(robot, measure(robot, reading, yaw, walk.error))
+    memory = init_memory(robot, loop.measure(robot, reading, yaw, walk.error))
     asked = anchor, tick, memory, yaw, reading, walk.error
     shapes = jax.eval_shape(
-        lambda: plan_tick(config, robot, job.weights, job.command, *asked, slots=2)[1]
+        lambda: loop.plan_tick(config, robot, job.weights, job.command, *asked, slots=2)[1]
     )
-    now = sample(
-        config,
-        robot,
-        job.command,
-        anchor,
-        time=1.0 * tick,
-        yaw=yaw,
-        after=reading,
-        effect=zero_wrench(),
-        touches=Touches(never, never),
-    )
+    known = robot, job.command, anchor, 1.0 * tick, yaw, reading
+    touches = Touches(never, never)
+    now = loop.sample(config, *known, effect=zero_wrench(), touches=touches)
     return _Carry(
         memory=memory,
         plan=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
         motors=init_actuators(),
         anchor=anchor,
         yaw=yaw,
-        physics=to_single(physics) if program.single else physics,
+        physics=mjx_model.to_single(physics) if program.single else physics,
         fallen=never,
         effect=zero_wrench(),
         legs=never,
@@ -269,7 +232,7 @@ def _walk_one(
     model = model.replace(**job.model)
     data = mjx.make_data(model)
     if program.single:
-        model, data = to_single((model, data))
+        model, data = mjx_model.to_single((model, data))
     walk = _Walk(robot, job, model, data, error=jnp.zeros(sensing.ERRORS))
     carry = _standing(program, walk, _Physics(qpos, jnp.zeros(model.nv), jnp.zeros(model.nv)))
     begin, each = first_tick(program.config), program.substeps // program.period
@@ -283,7 +246,7 @@ def _walk_one(
     initial = jax.tree.map(lambda x: x[lead - 1], samples.state)
     own = partial(jax.lax.dynamic_slice_in_dim, start_index=lead, slice_size=program.ticks * each)
     plans, samples = jax.tree.map(own, (plans, samples))
-    return as_trajectory(jnp.asarray(1e-3 * program.period), initial, plans, samples)
+    return loop.as_trajectory(jnp.asarray(1e-3 * program.period), initial, plans, samples)
 
 
 @partial(jax.jit, static_argnames="program")
@@ -352,12 +315,14 @@ def walk_batch(
     if not jobs:
         return iter(())
     _check_batch(jobs)
-    ticks = [walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
+    ticks = [loop.walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
     worlds = build_worlds([job.imperfections for job in jobs], robot.description)
-    model, varied = batched_model(worlds, single)
+    model, varied = mjx_model.batched_model(worlds, single)
     qpos = jnp.asarray(standing_qpos(worlds[0], robot.standing_joints, float(robot.trunk_height)))
     each = (stack(values) for values in zip(*((*job[:3], job.push) for job in jobs), strict=True))
     starts = np.array([job.start_tick for job in jobs], np.int32)
-    program = _Program(config, find_places(worlds[0]), int(starts.max()), ticks, fine, single)
+    program = _Program(
+        config, mjx_model.find_places(worlds[0]), int(starts.max()), ticks, fine, single
+    )
     walk = partial(_walk_all, program, robot, model, qpos)
     return _in_chunks(WalkBatch(*each, starts, varied), chunk, walk)

@@ -8,9 +8,9 @@ never started afresh.
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from functools import cache, partial
 from itertools import repeat
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -24,61 +24,37 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, quiet_mujoco
-from hector_jax.sim import sensing
+from hector_jax.sim import loop, sensing
 from hector_jax.sim.actuators import init_actuators
 from hector_jax.sim.changes import worlds_by_step
-from hector_jax.sim.loop import (
-    Job,
-    Sample,
-    as_trajectory,
-    contact_wrench,
-    first_tick,
-    measure,
-    motor_torques,
-    plan_tick,
-    sample,
-    substeps,
-    walk_ticks,
-)
+from hector_jax.sim.loop import Job, Sample, first_tick, substeps
 from hector_jax.sim.sensing import Contacts
 from hector_jax.sim.world import World, build_world, push_force, standing_qpos
 
 
-@dataclass(frozen=True)
-class _Programs:
-    """The compiled parts of the loop."""
-
-    begin: Callable
-    measure: Callable
-    plan: Callable
-    torques: Callable
-    samples: Callable
-
-
 @cache
-def _programs(config: WalkConfig) -> _Programs:
+def _programs(config: WalkConfig) -> SimpleNamespace:
+    """The compiled parts of the loop."""
+    count = substeps(config)
+
     def begin(robot: Robot, reading: Array) -> Memory:
         still = jnp.zeros(()), jnp.zeros(sensing.ERRORS)
-        return init_memory(robot, measure(robot, reading, *still))
+        return init_memory(robot, loop.measure(robot, reading, *still))
 
-    def samples(robot, command, anchor, tick, yaw, readings, contacts, floor, foot_of_geom):
-        count = substeps(config)
-
+    def samples(robot, command, anchor, tick, yaw, readings, contacts, place) -> Sample:
         def one(time: Array, before: Array, after: Array, contacts: Contacts) -> Sample:
-            effect, touches = contact_wrench(
-                robot, before, contacts, floor=floor, foot_of_geom=foot_of_geom
-            )
-            true = {"time": time, "yaw": yaw, "after": after, "effect": effect, "touches": touches}
-            return sample(config, robot, command, anchor, **true)
+            effect, touches = loop.contact_wrench(robot, before, contacts, *place)
+            known = robot, command, anchor, time, yaw, after
+            return loop.sample(config, *known, effect=effect, touches=touches)
 
         times = tick + (1 + jnp.arange(count)) / count
         return jax.vmap(one)(times, readings[:-1], readings[1:], contacts)
 
-    return _Programs(
+    return SimpleNamespace(
         begin=jax.jit(begin),
-        measure=jax.jit(measure),
-        plan=jax.jit(partial(plan_tick, config), static_argnames="slots"),
-        torques=jax.jit(partial(motor_torques, config)),
+        measure=jax.jit(loop.measure),
+        plan=jax.jit(partial(loop.plan_tick, config), static_argnames="slots"),
+        torques=jax.jit(partial(loop.motor_torques, config)),
         samples=jax.jit(samples),
     )
 
@@ -147,11 +123,12 @@ def walk(
             number of ticks.
     """
     count = substeps(config)
-    length = walk_ticks(config, job.seconds, job.start_tick) * count
+    length = loop.walk_ticks(config, job.seconds, job.start_tick) * count
     lead = (job.start_tick - first_tick(config)) * count
     plant = _Plant(config, robot, job, -lead, length)
     ticks = list(_walk_ticks(config, robot, job, plant, length // count, on_sample, retune))
-    return _trajectory(*zip(*ticks, strict=True), count, lead, length, plant.broken)
+    plans, samples = zip(*ticks, strict=True)
+    return _trajectory(plans, samples, count, lead, length, plant.broken)
 
 
 def _walk_ticks(
@@ -198,7 +175,7 @@ def _walk_ticks(
             if on_sample is not None:
                 on_sample(plant.world, plant.data)
         truth = now, yaw_before, plant.readings, plant.contacts
-        samples = programs.samples(body, command, anchor, *truth, *place)
+        samples = programs.samples(body, command, anchor, *truth, place)
         yield plan, samples
         if np.asarray(samples.fallen).any() or plant.broken:
             return
@@ -225,7 +202,7 @@ def _trajectory(
     plan = jax.tree.map(lambda x: x[rows // count], stack(plans))
     initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
     held = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=wanted > good)
-    return as_trajectory(np.array(TIME_STEP), initial, plan, held)
+    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, held)
 
 
 def walk_many(

@@ -83,14 +83,9 @@ def truth() -> Estimator:
     return Estimator(*(np.zeros(()) for _ in Estimator._fields))
 
 
-def _numbers(estimator: Estimator | None = None, **values: object) -> Imperfections:
-    arrays = {name: np.asarray(value, float) for name, value in values.items()}
-    return Imperfections(**arrays, estimator=truth() if estimator is None else estimator)
-
-
 def ideal() -> Imperfections:
     """For checking the controller: firm ground, joint damping 0.1, nothing else."""
-    return _numbers(
+    values = dict(
         joint_friction=0.0,
         joint_damping=0.1,
         armature=1.0,
@@ -104,23 +99,19 @@ def ideal() -> Imperfections:
         mass=1.0,
         trunk_com=np.zeros(3),
     )
+    arrays = {name: np.asarray(value, float) for name, value in values.items()}
+    return Imperfections(**arrays, estimator=truth())
 
 
 def hfs() -> Imperfections:
     """The high-fidelity simulator: friction, backlash, delay, lag and linkage as in the paper's."""
-    return _numbers(
-        joint_friction=0.3,
-        joint_damping=0.3,
-        armature=1.0,
-        backlash=0.005,
-        delay=0.002,
-        lag=0.004,
-        torque_gain=np.ones(10),
-        linkage=0.5,
-        contact_time=0.01,
-        floor_friction=0.8,
-        mass=1.0,
-        trunk_com=np.zeros(3),
+    return ideal()._replace(
+        joint_friction=np.asarray(0.3),
+        joint_damping=np.asarray(0.3),
+        backlash=np.asarray(0.005),
+        delay=np.asarray(0.002),
+        lag=np.asarray(0.004),
+        linkage=np.asarray(0.5),
     )
 
 
@@ -138,17 +129,8 @@ def hfs_drawn(seed: int, share: float = 0.2) -> Imperfections:
     """
     base, rng = hfs(), np.random.default_rng([0x4F5, round(1000 * share), seed])
     within = lambda value, part: np.asarray(value * rng.uniform(1 - part, 1 + part))  # noqa: E731
-    names = (
-        "joint_friction",
-        "joint_damping",
-        "armature",
-        "backlash",
-        "delay",
-        "lag",
-        "linkage",
-        "contact_time",
-        "floor_friction",
-    )
+    apart = ("torque_gain", "mass", "trunk_com", "estimator")  # drawn after the others
+    names = [name for name in base._fields if name not in apart]
     drawn = base._replace(**{name: within(getattr(base, name), share) for name in names})
     return drawn._replace(
         floor_friction=np.maximum(drawn.floor_friction, 0.6),

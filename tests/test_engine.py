@@ -1,0 +1,53 @@
+"""Engines as values: what is chosen once and passed down, and how one is added."""
+
+import jax
+import numpy as np
+import pytest
+
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.walking import WalkConfig
+from hector_jax.control.weights import nominal
+from hector_jax.core.inputs import InputError
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
+from hector_jax.sim.engine import ENGINES, MJX, MUJOCO_C, Engine, choose_engine
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import ideal
+from hector_jax.tuning.rollout import RolloutConfig, rollout
+
+
+def walk_rigid(pool, config, robot, jobs, *, exact=True, batch=0):
+    """The plain single rigid body as an engine: it knows no plant, and samples once per tick."""
+    walked = jax.jit(rollout, static_argnums=0)
+    for job in jobs:
+        rollout_config = RolloutConfig(config, ticks=round(job.seconds / config.gait.tick))
+        anchor = standing_anchor(robot, job.start_tick)
+        known = job.weights, job.command, anchor, last_command
+        yield jax.device_get(walked(rollout_config, robot, *known))
+
+
+RIGID = Engine("rigid", walk_rigid, lambda exact: 64)
+
+
+def test_an_engine_is_added_in_one_place(monkeypatch):
+    monkeypatch.setitem(ENGINES, "rigid", RIGID)
+    engine = choose_engine("rigid")
+    jobs = [Job(nominal(), named_command("straight"), ideal(), 0.5, start_tick=i) for i in (0, 20)]
+    left, right = engine.walk(None, WalkConfig(), load_robot(), jobs)
+    assert left.fallen.shape == (50,)
+    assert not left.fallen.any()
+    np.testing.assert_array_equal(left.contact[0], ~right.contact[0])
+
+
+def test_auto_is_mjx_where_there_is_an_accelerator(monkeypatch):
+    assert choose_engine("c") is MUJOCO_C
+    assert choose_engine("mjx") is MJX
+    for backend, engine, bits in (("cpu", MUJOCO_C, 64), ("gpu", MJX, 32)):
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        assert choose_engine("auto") is engine
+        assert (engine.bits(False), engine.bits(True)) == (bits, 64)
+
+
+def test_an_unknown_engine_is_refused_by_name():
+    with pytest.raises(InputError, match="engine must be 'auto', 'c' or 'mjx', got 'mjxx'.*'mjx'"):
+        choose_engine("mjxx")
