@@ -27,6 +27,7 @@ from typing import NamedTuple
 import alignment
 import jax
 import numpy as np
+import plots
 import tyro
 from lib import write_report
 
@@ -49,7 +50,6 @@ from hector_jax.core.trajectory import Load, Trajectory
 from hector_jax.grfm.dataset import walked_with
 from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect, linear_effect
-from hector_jax.report import plots
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, pipeline
 from hector_jax.sim.walk import Job, walk_many
