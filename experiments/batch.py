@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import plots
 import tyro
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
@@ -33,7 +34,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net, member_effects
-from hector_jax.report import plots
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, pipeline

@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import plots
 import tyro
 
 from hector_jax.control.reference import COMMANDS, named_command
@@ -40,7 +41,6 @@ from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
-from hector_jax.report import plots
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
@@ -372,7 +372,7 @@ def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
                 continue
             ends = window * np.arange(1, 1 + max(len(c) for c in courses.values()))
             file = f"weights-{which}.png"
-            caption = plots.weight_courses(
+            caption = plots.weight_histories(
                 flags.out / file, flags.change, ends, WEIGHT_NAMES, courses
             )
             pictures.append((file, f"Start: {which}, plant {names[0]}. {caption}"))

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import plots
 import tyro
 
 from hector_jax.control.reference import Command, named_command, standing_anchor
@@ -37,7 +38,6 @@ from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
-from hector_jax.report import plots
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import pipeline
@@ -357,7 +357,7 @@ def report(
         count = [walks(turns) for turns, _ in each]
         rows.append(
             [
-                plots.RIVALS[method],
+                plots.METHODS[method],
                 str(len(each)),
                 *(cell(losses) for losses in after.values()),
                 own,
@@ -418,7 +418,7 @@ def _words(
     took: Mapping[str, float] | None,
 ) -> list[str]:
     iterations = ", ".join(
-        f"{plots.RIVALS[n]} {prices.iterations[n]:.2f} s ({c.iterations} of them; compiling took "
+        f"{plots.METHODS[n]} {prices.iterations[n]:.2f} s ({c.iterations} of them; compiling took "
         f"{c.compiling:.0f} s and is not counted)"
         for n, c in courses.items()
     )

@@ -20,6 +20,7 @@ from typing import Annotated, NamedTuple
 
 import jax
 import numpy as np
+import plots
 import tyro
 from lib import write_report
 from scenes import (
@@ -42,7 +43,6 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import SOLVED
-from hector_jax.report import plots
 from hector_jax.report.report import WORLDS
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import kept, metrics

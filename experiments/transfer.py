@@ -27,6 +27,7 @@ from typing import NamedTuple
 import alignment
 import jax
 import numpy as np
+import plots
 import tyro
 from lib import write_report
 
@@ -52,7 +53,6 @@ from hector_jax.core.trajectory import Load, Trajectory
 from hector_jax.grfm.collection import walked_with
 from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect
-from hector_jax.report import plots
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import kept, pipeline
 from hector_jax.sim.engine import choose_engine

@@ -10,6 +10,7 @@ from synthetic import synthetic_walk
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.core.trajectory import Wrench
+from hector_jax.core.tree_file import read_card, save_tree
 from hector_jax.grfm import paper, residual
 from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Window, last_command
@@ -25,7 +26,6 @@ from hector_jax.grfm.network import (
 from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, plain_net
 from hector_jax.robot.model import load_robot
-from hector_jax.storage import read_card, save_tree
 
 apply = jax.jit(lambda effect, window: effect(window))
 

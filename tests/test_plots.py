@@ -12,7 +12,9 @@ from hector_jax.core.trajectory import State
 from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
+from hector_jax.report.motion import COLOURS, motions
 from hector_jax.report.plots.style import looks_of
+from hector_jax.robot.model import load_robot
 from hector_jax.tuning.loss import LossConfig
 
 FOUR = ("nominal", "expert", "without", "with")
@@ -70,13 +72,12 @@ def test_lines_end_at_a_fall(tmp_path, drawn, walks):
 
 
 def test_below_a_film_stand_the_distances_and_where_the_axes_are(tmp_path, drawn, walks):
-    pair = {name: walks[name] for name in ("nominal", "with")}
-    red, green = (255, 0, 0), (0, 255, 0)
-    box = plots.distances(tmp_path / "a.png", pair, (red, green), 800, 132)
+    pair = motions(load_robot(), {name: walks[name] for name in ("nominal", "with")})
+    box = plots.distances(tmp_path / "a.png", pair, 800, 132)
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (800, 132)
         inside = np.asarray(picture.convert("RGB"))[box[1] : box[3], box[0] : box[2]]
-    for colour in (red, green):
+    for colour in COLOURS:
         assert (np.abs(inside.astype(int) - colour).sum(axis=-1) < 30).any()
     away = (walks["with"].state.position - walks["with"].reference.position)[:, :2]
     found = lines(drawn[0].axes[0])
@@ -178,7 +179,7 @@ def test_wrenches_are_those_of_the_foot_that_is_asked_for(tmp_path, drawn, walks
     walk = walks["with"]
     curves = {"commanded": walk.command, "measured": walk.effect}
     for foot, side in enumerate(("left", "right")):
-        assert f"{side} foot" in plots.wrenches(tmp_path / "a.png", 0.01, curves, foot)
+        assert f"{side} foot" in plots.wrenches(tmp_path / "a.png", 0.01, curves, foot=foot)
         up = drawn[foot].axes[2]
         assert up.get_ylabel() == "$F_z$ [N]"
         found = {step.get_label(): step.get_data().values for step in up.patches}
@@ -205,61 +206,6 @@ def test_open_loop_errors_have_a_row_for_each_world(tmp_path, drawn):
     assert rows == ["hfs"] * 2 + ["hardware stand-in"] * 2
     np.testing.assert_allclose(lines(drawn[0].axes[0])["measured"][:, 1], 10 * time**2 / 6)
     assert len(set(legend_of(drawn[0]))) == len(names)
-
-
-def test_tuning_while_walking_is_drawn_with_walks_that_ended_early(tmp_path, drawn):
-    times = 0.4 * np.arange(1, 21)
-    arms = {"fixed": np.array([[1.0], [3.0], [9.0]]), "carried": np.ones((3, 1))}
-    curves = {
-        (name, "nominal"): {arm: 1e6 * x * np.ones((3, 20)) for arm, x in arms.items()}
-        for name in ("straight", "s")
-    }
-    plots.while_walking(tmp_path / "loss.png", 4.0, times, curves)
-    assert set(lines(drawn[0].axes[0])["weights stay"][:, 1]) == {3.0}
-    assert drawn[0].axes[0].get_ylabel() == "L of 0.4 s [10$^6$]"
-    ratios = np.exp(np.linspace(0.0, 1.0, 20)[:, None] * np.linspace(-1, 1, len(WEIGHT_NAMES)))
-    plots.weight_courses(
-        tmp_path / "weights.png", 4.0, times, WEIGHT_NAMES, {"straight": ratios, "c": ratios[:7]}
-    )
-    straight, c = (lines(axes) for axes in drawn[1].axes)
-    np.testing.assert_allclose(straight["Q roll"][:, 1], ratios[:, 0])  # it moved most
-    assert len(c["Q roll"]) == 7
-
-
-def test_sets_of_batches_stand_at_their_ratio_and_in_the_order_of_their_losses(tmp_path, drawn):
-    ratios = {"expert": np.array([0.8, 0.7]), "straight alone": np.array([0.3, 0.5])}
-    plots.ratios(tmp_path / "a.png", ("straight", "c"), ratios)
-    found = lines(drawn[0].axes[0])
-    assert found["straight alone"][:, 1].tolist() == [0.3, 0.5]
-    assert found["straight alone"][0, 0] != found["expert"][0, 0]
-    plots.by_plant(tmp_path / "b.png", {"nominal": np.array([4e7, 1e6, 2e6, 3e6])})
-    assert lines(drawn[1].axes[0])["nominal"].tolist() == [
-        [12.5, 1.0],
-        [37.5, 2.0],
-        [62.5, 3.0],
-        [87.5, 40.0],
-    ]
-
-
-def test_a_front_leaves_out_what_failed_and_labels_the_ends_and_the_papers_price(tmp_path, drawn):
-    prices = np.geomspace(0.01, 100, 9)
-    falling = 1e6 * np.stack([3 * prices**-0.4, 0.4 + 0.05 * prices**0.3], axis=1)
-    worlds = {"rigid body": falling.copy(), "hfs": 1.3 * falling}
-    worlds["rigid body"][0] = np.nan
-    plots.front(tmp_path / "c.png", prices, worlds, {"expert": (2e6, 6e5)})
-    model, hfs = drawn[0].axes
-    np.testing.assert_allclose(lines(model)["tuned"], falling[1:] / 1e6)
-    assert [text.get_text() for text in model.texts] == ["x0.032", "x1", "x100"]
-    assert [text.get_text() for text in hfs.texts] == ["x0.01", "x1", "x100"]
-    assert lines(hfs)["expert"].tolist() == [[2.0, 0.6]]
-
-
-def test_starts_end_where_their_last_accepted_step_is(tmp_path, drawn):
-    curves = 1e6 * np.array([[4.0, 3.0, 2.0], [9.0, np.nan, 5.0], [8.0, 1.0, np.nan]])
-    plots.starts(tmp_path / "d.png", curves)
-    way, end = drawn[0].axes
-    assert lines(way)["from elsewhere"].tolist() == [[0.0, 9.0], [2.0, 5.0]]
-    assert end.lines[0].get_ydata().tolist() == [1.0, 2.0, 5.0]
 
 
 @pytest.mark.parametrize("span", [1.3, 3.0, 20.0, 500.0])

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hector_jax.control.weights import bounds, nominal, weights_to_vector
-from hector_jax.report import plots
 from hector_jax.search.cmaes import Generation, SearchConfig, placed, room
 from hector_jax.search.race import lowest, race, walks
 from hector_jax.search.rivals import Bayes, CmaEs, Differences, Given, Random, steps_to
@@ -169,19 +168,3 @@ def test_bayes_without_its_package_says_what_to_install(monkeypatch):
     monkeypatch.setattr("hector_jax.search.rivals.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"hector-jax\[race\]"):
         Bayes().ask(nominal(), [Generation(np.zeros((1, 18)), np.ones(1))])
-
-
-def test_a_race_shows_each_repeat_thin_and_their_median(tmp_path, drawn):
-    x, losses = np.arange(20.0), 1e6 * np.array([[3.0], [5.0], [9.0]]) * np.linspace(1.0, 0.2, 20)
-    curves = {"with": [(x, losses[0])], "random": [(x, one) for one in losses]}
-    walks = plots.race(tmp_path / "a.png", curves, "walks on the simulator")
-    seconds = plots.race(tmp_path / "b.png", curves, "seconds of one core")
-    assert walks != seconds
-    assert "by seconds of one core" in seconds
-    axes = drawn[0].axes[0]
-    thin = [line.get_ydata() for line in axes.lines if line.get_linewidth() < 1.0]
-    np.testing.assert_allclose(thin, losses / 1e6)
-    middle = next(line for line in axes.lines if line.get_label() == "random")
-    np.testing.assert_allclose(middle.get_ydata(), losses[1] / 1e6)
-    low, high = axes.get_ylim()
-    assert sum(low <= y <= high for y in axes.get_yticks()) >= 4

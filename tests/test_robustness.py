@@ -23,7 +23,6 @@ from scenes import (
 from hector_jax.control.reference import UNSEEN
 from hector_jax.control.weights import nominal
 from hector_jax.core.files import as_json
-from hector_jax.report import plots
 from hector_jax.runs.metrics import stack_scores
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
@@ -127,26 +126,6 @@ def test_the_table_has_a_row_per_level_and_marks_what_does_not_count():
     assert len({line.count("|") for line in text}) == 1
     assert text[2] == "| push 50 N | 0 of 8 | 2.00 | 1 of 8 | 0.50 * |"
     assert json.loads(as_json(as_result(cells[levels[0]]["with"])))["ratio"]["low"] is None
-
-
-def test_pictures_show_survival_ratio_and_newtons_of_sets_of_any_name(tmp_path, drawn):
-    names, rng = ("nominal", "expert", "with", "mine", "yours"), np.random.default_rng(0)
-    base = scores(np.exp(rng.normal(size=(2, 4))) * 1e6)
-    others = [scores(np.exp(rng.normal(size=(2, 4))) * 1e6, {(0, i)}) for i in range(4)]
-    row = {
-        name: evaluate_level(one, base) for name, one in zip(names, (base, *others), strict=True)
-    }
-    plots.survival(tmp_path / "a.png", {"push 25 N": row, "push 50 N": row})
-    endured = {name: 100 * rng.random(8) for name in names}
-    plots.push_directions(tmp_path / "b.png", endured)
-    (ratio, stood), (around,) = (figure.axes for figure in drawn)
-    for axes, field, scale in ((ratio, "ratio", 1.0), (stood, "survived", 100.0)):
-        values = [line.get_xdata() for line in axes.lines][: len(names)]
-        expected = [2 * [scale * getattr(row[name], field)[0]] for name in names]
-        np.testing.assert_allclose(values, expected)
-    assert [label.get_text() for label in ratio.get_yticklabels()] == ["push 25 N", "push 50 N"]
-    np.testing.assert_allclose(around.lines[0].get_ydata()[:8], endured["nominal"])
-    assert all(label.get_text().endswith(" N") for label in around.get_yticklabels())
 
 
 @pytest.mark.slow

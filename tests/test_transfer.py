@@ -10,7 +10,6 @@ from alignment import BEYOND_SAG, SAG
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
 from hector_jax.control.weights import directions, moved, nominal, sample_weights, weights_to_vector
 from hector_jax.core.files import as_json
-from hector_jax.report import plots
 
 RNG = np.random.default_rng(1)
 TRUTH = RNG.normal(size=18) + 0.1 * RNG.normal(size=(4, 18))
@@ -128,18 +127,3 @@ def test_tables_hold_every_row_and_are_rectangular():
         assert len({line.count("|") for line in table.splitlines()}) == 1
     assert "above zero on 1 of 1" in alignment.summary(rows, "net")
     assert "could be made" in alignment.summary(rows, "paper")
-
-
-def test_pictures_show_gradients_of_unit_length_and_the_losses_of_both(tmp_path, drawn):
-    plots.gradients(tmp_path / "a.png", NAMES, TRUTH, {"command": -TRUTH, "net": TRUTH})
-    bars = {bars.get_label().split(",")[0]: bars for bars in drawn[0].axes[0].containers}
-    unit = TRUTH.mean(axis=0) / np.linalg.norm(TRUTH.mean(axis=0))
-    for name, sign in (("hfs", 1), ("command", -1), ("net", 1)):
-        np.testing.assert_allclose([bar.get_height() for bar in bars[name]], sign * unit)
-    losses = np.exp(RNG.normal(size=8)) * 1e6
-    key = ("straight", "1.5")
-    models, told = {key: {"net": 2 * losses}}, {key: {"net": 0.9}}
-    plots.ranks(tmp_path / "b.png", {key: losses}, models, told)
-    dots = drawn[1].axes[0].lines[0]
-    assert dots.get_label() == "net: 0.90"
-    np.testing.assert_allclose(dots.get_xydata(), np.c_[losses, 2 * losses] / 1e6)

@@ -1,6 +1,7 @@
 """Films: poses are those that were walked, and no machine's missing back end ends a run."""
 
 import subprocess
+from pathlib import Path
 
 import imageio_ffmpeg
 import mujoco
@@ -12,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
-from hector_jax.report import video
+from hector_jax.report import render, video
+from hector_jax.report.motion import motion, motions, poses
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip
 from hector_jax.robot.model import MODEL_PATH, load_robot
 
@@ -27,48 +29,56 @@ def test_a_drawn_pose_has_the_walked_centre_of_mass_and_attitude(robot):
     state = State(euler, position, np.zeros((1, 3)), np.zeros((1, 3)))
     model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
     data = mujoco.MjData(model)
-    data.qpos = video.poses(robot, state, np.asarray(robot.standing_joints)[None])[0]
+    data.qpos = poses(robot, state, np.asarray(robot.standing_joints)[None])[0]
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.subtree_com[1], position[0], atol=1e-9)
     expected = Rotation.from_euler("ZYX", euler[0, ::-1]).as_matrix()
     np.testing.assert_allclose(data.xmat[1].reshape(3, 3), expected, atol=1e-9)
 
 
-def request_of(robot, walks, times):
-    return video._request(VideoConfig(), robot, walks, np.asarray(times))
+def scene_of(robot, walks, times=(0.0,)):
+    path = Path("film.mp4")
+    scene = video.make_scene(path, robot, motions(robot, walks), VideoConfig(), strip=False)
+    return scene._replace(times=np.asarray(times))
 
 
 def test_a_film_shows_the_state_of_its_time_whatever_the_walks_rate(robot):
     slow, fast = (pretend_walk(seconds=1.0, period=p) for p in (0.01, 0.001))
-    found = request_of(robot, {"a": slow, "b": fast}, 0.04 * np.arange(26))
-    np.testing.assert_allclose(found["path_0"], found["path_1"], atol=0.01)
-    assert len(found["reference"]) == 50
-    assert found["sample"][[0, 10, 25]].tolist() == [0, 19, 49]
-    trunk = video.poses(robot, State(*(x[39:40] for x in slow.state)), slow.joints[39:40])
-    np.testing.assert_allclose(found["pose_0"][10], trunk[0])
+    one, other = motions(robot, {"a": slow, "b": fast}).values()
+    times = 0.04 * np.arange(26)
+    assert one.index(times)[[0, 10, 25]].tolist() == [0, 39, 99]
+    assert other.index(times)[[0, 10, 25]].tolist() == [0, 399, 999]
+    np.testing.assert_allclose(
+        one.path[one.index(times)], other.path[other.index(times)], atol=0.01
+    )
+    trunk = poses(robot, State(*(x[39:40] for x in slow.state)), slow.joints[39:40])
+    np.testing.assert_allclose(one.qpos[one.index(times)[10]], trunk[0])
+    for each in (one, other):
+        assert len(each.path[:: render._spacing(each.period)]) == 50
 
 
 def test_a_robot_that_fell_stays_where_it_was_last_seen(robot):
     walks = {"a": pretend_walk(seconds=1.0, fall_at=0.5), "b": pretend_walk(seconds=1.0)}
-    found = request_of(robot, walks, 0.04 * np.arange(26))
-    assert found["fall_0"] == pytest.approx(0.5)
-    assert np.isinf(found["fall_1"])
-    assert np.isfinite(found["pose_0"]).all()
-    np.testing.assert_array_equal(found["pose_0"][13], found["pose_0"][-1])
+    fell, stood = motions(robot, walks).values()
+    assert fell.fall_time == pytest.approx(0.5)
+    assert fell.upright == 50
+    assert np.isinf(stood.fall_time)
+    for values in (fell.qpos, fell.path):
+        assert np.isfinite(values).all()
+        np.testing.assert_array_equal(values[50], values[-1])
 
 
 def test_before_and_after_have_one_reference_wherever_the_robots_began(robot):
     walk = pretend_walk(seconds=1.0, turn=1.0)
-    found = request_of(robot, {"a": walk, "b": elsewhere(walk, (0.3, -0.2), 0.4)}, [0.0, 0.5])
-    np.testing.assert_allclose(found["path_1"], found["path_0"], atol=1e-9)
-    np.testing.assert_allclose(found["reference"], walk.reference.position[::2], atol=1e-9)
+    one, other = motions(robot, {"a": walk, "b": elsewhere(walk, (0.3, -0.2), 0.4)}).values()
+    np.testing.assert_allclose(other.path, one.path, atol=1e-9)
+    np.testing.assert_allclose(other.reference, walk.reference.position, atol=1e-9)
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.3, 1.7, 4.0])
 @pytest.mark.parametrize("tiles", [2, 6])
-def test_snapshots_show_as_many_phases_of_the_gait_as_there_are(seconds, tiles):
-    walks = {"a": pretend_walk(seconds=seconds), "b": pretend_walk(seconds=seconds)}
-    times = video._snapshots(walks, tiles)
+def test_snapshots_show_as_many_phases_of_the_gait_as_there_are(robot, seconds, tiles):
+    times = video._snapshot_times(motion(robot, pretend_walk(seconds=seconds)), seconds, tiles)
     assert (np.diff(times) > 0).all()
     assert times[0] == 0.0
     assert times[-1] <= seconds
@@ -78,18 +88,18 @@ def test_snapshots_show_as_many_phases_of_the_gait_as_there_are(seconds, tiles):
 
 def test_the_camera_of_four_seconds_stands_still_and_sees_the_whole_reference(robot):
     walk = pretend_walk(seconds=4.0, turn=np.pi / 4)
-    request = request_of(robot, {"a": walk, "b": walk}, 0.1 * np.arange(41))
-    first, *rest = video._cameras(request, 40.0, 1.0, 4.0)
+    scene = scene_of(robot, {"a": walk, "b": walk}, 0.1 * np.arange(41))
+    first, *rest = render._cameras(scene, 40.0, 1.0, 4.0)
     assert all((camera.lookat == first.lookat).all() for camera in rest)
     turn = [90.0 - first.azimuth, -first.elevation]  # looks along y, then down
     R = Rotation.from_euler("zx", turn, degrees=True).as_matrix()
-    for height in (0.0, float(request["top"])):
+    for height in (0.0, scene.top):
         points = walk.reference.position * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
         across, ahead, up = ((points - first.lookat) @ R.T).T
         seen = np.tan(np.deg2rad(20.0)) * (ahead + first.distance)
         assert (np.abs(across) < seen).all()
         assert (np.abs(up) < seen).all()
-    close, *_, last = video._cameras(request, 40.0, 1.0, 0.8)
+    close, *_, last = render._cameras(scene, 40.0, 1.0, 0.8)
     assert close.distance < first.distance
     assert np.linalg.norm(last.lookat - close.lookat) > 0.5
 
@@ -97,6 +107,7 @@ def test_the_camera_of_four_seconds_stands_still_and_sees_the_whole_reference(ro
 @pytest.mark.filterwarnings("ignore:os.fork")  # of the reader used here, not of the writer
 def test_films_and_strips_are_written_with_the_promised_size(robot, tmp_path):
     walks = {"nominal": pretend_walk(0, 0.05, 0.2), "with": pretend_walk(1, 0.01, 0.2)}
+    walks = motions(robot, walks)
     config = VideoConfig(width=640, height=432, rate=10, tiles=2)
     try:
         write_film(tmp_path / "film.mp4", robot, walks, config)
@@ -123,7 +134,7 @@ def test_films_and_strips_are_written_with_the_promised_size(robot, tmp_path):
 
 def test_no_back_end_costs_one_line(robot, tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "crayon")
-    walks = {"a": pretend_walk(seconds=0.1), "b": pretend_walk(seconds=0.1)}
+    walks = dict.fromkeys("ab", motion(robot, pretend_walk(seconds=0.1)))
     with pytest.raises(VideoUnavailable, match="no film: .*crayon") as caught:
         write_film(tmp_path / "film.mp4", robot, walks)
     assert "\n" not in str(caught.value)
@@ -133,12 +144,12 @@ def test_no_back_end_costs_one_line(robot, tmp_path, monkeypatch):
 @pytest.mark.parametrize("count", [1, 5])
 def test_the_plot_of_a_frame_is_pale_where_time_has_not_come_yet(robot, count):
     walks = {"a": pretend_walk(seconds=1.0), "b": pretend_walk(seconds=1.0)}
-    request = request_of(robot, walks, np.linspace(0.0, 1.0, 5)[:count])
-    request["box"] = (20, 10, 120, 40)
+    scene = scene_of(robot, walks, np.linspace(0.0, 1.0, 5)[:count])
+    scene = scene._replace(plot_box=(20, 10, 120, 40))
     black = np.zeros((60, 140, 3), np.uint8)
     half = np.zeros((100, 70, 3), np.uint8)
     for k in range(count):
-        below = np.asarray(video._frame(request, black, [half, half], k))[100:, :, 0]
+        below = np.asarray(render._frame(scene, black, [half, half], k))[100:, :, 0]
         assert below.shape == (60, 140)
         past = below[10:40, 20:121].max(axis=0) == 0
         assert past.tolist() == [True] * (25 * k) + [False] * (101 - 25 * k)
@@ -167,7 +178,7 @@ def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatc
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(video, "_draw_in_child", draw)
-    walks = {"a": pretend_walk(seconds=0.1), "b": pretend_walk(seconds=0.1)}
+    walks = dict.fromkeys("ab", motion(robot, pretend_walk(seconds=0.1)))
     assert write_film(tmp_path / "film.mp4", robot, walks) == "osmesa"
     assert tried == ["egl", "osmesa"]
     assert (tmp_path / "film.mp4").read_bytes() == b"film"
@@ -175,7 +186,13 @@ def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatc
 
 def test_a_film_shows_two_walks(robot, tmp_path):
     with pytest.raises(ValueError, match="two walks side by side, got 1"):
-        write_film(tmp_path / "film.mp4", robot, {"a": pretend_walk(seconds=0.1)})
+        write_film(tmp_path / "film.mp4", robot, {"a": motion(robot, pretend_walk(seconds=0.1))})
+
+
+def test_the_child_process_finds_the_module_that_draws(robot, tmp_path, monkeypatch):
+    """Whatever back ends there are: it gets as far as the scene that is missing."""
+    monkeypatch.setenv("PYTHONPATH", "")
+    assert "scene.pickle" in video._draw_in_child(tmp_path, "disable")
 
 
 def test_a_film_of_another_ending_is_refused(robot, tmp_path):

@@ -19,7 +19,8 @@ from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.report import folder as runs
 from hector_jax.report import pictures, view
-from hector_jax.report.view import Shown, motion
+from hector_jax.report.motion import motion
+from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import load_model, load_robot
 from hector_jax.runs import pipeline
 
@@ -34,10 +35,10 @@ def model():
     return load_model()
 
 
-def shown(seed=0, **kwargs):
+def viewed(seed=0, **kwargs):
     """A pretended walk; without turning, its yaw frame is the world frame."""
     walk = pretend_walk(seed, **kwargs)
-    return Shown(walk, {"commanded": walk.command, "measured": walk.effect})
+    return ViewedWalk(walk, {"commanded": walk.command, "measured": walk.effect})
 
 
 def pretend_run(folder, iterations=12, weights=()):
@@ -60,61 +61,46 @@ def write_metrics(folder, iterations, refused=()):
     (folder / "metrics.jsonl").write_text("".join(lines))
 
 
-def test_the_trunk_is_drawn_where_it_was(robot, model):
-    one = shown(seconds=0.5)
-    found = motion(robot, model, one)
-    trunk = model.body("trunk").id
-    apart = np.linalg.norm(found.position[:, trunk] - one.walk.state.position, axis=1)
-    np.testing.assert_allclose(apart, np.linalg.norm(robot.com_offset), atol=1e-9)
-    assert found.position.shape == (50, model.nbody, 3)
-
-
-def test_an_arrow_has_the_length_and_the_direction_of_its_force(robot, model):
-    one = shown(seconds=0.5)
-    arrows = motion(robot, model, one).arrows["force", "measured"]
+def test_an_arrow_has_the_length_and_the_direction_of_its_force(robot):
+    one = viewed(seconds=0.5)
+    ends = arrows(motion(robot, *one), "force", "measured")
     expected = one.walk.effect.force * 0.35 / 120.0
-    found = arrows[:, :, 1] - arrows[:, :, 0]
+    found = ends[:, :, 1] - ends[:, :, 0]
     np.testing.assert_allclose(found[..., 2], expected[..., 2])
     np.testing.assert_allclose(found, expected, atol=0.01)  # the pretended yaw sways a little
     # beside the foot, outwards
-    aside = arrows[:, :, 0, 1] - one.walk.feet[..., 1]
+    aside = ends[:, :, 0, 1] - one.walk.feet[..., 1]
     assert (aside[:, 0] > 0.05).all()
     assert (aside[:, 1] < -0.05).all()
 
 
-def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot, model):
+def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot):
     walk = pretend_walk(seconds=2.0, turn=np.pi / 4)
     force = np.zeros((200, 2, 3))
     force[..., 0] = 120.0  # ahead
-    ahead = Shown(walk, {"predicted": walk.effect._replace(force=force)})
-    arrows = motion(robot, model, ahead).arrows["force", "predicted"]
-    last = (arrows[-1, 0, 1] - arrows[-1, 0, 0]) / 0.35
+    found = motion(robot, walk, {"predicted": walk.effect._replace(force=force)})
     yaw = walk.state.euler[-2, 2]
-    np.testing.assert_allclose(last, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-9)
+    ahead = [np.cos(yaw), np.sin(yaw), 0.0]
+    np.testing.assert_allclose(found.wrenches["predicted"].force[-1, 0] / 120.0, ahead, atol=1e-9)
+    ends = arrows(found, "force", "predicted")[-1, 0]
+    np.testing.assert_allclose((ends[1] - ends[0]) / 0.35, ahead, atol=1e-9)
 
 
-def test_each_touchdown_leaves_one_sole_of_the_feet_length(robot, model):
-    found = motion(robot, model, shown(seconds=4.0))
+def test_each_touchdown_leaves_one_sole_of_the_feet_length(robot):
+    found = motion(robot, *viewed(seconds=4.0))
     assert len(found.soles) == 20
     length = np.linalg.norm(found.soles[:, 1] - found.soles[:, 0], axis=1)
     np.testing.assert_allclose(length, robot.toe + robot.heel)
 
 
-def test_both_walks_stand_on_one_reference_wherever_they_began(robot, model):
-    one = shown(seconds=0.5, turn=1.0)
-    found = motion(robot, model, one)
-    other = motion(robot, model, one._replace(walk=elsewhere(one.walk, (0.3, -0.2), 0.4)))
-    for name in ("reference", "path", "position", "soles"):
+def test_both_walks_stand_on_one_reference_wherever_they_began(robot):
+    one = viewed(seconds=0.5, turn=1.0)
+    found = motion(robot, *one)
+    other = motion(robot, *one._replace(walk=elsewhere(one.walk, (0.3, -0.2), 0.4)))
+    for name in ("reference", "path", "qpos", "soles"):
         np.testing.assert_allclose(getattr(other, name), getattr(found, name), atol=1e-9)
-    arrows = other.arrows["force", "commanded"]  # wrenches are of the yaw frame in any case
-    np.testing.assert_allclose(arrows, found.arrows["force", "commanded"], atol=1e-9)
-
-
-def test_a_robot_that_fell_stays_where_it_was_last_seen(robot, model):
-    found = motion(robot, model, shown(seconds=1.0, fall_at=0.5))
-    assert found.fall == pytest.approx(0.5)
-    assert np.isfinite(found.position).all()
-    np.testing.assert_array_equal(found.position[50], found.position[-1])
+    ends = arrows(other, "force", "commanded")  # wrenches are of the yaw frame in any case
+    np.testing.assert_allclose(ends, arrows(found, "force", "commanded"), atol=1e-9)
 
 
 def test_metrics_are_read_back_as_they_were_written(tmp_path):
@@ -219,20 +205,23 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
 def page(robot, model, tmp_path):
     viser = pytest.importorskip("viser", reason="viser, of the extra view, is not installed")
     run = pretend_run(tmp_path)
-    walks = {"before": shown(0, seconds=1.0), "after": shown(1, seconds=1.0, fall_at=0.6)}
-    motions = {name: motion(robot, model, one) for name, one in walks.items()}
+    walks = {"before": viewed(0, seconds=1.0), "after": viewed(1, seconds=1.0, fall_at=0.6)}
+    motions = {name: motion(robot, *one) for name, one in walks.items()}
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     yield view.Page(server, motions, model, run, "a story"), run, motions
     server.stop()
 
 
-def test_a_page_plays_from_start_to_end_and_again(page):
+def test_a_page_plays_from_start_to_end_and_again(robot, page):
     page, _, motions = page
     page._speed.value = 1.0
     page.advance(0.5)
     assert page._time.value == pytest.approx(0.5)
-    trunk = page._handles[0]["bodies"][1]
-    np.testing.assert_allclose(trunk.position, motions["before"].position[49, 1])
+    trunk, walked = page._handles[0]["bodies"][1], motions["before"]
+    np.testing.assert_allclose(trunk.position, walked.qpos[49, :3])
+    np.testing.assert_allclose(trunk.wxyz, walked.qpos[49, 3:7])
+    apart = np.linalg.norm(trunk.position - walked.path[49])
+    np.testing.assert_allclose(apart, np.linalg.norm(robot.com_offset), atol=1e-9)
     assert "fell" not in page._handles[1]["name"].text
     page.advance(0.3)
     assert page._handles[1]["name"].text == "after, fell at 0.60 s"
@@ -254,32 +243,32 @@ def test_a_page_that_is_paused_stands_still(page):
 
 def test_what_is_unchecked_is_not_drawn(page):
     page, _, _ = page
-    arrows = page._handles[0]["arrows"]
-    assert arrows["force", "measured"].visible
-    assert not arrows["moment", "measured"].visible
-    page._shown["measured"].value = False
-    page._shown["moment"].value = True
+    drawn = {key: handle for key, (handle, _) in page._handles[0]["arrows"].items()}
+    assert drawn["force", "measured"].visible
+    assert not drawn["moment", "measured"].visible
+    page._boxes["measured"].value = False
+    page._boxes["moment"].value = True
     page._tick = -1
     page.advance(0.0)
-    assert not arrows["force", "measured"].visible
-    assert arrows["force", "commanded"].visible
+    assert not drawn["force", "measured"].visible
+    assert drawn["force", "commanded"].visible
 
 
 def test_the_curves_grow_with_the_run(page):
     page, run, _ = page
     assert len(page._losses.data[0]) == 13
-    assert "the run goes on" in page._told.content
+    assert "the run goes on" in page._progress.content
     write_metrics(run, 20)
     page.advance(0.5)
     assert len(page._losses.data[0]) == 13  # not looked at yet
     page.advance(0.6)
     assert len(page._losses.data[0]) == 21
     assert [line["label"] for line in page._losses.series] == ["iteration", "without", "with"]
-    assert "with: iteration 20" in page._told.content
-    assert "the run goes on" in page._told.content
+    assert "with: iteration 20" in page._progress.content
+    assert "the run goes on" in page._progress.content
     write_json(run / "result.json", {})
     page.advance(1.1)
-    assert "the run is done" in page._told.content
+    assert "the run is done" in page._progress.content
 
 
 def test_a_taken_port_is_passed_by():

@@ -17,6 +17,7 @@ from hector_jax.core.inputs import one_line
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.dataset import SOLVED
+from hector_jax.report.motion import motions
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.model import MODEL_PATH, Robot, load_robot
 from hector_jax.runs.pipeline import walk_rigid_body
@@ -88,5 +89,5 @@ def _walks(robot: Robot) -> dict[str, Trajectory]:
 def _film(robot: Robot, walked: Trajectory) -> str:
     """Draw a film; the back end that drew it."""
     with tempfile.TemporaryDirectory() as folder:
-        film, pair = Path(folder) / "film.mp4", {"one": walked, "other": walked}
-        return write_film(film, robot, pair, VideoConfig(rate=2))
+        pair = motions(robot, {"one": walked, "other": walked})
+        return write_film(Path(folder) / "film.mp4", robot, pair, VideoConfig(rate=2))

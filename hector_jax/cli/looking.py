@@ -14,8 +14,9 @@ from hector_jax.core.files import as_json, make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
-from hector_jax.report import fidelity, pictures, view
+from hector_jax.report import fidelity, pictures, plots, view
 from hector_jax.report import folder as runs
+from hector_jax.report.motion import Motion, motion
 from hector_jax.report.report import WORLDS
 from hector_jax.report.tensorboard import write_events
 from hector_jax.report.video import check_film
@@ -42,7 +43,7 @@ def view_run(args: View) -> None:
     data = asked.folder_of(args.data or begun.data, begun.robot, robot)
     net = begun.net if args.data is None and begun.net else pipeline.net_path(data, begun.variant)
     effect = _phi_of(net, begun.variant, robot)
-    shown: dict[str, view.Shown] = {}
+    shown: dict[str, view.ViewedWalk] = {}
 
     def walk() -> str:
         place = WORLDS.get(args.world, args.world)
@@ -56,13 +57,13 @@ def view_run(args: View) -> None:
             walked = at_interval(walked, walk_config(robot).gait.tick)
             stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
             effects = {} if effect is None else {"residual": effect}
-            shown[name] = view.Shown(walked, fidelity.curves(robot, stacked, effects))
+            shown[name] = view.ViewedWalk(walked, fidelity.curves(robot, stacked, effects))
         return "\n\n".join(story)
 
-    def motions() -> tuple[dict[str, view.Motion], str]:
+    def motions() -> tuple[dict[str, Motion], str]:
         story = walk()
-        found = (view.motion(robot, model, one) for one in shown.values())
-        return dict(zip(view.titles(shown), found, strict=True)), story
+        found = (motion(robot, *one) for one in shown.values())
+        return dict(zip(plots.titles(shown), found, strict=True)), story
 
     if folder is not None:
         walk()
@@ -71,7 +72,7 @@ def view_run(args: View) -> None:
         return
     model = compile_model(robot.description)
     on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
-    view.serve(motions, model, args.run, on_open, args.host, args.port)
+    view.serve(motions, model, args.run, on_open, host=args.host, port=args.port)
 
 
 def _phi_of(path: Path, variant: str, robot: Robot) -> jax.tree_util.Partial | None:

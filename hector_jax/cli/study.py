@@ -23,6 +23,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.network import Params
 from hector_jax.report import plots, table
+from hector_jax.report.motion import motions
 from hector_jax.report.report import Picture
 from hector_jax.report.table import PAPER, Earlier, Fall, Search, Table
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
@@ -326,7 +327,7 @@ def _snapshots(folder: Path, robot: Robot, shown: Mapping[str, Trajectory]) -> P
     """A strip of both walks; None, with one line, where nothing can be drawn here."""
     pair = {name: shown[name] for name in ("nominal", "with")}
     try:
-        write_strip(folder / "strip.png", robot, pair, _SNAPSHOTS)
+        write_strip(folder / "strip.png", robot, motions(robot, pair), _SNAPSHOTS)
     except VideoUnavailable as error:
         say(f"no snapshots: {error}")
         return None

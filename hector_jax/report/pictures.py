@@ -1,4 +1,4 @@
-"""The pictures and the film that a command leaves, each drawn by plots or video.py."""
+"""The pictures and the film that each command leaves, drawn by plots and video.py."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,11 +9,13 @@ from hector_jax.control.weights import WEIGHT_NAMES, Weights, weights_to_vector
 from hector_jax.core.console import say
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.grfm.nets import History
-from hector_jax.report import plots, view
+from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.folder import Histories
+from hector_jax.report.motion import motions
 from hector_jax.report.report import WORLDS, Picture
 from hector_jax.report.video import VideoUnavailable, write_film, write_strip
+from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import LossConfig
@@ -28,7 +30,7 @@ def of_run(
     ground: Mapping[str, Wrench],
     training: History,
 ) -> list[Picture]:
-    """Draw what a tuning did, into `pictures/` of its folder.
+    """Draw the pictures of a tuning into `pictures/` of its folder.
 
     Args:
         folder: of the run.
@@ -45,14 +47,14 @@ def of_run(
     four = {name: walks[name] for name in ("nominal", "expert", "without", "with")}
     flat = {name: np.asarray(weights_to_vector(sets[name])) for name in four}
     histories = {name: tunings[name].history for name in ("without", "with")}
-    path = folder / "pictures"
+    path, tick = folder / "pictures", config.rollout.walk.gait.tick
     path.mkdir(exist_ok=True)
     captions = {
         "tracking": plots.tracking(path / "tracking.png", four),
         "path": plots.path_from_above(path / "path.png", four),
         "losses": plots.losses(path / "losses.png", config.loss, histories),
         "weights": plots.weights(path / "weights.png", WEIGHT_NAMES, flat),
-        "wrenches": plots.wrenches(path / "wrenches.png", config.rollout.walk.gait.tick, ground),
+        "wrenches": plots.wrenches(path / "wrenches.png", tick, ground),
         "training": plots.training(path / "training.png", training),
     }
     return [Picture(f"pictures/{name}.png", caption) for name, caption in captions.items()]
@@ -65,7 +67,7 @@ def of_nets(
     drifts: Mapping[str, Mapping[str, Drift]],
     trainings: Mapping[str, History],
 ) -> list[Picture]:
-    """Draw what nets are worth.
+    """Draw the predictions and the training of nets.
 
     Args:
         folder: where to.
@@ -78,11 +80,10 @@ def of_nets(
         The pictures, in the order of the report.
     """
     wrenches = plots.wrenches(folder / "wrenches.png", tick, ground)
+    worlds = {WORLDS.get(world, world): drift for world, drift in drifts.items()}
     captions = {
         "wrenches": f"{wrenches} The first held-out walk, in the robot's yaw frame.",
-        "open_loop": plots.open_loop(
-            folder / "open_loop.png", {WORLDS.get(w, w): found for w, found in drifts.items()}
-        ),
+        "open_loop": plots.open_loop(folder / "open_loop.png", worlds),
         **{name: plots.training(folder / f"{name}.png", one) for name, one in trainings.items()},
     }
     return [Picture(f"{name}.png", caption) for name, caption in captions.items()]
@@ -93,7 +94,7 @@ def of_view(
     robot: Robot,
     histories: Histories,
     loss: LossConfig,
-    shown: Mapping[str, view.Shown],
+    viewed: Mapping[str, ViewedWalk],
 ) -> None:
     """Draw what the page of `view` shows, as a film and pictures.
 
@@ -102,23 +103,23 @@ def of_view(
         robot: the body that walked.
         histories: of the run.
         loss: that its L is of.
-        shown: walks by the name of their set, before and after.
+        viewed: walks by the name of their set, before and after.
 
     Raises:
         VideoUnavailable: no film can be made here.
     """
-    walks = {name: one.walk for name, one in shown.items()}
+    walks = {name: one.walk for name, one in viewed.items()}
     plots.tracking(folder / "tracking.png", walks)
     plots.path_from_above(folder / "path.png", walks)
-    after = list(shown.values())[-1]
+    after = list(viewed.values())[-1]
     period, ticks = float(after.walk.period), len(after.walk.fallen)
     first = min(0.4, period * ticks)  # [s], two steps
     plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
     tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
     if tuned:
         plots.losses(folder / "losses.png", loss, tuned)
-    titled = dict(zip(view.titles(walks), walks.values(), strict=True))
     say("making the film")
+    titled = motions(robot, dict(zip(plots.titles(walks), walks.values(), strict=True)))
     write_film(folder / "film.mp4", robot, titled)
     write_strip(folder / "film.png", robot, titled)
 
@@ -126,15 +127,16 @@ def of_view(
 def film(
     path: Path, robot: Robot, walks: Mapping[str, Trajectory], strip: Path | None = None
 ) -> str:
-    """Film two walks and leave a strip of snapshots where asked to.
+    """Film two walks, and draw a strip of snapshots where it has a path.
 
     A missing back end costs one line, not the run; returns why there is no film.
     """
     say("making the film")
+    both = motions(robot, walks)
     try:
-        write_film(path, robot, walks)
+        write_film(path, robot, both)
         if strip is not None:
-            write_strip(strip, robot, walks)
+            write_strip(strip, robot, both)
     except VideoUnavailable as error:
         say(str(error))
         return str(error)

@@ -1,9 +1,8 @@
 """A run on a local web page: two walks side by side, what the ground does, the tuning as it goes.
 
-Where everything is at each tick is worked out before the page opens, and a displayed tick is one
-batch of updates. The walks stand beside one another, shifted across their way. To follow them the
-world moves under the camera, so that turning the camera by hand keeps working. The page is drawn by
-viser, of the extra `view`, and asks no other machine for anything.
+A displayed tick is one batch of updates. The walks stand beside one another, shifted across their
+way. To follow them the world moves under the camera, so that turning the camera by hand keeps
+working. The page is drawn by viser, of the extra `view`, and asks no other machine for anything.
 """
 
 import errno
@@ -11,45 +10,39 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import redirect_stdout
 from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.core.geometry import rot_z
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import Trajectory, Wrench, from_start
+from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.folder import METRICS, RESULT, as_sentence, curves, read_histories
-from hector_jax.report.plots.style import named
-from hector_jax.report.video import COLOURS, poses
-from hector_jax.robot.model import Robot
+from hector_jax.report.motion import COLOURS, INK, Motion
 
 HOST, PORT = "127.0.0.1", 8080
 
 _RATE = 30.0  # displayed ticks per second, at most
-_PAUSE = 1.0  # [s] between looks at the metrics
+_PAUSE = 1.0  # [s] between readings of the metrics
 _APART = 0.8  # [m] between the two walks
 # [m/N], [m/(N m)] of the arrows: that of the robot's weight has 35 cm
 _SCALES = {"force": 0.35 / 120.0, "moment": 0.35 / 12.0}
-_LEAST_ARROW = 0.03  # [m]; shorter ones are not drawn
+_MIN_ARROW = 0.03  # [m]; shorter ones are not drawn
 _RADII = {"force": 0.008, "moment": 0.014}  # [m] of their shafts
-_DARK = (20, 20, 25)
-# before, after and what else there is: told apart by dashes too
+# lines of plots, for before, after and what else there is: told apart by dashes too
 _STROKES = (
-    ("rgb(184, 33, 51)", [6, 4]),
-    ("rgb(0, 122, 94)", []),
+    (f"rgb{COLOURS[0]}", [6, 4]),
+    (f"rgb{COLOURS[1]}", []),
     ("rgb(0, 114, 178)", [2, 3]),
     ("rgb(122, 62, 157)", [10, 3, 2, 3]),
 )
-
-_NONE_YET = {"no iteration yet": np.full(1, np.nan)}  # a plot without a line is refused
+_NO_CURVES = {"no iteration yet": np.full(1, np.nan)}  # viser refuses a plot without a line
 
 
 class _Source(NamedTuple):
@@ -67,86 +60,29 @@ _SOURCES = {
 }
 
 
-class Shown(NamedTuple):
+class ViewedWalk(NamedTuple):
     """One walk, at the plan interval."""
 
     walk: Trajectory
     ground: dict[str, Wrench]  # commanded, measured, predicted, or some; (T, 2, 3), yaw frame
 
 
-class Motion(NamedTuple):
-    """Where everything of a walk is, world frame; after a fall, where it was last seen."""
-
-    seconds: Float[np.ndarray, " T"]
-    position: Float[np.ndarray, "T bodies 3"]  # of MuJoCo's bodies [m]
-    wxyz: Float[np.ndarray, "T bodies 4"]
-    path: Float[np.ndarray, "T 3"]  # of the centre of mass
-    reference: Float[np.ndarray, "T 3"]
-    arrows: dict[tuple[str, str], Float[np.ndarray, "T 2 2 3"]]  # by kind and source: start, end
-    soles: Float[np.ndarray, "n 2 3"]  # heel and toe of each foot as it was set down
-    fall: float  # [s], infinite where there is none
-
-
-def motion(robot: Robot, model: mujoco.MjModel, shown: Shown) -> Motion:
-    """What of a walk is drawn where, in the frame of its start.
+def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T 2 2 3"]:
+    """Start and end of the arrow at each foot.
 
     Args:
-        robot: the body that walked.
-        model: of the same body.
-        shown: the walk.
+        motion: with wrenches of this source.
+        kind: force or moment.
+        source: commanded, measured or predicted.
     """
-    walk = from_start(shown.walk)
-    fallen, period = np.asarray(walk.fallen), float(walk.period)
-    up = int(np.argmax(fallen)) if fallen.any() else len(fallen)
-    at = np.minimum(np.arange(len(fallen)), max(up - 1, 0))
-    state, feet, joints, contact = jax.tree.map(
-        lambda x: np.asarray(x)[at], (walk.state, walk.feet, walk.joints, walk.contact)
-    )
-    position, wxyz = _body_frames(model, poses(robot, state, joints))
-    # the yaw frame of a wrench is that as its tick starts
-    yaw = np.concatenate([np.asarray(walk.initial.euler)[None], state.euler])[:-1, 2]
-    R = np.asarray(jax.vmap(rot_z)(yaw))
-    outwards = np.stack([R[..., 1], -R[..., 1]], axis=1)  # of the left foot and of the right
-    arrows = {}
-    for source, wrench in shown.ground.items():
-        start = feet + _SOURCES[source].aside * outwards
-        for kind, scale in _SCALES.items():
-            turned = np.einsum("tij,tfj->tfi", R, np.asarray(getattr(wrench, kind))[at])
-            end = start + scale * turned
-            arrows[kind, source] = np.stack([start, end], axis=2)
-    landed = np.diff(contact.astype(int), axis=0, prepend=0) > 0
-    tick, foot = np.nonzero(landed)
-    ahead = R[tick, :, 0]
-    soles = [feet[tick, foot] - robot.heel * ahead, feet[tick, foot] + robot.toe * ahead]
-    return Motion(
-        seconds=period * np.arange(1, len(fallen) + 1),
-        position=position,
-        wxyz=wxyz,
-        path=state.position,
-        reference=np.asarray(walk.reference.position),
-        arrows=arrows,
-        soles=np.stack(soles, axis=1),
-        fall=period * up if fallen.any() else np.inf,
-    )
-
-
-def titles(names: Iterable[str]) -> list[str]:
-    """What stands above two walks."""
-    return [f"{when}: {named(name)}" for when, name in zip(("before", "after"), names, strict=True)]
-
-
-def _body_frames(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    data, frames = mujoco.MjData(model), []
-    for row in qpos:
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        frames.append((data.xpos.copy(), data.xquat.copy()))
-    position, wxyz = zip(*frames, strict=True)
-    return np.stack(position), np.stack(wxyz)
+    left = motion.R_yaw[:, :, 1]
+    outwards = np.stack([left, -left], axis=1)  # of the left foot and of the right
+    start = motion.feet + _SOURCES[source].aside * outwards
+    return np.stack([start, start + _SCALES[kind] * getattr(motion.wrenches[source], kind)], axis=2)
 
 
 def check_viser() -> None:
-    """Find out, before anything is walked, whether the page can be drawn.
+    """Check, before anything is walked, that the page can be drawn.
 
     Raises:
         InputError: viser is not installed.
@@ -163,6 +99,7 @@ def serve(
     model: mujoco.MjModel,
     folder: Path,
     on_open: Callable[[str], None],
+    *,
     host: str = HOST,
     port: int = PORT,
 ) -> None:
@@ -170,7 +107,7 @@ def serve(
 
     Args:
         walk: called once the page can be opened; gives the motions of the walks, before and after,
-            by the words that stand above them, and what is seen, in Markdown.
+            by the words that stand above them, and what is shown, in Markdown.
         model: of the body that walks.
         folder: of the run, whose metrics are read again as they grow.
         on_open: called with the page's address once it can be opened.
@@ -183,9 +120,10 @@ def serve(
     check_viser()
     import viser
 
-    # a browser that hangs up early would be told with a traceback
+    # a browser that hangs up early would leave a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):  # viser tells its own
+    # viser prints an address of its own
+    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
         server = viser.ViserServer(host, _free_port(host, port), label="hector", verbose=False)
         try:
             note = server.gui.add_markdown("The robots walk in a moment.")
@@ -203,16 +141,16 @@ def serve(
             server.stop()
 
 
-def _free_port(host: str, asked: int) -> int:
-    """The port, or a free one where it is taken."""
-    for port in (asked, 0):
+def _free_port(host: str, wanted: int) -> int:
+    """The wanted port, or a free one where it is taken."""
+    for port in (wanted, 0):
         try:
             with socket.create_server((host, port)) as listening:
                 return listening.getsockname()[1]
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
-                told = f"cannot listen on {host}, port {port}: {error.strerror}"
-                raise InputError(told) from None
+                reason = f"cannot listen on {host}, port {port}: {error.strerror}"
+                raise InputError(reason) from None
     raise InputError(f"no free port on {host}")
 
 
@@ -229,16 +167,17 @@ class Page:
     ) -> None:
         """Build the page on a `viser.ViserServer`; the rest as in `serve`."""
         self._server, self._folder = server, folder
+        self._model, self._data = model, mujoco.MjData(model)
         self._names, self._motions = list(motions), list(motions.values())
-        self._length = min(len(one.seconds) for one in self._motions)
+        self._length = min(len(one.times) for one in self._motions)
         self._playing, self._tick = True, -1  # the tick that is shown; -1: to be drawn anew
         self._read, self._since = (-1, False), np.inf  # size of the metrics, run done; [s] ago
         self._build_panel(story)
-        self._build_scene(model)
+        self._build_world()
         self.advance(0.0)
 
     def advance(self, elapsed: float) -> None:
-        """Let `elapsed` [s] go by: move on if playing, look at the metrics from time to time."""
+        """Let `elapsed` [s] go by: move on if playing, read the metrics from time to time."""
         if self._playing:
             now, end = self._time.value, self._time.max
             self._time.value = min(now + elapsed * self._speed.value, end) if now < end else 0.0
@@ -250,133 +189,128 @@ class Page:
         self._since += elapsed
         if self._since >= _PAUSE:
             self._since = 0.0
-            self._look()
+            self._read_metrics()
 
     def _build_panel(self, story: str) -> None:
-        gui = self._server.gui
+        gui, first = self._server.gui, self._motions[0]
+        times = first.times[: self._length]
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.add_markdown(story)
-        seconds = self._motions[0].seconds[: self._length]
         with gui.add_folder("Playback"):
             self._button = gui.add_button("Pause")
-            self._time = gui.add_slider("time [s]", 0.0, float(seconds[-1]), float(seconds[0]), 0.0)
+            self._time = gui.add_slider("time [s]", 0.0, float(times[-1]), first.period, 0.0)
             self._speed = gui.add_slider("speed", 0.05, 2.0, 0.05, 0.5)
             self._follow = gui.add_checkbox("follow the robots", True)
         with gui.add_folder("Ground on the feet"):
-            sources = {source: None for _, source in self._motions[0].arrows}
-            gui.add_html(_legend(list(sources)))
-            self._shown = {
-                **{source: gui.add_checkbox(_SOURCES[source].words, True) for source in sources},
-                "force": gui.add_checkbox("forces", True),
-                "moment": gui.add_checkbox("moments", False),
-            }
+            gui.add_html(_legend(first.wrenches))
+            words = {source: _SOURCES[source].words for source in first.wrenches}
+            words |= {"force": "forces", "moment": "moments"}
+            self._boxes = {k: gui.add_checkbox(w, k != "moment") for k, w in words.items()}
         with gui.add_folder("Tuning"):
-            self._losses = _plot(gui, "L on the model [1e6]", "iteration", np.zeros(1), _NONE_YET)
-            self._told = gui.add_markdown("")
+            self._losses = _plot(gui, "L on the model [1e6]", "iteration", np.zeros(1), _NO_CURVES)
+            self._progress = gui.add_markdown("")
         with gui.add_folder("Distance from the reference"):
-            errors = {
-                name: 100.0 * np.linalg.norm((m.path - m.reference)[: self._length, :2], axis=1)
-                for name, m in zip(self._names, self._motions, strict=True)
-            }
-            _plot(gui, "in the plane [cm]", "time [s]", seconds, errors)
+            lines = [100.0 * one.distance[: self._length] for one in self._motions]
+            errors = dict(zip(self._names, lines, strict=True))
+            _plot(gui, "in the plane [cm]", "time [s]", times, errors)
         self._button.on_click(lambda _: self._play(not self._playing))
         # moved by a person, not by us
         self._time.on_update(lambda event: event.client is not None and self._play(False))
-        for box in (self._follow, *self._shown.values()):
+        for box in (self._follow, *self._boxes.values()):
             box.on_update(lambda _: setattr(self, "_tick", -1))
 
     def _play(self, playing: bool) -> None:
         self._playing = playing
         self._button.label = "Pause" if playing else "Play"
 
-    def _build_scene(self, model: mujoco.MjModel) -> None:
-        scene = self._server.scene
+    def _build_world(self) -> None:
+        scene, camera = self._server.scene, self._server.initial_camera
         scene.set_up_direction("+z")
         way = self._motions[0].reference[-1] - self._motions[0].reference[0]
         heading = np.arctan2(way[1], way[0])
         across = np.array([-np.sin(heading), np.cos(heading), 0.0])
         side = heading - np.deg2rad(50.0)
-        self._server.initial_camera.look_at = (0.0, 0.0, 0.32)
-        self._server.initial_camera.position = (1.6 * np.cos(side), 1.6 * np.sin(side), 0.75)
+        camera.look_at = (0.0, 0.0, 0.32)
+        camera.position = (1.6 * np.cos(side), 1.6 * np.sin(side), 0.75)
         self._world = scene.add_frame("/world", show_axes=False)
-        scene.add_grid(
-            "/world/floor",
-            30.0,
-            30.0,
-            cell_color=(224, 228, 233),
-            section_color=(196, 203, 211),
-            plane_color=(241, 243, 246),
-            plane_opacity=1.0,
-        )
+        colours = {"cell_color": (224, 228, 233), "section_color": (196, 203, 211)}
+        colours |= {"plane_color": (241, 243, 246), "plane_opacity": 1.0}
+        scene.add_grid("/world/floor", 30.0, 30.0, **colours)
         self._handles = []
-        for i, one in enumerate(self._motions):
-            root = f"/world/{i}"
-            scene.add_frame(root, show_axes=False, position=(0.5 - i) * _APART * across)
-            lines = {
-                "footholds": (_on_floor(one.soles, 0.003), _pale(COLOURS[i]), 0.03),
-                "path": (_on_floor(_pieces(one.path, 2), 0.006), COLOURS[i], 0.008),
-                "reference": (_on_floor(_pieces(one.reference, 6)[::2], 0.008), _DARK, 0.01),
-            }
-            for line, (points, colour, thickness) in lines.items():
-                scene.add_line_segments(f"{root}/{line}", points, colour, thickness=thickness)
-            self._handles.append(
-                {
-                    "aim": scene.add_icosphere(f"{root}/aim", 0.018, _DARK),
-                    "name": scene.add_label(
-                        f"{root}/name", "", anchor="bottom-center", font_screen_scale=1.4
+        for i in range(len(self._motions)):
+            scene.add_frame(f"/world/{i}", show_axes=False, position=(0.5 - i) * _APART * across)
+            self._handles.append(self._add_walk(i))
+
+    def _add_walk(self, i: int) -> dict[str, Any]:
+        """Add one walk to the scene; returns the handles of what moves."""
+        scene, one, root, colour = self._server.scene, self._motions[i], f"/world/{i}", COLOURS[i]
+        lines = {
+            "footholds": (_on_floor(one.soles, 0.003), _pale(colour), 0.03),
+            "path": (_on_floor(_pieces(one.path, 2), 0.006), colour, 0.008),
+            "reference": (_on_floor(_pieces(one.reference, 6)[::2], 0.008), INK, 0.01),
+        }
+        for line, (points, shade, thickness) in lines.items():
+            scene.add_line_segments(f"{root}/{line}", points, shade, thickness=thickness)
+        label = {"anchor": "bottom-center", "font_screen_scale": 1.4}
+        return {
+            "aim": scene.add_icosphere(f"{root}/aim", 0.018, INK),
+            "name": scene.add_label(f"{root}/name", "", **label),
+            "bodies": {
+                body: scene.add_mesh_trimesh(f"{root}/body{body}", mesh)
+                for body, mesh in body_meshes(self._model, colour).items()
+            },
+            "arrows": {
+                (kind, source): (
+                    scene.add_arrows(
+                        f"{root}/{kind}/{source}",
+                        np.zeros((1, 2, 3), np.float32),
+                        _SOURCES[source].colour,
+                        shaft_radius=_RADII[kind],
+                        head_radius=2.3 * _RADII[kind],
+                        head_length=0.035,
                     ),
-                    "bodies": {
-                        body: scene.add_mesh_trimesh(f"{root}/body{body}", mesh)
-                        for body, mesh in _meshes(model, COLOURS[i]).items()
-                    },
-                    "arrows": {
-                        (kind, source): scene.add_arrows(
-                            f"{root}/{kind}/{source}",
-                            np.zeros((1, 2, 3), np.float32),
-                            _SOURCES[source].colour,
-                            shaft_radius=_RADII[kind],
-                            head_radius=2.3 * _RADII[kind],
-                            head_length=0.035,
-                        )
-                        for kind, source in one.arrows
-                    },
-                }
-            )
+                    arrows(one, kind, source),
+                )
+                for source in one.wrenches
+                for kind in _SCALES
+            },
+        }
 
     def _draw(self, tick: int) -> None:
         aim = self._motions[0].reference[tick] * [1.0, 1.0, 0.0]
         self._world.position = -aim * self._follow.value
         for name, one, handles in zip(self._names, self._motions, self._handles, strict=True):
+            self._data.qpos[:] = one.qpos[tick]
+            mujoco.mj_kinematics(self._model, self._data)
             for body, handle in handles["bodies"].items():
-                handle.position, handle.wxyz = one.position[tick, body], one.wxyz[tick, body]
-            for (kind, source), handle in handles["arrows"].items():
-                arrows = one.arrows[kind, source][tick]
-                seen = (
-                    np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1) > _LEAST_ARROW
-                )  # NaN: not
-                shown = self._shown[kind].value and self._shown[source].value
-                handle.visible = bool(shown and seen.any())
+                handle.position = self._data.xpos[body].copy()
+                handle.wxyz = self._data.xquat[body].copy()
+            for (kind, source), (handle, ends) in handles["arrows"].items():
+                length = np.linalg.norm(ends[tick, :, 1] - ends[tick, :, 0], axis=1)
+                drawn = length > _MIN_ARROW  # false where it is NaN
+                checked = self._boxes[kind].value and self._boxes[source].value
+                handle.visible = bool(checked and drawn.any())
                 if handle.visible:
-                    handle.points = arrows[seen].astype(np.float32)
+                    handle.points = ends[tick, drawn].astype(np.float32)
             handles["aim"].position = one.reference[tick]
             handles["name"].position = one.path[tick] + [0.0, 0.0, 0.36]
-            fell = f", fell at {one.fall:.2f} s" if one.seconds[tick] > one.fall else ""
-            handles["name"].text = name + fell
+            fell = one.times[tick] > one.fall_time
+            handles["name"].text = f"{name}, fell at {one.fall_time:.2f} s" if fell else name
 
-    def _look(self) -> None:
+    def _read_metrics(self) -> None:
         path, done = self._folder / METRICS, (self._folder / RESULT).exists()
         now = (path.stat().st_size if path.exists() else 0, done)
         if now == self._read:
             return
         self._read = now
         histories = read_histories(self._folder)
-        found = curves(histories) or _NONE_YET
-        iterations = np.arange(float(len(next(iter(found.values())))))
+        lines = curves(histories) or _NO_CURVES
+        iterations = np.arange(float(len(next(iter(lines.values())))))
         with self._server.atomic():
-            self._losses.series = _series("iteration", found)
-            self._losses.data = (iterations, *found.values())
-            self._told.content = as_sentence(histories, done)
+            self._losses.series = _series("iteration", lines)
+            self._losses.data = (iterations, *lines.values())
+            self._progress.content = as_sentence(histories, done)
 
 
 def _plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
@@ -397,12 +331,13 @@ def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]
     return ({"label": x_name}, *lines)
 
 
-def _legend(sources: Sequence[str]) -> str:
-    """Which colour is whose, and the scale, as HTML."""
-    marks = []
-    for source in sources:
-        words, colour, _ = _SOURCES[source]
-        marks.append(f'<span style="color:rgb{colour}">&#9650;</span>&nbsp;{words}')
+def _legend(sources: Iterable[str]) -> str:
+    """Colours of the sources and the scale, as HTML."""
+    marks = [
+        f'<span style="color:rgb{_SOURCES[source].colour}">&#9650;</span>&nbsp;'
+        f"{_SOURCES[source].words}"
+        for source in sources
+    ]
     scale = "thin: forces, 35 cm are 120 N; thick: moments, 35 cm are 12 N m"  # see _SCALES
     return f'<div style="padding:0 1em; font-size:smaller">{" &ensp;".join(marks)}<br>{scale}</div>'
 
@@ -421,43 +356,47 @@ def _on_floor(pieces: Float[np.ndarray, "n 2 3"], height: float) -> Float[np.nda
     return pieces * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
 
 
-def _meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
-    """What MuJoCo draws of each body (geom groups 0 to 2), the material `accent` recoloured."""
+def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
+    """Meshes of what MuJoCo draws of each body (geom groups 0 to 2).
+
+    Args:
+        model: of the robot.
+        accent: colour for the material of that name.
+    """
     import trimesh
 
-    box, ball = trimesh.creation.box, trimesh.creation.icosphere
-    kinds, pieces = mujoco.mjtGeom, {}
+    meshes: dict[int, list[Any]] = {}
     for i in np.nonzero((model.geom_bodyid > 0) & (model.geom_group <= 2))[0]:
-        size, kind = model.geom_size[i], model.geom_type[i]
-        if kind == kinds.mjGEOM_BOX:
-            mesh = box(extents=2.0 * size)
-        elif kind == kinds.mjGEOM_CYLINDER:
-            mesh = trimesh.creation.cylinder(radius=size[0], height=2.0 * size[1])
-        elif kind == kinds.mjGEOM_CAPSULE:
-            mesh = trimesh.creation.capsule(radius=size[0], height=2.0 * size[1])
-        elif kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
-            mesh = ball(subdivisions=2).apply_scale(
-                size if kind == kinds.mjGEOM_ELLIPSOID else size[0]
-            )
-        else:
+        mesh = _geom_mesh(int(model.geom_type[i]), model.geom_size[i])
+        if mesh is None:
             continue
-        if kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER):
-            mesh.unmerge_vertices()  # sharp edges
         material = model.geom_matid[i]
         rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[i]
         if material >= 0 and model.material(material).name == "accent":
             rgba = np.array([*accent, 255]) / 255.0
-        pieces.setdefault(int(model.geom_bodyid[i]), []).append(
-            _placed(mesh, model.geom_pos[i], model.geom_quat[i], rgba)
-        )
-    return {body: trimesh.util.concatenate(parts) for body, parts in pieces.items()}
+        T = trimesh.transformations.quaternion_matrix(model.geom_quat[i])
+        T[:3, 3] = model.geom_pos[i]
+        mesh.apply_transform(T)
+        mesh.visual.vertex_colors = np.round(255.0 * np.asarray(rgba)).astype(np.uint8)
+        meshes.setdefault(int(model.geom_bodyid[i]), []).append(mesh)
+    return {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}
 
 
-def _placed(mesh: Any, position: np.ndarray, wxyz: np.ndarray, rgba: Any) -> Any:
-    import trimesh
+def _geom_mesh(kind: int, size: Float[np.ndarray, "3"]) -> Any:
+    """Mesh of a geom about its own centre; None for kinds that have no volume."""
+    from trimesh import creation
 
-    T = trimesh.transformations.quaternion_matrix(wxyz)
-    T[:3, 3] = position
-    mesh.apply_transform(T)
-    mesh.visual.vertex_colors = np.round(255.0 * np.asarray(rgba)).astype(np.uint8)
+    kinds = mujoco.mjtGeom
+    if kind == kinds.mjGEOM_CAPSULE:
+        return creation.capsule(radius=size[0], height=2.0 * size[1])
+    if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
+        ball = creation.icosphere(subdivisions=2)
+        return ball.apply_scale(size if kind == kinds.mjGEOM_ELLIPSOID else size[0])
+    if kind == kinds.mjGEOM_BOX:
+        mesh = creation.box(extents=2.0 * size)
+    elif kind == kinds.mjGEOM_CYLINDER:
+        mesh = creation.cylinder(radius=size[0], height=2.0 * size[1])
+    else:
+        return None
+    mesh.unmerge_vertices()  # sharp edges
     return mesh

@@ -1,7 +1,8 @@
-"""How all pictures look: figure and legend, axes, and what each weight set is drawn with."""
+"""Style of all pictures: figure and legend, axes, and the line and marker of each weight set."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,7 +48,7 @@ SETS = {
     "shared_worst": {"color": "#d670a5", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5))},
     "ceiling": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},
 }
-"""Lines of the weight sets that we know by name; `looks_of` has those of any."""
+"""Lines of the weight sets that the package names; `looks_of` has a look for any set."""
 
 CURVES = {
     "reference": {"color": "black", "linestyle": (0, (1, 1)), "linewidth": 1.1},
@@ -58,28 +59,13 @@ CURVES = {
     "paper": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "gated": {"color": BLUE, "linestyle": (0, (5, 1.5))},
 }
-"""Lines of what is no weight set."""
+"""Lines of references and wrenches."""
 CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 
-_MARKER = {
-    "nominal": "v",
-    "expert": "D",
-    "without": "s",
-    "with": "o",
-    "ceiling": "*",
-    "shared_mean": "<",
-    "shared_worst": ">",
-}
-_SPARE = tuple(
-    ({"color": color, "linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}, marker)
-    for color, marker in (
-        ("#b0186a", "s"),
-        ("#6cb0dc", "^"),
-        ("#8a8a00", "h"),
-        ("black", "P"),
-        ("#c07a3a", "X"),
-    )
-)
+_MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o"}
+_MARKER |= {"ceiling": "*", "shared_mean": "<", "shared_worst": ">"}
+_SPARE_STYLE = {"linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
+_SPARE = (("#b0186a", "s"), ("#6cb0dc", "^"), ("#8a8a00", "h"), ("black", "P"), ("#c07a3a", "X"))
 _NAMES = {
     "without": "without (tuned, no net)",
     "with": "with (tuned, net)",
@@ -96,7 +82,7 @@ _NAMES = {
 class Look(NamedTuple):
     """How a weight set is drawn."""
 
-    line: dict[str, Any]  # colour, style and, where it is not the usual one, width
+    line: dict[str, Any]  # arguments of plot: colour, style and, unless it is the default, width
     marker: str
 
     @property
@@ -111,41 +97,58 @@ class Look(NamedTuple):
 
 
 def looks_of(names: Iterable[str]) -> dict[str, Look]:
-    """How each weight set is drawn; those that are none of ours take what is spare, in turn."""
-    names = list(names)
-    unknown = [name for name in names if name not in SETS]
-    spare = {name: Look(*_SPARE[i % len(_SPARE)]) for i, name in enumerate(unknown)}
-    return {name: spare.get(name) or Look(SETS[name], _MARKER.get(name, "^")) for name in names}
+    """How each weight set is drawn; sets of the user's own take the spare looks in turn."""
+    looks, spare = {}, cycle(_SPARE)
+    for name in names:
+        if name in SETS:
+            looks[name] = Look(SETS[name], _MARKER.get(name, "^"))
+        else:
+            color, marker = next(spare)
+            looks[name] = Look({"color": color, **_SPARE_STYLE}, marker)
+    return looks
 
 
 def named(name: str) -> str:
-    """What a legend calls a weight set, by its name in the tables, or a curve."""
+    """Words of a legend for a weight set, by its name in the tables, or for a curve."""
     return _NAMES.get(name, name)
 
 
+def titles(names: Iterable[str]) -> list[str]:
+    """Words that stand above two walks, before and after."""
+    return [f"{when}: {named(name)}" for when, name in zip(("before", "after"), names, strict=True)]
+
+
 @contextmanager
-def drawing(path: Path, width: float, height: float, dpi: float = 160) -> Iterator[Figure]:
-    """A figure [inch] that is written when its block ends."""
+def drawing(
+    path: Path, width: float, height: float, *, dpi: float = 160, legend_columns: int = 6
+) -> Iterator[Figure]:
+    """Figure that is written to a file when its block ends, with one legend above all panels.
+
+    Args:
+        path: file to write.
+        width: of the figure [inch].
+        height: of the figure [inch].
+        dpi: pixels per inch.
+        legend_columns: most labels beside each other; 0 for a figure without a common legend.
+    """
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
         yield figure
+        handles: dict[str, Any] = {}
+        for axes in figure.axes:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                handles.setdefault(label, handle)
+        if legend_columns and handles:
+            place, columns = "outside upper center", min(len(handles), legend_columns)
+            figure.legend([*handles.values()], [*handles], loc=place, ncols=columns)
         # no date and no version inside: the same picture gives the same bytes
-        metadata = {
-            ".png": {"Software": None},
-            ".svg": {"Date": None},
-            ".pdf": {"CreationDate": None},
-        }
-        figure.savefig(path, metadata=metadata.get(path.suffix.lower()))
-
-
-def legend(figure: Figure, axes: Axes, columns: int = 6) -> None:
-    """One legend above all panels, from the labels of one of them."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), columns))
+        dated = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
+        key = dated.get(path.suffix.lower())
+        figure.savefig(path, metadata={key: None} if key else None)
 
 
 def widen(axes: Axes, least: float) -> None:
-    """Keep an axis from blowing noise up: at least `least` either side of its middle."""
+    """Let a y axis span at least `least` either side of its middle, so that noise stays small."""
     low, high = axes.get_ylim()
     if high - low < 2 * least:
         axes.set_ylim((low + high) / 2 - least, (low + high) / 2 + least)
@@ -153,12 +156,21 @@ def widen(axes: Axes, least: float) -> None:
 
 def weight_label(name: str) -> str:
     """A weight's name as a tick's label."""
-    matrix, _, rest = name.partition("_")
-    return f"{matrix} {rest.replace('_', ' ')}"
+    return name.replace("_", " ")
+
+
+def category_axis(axes: Axes, labels: Sequence[str], group: int = 1, **text: Any) -> None:
+    """Name the places 0, 1, ... of an x axis, with a thin line between groups of them."""
+    axes.grid(visible=False, axis="x")
+    axes.set_xticks(range(len(labels)), labels, **text)
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlim(-0.6, len(labels) - 0.4)
+    for edge in range(group, len(labels), group):
+        axes.axvline(edge - 0.5, color="0.8", linewidth=0.8, zorder=0)
 
 
 def log_axis(axes: Axes, which: str) -> None:
-    """Make the axis `which` (x or y) logarithmic, with a few plain numbers whatever it spans."""
+    """Make the axis `which` (x or y) logarithmic, with a few plain numbers whatever its span."""
     axes.set(**{f"{which}scale": "log"})
     axis = getattr(axes, f"{which}axis")
     low, high = axis.get_view_interval()

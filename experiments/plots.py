@@ -1,0 +1,411 @@
+"""Pictures of the experiments, in the style of the package's own; each returns its caption."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.artist import setp
+
+from hector_jax.report.plots.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SETS,
+    category_axis,
+    drawing,
+    log_axis,
+    looks_of,
+    named,
+    weight_label,
+)
+
+
+def ratios(
+    path: Path, columns: Sequence[str], sets: Mapping[str, Float[np.ndarray, " columns"]]
+) -> str:
+    """Draw the losses of weight sets as ratios to nominal, by trajectory.
+
+    Args:
+        path: file to write.
+        columns: the trajectories.
+        sets: by name, a ratio per trajectory.
+    """
+    at, width = np.arange(len(columns)), 0.7 / max(len(sets), 1)
+    with drawing(path, 7.5, 3.2) as figure:
+        axes, looks = figure.subplots(), looks_of(sets)
+        for i, (name, values) in enumerate(sets.items()):
+            x = at + width * (i - (len(sets) - 1) / 2)
+            axes.plot(x, values, markersize=6, label=named(name), **looks[name].dot)
+        axes.axhline(1.0, color="black", linewidth=0.8)
+        category_axis(axes, columns)
+        log_axis(axes, "y")
+        axes.set_ylabel("L / L of nominal")
+    return "Loss on the hfs as a ratio to that of the nominal weights (1)."
+
+
+def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> str:
+    """Draw the losses of weight sets on many plants, each set's in rising order.
+
+    Args:
+        path: file to write.
+        sets: by name, a loss per plant.
+    """
+    with drawing(path, 6.0, 3.4) as figure:
+        axes = figure.subplots()
+        for name, look in looks_of(sets).items():
+            share = 100 * (np.arange(len(sets[name])) + 0.5) / len(sets[name])
+            style = {"marker": look.marker, "label": named(name), **look.line}
+            axes.plot(share, np.sort(sets[name]) / 1e6, **style)
+        log_axis(axes, "y")
+        axes.set(xlabel="plants [%], by their loss", ylabel="L [10$^6$]", xlim=(0, 100))
+    return "Loss on each plant, in rising order for each set: the right end is the tail."
+
+
+def front(
+    path: Path,
+    prices: Float[np.ndarray, " points"],
+    worlds: Mapping[str, Float[np.ndarray, "points 2"]],
+    others: Mapping[str, tuple[float, float]],
+) -> str:
+    """Draw tracking against smoothness of weights tuned at several prices of tracking.
+
+    Args:
+        path: file to write.
+        prices: factors of the paper's loss weights.
+        worlds: by name, tracking and L_ctrl by price.
+        others: the same of other weight sets, in the world named last.
+    """
+    with drawing(path, 4.0 * len(worlds), 3.6) as figure:
+        panels = figure.subplots(1, len(worlds), squeeze=False)[0]
+        for panel, (world, values) in zip(panels, worlds.items(), strict=True):
+            finite = np.isfinite(values).all(axis=1)
+            points, factors = values[finite] / 1e6, prices[finite]
+            panel.plot(*points.T, "o-", color=GREEN, label="tuned")
+            if world == list(worlds)[-1]:
+                for name, look in looks_of(others).items():
+                    panel.plot(*np.divide(others[name], 1e6), label=named(name), **look.dot)
+            paper = int(np.argmin(np.abs(np.log(factors))))
+            places = {0: (6, 0, "left"), paper: (-6, -4, "right"), -1: (0, 6, "center")}
+            for i, (x, y, side) in places.items():
+                text = f"x{float(f'{factors[i]:.2g}'):g}"
+                panel.annotate(text, points[i], (x, y), textcoords="offset points", ha=side)
+            panel.margins(0.15, 0.1)
+            log_axis(panel, "x")
+            panel.set(title=world, xlabel="tracking [10$^6$]")
+        panels[0].set_ylabel(r"$L_\mathrm{ctrl}$ [10$^6$]")
+    return (
+        "Each point is a tuning. Along the line the price of tracking grows by one factor from "
+        "point to point; labels stand at its ends and at the paper's price (x1). Left and down is "
+        "better."
+    )
+
+
+def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
+    """Draw the loss by iteration from several starts, and where they end.
+
+    Args:
+        path: file to write.
+        curves: losses that were accepted, NaN elsewhere; the first row starts at nominal.
+    """
+    with drawing(path, 7.5, 3.4) as figure:
+        left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
+        ends = []
+        for i, row in enumerate(curves):
+            accepted = np.flatnonzero(np.isfinite(row))
+            look = {"color": "0.7", "linewidth": 0.8} if i else SETS["with"] | {"zorder": 3}
+            label = {0: "from nominal", 1: "from elsewhere"}.get(i)
+            left.plot(accepted, row[accepted] / 1e6, label=label, **look)
+            ends.append(row[accepted[-1]] / 1e6)
+        order = np.sort(ends)
+        share = 100 * (np.arange(len(ends)) + 0.5) / len(ends)
+        right.plot(share, order, "o", color="0.5", markersize=3)
+        right.plot(share[np.searchsorted(order, ends[0])], ends[0], "o", color=GREEN)
+        log_axis(left, "y")
+        left.set(xlabel="iteration", ylabel="L on the model [10$^6$]", title="on the way")
+        left.xaxis.get_major_locator().set_params(integer=True)
+        right.set(xlabel="starts [%]", title="at the end", xlim=(0, 100))
+    return "Loss on the model by iteration from each start, and the losses at the end in order."
+
+
+_ARMS = {
+    "fixed": ("weights stay", SETS["nominal"]),
+    "until": ("tuned until the change", SETS["without"]),
+    "carried": ("tuned all the way", SETS["with"]),
+}
+
+
+def while_walking(
+    path: Path,
+    change: float,
+    times: Float[np.ndarray, " windows"],
+    curves: Mapping[tuple[str, str], Mapping[str, Float[np.ndarray, "plants windows"]]],
+) -> str:
+    """Draw the loss along walks on which the plant changes, with weights that stay or are tuned.
+
+    Args:
+        path: file to write.
+        change: when the plant changes [s].
+        times: middles of the windows of which the losses are [s].
+        curves: losses by trajectory and start weights, the columns and rows of panels, and by arm.
+    """
+    columns, rows = (list(dict.fromkeys(key[i] for key in curves)) for i in (0, 1))
+    size = (3.3 * len(columns) + 0.2, 2.0 * len(rows) + 0.5)
+    with drawing(path, *size, legend_columns=len(columns)) as figure:
+        panels = figure.subplots(len(rows), len(columns), sharex=True, squeeze=False)
+        for (trajectory, start), arms in curves.items():
+            panel = panels[rows.index(start), columns.index(trajectory)]
+            panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            for arm, losses in arms.items():
+                label, look = _ARMS[arm]
+                panel.plot(times, np.median(losses, axis=0) / 1e6, **look, label=label)
+            panel.set(title=f"{trajectory}, from {start}", ylim=(0, 1.05 * panel.get_ylim()[1]))
+        setp(panels[-1], xlabel="time [s]")
+        setp(panels[:, 0], ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
+    return "Loss along the walk, median over the plants; the line is where the plant changes."
+
+
+def weight_histories(
+    path: Path,
+    change: float,
+    times: Float[np.ndarray, " steps"],
+    names: Sequence[str],
+    histories: Mapping[str, Float[np.ndarray, "steps weights"]],
+    *,
+    count: int = 6,
+) -> str:
+    """Draw the weights that moved most while walking, as ratios to where they started.
+
+    Args:
+        path: file to write.
+        change: when the plant changes [s].
+        times: of the steps [s].
+        names: of the weights.
+        histories: ratios by trajectory; a walk that ended early has fewer steps.
+        count: how many weights to draw in each panel.
+    """
+    colors, marks = (BLUE, ORANGE, GREEN, PURPLE, "0.35", "black"), "osD^vP"
+    single = [i for i, name in enumerate(names) if not name.endswith("_right")]
+    with drawing(path, 3.3 * len(histories) + 0.2, 3.4, legend_columns=0) as figure:
+        panels = figure.subplots(1, len(histories), squeeze=False)[0]
+        for panel, (trajectory, ratios) in zip(panels, histories.items(), strict=True):
+            panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            moved = np.abs(np.log(ratios[:, single])).max(axis=0)
+            for i, color, mark in zip(np.argsort(-moved)[:count], colors, marks, strict=False):
+                label = weight_label(names[single[i]].removesuffix("_left"))
+                look = {"color": color, "marker": mark, "markersize": 2.6, "label": label}
+                panel.plot(times[: len(ratios)], ratios[:, single[i]], **look)
+            panel.set(title=trajectory, xlabel="time [s]")
+            log_axis(panel, "y")
+            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18)}
+            panel.legend(ncols=3, columnspacing=1.2, **below)
+        panels[0].set_ylabel("weight / its start")
+    return f"The {count} weights that moved most; both feet share one R."
+
+
+METHODS = {
+    "without": "DiffTune without net",
+    "with": "DiffTune with net",
+    "adam": "Adam with net",
+    "differences": "differences on the simulator",
+    "cma-es": "CMA-ES",
+    "bayes": "Bayesian, whole box",
+    "bayes near": "Bayesian, near the start",
+    "random": "random",
+}
+"""Names of the ways of tuning that race."""
+
+_METHOD_LINES = {
+    "without": SETS["without"],
+    "with": SETS["with"] | {"linewidth": 1.8},
+    "adam": {"color": "#63b89f", "linestyle": (0, (3, 1.2))},
+    "differences": {"color": "black", "linestyle": (0, (5, 1.5)), "linewidth": 1.1},
+    "cma-es": SETS["searched"],
+    "bayes": {"color": BLUE, "linestyle": (0, (5, 1.5))},
+    "bayes near": {"color": BLUE, "linestyle": "-"},
+    "random": {"color": GREY, "linestyle": "-"},
+}
+
+
+def race(
+    path: Path,
+    curves: Mapping[str, Sequence[tuple[Float[np.ndarray, " walks"], Float[np.ndarray, " walks"]]]],
+    abscissa: str,
+) -> str:
+    """Draw the lowest loss so far of each way of tuning: its repeats, and their median.
+
+    Args:
+        path: file to write.
+        curves: by method, abscissa and loss of each repeat.
+        abscissa: what the losses are drawn against.
+    """
+    with drawing(path, 7.0, 4.4, legend_columns=3) as figure:
+        axes = figure.subplots()
+        for name, repeats in curves.items():
+            count = min(len(losses) for _, losses in repeats)
+            x = np.median([at[:count] for at, _ in repeats], axis=0)
+            losses = np.array([losses[:count] for _, losses in repeats]) / 1e6
+            look, median = _METHOD_LINES[name], np.median(losses, axis=0)
+            if len(losses) > 1:
+                axes.step(x, losses.T, where="post", color=look["color"], alpha=0.45, lw=0.6)
+            axes.step(x, median, where="post", **look, label=METHODS[name])
+            axes.plot(x[-1], median[-1], "o", color=look["color"], markersize=3)
+        axes.set(xlabel=abscissa, ylabel="lowest L on the simulator so far [10$^6$]")
+        log_axis(axes, "y")
+    return (
+        f"Lowest loss on the high-fidelity simulator so far, by {abscissa}: median of the repeats, "
+        "each of them thin."
+    )
+
+
+def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
+    """Draw the loss against the baseline and the share of walks without a fall, a row each.
+
+    Args:
+        path: file to write.
+        rows: by disturbance, the results by set, the baseline first: `ratio` of the losses and
+            share `survived`, each a value with the ends of its interval.
+    """
+    looks = looks_of(next(iter(rows.values())))
+    baseline, at = next(iter(looks)), -np.arange(len(rows))
+    with drawing(path, 7.5, 0.3 * len(rows) + 0.9) as figure:
+        panels = figure.subplots(1, 2, sharey=True)
+        for i, (name, look) in enumerate(looks.items()):
+            y = at + 0.25 * ((len(looks) - 1) / 2 - i)
+            ratio = np.array([row[name].ratio for row in rows.values()])
+            stood = 100 * np.array([row[name].survived for row in rows.values()])
+            for panel, (value, low, high) in zip(panels, (ratio.T, stood.T), strict=True):
+                panel.plot(value, y, **look.dot, label=named(name))
+                panel.hlines(y, low, high, color=look.color, linewidth=1.2)
+        panels[0].axvline(1.0, color="black", linewidth=0.8, zorder=1)
+        panels[0].set_xlabel(f"median of L / L of {baseline}")
+        panels[0].set_yticks(at, list(rows))
+        log_axis(panels[0], "x")
+        panels[1].set(xlabel="walks without a fall [%]", xlim=(-4, 104))
+    return (
+        "What is in the way, a row each: the median ratio of L to the baseline's in the same scene "
+        "on the same plant (left of 1 is better), and the walks without a fall (right is better). "
+        "Lines are 95 % intervals from redrawing the plants."
+    )
+
+
+def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -> str:
+    """Draw the largest push survived, by the direction in which it pushes.
+
+    Args:
+        path: file to write.
+        endured: [N] by set, in steps of 45 degrees to the left, the first ahead.
+    """
+    angles = np.deg2rad(45.0 * np.arange(9))
+    with drawing(path, 4.6, 4.4, legend_columns=3) as figure:
+        axes = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
+        for name, look in looks_of(endured).items():
+            style = {"marker": look.marker, "markersize": 3.5, "label": named(name), **look.line}
+            axes.plot(angles, np.append(endured[name], endured[name][0]), **style)
+        axes.set_rmin(0.0)
+        axes.set_rlabel_position(22.5)
+        axes.yaxis.set_major_formatter(lambda force, _: f"{force:g} N")
+        axes.set_title("Largest push of 0.1 s survived, by where it pushes to", pad=14)
+        axes.set_xticks(angles[:-1], ["ahead", "", "left", "", "back", "", "right", ""])
+    return (
+        "Largest push [N] of 0.1 s that is survived together with all smaller ones, by where it "
+        "pushes to; mean over plants and gait phases."
+    )
+
+
+class _PhiLook(NamedTuple):
+    """How results of one phi are drawn."""
+
+    color: str
+    marker: str
+    hatch: str | None = None  # of bars
+
+
+_PHI = {
+    "command": _PhiLook("black", "."),
+    "linear": _PhiLook(PURPLE, "^", "//////"),
+    "paper": _PhiLook(ORANGE, "x"),
+    "net": _PhiLook(GREEN, "o"),
+    "net without legs": _PhiLook(BLUE, "s", "......"),
+}
+
+
+def gradients(
+    path: Path,
+    names: Sequence[str],
+    simulator: Float[np.ndarray, "phases weights"],
+    models: Mapping[str, Float[np.ndarray, "phases weights"]],
+) -> str:
+    """Draw gradients of the loss in log-weights, scaled to unit length: hfs, and the model by phi.
+
+    Args:
+        path: file to write.
+        names: of the weights.
+        simulator: those of the hfs by start phase.
+        models: those of the model likewise, by the name of a phi.
+    """
+    at, width = np.arange(len(names)), 0.8 / len(models)
+    with drawing(path, 10.0, 4.2, legend_columns=3) as figure:
+        axes = figure.subplots()
+
+        def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, **look: Any) -> None:
+            mean = rows.mean(axis=0)
+            size = np.linalg.norm(mean)
+            axes.bar(x, mean / size, width, label=f"{name}, {size / 1e6:.1f}e6", **look)
+
+        bars(at, simulator, 0.9, "hfs", facecolor="0.95", edgecolor="0.3", linewidth=0.9)
+        size = np.linalg.norm(simulator.mean(axis=0))
+        low, high = simulator.min(axis=0) / size, simulator.max(axis=0) / size
+        axes.vlines(at - 0.45, low, high, color="black", linewidth=2.0, zorder=3)
+        for i, (name, rows) in enumerate(models.items()):
+            x = at + width * (i - (len(models) - 1) / 2)
+            look = {"color": _PHI[name].color, "hatch": _PHI[name].hatch}
+            bars(x, rows, 0.8 * width, name, **look, edgecolor="white", linewidth=0.0)
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        category_axis(axes, [weight_label(name) for name in names], 3)
+        axes.set_ylabel("dL / d log weight, unit length")
+    return (
+        "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "
+        "lengths are in the legend. The line at the left of each wide bar spans the start phases "
+        f"on the hfs; the narrow ones are, from the left, {', '.join(models)}."
+    )
+
+
+def ranks(
+    path: Path,
+    simulator: Mapping[tuple[str, str], Float[np.ndarray, " sets"]],
+    models: Mapping[tuple[str, str], Mapping[str, Float[np.ndarray, " sets"]]],
+    correlations: Mapping[tuple[str, str], Mapping[str, float]],
+) -> str:
+    """Draw the loss of disturbed weight sets on the model against that on the hfs.
+
+    Args:
+        path: file to write.
+        simulator: losses on the hfs by trajectory and factor, the rows and columns of panels.
+        models: losses on the model, likewise and by the name of a phi.
+        correlations: of ranks, likewise.
+    """
+    trajectories, factors = (list(dict.fromkeys(k[i] for k in simulator)) for i in (0, 1))
+    size = (3.3 * len(trajectories) + 0.2, 3.0 * len(factors) + 0.4)
+    hollow = {"linestyle": "none", "markerfacecolor": "none", "markersize": 3.5, "mew": 0.8}
+    with drawing(path, *size, legend_columns=0) as figure:
+        panels = figure.subplots(len(factors), len(trajectories), squeeze=False)
+        for (trajectory, factor), truth in simulator.items():
+            panel = panels[factors.index(factor), trajectories.index(trajectory)]
+            for name, losses in models[trajectory, factor].items():
+                look = {"color": _PHI[name].color, "marker": _PHI[name].marker, **hollow}
+                label = f"{name}: {correlations[trajectory, factor][name]:.2f}"
+                panel.plot(truth / 1e6, losses / 1e6, **look, label=label)
+            panel.legend(loc="upper left", handlelength=1.0, borderaxespad=0.2)
+            panel.set_title(f"{trajectory}, within x/{factor}")
+            log_axis(panel, "x")
+            panel.set_yscale("log")
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
+            log_axis(panel, "y")
+        setp(panels[-1], xlabel="L on the hfs [10$^6$]")
+        setp(panels[:, 0], ylabel="L on the model [10$^6$]")
+    return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."

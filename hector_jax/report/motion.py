@@ -1,0 +1,108 @@
+"""The motion of a robot over a walk: what both the film and the page draw, made once."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from hector_jax.core.trajectory import State, Trajectory, Wrench, from_start
+from hector_jax.robot.model import Robot
+
+COLOURS = ((184, 33, 51), (0, 122, 94))  # of before and after
+INK = (20, 20, 25)
+
+
+class Motion(NamedTuple):
+    """A walk in the frame of its start; after a fall the robot stays where it was last seen."""
+
+    period: float  # [s] between samples, which stand at the ends of their intervals
+    qpos: Float[np.ndarray, "T 17"]  # of MuJoCo
+    path: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
+    reference: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
+    contact: Bool[np.ndarray, "T 2"]  # planned stance
+    feet: Float[np.ndarray, "T 2 3"]  # foot points [m]
+    R_yaw: Float[np.ndarray, "T 3 3"]  # heading of the trunk as each interval starts
+    wrenches: dict[str, Wrench]  # of the ground on the feet by source, (T, 2, 3) each
+    soles: Float[np.ndarray, "n 2 3"]  # heel and toe of each foot as it was set down
+    upright: int  # samples before the fall; all of them where there is none
+
+    @property
+    def times(self) -> Float[np.ndarray, " T"]:
+        """Times of the samples [s]."""
+        return self.period * np.arange(1, len(self.qpos) + 1)
+
+    @property
+    def fall_time(self) -> float:
+        """Time of the fall [s]; infinite where there is none."""
+        return self.period * self.upright if self.upright < len(self.qpos) else np.inf
+
+    @property
+    def distance(self) -> Float[np.ndarray, " T"]:
+        """Distance of the centre of mass from its reference in the plane [m]."""
+        return np.linalg.norm((self.path - self.reference)[:, :2], axis=1)
+
+    def index(self, times: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+        """Indices of the samples at some times [s]."""
+        return np.clip(np.round(times / self.period).astype(int) - 1, 0, len(self.qpos) - 1)
+
+
+def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None = None) -> Motion:
+    """Compute the motion of a walk.
+
+    Args:
+        robot: the body that walked.
+        walk: its trajectory, at any period.
+        ground: wrenches of the ground by source, (T, 2, 3) each, in the yaw frame of the walk.
+    """
+    walk = from_start(walk)
+    count, fallen = len(walk.fallen), walk.fallen
+    upright = int(np.argmax(fallen)) if fallen.any() else count
+    last_seen = np.minimum(np.arange(count), max(upright - 1, 0))
+    state, feet, joints = jax.tree.map(
+        lambda x: np.asarray(x)[last_seen], (walk.state, walk.feet, walk.joints)
+    )
+    heading = np.append(walk.initial.euler[2], state.euler[:-1, 2])
+    R_yaw = Rotation.from_euler("z", heading[:, None]).as_matrix()
+    ahead = R_yaw[:, None, :, 0]
+    soles = np.stack([feet - robot.heel * ahead, feet + robot.toe * ahead], axis=2)
+    set_down = np.diff(walk.contact[:upright].astype(int), axis=0, prepend=0) > 0
+    return Motion(
+        period=float(walk.period),
+        qpos=poses(robot, state, joints),
+        path=state.position,
+        reference=walk.reference.position,
+        contact=walk.contact,
+        feet=feet,
+        R_yaw=R_yaw,
+        wrenches={
+            source: Wrench(
+                *(np.einsum("tij,tfj->tfi", R_yaw, np.asarray(part)[last_seen]) for part in wrench)
+            )
+            for source, wrench in (ground or {}).items()
+        },
+        soles=soles[:upright][set_down],
+        upright=upright,
+    )
+
+
+def motions(robot: Robot, walks: Mapping[str, Trajectory]) -> dict[str, Motion]:
+    """Compute the motions of walks by name, without the ground."""
+    return {name: motion(robot, walk) for name, walk in walks.items()}
+
+
+def poses(
+    robot: Robot, state: State, joints: Float[np.ndarray, "T 10"]
+) -> Float[np.ndarray, "T 17"]:
+    """MuJoCo's qpos of a walk: trunk position, trunk quaternion, joints.
+
+    Args:
+        robot: whose CoM offset leads from the centre of mass to the trunk.
+        state: (T, 3) each, world frame.
+        joints: [rad].
+    """
+    R_wb = Rotation.from_euler("ZYX", np.asarray(state.euler)[:, ::-1])
+    trunk = np.asarray(state.position) - R_wb.apply(np.asarray(robot.com_offset))
+    return np.concatenate([trunk, R_wb.as_quat(scalar_first=True), joints], axis=1)

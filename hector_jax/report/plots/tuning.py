@@ -1,0 +1,161 @@
+"""Pictures of a tuning: losses by iteration, weights, and the loss on the stand-in's plants."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from hector_jax.report.plots.style import (
+    SETS,
+    category_axis,
+    drawing,
+    log_axis,
+    looks_of,
+    named,
+    weight_label,
+)
+from hector_jax.runs.metrics import BASELINES, Verdict, compare
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
+from hector_jax.tuning.loss import LossConfig
+
+
+def losses(
+    path: Path,
+    alpha: LossConfig,
+    histories: Mapping[str, Sequence[Iteration]],
+    *,
+    ten: int = PAPER_ITERATIONS,
+) -> str:
+    """Draw the loss on the model by iteration, whole and by part.
+
+    Args:
+        path: file to write.
+        alpha: loss weights, by which the parts are multiplied.
+        histories: of the tunings, by weight set: `without` and `with`.
+        ten: the iteration to mark.
+    """
+    parts = {
+        "$L$": lambda found: found.loss,
+        r"$\alpha_1 L_\mathrm{Eul}$": lambda found: alpha.euler * found.parts.euler,
+        r"$\alpha_2 L_\mathrm{pos}$": lambda found: alpha.position * found.parts.position,
+        r"$L_\mathrm{ctrl}$": lambda found: found.parts.control,
+    }
+    accepted = {n: np.array([i.accepted for i in history]) for n, history in histories.items()}
+    cross = {"linestyle": "none", "marker": "x", "color": "black", "markersize": 4.5}
+    with drawing(path, 10.0, 2.7) as figure:
+        panels = figure.subplots(1, len(parts))
+        for panel, (title, part) in zip(panels, parts.items(), strict=True):
+            panel.axvline(ten, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            for name, look in looks_of(histories).items():
+                values = np.array([float(part(i.evaluation)) for i in histories[name]]) / 1e6
+                good, bad = np.flatnonzero(accepted[name]), np.flatnonzero(~accepted[name])
+                # a marker at each iteration would hide how the line is dashed
+                marks = {"marker": look.marker, "markersize": 3.2, "markevery": 10}
+                panel.plot(good, values[good], **look.line, **marks, label=named(name))
+                if title == "$L$":
+                    top = 1.1 * values[good].max()  # a rejected step need not have a finite loss
+                    panel.plot(bad, np.where(values < top, values, top)[bad], **cross)
+            panel.set(title=title, xlabel="iteration", ylim=(0, 1.12 * panel.get_ylim()[1]))
+            panel.xaxis.get_major_locator().set_params(integer=True)
+        panels[0].set_ylabel("loss on the model [10$^6$]")
+        if not all(flags.all() for flags in accepted.values()):
+            panels[0].plot([], [], **cross, label="refused step")
+    return (
+        f"Loss on the model by iteration, whole and by part; the line is iteration {ten}, "
+        "a cross is a refused step; every tenth accepted one has a marker."
+    )
+
+
+def weights(
+    path: Path, names: Sequence[str], sets: Mapping[str, Float[np.ndarray, " weights"]]
+) -> str:
+    """Draw tuned weights as ratios to the nominal ones.
+
+    Args:
+        path: file to write.
+        names: of the weights, such as `WEIGHT_NAMES`.
+        sets: `nominal`, `expert` and the tuned `without`, `with`, flat in the order of `names`.
+    """
+    ratio = {
+        name: np.asarray(values) / np.asarray(sets["nominal"]) for name, values in sets.items()
+    }
+    tuned = [name for name in ("without", "with") if name in sets]
+    with drawing(path, 10.0, 3.4) as figure:
+        axes = figure.subplots()
+        for i, name in enumerate(tuned):
+            x = np.arange(len(names)) + 0.38 * (i - (len(tuned) - 1) / 2)
+            look = {"color": SETS[name]["color"], "hatch": "////" if name == "without" else None}
+            look |= {"edgecolor": "white", "linewidth": 0.0}
+            axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=named(name))
+        if "expert" in sets:
+            look = looks_of(["expert"])["expert"].dot
+            axes.plot(ratio["expert"], **look, markerfacecolor="white", label="expert")
+        axes.axhline(1.0, color="black", linewidth=0.8)
+        log_axis(axes, "y")
+        labels = {"rotation": 60, "ha": "right", "va": "center", "rotation_mode": "anchor"}
+        category_axis(axes, [weight_label(name) for name in names], 3, **labels)
+        axes.set_ylabel("weight / nominal")
+    return "Tuned weights as ratios to the nominal ones (1); diamonds are the expert's."
+
+
+def changes(
+    path: Path, verdicts: Mapping[str, Verdict], paper: Mapping[tuple[str, str, str], float]
+) -> str:
+    """Draw the loss of every weight set against nominal and expert on every plant.
+
+    Args:
+        path: file to write.
+        verdicts: by trajectory.
+        paper: the paper's change [%] by trajectory, set and baseline.
+    """
+    every = dict.fromkeys(name for verdict in verdicts.values() for name in verdict.scores)
+    names = [name for name in every if name not in BASELINES]
+    size = (3.3 * len(verdicts) + 1.2, 2 * (0.27 * len(names) + 0.75) + 0.3)
+    diamond = {"linestyle": "none", "marker": "D", "color": "black", "markerfacecolor": "white"}
+    diamond |= {"markersize": 5, "zorder": 4, "label": "the paper, on the robot"}
+    with drawing(path, *size) as figure:
+        panels = figure.subplots(2, len(verdicts), sharex="row", sharey=True, squeeze=False)
+        for row, baseline in zip(panels, BASELINES, strict=True):
+            for panel, (trajectory, verdict) in zip(row, verdicts.items(), strict=True):
+                _draw_changes(panel, verdict, names, baseline)
+                change = {i: paper.get((trajectory, n, baseline)) for i, n in enumerate(names)}
+                points = [(1 + x / 100, i) for i, x in change.items() if x is not None]
+                panel.plot(*np.reshape(points, (-1, 2)).T, **diamond)
+                panel.set(xlabel=f"change of L against {baseline} [%]", title=trajectory)
+            log_axis(row[0], "x")
+            percent = lambda r, _: f"{100 * (r - 1):+.0f}" if r != 1 else "0"  # noqa: E731
+            row[0].xaxis.set_major_formatter(percent)
+        first = panels[0, 0]
+        first.set_yticks(range(len(names)), [named(name) for name in names])
+        first.set_ylim(len(names) - 0.5, -0.5)
+        first.plot([], [], "o", color="0.4", alpha=0.5, label="one plant")
+        cross = {"color": "0.2", "markersize": 11, "mew": 2.2}
+        first.plot([], [], "+", **cross, label="median and its interval")
+    return (
+        "L of each set against that of nominal and expert on the same plant, one dot per plant, "
+        "with the median and its 95 % bootstrap interval; left of the line is better. Plants on "
+        "which the set fell have no dot, their number stands at the right; the median counts them. "
+        "Diamonds are the paper's table, after ten iterations."
+    )
+
+
+def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline: str) -> None:
+    panel.axvline(1.0, color="black", linewidth=0.9)
+    looks = looks_of(names)
+    for row, name in enumerate(names):
+        if name not in verdict.scores:
+            continue
+        score, color = verdict.scores[name], looks[name].color
+        ratio = (score.L / verdict.scores[baseline].L)[~score.fallen]
+        panel.plot(ratio, [row] * len(ratio), "o", color=color, alpha=0.3, markersize=3, mew=0)
+        if falls := int(score.fallen.sum()):
+            edge = {"transform": panel.get_yaxis_transform(), "ha": "right", "va": "center"}
+            panel.text(0.99, row, f"{falls} fell", color=color, **edge)
+        value, low, high = (1 + x / 100 for x in compare(verdict, name, baseline).change["L"])
+        if len(ratio):  # an interval that falls widen shall not squeeze the axis
+            high = min(high, 1.1 * max(*ratio, value))
+        panel.hlines(row, low, high, color=color, linewidth=2.2, zorder=3)
+        panel.plot(value, row, "|", color=color, markersize=11, mew=2.2, zorder=3)
+    panel.grid(visible=False, axis="y")

@@ -1,0 +1,210 @@
+"""The child process of a film: draws a `video.Scene` with MuJoCo and writes the film or strip.
+
+It runs in a folder that holds `scene.pickle` and, for a film, `plot.png`, which stands below it.
+"""
+
+import pickle
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from hector_jax.core.headless import mujoco
+from hector_jax.report.motion import COLOURS, INK
+from hector_jax.report.video import Scene
+
+_WINDOW = 4.0  # [s] of the reference that a film keeps in view
+_STRIP_WINDOW = 0.8  # [s], of a snapshot
+_SAMPLE = 0.02  # [s] between the points of the lines on the floor
+_DASH = 4  # of these points
+_DOWN, _ASIDE = np.deg2rad(30.0), np.deg2rad(35.0)  # how the camera looks along the way
+_LAST = 1500  # [ms] that an animated picture stands still before it starts again
+
+
+def main() -> None:
+    """Draw scene.pickle of the working directory."""
+    scene: Scene = pickle.loads(Path("scene.pickle").read_bytes())
+    width, height = scene.config.width, scene.config.height
+    across, down = (3 * width // 10 if scene.strip else width // 2), 3 * height // 4
+    views = _views(scene, across, down)
+    if scene.strip:
+        _strip(scene, list(views)).save(scene.file)
+    else:
+        plot = np.asarray(Image.open("plot.png").convert("RGB"))
+        frames = (_frame(scene, plot, halves, k) for k, halves in enumerate(views))
+        _encode(scene.file, frames, (width, height), scene.config.rate)
+
+
+def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndarray, "h w 3"]]]:
+    """Render both walks at each time of the scene."""
+    model = mujoco.MjModel.from_xml_path(scene.model)
+    data = mujoco.MjData(model)
+    model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
+    model.vis.global_.offheight = max(model.vis.global_.offheight, height)
+    model.vis.quality.shadowsize = 2048  # drawn without a GPU, shadows cost the most
+    accent = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, "accent")
+    seconds = _STRIP_WINDOW if scene.strip else _WINDOW
+    cameras = _cameras(scene, model.vis.global_.fovy, width / height, seconds)
+    with mujoco.Renderer(model, height, width) as renderer:
+
+        def view(i: int, now: int, camera: mujoco.MjvCamera) -> np.ndarray:
+            motion, colour = scene.motions[i], _rgba(COLOURS[i])
+            if accent >= 0:
+                model.mat_rgba[accent] = colour
+            data.qpos[:] = motion.qpos[now]
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera)
+            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+            path = motion.path[: min(now + 1, motion.upright) : _spacing(motion.period)]
+            for ends in pairwise(path):
+                _line(renderer.scene, ends, 5.0, 0.003, colour)
+            reference = _floor_reference(scene)
+            starts, stops = reference[:: 2 * _DASH], reference[_DASH :: 2 * _DASH]
+            for ends in zip(starts, stops, strict=False):
+                _line(renderer.scene, ends, 2.5, 0.005, _rgba(INK))
+            return renderer.render()
+
+        samples = np.stack([motion.index(scene.times) for motion in scene.motions], axis=1)
+        for now, camera in zip(samples, cameras, strict=True):
+            yield [view(i, now[i], camera) for i in range(2)]
+
+
+def _rgba(colour: tuple[int, int, int]) -> Float[np.ndarray, "4"]:
+    return np.array([*colour, 255]) / 255.0
+
+
+def _spacing(period: float) -> int:
+    """Samples from one point of a line on the floor to the next."""
+    return max(1, round(_SAMPLE / period))
+
+
+def _floor_reference(scene: Scene) -> Float[np.ndarray, "n 3"]:
+    last = scene.motions[-1]
+    return last.reference[:: _spacing(last.period)]
+
+
+def _line(scene: Any, ends: Any, pixels: float, height: float, rgba: np.ndarray) -> None:
+    """Draw a line under two points, at a `height` [m]; the higher hides the lower."""
+    geom, kind, zero = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3)
+    rgba = rgba * [0.6, 0.6, 0.6, 1.0]  # MuJoCo draws lines brighter than bodies
+    mujoco.mjv_initGeom(geom, kind, zero, zero, np.eye(3).ravel(), rgba.astype("f"))
+    mujoco.mjv_connector(geom, kind, pixels, *(np.array([*end[:2], height]) for end in ends))
+    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+    scene.ngeom += 1
+
+
+def _cameras(scene: Scene, fovy: float, aspect: float, seconds: float) -> list[mujoco.MjvCamera]:
+    """Cameras from behind and above that see the robot and `seconds` of the reference around it.
+
+    A walk that lasts no longer is seen by a camera that does not move.
+    """
+    last, top = scene.motions[-1], scene.top
+    reference = _floor_reference(scene) * [1.0, 1.0, 0.0]
+    way = reference[-1] - reference[0]
+    heading = np.arctan2(way[1], way[0]) if np.linalg.norm(way) > top else 0.0
+    azimuth = heading + _ASIDE
+    ahead = np.array(
+        [np.cos(azimuth) * np.cos(_DOWN), np.sin(azimuth) * np.cos(_DOWN), -np.sin(_DOWN)]
+    )
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    axes = np.stack([right, np.cross(right, ahead), ahead], axis=1)
+    half = np.tan(np.deg2rad(fovy) / 2) * np.array([aspect, 1.0])
+    count = min(len(reference), round(seconds / _SAMPLE))
+    middles, distances = [], []
+    for sample in last.index(scene.times) // _spacing(last.period):
+        first = int(np.clip(sample - count // 2, 0, len(reference) - count))
+        floor = reference[first : first + count]
+        body = np.concatenate([floor, floor + [0.0, 0.0, top]]) @ axes
+        middle = (body.min(axis=0) + body.max(axis=0)) / 2
+        spread = np.abs(body[:, :2] - middle[:2]) + 0.3 * top * np.array([1.0, 0.4])
+        distances.append(np.max(spread / half - (body[:, 2:] - middle[2])))
+        middles.append(axes @ middle)
+    cameras = [mujoco.MjvCamera() for _ in middles]
+    for camera, middle in zip(cameras, middles, strict=True):
+        camera.lookat[:], camera.distance = middle, max(distances)
+        camera.azimuth, camera.elevation = np.rad2deg(azimuth), -np.rad2deg(_DOWN)
+    return cameras
+
+
+def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rate: int) -> None:
+    if not file.endswith(".mp4"):
+        first, *rest = frames
+        lasts = [1000 // rate] * len(rest) + [_LAST]
+        first.save(file, save_all=True, append_images=rest, duration=lasts, loop=0, quality=75)
+        return
+    writer = imageio_ffmpeg.write_frames(
+        file,
+        size,
+        fps=rate,
+        codec="libx264",
+        macro_block_size=2,
+        quality=None,
+        ffmpeg_log_level="error",
+        output_params=["-crf", "19", "-preset", "fast", "-movflags", "+faststart"],
+    )
+    writer.send(None)
+    for frame in frames:
+        writer.send(frame.tobytes())
+    writer.close()
+
+
+def _frame(scene: Scene, plot: np.ndarray, halves: list[np.ndarray], k: int) -> Image.Image:
+    """Join both halves, their labels, and the plot below, pale where time has not come yet."""
+    time, last = scene.times[k], max(motion.times[-1] for motion in scene.motions)
+    left, top, right, bottom = scene.plot_box
+    now = round(left + (right - left) * time / last)
+    plot = plot.copy()
+    future = plot[top:bottom, now : right + 1]
+    future[:] = 255 - (255 - future) // 5
+    picture = Image.fromarray(np.concatenate([np.concatenate(halves, axis=1), plot]))
+    draw = ImageDraw.Draw(picture, "RGBA")
+    height, half, _ = halves[0].shape
+    for i, (motion, label) in enumerate(zip(scene.motions, scene.labels, strict=True)):
+        _text(draw, (i * half + 12, 12), label, COLOURS[i])
+        if time >= motion.fall_time:
+            _text(draw, (i * half + 12, 40), f"fell at {motion.fall_time:.2f} s", COLOURS[0])
+    draw.rectangle((half - 1, 0, half, height - 1), fill="white")
+    _text(draw, (picture.width - 12, height - 12), f"{time:.1f} s", size=14, anchor="rb")
+    _text(draw, (picture.width - 12, 12), "dashed: reference", size=14, anchor="rt")
+    return picture
+
+
+def _strip(scene: Scene, columns: list[list[np.ndarray]]) -> Image.Image:
+    """Join snapshots, one row per walk."""
+    picture = Image.fromarray(np.concatenate([np.concatenate(c) for c in columns], axis=1))
+    draw = ImageDraw.Draw(picture, "RGBA")
+    high, wide, _ = columns[0][0].shape
+    for i, label in enumerate(scene.labels):
+        _text(draw, (12, i * high + 12), label, COLOURS[i])
+        for k, time in enumerate(scene.times):
+            place = (wide * (k + 1) - 10, high * (i + 1) - 10)
+            _text(draw, place, f"{time:.2f} s", size=14, anchor="rb")
+    for k in range(1, len(columns)):
+        draw.rectangle((wide * k - 1, 0, wide * k, picture.height), fill="white")
+    draw.rectangle((0, high - 1, picture.width, high), fill="white")
+    return picture
+
+
+def _text(
+    draw: ImageDraw.ImageDraw,
+    place: tuple[int, int],
+    text: str,
+    colour: tuple[int, int, int] | None = None,
+    *,
+    size: int = 16,
+    anchor: str = "lt",
+) -> None:
+    """Write words on a light plate, with a mark in the colour of what they name."""
+    font = ImageFont.load_default(size=size)
+    left, top, right, bottom = draw.textbbox(place, text, font, anchor)
+    mark = 0 if colour is None else size
+    plate = (left - 5, top - 5, right + 5 + mark, bottom + 5)
+    draw.rounded_rectangle(plate, 4, fill=(255, 255, 255, 205))
+    if colour is not None:
+        draw.rounded_rectangle((left, top, left + size - 5, bottom), 2, fill=colour)
+    draw.text((place[0] + mark, place[1]), text, INK, font, anchor)
