@@ -213,7 +213,7 @@ def _block(translator, node) -> None:
 
 
 def _plain(text: str) -> str:
-    """A docstring's line with what reStructuredText would take for markup escaped."""
+    """Escape in a docstring's line what reStructuredText would take for markup."""
     parts = _CODE.split(text)
     for i in range(0, len(parts), 2):
         parts[i] = re.sub(r"([*|\\])", r"\\\1", parts[i])
@@ -228,7 +228,7 @@ def _indent(line: str) -> int:
 
 
 def _as_rst(app, what, name, obj, options, lines: list[str]) -> None:
-    """Formulas that stand apart become literal blocks, comments beside fields become their text."""
+    """Turn indented formulas into literal blocks, and comments of fields into their description."""
     result: list[str] = []
     literal: int | None = None  # the indent that a literal block has at least
     for i, line in enumerate(lines):
@@ -256,8 +256,15 @@ def _as_rst(app, what, name, obj, options, lines: list[str]) -> None:
 
 
 def _short(app, what, name, obj, options, signature, returns) -> tuple:
-    """Arrays are called what the code calls them."""
-    short = lambda text: text and text.replace("jaxlib._jax.Array", "Array")  # noqa: E731
+    """Arrays have the name that the code uses; paths are relative to the repository."""
+    root = Path(hector_jax.__file__).parents[1]
+    names = {"jaxlib._jax.Array": "Array", "PosixPath(": "Path(", f"{root}/": ""}
+
+    def short(text: str | None) -> str | None:
+        for long, name in names.items():
+            text = text and text.replace(long, name)
+        return text
+
     return short(signature), short(returns)
 
 
