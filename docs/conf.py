@@ -65,10 +65,6 @@ PUBLIC = {  # of packages without `__all__`
         hector_jax.robot.kinematics.foot_jacobians hector_jax.robot.kinematics.inverse_legs
         hector_jax.robot.srbm.linearise
     """,
-    "hector_jax.qp": """
-        hector_jax.qp.solve.QP hector_jax.qp.solve.QpConfig hector_jax.qp.solve.Solution
-        hector_jax.qp.solve.Status hector_jax.qp.solve.solve_qp hector_jax.qp.solve.check_solved
-    """,
     "hector_jax.control": """
         hector_jax.control.weights.Weights hector_jax.control.weights.nominal
         hector_jax.control.weights.expert hector_jax.control.reference.Command
@@ -102,7 +98,8 @@ PUBLIC = {  # of packages without `__all__`
     "hector_jax.search": "hector_jax.search.cmaes.SearchConfig hector_jax.search.cmaes.search",
     "hector_jax.runs": """
         hector_jax.runs.metrics.Score hector_jax.runs.metrics.score
-        hector_jax.runs.metrics.Verdict hector_jax.runs.metrics.judge hector_jax.runs.export.export
+        hector_jax.runs.metrics.Verdict hector_jax.runs.metrics.make_verdict
+        hector_jax.runs.export.export
     """,
     "hector_jax.report": """
         hector_jax.report.folder.load_run hector_jax.report.folder.compare_runs
@@ -111,6 +108,7 @@ PUBLIC = {  # of packages without `__all__`
 }
 _ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")
 logger = logging.getLogger(__name__)
+aliases: dict[str, str] = {}  # of names that pages link to: the name that the reference has
 
 _FIELD = re.compile(r"^    (\w+): [^#]*?  # (.+)$", re.MULTILINE)
 _CODE = re.compile(r"(`[^`]*`)")
@@ -127,28 +125,29 @@ def _resolve(name: str) -> tuple[str, object]:
     for at in range(name.count(".") + 1, 0, -1):
         module, *inside = name.rsplit(".", name.count(".") + 1 - at)
         try:
-            found = importlib.import_module(module)
+            value = importlib.import_module(module)
         except ModuleNotFoundError:
             continue
         for part in inside:
-            found = getattr(found, part)
-        home = getattr(found, "__module__", None)
-        known = inside and home and getattr(found, "__qualname__", None) == inside[-1]
-        return (f"{home}.{inside[-1]}" if known else name), found
+            value = getattr(value, part)
+        is_defined = inside and getattr(value, "__qualname__", None) == inside[-1]
+        return (f"{value.__module__}.{inside[-1]}" if is_defined else name), value
     raise AttributeError(name)
 
 
-def _entry(name: str, found: object) -> str:
+def _entry(name: str, value: object) -> str:
     """The directive that documents an object."""
-    if inspect.ismodule(found):
+    if inspect.ismodule(value):
         return f".. automodule:: {name}"
-    if inspect.isclass(found):
+    if inspect.isclass(value):
         return f".. autoclass:: {name}\n   :members:"
-    return f".. {'autofunction' if callable(found) else 'autodata'}:: {name}"
+    if callable(value):
+        return f".. autofunction:: {name}"
+    return f".. autodata:: {name}\n   :no-value:"
 
 
-def _summary(found: object) -> str:
-    doc = inspect.getdoc(found) or ""
+def _summary(value: object) -> str:
+    doc = inspect.getdoc(value) or ""
     return doc.split("\n\n")[0].replace("\n", " ").replace("|", "\\|")
 
 
@@ -167,27 +166,30 @@ def _write_reference(app) -> None:
         for name in _ROLE.findall(path.read_text())
     }
     top = _public("hector_jax")
-    pages: dict[str, dict[str, object]] = {package: {} for package in PACKAGES}
-    rows = ["# Public names of hector_jax", "", inspect.getdoc(hector_jax) or "", ""]
-    rows += ["| name | what it is |", "|---|---|"] * bool(top)
     public = [name for package in PACKAGES for name in _public(f"hector_jax.{package}")]
-    for name in dict.fromkeys([*top, *public, *sorted(cited)]):
+    pages: dict[str, list[str]] = {package: [] for package in PACKAGES}
+    documented: dict[str, str] = {}  # name by the place of definition
+    rows = []
+    for name in dict.fromkeys([*public, *sorted(cited), *top]):
         try:
-            home, found = _resolve(name)
+            home, value = _resolve(name)
         except AttributeError:
             logger.warning("reference: there is no %s", name)
             continue
-        package = home.split(".")[1]
-        pages.setdefault(package, {})[home] = found
+        if home not in documented:
+            documented[home] = name if name not in top else home
+            pages.setdefault(home.split(".")[1], []).append(_entry(documented[home], value))
+        aliases[name] = documented[home]
         if name in top:
-            role = "mod" if inspect.ismodule(found) else "obj"
-            rows.append(f"| {{py:{role}}}`{name.split('.')[-1]} <{home}>` | {_summary(found)} |")
-    texts = {"hector_jax": "\n".join(rows) + "\n"}
+            row = f"{{py:obj}}`{name.split('.')[-1]} <{documented[home]}>`"
+            rows.append(f"| {row} | {_summary(value)} |")
+    rows = ["| name | what it is |", "|---|---|", *rows] if rows else []
+    head = ["# Public names of hector_jax", "", inspect.getdoc(hector_jax) or "", ""]
+    texts = {"hector_jax": "\n".join([*head, *rows]) + "\n"}
     for package, entries in pages.items():
-        blocks = [_entry(name, found) for name, found in entries.items()]
         title, purpose = PACKAGES.get(package, (package.capitalize(), ""))
         texts[package] = f"# {title}: `hector_jax.{package}`\n\n{purpose}\n\n" + "\n".join(
-            f"```{{eval-rst}}\n{block}\n```\n" for block in blocks
+            f"```{{eval-rst}}\n{entry}\n```\n" for entry in entries
         )
     for path in folder.glob("*.md"):
         if path.stem not in texts:
@@ -196,6 +198,17 @@ def _write_reference(app) -> None:
         path = folder / f"{name}.md"
         if not path.exists() or path.read_text() != text:  # an unchanged page is not read again
             path.write_text(text)
+
+
+def _by_other_name(app, env, node, content) -> nodes.reference | None:
+    """A link to a name that is documented under another one."""
+    target = aliases.get(node.get("reftarget"))
+    if target is None or target == node["reftarget"]:
+        return None
+    python = env.get_domain("py")
+    return python.resolve_xref(
+        env, node["refdoc"], app.builder, node["reftype"], target, node, content
+    )
 
 
 def _inline(translator, node) -> None:
@@ -277,6 +290,7 @@ def setup(app) -> None:
     app.connect("builder-inited", _write_reference)
     nothing = lambda translator, node: None  # noqa: E731
     app.add_html_math_renderer("mathml", (_inline, nothing), (_block, nothing))
+    app.connect("missing-reference", _by_other_name)
     app.connect("autodoc-process-docstring", _as_rst, priority=400)
     app.connect("autodoc-process-signature", _short)
     app.connect("autodoc-skip-member", _skip)
