@@ -110,7 +110,7 @@ _ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")
 logger = logging.getLogger(__name__)
 aliases: dict[str, str] = {}  # of names that pages link to: the name that the reference has
 
-_FIELD = re.compile(r"^    (\w+): [^#]*?  # (.+)$", re.MULTILINE)
+_FIELD = re.compile(r"^    (\w+): [^#\n]*?  # (.+)$", re.MULTILINE)
 _CODE = re.compile(r"(`[^`]*`)")
 
 
@@ -146,6 +146,10 @@ def _entry(name: str, value: object) -> str:
     return f".. autodata:: {name}\n   :no-value:"
 
 
+def _blocks(entries: list[str]) -> str:
+    return "\n".join(f"```{{eval-rst}}\n{entry}\n```\n" for entry in entries)
+
+
 def _summary(value: object) -> str:
     doc = inspect.getdoc(value) or ""
     return doc.split("\n\n")[0].replace("\n", " ").replace("|", "\\|")
@@ -169,7 +173,7 @@ def _write_reference(app) -> None:
     public = [name for package in PACKAGES for name in _public(f"hector_jax.{package}")]
     pages: dict[str, list[str]] = {package: [] for package in PACKAGES}
     documented: dict[str, str] = {}  # name by the place of definition
-    rows = []
+    rows, others = [], []
     for name in dict.fromkeys([*public, *sorted(cited), *top]):
         try:
             home, value = _resolve(name)
@@ -178,19 +182,22 @@ def _write_reference(app) -> None:
             continue
         if home not in documented:
             documented[home] = name if name not in top else home
-            pages.setdefault(home.split(".")[1], []).append(_entry(documented[home], value))
+            package = home.split(".")[1]
+            page = pages[package] if package in pages else others
+            page.append(_entry(documented[home], value))
         aliases[name] = documented[home]
         if name in top:
             row = f"{{py:obj}}`{name.split('.')[-1]} <{documented[home]}>`"
             rows.append(f"| {row} | {_summary(value)} |")
-    rows = ["| name | what it is |", "|---|---|", *rows] if rows else []
     head = ["# Public names of hector_jax", "", inspect.getdoc(hector_jax) or "", ""]
-    texts = {"hector_jax": "\n".join([*head, *rows]) + "\n"}
+    if rows:
+        head += ["| name | what it is |", "|---|---|", *rows, ""]
+    head += ["| package | content |", "|---|---|"]
+    head += [f"| [hector_jax.{name}]({name}.md) | {text} |" for name, (_, text) in PACKAGES.items()]
+    texts = {"hector_jax": "\n".join([*head, "", ""]) + _blocks(others)}
     for package, entries in pages.items():
-        title, purpose = PACKAGES.get(package, (package.capitalize(), ""))
-        texts[package] = f"# {title}: `hector_jax.{package}`\n\n{purpose}\n\n" + "\n".join(
-            f"```{{eval-rst}}\n{entry}\n```\n" for entry in entries
-        )
+        title, purpose = PACKAGES[package]
+        texts[package] = f"# {title}: `hector_jax.{package}`\n\n{purpose}\n\n{_blocks(entries)}"
     for path in folder.glob("*.md"):
         if path.stem not in texts:
             path.unlink()
