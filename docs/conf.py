@@ -1,13 +1,14 @@
 """The site: Markdown and docstrings in, pages that need no network out (`make docs`)."""
 
+import importlib
 import inspect
-import pkgutil
 import re
 from importlib import metadata
 from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.util import logging
 
 import hector_jax
 
@@ -30,7 +31,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 
 autodoc_member_order = "bysource"
-autodoc_default_options = {"members": True}
+autodoc_preserve_defaults = True  # a default is shown as the code has it, not as a path of here
 autodoc_typehints_format = "short"
 python_maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
@@ -40,27 +41,181 @@ default_role = "code"  # docstrings put names between single backticks
 
 html_math_renderer = "mathml"  # drawn by the browser itself: no script, no font from elsewhere
 
-_FIELD = re.compile(r"^    (\w+): [^#]*?  # (.+)$", re.MULTILINE)
+PACKAGES = {  # in this order: title and purpose of each page of the reference
+    "core": ("Types and geometry", "What every other package uses. SI units, world frame."),
+    "robot": ("Robot", "The body: its file, kinematics and single rigid body."),
+    "qp": ("Quadratic programs", "Solver, status and derivative ([explained](../qp.md))."),
+    "control": ("Controller", "Weights, gait, reference, footholds, MPC and legs; pure JAX."),
+    "sim": ("Simulation", "The robot in MuJoCo, one walk at a time or in batches."),
+    "grfm": ("Ground reaction net", "phi: the map from command to effect, its data and training."),
+    "tuning": ("Tuning", "Rollout, loss and gradient steps, for one problem or for many."),
+    "search": ("Search", "Tuning by walks on a simulator, without derivatives."),
+    "runs": ("Runs", "Steps from data to evaluation, scores, files of a run, export."),
+    "report": ("Report", "Tables, pictures, films and pages of a run."),
+}
+PUBLIC = {  # of packages without `__all__`
+    "hector_jax.core": """
+        hector_jax.core.trajectory.State hector_jax.core.trajectory.Wrench
+        hector_jax.core.trajectory.Load hector_jax.core.trajectory.Trajectory
+        hector_jax.core.inputs.InputError hector_jax.core.runtime.setup_jax
+    """,
+    "hector_jax.robot": """
+        hector_jax.robot.model.Robot hector_jax.robot.model.load_robot
+        hector_jax.robot.description.Description hector_jax.robot.kinematics.foot_poses
+        hector_jax.robot.kinematics.foot_jacobians hector_jax.robot.kinematics.inverse_legs
+        hector_jax.robot.srbm.linearise
+    """,
+    "hector_jax.control": """
+        hector_jax.control.weights.Weights hector_jax.control.weights.nominal
+        hector_jax.control.weights.expert hector_jax.control.reference.Command
+        hector_jax.control.reference.Anchor hector_jax.control.reference.named_command
+        hector_jax.control.reference.standing_anchor hector_jax.control.reference.reference_at
+        hector_jax.control.gait.GaitConfig hector_jax.control.footstep.FootstepConfig
+        hector_jax.control.legs.LegConfig hector_jax.control.mpc.MpcConfig
+        hector_jax.control.mpc.Horizon hector_jax.control.mpc.solve_mpc
+        hector_jax.control.walking.WalkConfig hector_jax.control.walking.Plan
+        hector_jax.control.walking.plan
+    """,
+    "hector_jax.sim": """
+        hector_jax.sim.world.Imperfections hector_jax.sim.world.ideal hector_jax.sim.world.hfs
+        hector_jax.sim.world.hfs_varied hector_jax.sim.standin.standin
+        hector_jax.sim.walk.Job hector_jax.sim.walk.walk hector_jax.sim.walk.walk_many
+    """,
+    "hector_jax.grfm": """
+        hector_jax.grfm.effect.Window hector_jax.grfm.effect.Effect
+        hector_jax.grfm.network.as_effect hector_jax.grfm.network.load_net
+        hector_jax.grfm.network.save_net hector_jax.grfm.dataset.load_walks
+        hector_jax.grfm.training.TrainConfig hector_jax.grfm.training.train
+    """,
+    "hector_jax.tuning": """
+        hector_jax.tuning.rollout.RolloutConfig hector_jax.tuning.rollout.rollout
+        hector_jax.tuning.loss.LossConfig hector_jax.tuning.loss.Losses
+        hector_jax.tuning.loss.losses hector_jax.tuning.difftune.TuneConfig
+        hector_jax.tuning.difftune.Evaluation hector_jax.tuning.difftune.Tuning
+        hector_jax.tuning.difftune.tune hector_jax.tuning.difftune.descend
+        hector_jax.tuning.measured.tune_measured hector_jax.tuning.online.OnlineConfig
+    """,
+    "hector_jax.search": "hector_jax.search.cmaes.SearchConfig hector_jax.search.cmaes.search",
+    "hector_jax.runs": """
+        hector_jax.runs.metrics.Score hector_jax.runs.metrics.score
+        hector_jax.runs.metrics.Verdict hector_jax.runs.metrics.make_verdict
+        hector_jax.runs.export.export
+    """,
+    "hector_jax.report": """
+        hector_jax.report.folder.load_run hector_jax.report.folder.compare_runs
+        hector_jax.report.video.write_film hector_jax.report.tensorboard.write_events
+    """,
+}
+_ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")
+logger = logging.getLogger(__name__)
+aliases: dict[str, str] = {}  # of names that pages link to: the name that the reference has
+
+_FIELD = re.compile(r"^    (\w+): [^#\n]*?  # (.+)$", re.MULTILINE)
 _CODE = re.compile(r"(`[^`]*`)")
 
 
+def _public(package: str) -> list[str]:
+    """Names of a package's `__all__`; without one, those of PUBLIC."""
+    names = getattr(importlib.import_module(package), "__all__", None)
+    return [f"{package}.{name}" for name in names] if names else PUBLIC.get(package, "").split()
+
+
+def _resolve(name: str) -> tuple[str, object]:
+    """The object behind a dotted name, and the name of the place that defines it."""
+    for at in range(name.count(".") + 1, 0, -1):
+        module, *inside = name.rsplit(".", name.count(".") + 1 - at)
+        try:
+            value = importlib.import_module(module)
+        except ModuleNotFoundError:
+            continue
+        for part in inside:
+            value = getattr(value, part)
+        is_defined = inside and getattr(value, "__qualname__", None) == inside[-1]
+        return (f"{value.__module__}.{inside[-1]}" if is_defined else name), value
+    raise AttributeError(name)
+
+
+def _entry(name: str, value: object) -> str:
+    """The directive that documents an object."""
+    if inspect.ismodule(value):
+        return f".. automodule:: {name}"
+    if inspect.isclass(value):
+        return f".. autoclass:: {name}\n   :members:"
+    if callable(value):
+        return f".. autofunction:: {name}"
+    return f".. autodata:: {name}\n   :no-value:"
+
+
+def _blocks(entries: list[str]) -> str:
+    return "\n".join(f"```{{eval-rst}}\n{entry}\n```\n" for entry in entries)
+
+
+def _summary(value: object) -> str:
+    doc = inspect.getdoc(value) or ""
+    return doc.split("\n\n")[0].replace("\n", " ").replace("|", "\\|")
+
+
 def _write_reference(app) -> None:
-    """A page for each room and one for what stands above them; none is missing."""
-    rooms: dict[str, list[str]] = {}
-    for module in pkgutil.walk_packages(hector_jax.__path__, "hector_jax."):
-        _, room, *inside = module.name.split(".")
-        rooms.setdefault(room if inside or module.ispkg else "hector_jax", []).append(module.name)
+    """One page for the names of `hector_jax`, and one for each package.
+
+    A page documents the public names of its package (`_public`) and the other names that pages
+    link to. A name that does not exist is a warning, which fails the build.
+    """
     folder = Path(app.srcdir) / "reference"
     folder.mkdir(exist_ok=True)
+    cited = {
+        name
+        for path in Path(app.srcdir).rglob("*.md")
+        if not {"_build", "reference"} & set(path.parts)
+        for name in _ROLE.findall(path.read_text())
+    }
+    top = _public("hector_jax")
+    public = [name for package in PACKAGES for name in _public(f"hector_jax.{package}")]
+    pages: dict[str, list[str]] = {package: [] for package in PACKAGES}
+    documented: dict[str, str] = {}  # name by the place of definition
+    rows, others = [], []
+    for name in dict.fromkeys([*public, *sorted(cited), *top]):
+        try:
+            home, value = _resolve(name)
+        except AttributeError:
+            logger.warning("reference: there is no %s", name)
+            continue
+        if home not in documented:
+            documented[home] = name if name not in top else home
+            package = home.split(".")[1]
+            page = pages[package] if package in pages else others
+            page.append(_entry(documented[home], value))
+        aliases[name] = documented[home]
+        if name in top:
+            row = f"{{py:obj}}`{name.split('.')[-1]} <{documented[home]}>`"
+            rows.append(f"| {row} | {_summary(value)} |")
+    head = ["# Public names of hector_jax", "", inspect.getdoc(hector_jax) or "", ""]
+    if rows:
+        head += ["| name | what it is |", "|---|---|", *rows, ""]
+    head += ["| package | content |", "|---|---|"]
+    head += [f"| [hector_jax.{name}]({name}.md) | {text} |" for name, (_, text) in PACKAGES.items()]
+    texts = {"hector_jax": "\n".join([*head, "", ""]) + _blocks(others)}
+    for package, entries in pages.items():
+        title, purpose = PACKAGES[package]
+        texts[package] = f"# {title}: `hector_jax.{package}`\n\n{purpose}\n\n{_blocks(entries)}"
     for path in folder.glob("*.md"):
-        if path.stem not in rooms:
+        if path.stem not in texts:
             path.unlink()
-    for room, names in rooms.items():
-        parts = [f"## `{n}`\n\n```{{eval-rst}}\n.. automodule:: {n}\n```\n" for n in sorted(names)]
-        text = "\n".join([f"# {room}\n", *parts])
-        path = folder / f"{room}.md"
+    for name, text in texts.items():
+        path = folder / f"{name}.md"
         if not path.exists() or path.read_text() != text:  # an unchanged page is not read again
             path.write_text(text)
+
+
+def _by_other_name(app, env, node, content) -> nodes.reference | None:
+    """A link to a name that is documented under another one."""
+    target = aliases.get(node.get("reftarget"))
+    if target is None or target == node["reftarget"]:
+        return None
+    python = env.get_domain("py")
+    return python.resolve_xref(
+        env, node["refdoc"], app.builder, node["reftype"], target, node, content
+    )
 
 
 def _inline(translator, node) -> None:
@@ -78,7 +233,7 @@ def _block(translator, node) -> None:
 
 
 def _plain(text: str) -> str:
-    """A docstring's line with what reStructuredText would take for markup escaped."""
+    """Escape in a docstring's line what reStructuredText would take for markup."""
     parts = _CODE.split(text)
     for i in range(0, len(parts), 2):
         parts[i] = re.sub(r"([*|\\])", r"\\\1", parts[i])
@@ -93,8 +248,8 @@ def _indent(line: str) -> int:
 
 
 def _as_rst(app, what, name, obj, options, lines: list[str]) -> None:
-    """Formulas that stand apart become literal blocks, comments beside fields become their text."""
-    found: list[str] = []
+    """Turn indented formulas into literal blocks, and comments of fields into their description."""
+    result: list[str] = []
     literal: int | None = None  # the indent that a literal block has at least
     for i, line in enumerate(lines):
         if line.strip() and literal is not None and _indent(line) < literal:
@@ -104,19 +259,32 @@ def _as_rst(app, what, name, obj, options, lines: list[str]) -> None:
             before = next(one for one in reversed(lines[: i - 1]) if one.strip())
             if _indent(line) >= _indent(before) + 4:
                 literal = _indent(line)
-                found += [" " * _indent(before) + "::", ""]
-        found.append(line if literal is not None or ">>>" in line else _plain(line))
+                result += [" " * _indent(before) + "::", ""]
+        result.append(line if literal is not None or ">>>" in line else _plain(line))
     fields = getattr(obj, "_fields", ()) or getattr(obj, "__dataclass_fields__", ())
     if what == "class" and fields:
-        told = [(n, text) for n, text in _FIELD.findall(inspect.getsource(obj)) if n in fields]
-        if told:
-            found += ["", "Attributes:", *(f"    {n}: {_plain(text)}" for n, text in told), ""]
-    lines[:] = found
+        source = inspect.getsource(obj)
+        described = [(name, text) for name, text in _FIELD.findall(source) if name in fields]
+        if described:
+            result += [
+                "",
+                "Attributes:",
+                *(f"    {n}: {_plain(text)}" for n, text in described),
+                "",
+            ]
+    lines[:] = result
 
 
 def _short(app, what, name, obj, options, signature, returns) -> tuple:
-    """Arrays are called what the code calls them."""
-    short = lambda text: text and text.replace("jaxlib._jax.Array", "Array")  # noqa: E731
+    """Arrays have the name that the code uses; paths are relative to the repository."""
+    root = Path(hector_jax.__file__).parents[1]
+    names = {"jaxlib._jax.Array": "Array", "PosixPath(": "Path(", f"{root}/": ""}
+
+    def short(text: str | None) -> str | None:
+        for long, name in names.items():
+            text = text and text.replace(long, name)
+        return text
+
     return short(signature), short(returns)
 
 
@@ -129,6 +297,7 @@ def setup(app) -> None:
     app.connect("builder-inited", _write_reference)
     nothing = lambda translator, node: None  # noqa: E731
     app.add_html_math_renderer("mathml", (_inline, nothing), (_block, nothing))
+    app.connect("missing-reference", _by_other_name)
     app.connect("autodoc-process-docstring", _as_rst, priority=400)
     app.connect("autodoc-process-signature", _short)
     app.connect("autodoc-skip-member", _skip)
