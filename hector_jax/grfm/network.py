@@ -29,7 +29,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hector_jax.control.gait import GaitConfig, since_switch
-from hector_jax.core.inputs import InputError, Range, short_repr, validation_error
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.settings import Range, validation_error
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.dataset import Dataset

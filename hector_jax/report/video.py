@@ -28,7 +28,8 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.console import Broken
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import AT_LEAST_ONE, InputError, Range, check, choose
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
 from hector_jax.core.trajectory import State, Trajectory, from_start
 from hector_jax.report.plots import distances, named
 from hector_jax.robot.model import Robot

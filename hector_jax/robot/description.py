@@ -24,14 +24,8 @@ from typing import Any
 
 import jax
 
-from hector_jax.core.inputs import (
-    POSITIVE,
-    InputError,
-    did_you_mean,
-    read_toml,
-    short_repr,
-    validation_error,
-)
+from hector_jax.core.inputs import InputError, did_you_mean, short_repr
+from hector_jax.core.settings import POSITIVE, read_toml, validation_error
 from hector_jax.core.trajectory import MAX_TILT, MIN_HEIGHT
 
 _PACKAGE = Path(__file__).parents[1]

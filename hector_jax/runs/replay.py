@@ -19,7 +19,8 @@ from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import WriteError
-from hector_jax.core.inputs import InputError, from_table
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import from_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.network import NetParams, Params, effect_of, layout, widths
