@@ -94,10 +94,10 @@ def convert(value: Any, kind: Any, rule: Rule | None = None) -> Any:
 
 
 def _builtin(value: Any) -> Any:
-    """A number of NumPy as one of Python."""
-    if isinstance(value, bool | int | str) or type(value) is float:
-        return value
-    if isinstance(value, Real):
+    """A number of NumPy, or a `Part`, as Python's own type."""
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, Real) and not isinstance(value, bool):
         return int(value) if isinstance(value, Integral) else float(value)
     return tuple(map(_builtin, value)) if isinstance(value, list | tuple) else value
 
@@ -214,12 +214,14 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
     for name, value in table.items():
         if name not in known:
             raise InputError(f"{where}: {unknown('field', name, known)}")
-        inner = known[name].type
-        if isinstance(inner, type) and is_dataclass(inner):
+        type_ = known[name].type
+        types = [x for x in (type_, *get_args(type_)) if isinstance(x, type)]
+        inner = next(filter(is_dataclass, types), None)
+        if inner and value is not None:
             values[name] = from_table(f"{where}: {name}", inner, value)
             continue
         try:
-            values[name] = convert(value, inner)
+            values[name] = convert(value, type_)
         except InputError as error:
             raise InputError(f"{where}: {name} {error}") from None
     for name, field in known.items():
