@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
-from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, InputError, check, short_repr
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.report.report import markdown_table
 from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
 from hector_jax.sim.changes import Change

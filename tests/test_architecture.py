@@ -31,7 +31,7 @@ DOORS = {
     "sklearn": ("search.rivals",),
     "matplotlib": ("report.plots",),
     "tensorboardX": ("report.tensorboard",),
-    "tyro": ("cli.main",),
+    "tyro": ("cli.parse",),
 }
 
 

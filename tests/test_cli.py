@@ -16,8 +16,9 @@ from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
 from hector_jax.cli import asked, doctor, judging, study
-from hector_jax.cli.flags import Command, Tune, command_name, from_file
+from hector_jax.cli.flags import Command, Tune, command_name
 from hector_jax.cli.main import main
+from hector_jax.cli.parse import from_file
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.tree_file import read_card

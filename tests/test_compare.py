@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from hector_jax.cli import main as cli
-from hector_jax.cli.flags import Tune, from_file, settings
+from hector_jax.cli.flags import Tune
+from hector_jax.cli.parse import as_table, from_file
 from hector_jax.report.folder import compare_runs, load_run, print_comparison, read_metrics
 from hector_jax.report.tensorboard import write_events
 
@@ -43,7 +44,7 @@ def run_folder(folder, flags=None, versions=None):
             },
         },
     }
-    config = {"flags": settings(flags or Tune()), "tune": {"loss": {"euler": 1e5}}}
+    config = {"flags": as_table(flags or Tune()), "tune": {"loss": {"euler": 1e5}}}
     (folder / "result.json").write_text(json.dumps(result))
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "versions.json").write_text(json.dumps({"jax": "1"} | (versions or {})))
@@ -133,7 +134,7 @@ def test_what_is_no_finished_run_is_told_by_its_file(runs, name, text, fault):
 def test_no_run_at_all_is_refused(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["hector", "compare"])
     assert cli.main() == 2
-    assert "compare expects RUNS" in capsys.readouterr().err
+    assert "RUNS expects a value, got none" in capsys.readouterr().err
 
 
 def test_a_line_that_is_being_written_is_not_read_yet(runs):

@@ -16,8 +16,7 @@ from typing import get_args
 import pytest
 
 import hector_jax
-from hector_jax.cli import flags
-from hector_jax.cli import main as cli
+from hector_jax.cli import flags, parse
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -108,7 +107,7 @@ def test_commands_in_pages_parse(page, line, capsys):
         del words[at : at + 2]
     code = 0
     try:
-        cli._parsed(words)
+        parse.from_line(words)
     except SystemExit as left:  # after --help, too
         code = left.code
     assert code == 0, capsys.readouterr().err
@@ -117,7 +116,7 @@ def test_commands_in_pages_parse(page, line, capsys):
 def test_settings_in_pages_are_read(tmp_path):
     (told,) = blocks((DOCS / "howto" / "outputs.md").read_text(), "toml")
     (tmp_path / "night.toml").write_text(told)
-    assert flags.from_file(flags.Tune, tmp_path / "night.toml").seeds == 32
+    assert parse.from_file(flags.Tune, tmp_path / "night.toml").seeds == 32
 
 
 @pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)

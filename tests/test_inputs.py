@@ -25,7 +25,8 @@ from hector_jax.control.trajectories import load_course
 from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.inputs import Range, did_you_mean, short_repr, validation_error
+from hector_jax.core.inputs import did_you_mean, short_repr
+from hector_jax.core.settings import Range, validation_error
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import collection, network
 from hector_jax.grfm.training import TrainConfig

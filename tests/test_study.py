@@ -8,7 +8,8 @@ import pytest
 from pretend import pretend_history, pretend_walk
 
 from hector_jax.cli import flags, study, tuning
-from hector_jax.cli.flags import Table, as_command
+from hector_jax.cli.flags import Table
+from hector_jax.cli.parse import as_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.report.video import VideoUnavailable

@@ -73,7 +73,7 @@ HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
         ('name = "mine"\nsegment = []', ["[[segment]] must be given 1 to 100 times, got 0"]),
         ('name = "mine"\nsegment = 3', ["segment must be a list, got 3"]),
         ('name = "mine"\nsegment = [3]', ["segment 1 must be a table of seconds, v_x"]),
-        ("name = 3\nsegment = [{seconds = 1}]", ["name must be words, got 3"]),
+        ("name = 3\nsegment = [{seconds = 1}]", ["name must be text, got 3"]),
         ('name = "../up"\nsegment = [{seconds = 1}]', ["name must be 1 to 40", "'../up'"]),
         ('name = "s"\nsegment = [{seconds = 1}]', ["built-in trajectory", "'s'"]),
         (HEAD + "vx = 0.3", ["segment 1: unknown field 'vx'; did you mean 'v_x'", "yaw_rate"]),

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from hector_jax.cli import asked, study
-from hector_jax.cli.flags import Compare, Evaluate, Table, Walk, settings
+from hector_jax.cli.flags import Compare, Evaluate, Table, Walk
+from hector_jax.cli.parse import as_table
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, say
@@ -79,7 +80,7 @@ def walk(args: Walk) -> None:
     unsolved = int(np.sum(~(plans <= SOLVED)))
     fell = bool(found.fallen) and not unsolved  # without a plan it is no fall of these weights
     if args.out is not None:
-        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=settings(args))
+        save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
     if args.json:
         losses = {part: float(loss) for part, loss in found.losses.items()}
         errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}

@@ -10,33 +10,12 @@ import json
 import logging
 import sys
 from collections.abc import Sequence
-from pathlib import Path
-from types import NoneType, UnionType
-from typing import Annotated, Any, Union, get_args
 
-import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
-
-from hector_jax.cli.flags import (
-    Command,
-    Completion,
-    Doctor,
-    Export,
-    check,
-    command,
-    command_name,
-    from_line,
-    resolve_latest,
-)
+from hector_jax.cli.flags import Completion, Doctor, Export
+from hector_jax.cli.parse import check, from_line, print_completion, resolve_latest
 from hector_jax.core.console import Broken, exit_code, say, say_if_slow
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import cache_folder, check_jax, home_cache, setup_jax
-
-_ABOUT = (
-    "Gradient tuning of a walking biped's model predictive controller. "
-    "The whole way, from data to evaluation: hector tune --traj straight. "
-    "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
-)
 
 
 def main() -> int:
@@ -45,11 +24,10 @@ def main() -> int:
 
 
 def _run(words: Sequence[str]) -> None:
-    args = _parsed(words)
-    args = resolve_latest(args)
+    args = resolve_latest(from_line(words))
     check(args)
     if isinstance(args, Completion):
-        _tyro(["--tyro-print-completion", args.shell])
+        print_completion(args.shell)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of its own cache
     try:
         if (cache := cache_folder()) != (usual := home_cache()):
@@ -65,53 +43,6 @@ def _run(words: Sequence[str]) -> None:
             print(json.dumps({"faults": [str(error)]}))
         raise Broken(str(error)) from None
     commands.run(args)
-
-
-def _parsed(words: Sequence[str]) -> Any:
-    """The command that the words ask for; leaves by SystemExit after help.
-
-    Raises:
-        InputError: a word is wrong, or the file of `--config`.
-    """
-    others = [word for word in words if word not in ("-h", "--help")]
-    if len(others) == len(words):
-        return from_line(words)
-    if others:
-        command(others[0])  # there is such a command
-    return _tyro([*others[:1], "--help"], from_line(others) if "--config" in others else None)
-
-
-def _tyro(words: Sequence[str], default: Any = None) -> Any:
-    """Print help or a completion script; `default` holds other defaults of its command."""
-    kinds = []
-    for kind in get_args(Command):
-        known = {"default": default} if isinstance(default, kind) else {}
-        kinds.append(Annotated[kind, tyro.conf.subcommand(command_name(kind), **known)])
-    commands: Any = Union[tuple(kinds)]  # noqa: UP007
-    registry = ConstructorRegistry()
-    registry.primitive_rule(_optional)
-    with registry:
-        return tyro.cli(
-            commands,
-            prog="hector",
-            description=_ABOUT,
-            args=words,
-            config=(tyro.conf.PositionalRequiredArgs,),
-        )
-
-
-def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """How help shows a flag that may be left out: PATH, not Python's `{None}|PATH`."""
-    if info.type_origin not in (Union, UnionType) or NoneType not in get_args(info.type):
-        return None
-    kind = next(kind for kind in get_args(info.type) if kind is not NoneType)
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="PATH" if kind is Path else kind.__name__.upper(),
-        instance_from_str=lambda words: kind(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, kind),
-        str_from_instance=lambda value: ["none" if value is None else str(value)],
-    )
 
 
 if __name__ == "__main__":

@@ -11,15 +11,16 @@ from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from hector_jax.cli import flags
+from hector_jax.cli import flags, parse
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import locked, make_folder
-from hector_jax.core.inputs import InputError, plural, read_json
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
+from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.network import Params
 from hector_jax.report import plots, table
@@ -74,7 +75,7 @@ class _Plan:
 
 def _plan(args: flags.Table) -> _Plan:
     """Raises InputError, before anything is computed, where the flags ask for what cannot be."""
-    flags.check(args)
+    parse.check(args)
     for name in args.trajectories:
         if name not in COMMANDS:
             raise InputError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
@@ -189,13 +190,13 @@ def _make_table(
             ceilings=plan.ceilings,
             pictures=_draw(out, robot, verdicts, judged),
             config={
-                "flags": flags.settings(args),
+                "flags": parse.as_table(args),
                 "tune": asdict(plan.tune),
                 "search": asdict(plan.search),
             },
             environment=made_with,
             commits=sorted(commits),
-            command=flags.as_command("table", asked),
+            command=parse.as_command("table", asked),
             earlier=plan.earlier,
         ),
     )

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 
 from hector_jax.cli import asked, judging
-from hector_jax.cli.flags import Search, Tune, Walk, as_command, from_file, settings
+from hector_jax.cli.flags import Search, Tune, Walk
+from hector_jax.cli.parse import as_command, as_table, from_file
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import Course
 from hector_jax.control.weights import expert, nominal
@@ -90,7 +91,7 @@ def _begin(folder: Path, args: Tune) -> Path:
         new = Path(part) / "run"
         write_json(new / "versions.json", environment())
         # without the folder, so that `--config` can ask for the same in another one
-        flags = settings(replace(args, run=None, resume=None))
+        flags = as_table(replace(args, run=None, resume=None))
         robot, here = robot_hash(load_robot(args.robot)), str(Path.cwd())
         config = {"flags": flags, "directory": here, "robot": robot, "code": code_hash(*_CODE)}
         write_json(new / "config.json", config)

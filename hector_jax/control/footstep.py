@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hector_jax.core.geometry import rot_z
-from hector_jax.core.inputs import NOT_NEGATIVE, check
+from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, InputError, check
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
 
 
 @dataclass(frozen=True)

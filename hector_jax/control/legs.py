@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
-from hector_jax.core.inputs import NOT_NEGATIVE, InputError, check, short_repr
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_jacobians, inverse_legs, leg_gravity
 from hector_jax.robot.model import Robot

@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rot_z
-from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, check
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.robot import srbm

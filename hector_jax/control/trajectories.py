@@ -16,20 +16,21 @@ is told and walked all the same.
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
-from hector_jax.core.inputs import InputError, Range, check, from_table, read_toml, short_repr
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.settings import Range, check, from_table, read_toml
 from hector_jax.robot.model import Robot
 
 _MOST_SECONDS = 600.0
 _GRID = 0.05  # [s]
 _MOST_SEGMENTS = 100
 _MOST_BYTES = 100_000
-_FASTEST = 10.0  # [m/s], [rad/s]; more is another unit
+_SPEED = Range(-10.0, 10.0)  # [m/s], [rad/s]; more is another unit
 
 
 class Course(NamedTuple):
@@ -44,18 +45,13 @@ class Course(NamedTuple):
 class Segment:
     """A stretch of constant velocity in the robot's own directions."""
 
-    seconds: float
-    v_x: float = 0.0  # [m/s] ahead
-    v_y: float = 0.0  # [m/s] to the left
-    yaw_rate: float = 0.0  # [rad/s]
-
-    RULES: ClassVar = {
-        "seconds": Range(_GRID, _MOST_SECONDS),
-        **dict.fromkeys(("v_x", "v_y", "yaw_rate"), Range(-_FASTEST, _FASTEST)),
-    }
+    seconds: Annotated[float, Range(_GRID, _MOST_SECONDS)]
+    v_x: Annotated[float, _SPEED] = 0.0  # [m/s] ahead
+    v_y: Annotated[float, _SPEED] = 0.0  # [m/s] to the left
+    yaw_rate: Annotated[float, _SPEED] = 0.0  # [rad/s]
 
     def __post_init__(self) -> None:
-        check(self, **self.RULES)
+        check(self)
         if abs(self.seconds / _GRID - round(self.seconds / _GRID)) > 1e-6:
             raise InputError(
                 f"Segment.seconds must be a multiple of {_GRID} s, got {short_repr(self.seconds)}"
@@ -65,7 +61,7 @@ class Segment:
 @dataclass(frozen=True)
 class _File:
     name: str
-    segment: list
+    segment: tuple
 
     def __post_init__(self) -> None:
         check(self)

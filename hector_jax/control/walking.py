@@ -21,7 +21,8 @@ from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
-from hector_jax.core.inputs import InputError, check, from_table
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import check, from_table
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot

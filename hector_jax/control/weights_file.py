@@ -9,7 +9,8 @@ import numpy as np
 
 from hector_jax.control.weights import Weights
 from hector_jax.core.files import write_file
-from hector_jax.core.inputs import InputError, Range, read_json, validation_error
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import Range, read_json, validation_error
 from hector_jax.core.trajectory import State, Wrench
 
 WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved

@@ -1,25 +1,9 @@
-"""What a person hands in: one line says what came, what was expected and the nearest known name.
+"""What a person hands in: the exception for it, the words of its message, and files as text."""
 
-Settings are frozen dataclasses that call `check` when they are made; tables of a TOML file become
-such dataclasses by `from_table`. A rule narrows what the type of a field allows: an `Interval` of
-numbers, or the words to choose from.
-"""
-
-import dataclasses
 import difflib
-import json
-import math
-import tomllib
-import types
-import typing
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from enum import Enum
-from numbers import Integral, Real
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar
-
-T = TypeVar("T")
+from typing import Any
 
 
 class InputError(ValueError):
@@ -30,43 +14,21 @@ class InputError(ValueError):
     """
 
 
-@dataclass(frozen=True)
-class Range:
-    """Finite numbers from `low` to `high`, both allowed."""
-
-    low: int | float = -math.inf
-    high: int | float = math.inf
-    above: bool = False  # low itself is not allowed
-
-    def __contains__(self, number: Any) -> bool:
-        over = number > self.low if self.above else number >= self.low
-        return bool(over and number <= self.high and math.isfinite(number))
-
-    def __str__(self) -> str:
-        write = lambda x: str(x) if isinstance(x, int) else f"{x:g}"  # noqa: E731
-        if math.isfinite(self.low) and math.isfinite(self.high) and not self.above:
-            return f"from {write(self.low)} to {write(self.high)}"
-        parts = [f"{'above' if self.above else 'of at least'} {write(self.low)}"]
-        parts = parts * math.isfinite(self.low)
-        parts += [f"{'' if parts else 'of '}at most {write(self.high)}"] * math.isfinite(self.high)
-        return " and ".join(parts) or "that is finite"
-
-
-POSITIVE = Range(0.0, above=True)
-NOT_NEGATIVE = Range(0.0)
-SHARE = Range(0.0, 1.0)
-AT_LEAST_ONE = Range(1)  # a number of things, at least one
-SEED = Range(0, 2**32 - 1)
-
-
-Rule = Range | tuple[str, ...] | Enum
-"""What is allowed beyond a type: numbers, or words; a member of an `Enum` is for the caller."""
-
-
 def did_you_mean(name: str, names: Iterable[str]) -> str:
     """`; did you mean 'NAME'?` with the nearest of some names; nothing where none is near."""
     near = difflib.get_close_matches(str(name)[:100], [n for n in names if n], n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def unknown(what: str, name: Any, names: Iterable[str]) -> str:
+    """Message for a name that is not one of the names.
+
+    >>> unknown("set", "wiht", ["with", "without"])
+    "unknown set 'wiht'; did you mean 'with'?; known: with, without"
+    """
+    names = list(names)
+    known = ", ".join(names) or "none"
+    return f"unknown {what} {short_repr(name)}{did_you_mean(name, names)}; known: {known}"
 
 
 def short_repr(value: Any) -> str:
@@ -79,7 +41,7 @@ def short_repr(value: Any) -> str:
 
 
 def one_line(error: BaseException | str) -> str:
-    """What an error or a text says, on one line of at most 300 characters."""
+    """Text of an error, on one line of at most 300 characters."""
     return printable(" ".join(str(error).split()))[:300]
 
 
@@ -97,84 +59,6 @@ def plural(number: int, noun: str) -> str:
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
-def _words(choices: Iterable[str]) -> str:
-    *others, last = map(repr, choices)
-    return f"{', '.join(others)} or {last}" if others else last
-
-
-def validation_error(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
-    """What is wrong with a value, `must be ..., got ...`; None where nothing is.
-
-    Args:
-        value: what came.
-        kind: the annotation: bool, int, float, str, a class, a tuple or a union of these, with the
-            rule where it is `Annotated`, or words as a `Literal`; any other allows everything.
-        rule: what is allowed of numbers or words; without one, numbers have to be finite.
-    """
-    if typing.get_origin(kind) is typing.Annotated:
-        return validation_error(value, *typing.get_args(kind)[:2])
-    if typing.get_origin(kind) is typing.Literal:
-        return validation_error(value, str, typing.get_args(kind))
-    if isinstance(kind, types.UnionType):
-        kinds = typing.get_args(kind)
-        found = [validation_error(value, one, rule) for one in kinds if one is not types.NoneType]
-        missing = value is None and types.NoneType in kinds
-        return None if missing or None in found else found[0]
-    if typing.get_origin(kind) is tuple:
-        if not isinstance(value, tuple):
-            return f"must be a tuple, got {short_repr(value)}"
-        of = typing.get_args(kind)[0]
-        found = [told for one in value if (told := validation_error(one, of, rule))]
-        return f"{found[0]} in {short_repr(value)}" if found else None
-    return _simple_problem(value, kind, rule)
-
-
-def _simple_problem(value: Any, kind: Any, rule: Rule | None) -> str | None:
-    if kind is bool:
-        return (
-            None if isinstance(value, bool) else f"must be true or false, got {short_repr(value)}"
-        )
-    if kind in (int, float):
-        number, name = (Integral, "a whole number") if kind is int else (Real, "a number")
-        allowed = rule if isinstance(rule, Range) else Range()
-        try:
-            fine = isinstance(value, number) and not isinstance(value, bool) and value in allowed
-        except OverflowError:  # an integer that no float holds
-            fine = False
-        return None if fine else f"must be {name} {allowed}, got {short_repr(value)}"
-    if kind is str and isinstance(rule, tuple):
-        hint = did_you_mean(value, rule) if isinstance(value, str) else ""
-        return None if value in rule else f"must be {_words(rule)}, got {short_repr(value)}{hint}"
-    if isinstance(kind, type) and not isinstance(value, kind):
-        return (
-            f"must be {'words' if kind is str else f'a {kind.__name__}'}, got {short_repr(value)}"
-        )
-    return None
-
-
-def check(settings: Any, /, **rules: Rule) -> None:
-    """Check the fields of a dataclass against their types and rules; for `__post_init__`.
-
-    Raises:
-        InputError: `CLASS.FIELD must be ..., got ...`.
-    """
-    for field in dataclasses.fields(settings):
-        told = validation_error(getattr(settings, field.name), field.type, rules.get(field.name))
-        if told:
-            raise InputError(f"{type(settings).__name__}.{field.name} {told}")
-
-
-def choose(name: str, word: str, choices: Iterable[str]) -> str:
-    """The word, one of those there are.
-
-    Raises:
-        InputError: `NAME must be ..., got ...`.
-    """
-    if told := validation_error(word, str, tuple(choices)):
-        raise InputError(f"{name} {told}")
-    return word
-
-
 def check_file(path: Path, what: str) -> int:
     """Size of a plain file in bytes.
 
@@ -188,106 +72,29 @@ def check_file(path: Path, what: str) -> int:
     try:
         size = path.stat().st_size
     except (OSError, ValueError) as error:  # such as a null byte in the name
-        told = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot read {what}: {told}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot read {what}: {reason}") from None
     if not path.is_file():  # a pipe or a device might never end
         raise InputError(f"{path}: cannot read {what}: not a plain file")
     return size
 
 
-def read_text(path: Path, what: str, most: int) -> str:
+def read_text(path: Path, what: str, max_bytes: int) -> str:
     """Text of a file in UTF-8, with or without a byte order mark.
 
     Args:
         path: the file.
         what: it should be, in words.
-        most: bytes it may have.
+        max_bytes: size it may have.
 
     Raises:
         InputError: one line naming the file: missing, too large, no text.
     """
-    if (size := check_file(path, what)) > most:
-        raise InputError(f"{path}: {size / 1e6:.1f} MB, expected at most {most / 1e6:g} MB")
+    if (size := check_file(path, what)) > max_bytes:
+        raise InputError(f"{path}: {size / 1e6:.1f} MB, expected at most {max_bytes / 1e6:g} MB")
     try:
         return path.read_text(encoding="utf-8-sig")  # Windows writes a mark before the text
     except OSError as error:
         raise InputError(f"{path}: cannot read {what}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file, expected {what} in UTF-8") from None
-
-
-def read_json(path: Path, what: str, most: int = 10_000_000, **options: Any) -> Any:
-    """What a JSON file holds; see `read_text`, with `options` of `json.loads`.
-
-    Raises:
-        InputError: one line naming the file: as `read_text`, or not valid JSON.
-    """
-    return _decoded(path, "JSON", lambda: json.loads(read_text(path, what, most), **options))
-
-
-def read_toml(path: Path, what: str, most: int) -> dict[str, Any]:
-    """What a TOML file holds; see `read_text`.
-
-    Raises:
-        InputError: one line naming the file: as `read_text`, or not valid TOML.
-    """
-    return _decoded(path, "TOML", lambda: tomllib.loads(read_text(path, what, most)))
-
-
-def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
-    try:
-        return decode()
-    except InputError:
-        raise
-    except RecursionError:
-        told = "nested too deeply"
-    except ValueError as error:
-        told = one_line(error)
-        if "set_int_max_str_digits" in told:  # Python's advice to a programmer
-            told = "a number has too many digits"
-    raise InputError(f"{path}: not valid {language}: {told}")
-
-
-def from_table(where: str, kind: type[T], table: Any) -> T:
-    """A dataclass from a table of a file; dataclasses inside it from tables inside that.
-
-    Args:
-        where: the file and the place in it, for the message.
-        kind: the dataclass, which checks itself; fields without a default have to be there. Its
-            `RULES`, where it has any, are told with values of a wrong type.
-        table: what was read.
-
-    Raises:
-        InputError: one line naming `where` and the field that is unknown, missing or wrong.
-    """
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    if not isinstance(table, Mapping):
-        raise InputError(f"{where} must be a table of {', '.join(fields)}, got {short_repr(table)}")
-    for name in table:
-        if name not in fields:
-            raise InputError(
-                f"{where}: unknown field {short_repr(name)}{did_you_mean(name, fields)}; "
-                f"known: {', '.join(fields)}"
-            )
-    for name, field in fields.items():
-        if name not in table and field.default is field.default_factory is dataclasses.MISSING:
-            raise InputError(f"{where}: missing field {name!r}; known: {', '.join(fields)}")
-    values = {name: _value(f"{where}: {name}", fields[name].type, x) for name, x in table.items()}
-    rules = getattr(kind, "RULES", {})
-    for name, value in values.items():
-        if told := validation_error(value, fields[name].type, rules.get(name)):
-            raise InputError(f"{where}: {name} {told}")
-    try:
-        return kind(**values)
-    except InputError as error:
-        told = str(error).removeprefix(f"{kind.__name__}.")
-        raise InputError(f"{where}: {told}") from None
-
-
-def _value(where: str, kind: Any, value: Any) -> Any:
-    """A value of a file as its type: 1 where 1.0 is meant, a tuple of a list, a dataclass."""
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-        return from_table(where, kind, value)
-    if typing.get_origin(kind) is tuple and isinstance(value, list | tuple):
-        return tuple(_value(where, typing.get_args(kind)[0], one) for one in value)
-    return float(value) if kind is float and type(value) is int and abs(value) < 2**53 else value

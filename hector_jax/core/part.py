@@ -15,7 +15,8 @@ compiled anew for another of the same name.
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
-from hector_jax.core.inputs import InputError, choose
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import choose
 
 
 class Part(str):

@@ -20,7 +20,8 @@ import numpy as np
 
 from hector_jax.core.environment import NUMERIC, versions
 from hector_jax.core.files import write_file
-from hector_jax.core.inputs import InputError, one_line, short_repr, validation_error
+from hector_jax.core.inputs import InputError, one_line, short_repr
+from hector_jax.core.settings import validation_error
 
 FORMAT = 1
 ROBOT_DIGITS = 9  # of a robot's numbers: two machines' last bits make the same robot

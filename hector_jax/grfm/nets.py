@@ -18,7 +18,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Key
 
-from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED, InputError, check
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED, check
 from hector_jax.core.trajectory import Wrench
 
 

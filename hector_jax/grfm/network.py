@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from hector_jax.control.gait import GaitConfig
-from hector_jax.core.inputs import InputError, Range, short_repr, validation_error
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.settings import Range, validation_error
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.effect import Phi
 from hector_jax.grfm.gated import GATED

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.core.inputs import InputError, check
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import check
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import Window

@@ -29,8 +29,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.part import Part, choose_part
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.qp.active_set import active_set, first_guess
 from hector_jax.qp.certificates import is_held, only_if, without_rows
 from hector_jax.qp.interior_point import approach

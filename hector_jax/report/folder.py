@@ -17,7 +17,7 @@ from rich.text import Text
 
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, vector_to_weights
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core import inputs
+from hector_jax.core import settings
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.report.report import VOID, change_text
 from hector_jax.robot.model import Robot
@@ -172,7 +172,7 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         InputError: one line naming the file that is missing or holds something else.
     """
-    found = inputs.read_json(path, "a file of a run of `hector tune`", _MOST_BYTES)
+    found = settings.read_json(path, "a file of a run of `hector tune`", _MOST_BYTES)
     if not isinstance(found, dict):
         raise InputError(f"{path}: expected a JSON object, got {short_repr(found)}")
     return found

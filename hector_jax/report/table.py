@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hector_jax.core.files import write_file, write_json
-from hector_jax.core.inputs import InputError, plural, read_json
+from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.settings import read_json
 from hector_jax.report.report import (
     STAND_IN,
     UNITS,

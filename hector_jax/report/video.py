@@ -23,7 +23,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.console import Broken
-from hector_jax.core.inputs import AT_LEAST_ONE, InputError, Range, check, choose
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
 from hector_jax.report.motion import Motion
 from hector_jax.report.plots.style import named
 from hector_jax.report.plots.walks import distances

@@ -12,16 +12,8 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from hector_jax.core.inputs import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    InputError,
-    Range,
-    did_you_mean,
-    one_line,
-    read_text,
-    short_repr,
-)
+from hector_jax.core.inputs import InputError, did_you_mean, one_line, read_text, short_repr
+from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples, whatever the robot
 _MOST_BYTES = 1_000_000

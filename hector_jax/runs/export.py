@@ -50,7 +50,8 @@ from hector_jax.control.weights_file import WEIGHTS, save_weights, weights_tree
 from hector_jax.core.console import Broken
 from hector_jax.core.environment import versions
 from hector_jax.core.files import make_folder, write_file, write_json
-from hector_jax.core.inputs import InputError, from_table, read_json
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import from_table, read_json
 from hector_jax.core.trajectory import State, Wrench, pack_wrench
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.qp import Status

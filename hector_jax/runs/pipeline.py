@@ -23,17 +23,9 @@ from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_t
 from hector_jax.core.console import bar, say_if_slow
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import append_file, as_json, locked, write_file
-from hector_jax.core.inputs import (
-    AT_LEAST_ONE,
-    POSITIVE,
-    SEED,
-    InputError,
-    check,
-    from_table,
-    plural,
-    short_repr,
-)
+from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.runtime import letters
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, check, from_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings, tree_hash

@@ -19,11 +19,12 @@ from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import WriteError
-from hector_jax.core.inputs import InputError, from_table
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import from_table, to_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.network import Params, effect_of, layout, variant_of
-from hector_jax.robot.description import as_table, from_card
+from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.tuning.difftune import (
     Evaluation,
@@ -107,7 +108,7 @@ def keep(
             "hidden": variant_of(params).widths(params),
         },
         "config": asdict(config),
-        "description": as_table(robot.description),
+        "description": to_table(robot.description),
         "environment": environment(),
     }
     try:
@@ -129,7 +130,7 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
     net, none = about.get("net"), np.zeros(())
     try:
         params = None if net is None else layout(net["variant"], tuple(net["hidden"]))
-        description = from_card(about.get("description", {}))
+        description = from_table(f"{path}: description", Description, about.get("description", {}))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: settings that this version does not know: {error}") from error
     like = Dump(

@@ -34,7 +34,8 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.core.files import append_file, write_file
-from hector_jax.core.inputs import AT_LEAST_ONE, POSITIVE, SEED, InputError, Range, check
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 
 FORMAT = 1
 

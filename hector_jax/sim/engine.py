@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 
 from hector_jax.control.walking import WalkConfig
-from hector_jax.core.inputs import choose
+from hector_jax.core.settings import choose
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job

@@ -26,7 +26,8 @@ from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds, weights_to_vector
-from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, InputError, check
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import LossConfig, Losses, LossWeights, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout

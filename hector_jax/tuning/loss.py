@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hector_jax.core.inputs import NOT_NEGATIVE, check
+from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import Trajectory, Wrench
 
 SAMPLE = 1e-3  # [s] the rate at which the paper sums

@@ -25,7 +25,8 @@ from jaxtyping import Array, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.walking import Feet, Measurement, Retune, measured_feet
 from hector_jax.control.weights import Weights
-from hector_jax.core.inputs import NOT_NEGATIVE, SHARE, InputError, Range, check
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import NOT_NEGATIVE, SHARE, Range, check
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.grfm.effect import HISTORY
 from hector_jax.robot.model import Robot

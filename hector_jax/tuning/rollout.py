@@ -23,7 +23,8 @@ from hector_jax.control.reference import Anchor, Command, anchor_at, reference_a
 from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler
-from hector_jax.core.inputs import AT_LEAST_ONE, NOT_NEGATIVE, InputError, Range, check
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, Range, check
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench, has_fallen
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import srbm

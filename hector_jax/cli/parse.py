@@ -1,0 +1,280 @@
+"""A command with its flags from the words of a line or from a file, checked, and written again.
+
+tyro reads the line; a TOML file, or the `config.json` of a run, has the same flags by name. All of
+it happens before the slow imports: a wrong word is told at once, in one line.
+"""
+
+import io
+import os
+import re
+import shlex
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from hector_jax.cli.flags import NAMED_WEIGHTS, Command, Source, command, command_name
+from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
+from hector_jax.core.settings import (
+    SEED,
+    from_table,
+    read_json,
+    read_toml,
+    to_table,
+    validation_error,
+)
+
+_ABOUT = (
+    "Gradient tuning of a walking biped's model predictive controller. "
+    "The whole way, from data to evaluation: hector tune --traj straight. "
+    "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
+)
+_HELP = ("-h", "--help")
+_LATEST = Path("latest")  # stands for the newest run
+_MAX_BYTES = 1_000_000
+_NUMBERS: dict[Any, str] = {int: "a whole number", float: "a number"}
+
+Flags = TypeVar("Flags")
+
+
+# The line
+
+
+def from_line(words: Sequence[str]) -> Any:
+    """A command with its flags, as the words after `hector` give them.
+
+    Flags that are not on the line come from the file of `--config`, else from their defaults. Help
+    is printed, and ends in SystemExit.
+
+    Raises:
+        InputError: one line with the word that is unknown, given twice, missing, too much or of the
+            wrong type.
+    """
+    others = [word for word in words if word not in _HELP]
+    wants_help = len(others) < len(words)
+    if wants_help and not others:
+        return _all_commands(["--help"])
+    kind = command(others[0] if others else "")
+    words, options = others[1:], {"prog": f"hector {others[0]}"}
+    names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
+    flags = [name.removeprefix("no-") for name in names]
+    for name in flags:
+        if flags.count(name) > 1:
+            raise InputError(f"--{name} is given twice")
+    if "config" in flags:
+        options["default"] = from_file(kind, _quietly(kind, words, **options).config)
+    return _tyro(kind, ["--help"], **options) if wants_help else _quietly(kind, words, **options)
+
+
+def print_completion(shell: str) -> None:
+    """Print the script that completes `hector` in a shell, and leave by SystemExit."""
+    _all_commands(["--tyro-print-completion", shell])
+
+
+def _all_commands(words: Sequence[str]) -> Any:
+    kinds = [
+        Annotated[kind, tyro.conf.subcommand(command_name(kind))] for kind in get_args(Command)
+    ]
+    return _tyro(Union[tuple(kinds)], words, prog="hector", description=_ABOUT)  # noqa: UP007
+
+
+def _quietly(kind: type, words: Sequence[str], **options: Any) -> Any:
+    """Parse; what tyro would draw a box around is an InputError of one line."""
+    text = io.StringIO()
+    try:
+        with redirect_stdout(text), redirect_stderr(text):
+            flags, rest = _tyro(kind, words, return_unknown_args=True, **options)
+    except SystemExit:
+        title, *body = re.split(r"\n\s*-{5,}\s*\n", text.getvalue())
+        raise InputError(one_line(body[0] if body else title)) from None
+    if not rest:
+        return flags
+    name, help_line = command_name(kind), f"; see hector {command_name(kind)} --help"
+    if not rest[0].startswith("--"):
+        raise InputError(f"{name} does not expect {short_repr(rest[0])}{help_line}")
+    flag = rest[0].partition("=")[0]
+    names = [label[2:] for field in fields(kind) if (label := _label(field))[:2] == "--"]
+    hint = did_you_mean(flag[2:], names).replace(" '", " '--")
+    raise InputError(f"{name} has no flag {short_repr(flag)}{hint or help_line}")
+
+
+def _tyro(kind: Any, words: Sequence[str], **options: Any) -> Any:
+    registry = ConstructorRegistry()
+    registry.primitive_rule(_scalar)
+    positional = (tyro.conf.PositionalRequiredArgs,)
+    return tyro.cli(kind, args=words, config=positional, registry=registry, **options)
+
+
+def _scalar(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """A number, or a flag that may be left out; help shows PATH, not Python's `{None}|PATH`."""
+    optional = info.type_origin in (Union, UnionType) and NoneType in get_args(info.type)
+    kind = next(x for x in get_args(info.type) if x is not NoneType) if optional else info.type
+    if not optional and kind not in _NUMBERS:
+        return None
+
+    def read(words: Sequence[str]) -> Any:
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"expected {_NUMBERS[kind]}, got {words[0]!r}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH" if kind is Path else kind.__name__.upper(),
+        instance_from_str=read,
+        is_instance=lambda value: value is None or isinstance(value, kind),
+        str_from_instance=lambda value: ["none" if value is None else str(value)],
+    )
+
+
+# The file
+
+
+def from_file(kind: type[Flags], path: Path) -> Flags:
+    """Flags of a command as a file gives them, others at their default.
+
+    Args:
+        kind: the command, a dataclass of `flags`.
+        path: TOML whose keys are flags (`first-seed` or `first_seed`), or the `config.json` that a
+            run leaves, of which `flags` are read. Paths inside are relative to where the command
+            is called, as on its line.
+
+    Raises:
+        InputError: one line naming file and key, for one that is unknown, with the nearest known
+            name, of a wrong type or out of range; or the file, where it cannot be read.
+    """
+    values: dict[str, Any] = {}
+    for key, value in _flags_in(path).items():
+        name = key.replace("-", "_")
+        if name in values:
+            raise InputError(f"{path}: {key} is given twice")
+        if name == "config":
+            raise InputError(f"{path}: config stands on the line only")
+        values[name] = value
+    return from_table(str(path), kind, values)
+
+
+def _flags_in(path: Path) -> dict[str, Any]:
+    if path.suffix != ".json":
+        return read_toml(path, "flags as TOML", _MAX_BYTES)
+    content = read_json(path, "flags as JSON", _MAX_BYTES)
+    flags = content.get("flags") if isinstance(content, dict) else None
+    if not isinstance(flags, dict):
+        raise InputError(f"{path}: no `flags` in it; expected the config.json of a run")
+    return flags
+
+
+def as_table(flags: Any) -> dict[str, Any]:
+    """The flags as values of JSON, those that came from a file included; `from_file` reads them."""
+    return {name: value for name, value in to_table(flags).items() if name != "config"}
+
+
+def as_command(name: str, flags: Any) -> str:
+    """The line that gives these flags, those at their default left out."""
+    words = ["hector", name]
+    for field in fields(flags):
+        value, flag = getattr(flags, field.name), field.name.replace("_", "-")
+        if value == field.default or field.name == "config":  # its flags are written out
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{'' if value else 'no-'}{flag}")
+        else:
+            words += [f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return shlex.join(words)
+
+
+# The checks
+
+
+def check(flags: Any) -> None:
+    """Check the types and ranges of flags, and that the files are there that they name.
+
+    Raises:
+        InputError: one line with the flag, what was expected and what came.
+    """
+    for field in fields(flags):
+        value, label = getattr(flags, field.name), _label(field)
+        if error := validation_error(value, field.type):
+            raise InputError(f"{label} {error}")
+        if value == () != field.default:
+            raise InputError(f"{label} expects a value, got none")
+        each = value if isinstance(value, tuple) else (value,)
+        for i, one in enumerate(each):
+            if one in each[:i]:
+                raise InputError(f"{label} names {short_repr(str(one))} twice")
+            if one is not None and (source := _source(field.type)):
+                _check_source(label, one, source)
+    if hasattr(flags, "first_seed") and flags.first_seed + flags.seeds - 1 not in SEED:
+        raise InputError(
+            f"--first-seed {flags.first_seed} and --seeds {flags.seeds} reach beyond the largest "
+            f"seed, {SEED.high}"
+        )
+
+
+def _label(field: Any) -> str:
+    """How a message calls a flag; one without a default stands on the line without its name."""
+    name = field.name.replace("_", "-")
+    return name.upper() if field.default is MISSING else f"--{name}"
+
+
+def _source(kind: Any) -> Source | None:
+    if get_origin(kind) is tuple:
+        kind = get_args(kind)[0]
+    return next((note for note in get_args(kind) if isinstance(note, Source)), None)
+
+
+def _check_source(label: str, value: Path | str, source: Source) -> None:
+    """Raises InputError where a file or folder is missing that a flag names."""
+    path, hint = Path(value), ""
+    named, is_dir = value in NAMED_WEIGHTS, os.path.isdir(path)
+    match source:
+        case Source.RUN:
+            fine = is_dir
+        case Source.FOLDER:
+            fine = os.path.isdir(next(x for x in (path, *path.parents) if os.path.exists(x)))
+        case Source.ROBOT:
+            fine = path.suffix == ".toml"
+        case Source.WEIGHTS:
+            fine = named or path.suffix or os.path.lexists(path)
+            hint = did_you_mean(str(value), NAMED_WEIGHTS)
+        case _:
+            fine = True
+    if not fine:
+        raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
+    if (
+        source in (Source.FILE, Source.ROBOT)
+        or (source is Source.WEIGHTS and not named)
+        or (source is Source.EXPORTABLE and not is_dir)
+        or (source is Source.TRAJECTORY and path.suffix == ".toml")
+    ):
+        check_file(path, "the file")
+
+
+def resolve_latest(flags: Flags) -> Flags:
+    """The flags with the newest run under `runs/` wherever `latest` stands for a run folder.
+
+    Raises:
+        InputError: there is no run.
+    """
+
+    def newest(path: Path) -> Path:
+        if path != _LATEST or path.exists():
+            return path
+        runs = [file for file in Path("runs").rglob("config.json") if file.is_file()]
+        if not runs:
+            raise InputError("latest: there is no run in the folder `runs` of this directory")
+        return max(runs, key=lambda file: file.stat().st_mtime).parent
+
+    values = {}
+    for field in fields(flags):  # pyright: ignore[reportArgumentType]
+        value = getattr(flags, field.name)
+        if value is not None and _source(field.type) in (Source.RUN, Source.EXPORTABLE):
+            values[field.name] = (
+                tuple(map(newest, value)) if isinstance(value, tuple) else newest(value)
+            )
+    return replace(flags, **values)  # pyright: ignore[reportType]

@@ -1,0 +1,238 @@
+"""Settings from JSON and TOML and back; whatever is wrong is told in one line.
+
+Settings are frozen dataclasses that call `check` when they are made. msgspec converts values to the
+types of the fields; the ranges and the words of the messages are here: the field, what was
+expected, what came, and the nearest name. A range stands beside the field as
+`Annotated[float, POSITIVE]`, or is an argument of `check`.
+"""
+
+import json
+import math
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+
+import msgspec
+
+from hector_jax.core.inputs import (
+    InputError,
+    did_you_mean,
+    one_line,
+    read_text,
+    short_repr,
+    unknown,
+)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Range:
+    """Finite numbers from `low` to `high`, both allowed."""
+
+    low: int | float = -math.inf
+    high: int | float = math.inf
+    above: bool = False  # low itself is not allowed
+
+    def __contains__(self, number: Any) -> bool:
+        over = number > self.low if self.above else number >= self.low
+        return bool(over and number <= self.high and abs(number) <= sys.float_info.max)
+
+    def __str__(self) -> str:
+        write = lambda x: str(x) if isinstance(x, int) else f"{x:g}"  # noqa: E731
+        if math.isfinite(self.low) and math.isfinite(self.high) and not self.above:
+            return f"from {write(self.low)} to {write(self.high)}"
+        parts = [f"{'above' if self.above else 'of at least'} {write(self.low)}"]
+        parts = parts * math.isfinite(self.low)
+        parts += [f"{'' if parts else 'of '}at most {write(self.high)}"] * math.isfinite(self.high)
+        return " and ".join(parts) or "that is finite"
+
+
+POSITIVE = Range(0.0, above=True)
+NOT_NEGATIVE = Range(0.0)
+SHARE = Range(0.0, 1.0)
+AT_LEAST_ONE = Range(1)
+SEED = Range(0, 2**32 - 1)
+
+Rule = Range | tuple[str, ...]
+"""Allowed numbers, or the words to choose from."""
+
+
+def convert(value: Any, kind: Any, rule: Rule | None = None) -> Any:
+    """A value as its type says: a tuple for a list, 1.0 for 1, a `Path` for text.
+
+    Args:
+        value: from a file or a program.
+        kind: the annotation, with its range where it is `Annotated`.
+        rule: allowed numbers or words; without one, numbers have to be finite.
+
+    Raises:
+        InputError: `must be ..., got ...`.
+    """
+    if get_origin(kind) is Annotated:
+        kind, *notes = get_args(kind)
+        rule = next((note for note in notes if isinstance(note, Range)), rule)
+    if isinstance(rule, tuple):
+        kind, rule = Literal[rule], None
+    try:
+        made = msgspec.convert(_builtin(value), kind, dec_hook=_instance)
+        allowed = rule or Range()
+        numbers = made if isinstance(made, tuple) else (made,)
+        fine = all(x in allowed for x in numbers if type(x) in (int, float))
+    except msgspec.ValidationError:
+        fine, made = False, None
+    if not fine:
+        words = get_args(kind) if get_origin(kind) is Literal else ()
+        hint = did_you_mean(value, words) if isinstance(value, str) else ""
+        raise InputError(f"must be {_expected(kind, rule)}, got {short_repr(value)}{hint}")
+    return made
+
+
+def _builtin(value: Any) -> Any:
+    """A number of NumPy, or a `Part`, as Python's own type."""
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, Real) and not isinstance(value, bool):
+        return int(value) if isinstance(value, Integral) else float(value)
+    return tuple(map(_builtin, value)) if isinstance(value, list | tuple) else value
+
+
+def _instance(kind: type, value: Any) -> Any:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if isinstance(kind, type) and not isinstance(value, kind):
+        raise msgspec.ValidationError(f"expected {kind}")
+    return value
+
+
+def _expected(kind: Any, rule: Rule | None = None) -> str:
+    """What a type allows, in words."""
+    inner = get_args(kind)
+    if get_origin(kind) is Annotated:
+        return _expected(*inner[:2])
+    if get_origin(kind) is Literal:
+        *others, last = map(repr, inner)
+        return f"{', '.join(others)} or {last}" if others else last
+    if isinstance(kind, UnionType):
+        return " or ".join(_expected(one, rule) for one in inner if one is not NoneType)
+    if get_origin(kind) is tuple:
+        number = "" if inner[-1] is Ellipsis else f" of {len(inner)}"
+        return f"a list{number}, each {_expected(inner[0], rule)}"
+    numbers = rule if isinstance(rule, Range) else Range()
+    words = {bool: "true or false", int: f"a whole number {numbers}", float: f"a number {numbers}"}
+    words |= {str: "text", Path: "a path", tuple: "a list"}
+    return words.get(kind) or f"a {kind.__name__}"
+
+
+def validation_error(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
+    """What is wrong with a value, `must be ..., got ...`; None where nothing is."""
+    try:
+        convert(value, kind, rule)
+    except InputError as error:
+        return str(error)
+    return None
+
+
+def check(settings: Any, /, **rules: Rule) -> None:
+    """Check the fields of a dataclass against their types and ranges; for `__post_init__`.
+
+    Raises:
+        InputError: `CLASS.FIELD must be ..., got ...`.
+    """
+    for field in fields(settings):
+        value = getattr(settings, field.name)
+        error = validation_error(value, field.type, rules.get(field.name))
+        if not error and isinstance(value, list | dict):
+            error = f"must be hashable, got {short_repr(value)}"
+        if error:
+            raise InputError(f"{type(settings).__name__}.{field.name} {error}")
+
+
+def choose(name: str, word: str, choices: Iterable[str]) -> str:
+    """The word, one of those there are.
+
+    Raises:
+        InputError: `NAME must be ..., got ...`.
+    """
+    if error := validation_error(word, str, tuple(choices)):
+        raise InputError(f"{name} {error}")
+    return word
+
+
+def read_json(path: Path, what: str, max_bytes: int = 10_000_000, **options: Any) -> Any:
+    """Content of a JSON file; see `inputs.read_text`, with `options` of `json.loads`.
+
+    Raises:
+        InputError: one line naming the file: as `inputs.read_text`, or not valid JSON.
+    """
+    return _decoded(path, "JSON", lambda: json.loads(read_text(path, what, max_bytes), **options))
+
+
+def read_toml(path: Path, what: str, max_bytes: int) -> dict[str, Any]:
+    """Content of a TOML file; see `inputs.read_text`.
+
+    Raises:
+        InputError: one line naming the file: as `inputs.read_text`, or not valid TOML.
+    """
+    return _decoded(path, "TOML", lambda: tomllib.loads(read_text(path, what, max_bytes)))
+
+
+def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
+    try:
+        return decode()
+    except InputError:
+        raise
+    except RecursionError:
+        reason = "nested too deeply"
+    except ValueError as error:
+        reason = one_line(error)
+        if "set_int_max_str_digits" in reason:  # Python's advice to a programmer
+            reason = "a number has too many digits"
+    raise InputError(f"{path}: not valid {language}: {reason}")
+
+
+def from_table(where: str, kind: type[T], table: Any) -> T:
+    """A dataclass from a table of a file; dataclasses inside it from tables inside that.
+
+    Args:
+        where: the file and the place in it, for the message.
+        kind: the dataclass, which checks itself; fields without a default have to be there.
+        table: read from the file.
+
+    Raises:
+        InputError: one line naming `where` and the field that is unknown, missing or wrong.
+    """
+    known = {field.name: field for field in fields(kind)}  # pyright: ignore[reportArgumentType]
+    if not isinstance(table, Mapping):
+        raise InputError(f"{where} must be a table of {', '.join(known)}, got {short_repr(table)}")
+    values = {}
+    for name, value in table.items():
+        if name not in known:
+            raise InputError(f"{where}: {unknown('field', name, known)}")
+        type_ = known[name].type
+        types = [x for x in (type_, *get_args(type_)) if isinstance(x, type)]
+        inner = next(filter(is_dataclass, types), None)
+        if inner and value is not None:
+            values[name] = from_table(f"{where}: {name}", inner, value)
+            continue
+        try:
+            values[name] = convert(value, type_)
+        except InputError as error:
+            raise InputError(f"{where}: {name} {error}") from None
+    for name, field in known.items():
+        if name not in table and field.default is field.default_factory is MISSING:
+            raise InputError(f"{where}: missing field {name!r}; known: {', '.join(known)}")
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {str(error).removeprefix(f'{kind.__name__}.')}") from None
+
+
+def to_table(settings: Any) -> Any:
+    """Settings as values of JSON, which `from_table` reads; a path becomes text."""
+    return msgspec.to_builtins(settings, enc_hook=str)
