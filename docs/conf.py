@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import pkgutil
 import re
 from importlib import metadata
 from pathlib import Path
@@ -53,58 +54,18 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
     "runs": ("Runs", "Steps from data to evaluation, scores, files of a run, export."),
     "report": ("Report", "Tables, pictures, films and pages of a run."),
 }
-PUBLIC = {  # of packages without `__all__`
-    "hector_jax.core": """
-        hector_jax.core.trajectory.State hector_jax.core.trajectory.Wrench
-        hector_jax.core.trajectory.Load hector_jax.core.trajectory.Trajectory
-        hector_jax.core.inputs.InputError hector_jax.core.runtime.setup_jax
-    """,
-    "hector_jax.robot": """
-        hector_jax.robot.model.Robot hector_jax.robot.model.load_robot
-        hector_jax.robot.description.Description hector_jax.robot.kinematics.foot_poses
-        hector_jax.robot.kinematics.foot_jacobians hector_jax.robot.kinematics.inverse_legs
-        hector_jax.robot.srbm.linearise
-    """,
-    "hector_jax.control": """
-        hector_jax.control.weights.Weights hector_jax.control.weights.nominal
-        hector_jax.control.weights.expert hector_jax.control.reference.Command
-        hector_jax.control.reference.Anchor hector_jax.control.reference.named_command
-        hector_jax.control.reference.standing_anchor hector_jax.control.reference.reference_at
-        hector_jax.control.gait.GaitConfig hector_jax.control.footstep.FootstepConfig
-        hector_jax.control.legs.LegConfig hector_jax.control.mpc.MpcConfig
-        hector_jax.control.mpc.Horizon hector_jax.control.mpc.solve_mpc
-        hector_jax.control.walking.WalkConfig hector_jax.control.walking.Plan
-        hector_jax.control.walking.plan
-    """,
-    "hector_jax.sim": """
-        hector_jax.sim.world.Imperfections hector_jax.sim.world.ideal hector_jax.sim.world.hfs
-        hector_jax.sim.world.hfs_varied hector_jax.sim.standin.standin
-        hector_jax.sim.walk.Job hector_jax.sim.walk.walk hector_jax.sim.walk.walk_many
-    """,
-    "hector_jax.grfm": """
-        hector_jax.grfm.effect.Window hector_jax.grfm.effect.Effect
-        hector_jax.grfm.network.as_effect hector_jax.grfm.network.load_net
-        hector_jax.grfm.network.save_net hector_jax.grfm.dataset.load_walks
-        hector_jax.grfm.training.TrainConfig hector_jax.grfm.training.train
-    """,
-    "hector_jax.tuning": """
-        hector_jax.tuning.rollout.RolloutConfig hector_jax.tuning.rollout.rollout
-        hector_jax.tuning.loss.LossConfig hector_jax.tuning.loss.Losses
-        hector_jax.tuning.loss.losses hector_jax.tuning.difftune.TuneConfig
-        hector_jax.tuning.difftune.Evaluation hector_jax.tuning.difftune.Tuning
-        hector_jax.tuning.difftune.tune hector_jax.tuning.difftune.descend
-        hector_jax.tuning.measured.tune_measured hector_jax.tuning.online.OnlineConfig
-    """,
-    "hector_jax.search": "hector_jax.search.cmaes.SearchConfig hector_jax.search.cmaes.search",
-    "hector_jax.runs": """
-        hector_jax.runs.metrics.Score hector_jax.runs.metrics.score
-        hector_jax.runs.metrics.Verdict hector_jax.runs.metrics.make_verdict
-        hector_jax.runs.export.export
-    """,
-    "hector_jax.report": """
-        hector_jax.report.folder.load_run hector_jax.report.folder.compare_runs
-        hector_jax.report.video.write_film hector_jax.report.tensorboard.write_events
-    """,
+PUBLIC = {  # of packages without `__all__`, in whichever of their modules they are defined
+    "core": "State Wrench Load Trajectory InputError setup_jax",
+    "robot": "Robot load_robot Description foot_poses foot_jacobians inverse_legs linearise",
+    "control": """Weights nominal expert Command Anchor named_command standing_anchor reference_at
+        GaitConfig FootstepConfig LegConfig MpcConfig Horizon solve_mpc WalkConfig Plan plan""",
+    "sim": "Imperfections ideal hfs hfs_varied standin Job walk walk_many",
+    "grfm": "Window Effect as_effect load_net save_net load_walks TrainConfig train",
+    "tuning": """RolloutConfig rollout LossConfig losses TuneConfig Evaluation Tuning tune descend
+        tune_measured OnlineConfig""",
+    "search": "SearchConfig search",
+    "runs": "Score score Verdict make_verdict export",
+    "report": "load_run compare_runs write_film write_events",
 }
 _ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")
 logger = logging.getLogger(__name__)
@@ -116,8 +77,18 @@ _CODE = re.compile(r"(`[^`]*`)")
 
 def _public(package: str) -> list[str]:
     """Names of a package's `__all__`; without one, those of PUBLIC."""
-    names = getattr(importlib.import_module(package), "__all__", None)
-    return [f"{package}.{name}" for name in names] if names else PUBLIC.get(package, "").split()
+    package = importlib.import_module(package)
+    if hasattr(package, "__all__"):
+        return [f"{package.__name__}.{name}" for name in package.__all__]
+    names = PUBLIC.get(package.__name__.split(".")[-1], "").split()
+    inside = pkgutil.walk_packages(package.__path__, f"{package.__name__}.") if names else ()
+    modules = [importlib.import_module(module.name) for module in inside]
+    home = {name: package.__name__ for name in names}  # where it is not found there is a warning
+    for module in modules:
+        for name in names:
+            if getattr(vars(module).get(name), "__module__", None) == module.__name__:
+                home[name] = module.__name__
+    return [f"{home[name]}.{name}" for name in names]
 
 
 def _resolve(name: str) -> tuple[str, object]:
