@@ -20,7 +20,7 @@ from hector_jax.cli import table as study
 from hector_jax.cli.flags import Command, Tune, command_name
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
-from hector_jax.control.weights import expert
+from hector_jax.control.weights import WEIGHT_NAMES, expert, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm.collection import load_walks, walked_with
@@ -359,6 +359,27 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
+
+    # one set for two trajectories, from those weights, on the same data
+    start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "10")
+    several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
+    assert call(monkeypatch, "tune", *flags, *several) == 0
+    out = capsys.readouterr().out
+    for title in ("straight, c, 1 plant", "straight, 1 plant", "c, 1 plant"):
+        assert f"\n{title} on the" in f"\n{out}"
+    result = json.loads(Path("both/result.json").read_text())
+    names = ["nominal", "expert", "start", "without_ten", "with_ten", "without", "with"]
+    assert list(result["sets"]) == names
+    each = result["trajectories"]
+    assert list(each) == ["straight", "c"]
+    means = [each[name]["sets"]["with"]["standin"]["L"]["mean"] for name in each]
+    assert result["sets"]["with"]["standin"]["L"]["mean"] == pytest.approx(np.mean(means))
+    assert result["sets"]["with"]["hfs"]["L"]["mean"] > 0.0
+    lines = [json.loads(line) for line in Path("both/metrics.jsonl").read_text().splitlines()]
+    assert lines[0]["weights"] == pytest.approx(
+        dict(zip(WEIGHT_NAMES, weights_to_vector(load_weights(start)).tolist(), strict=True))
+    )
+    assert "walking: straight, c" in Path("both/report.md").read_text()
 
 
 @pytest.mark.slow
