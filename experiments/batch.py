@@ -14,7 +14,6 @@ stand-in is read by `verdict` alone, which tunes nothing.
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net, member_effects
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import metrics, pipeline
+from hector_jax.runs import metrics, verdicts
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
@@ -184,9 +183,8 @@ def judged(
 ) -> dict[str, Score]:
     """Scores of weight sets on plants, stacked over these."""
     seeds = range(first_seed, first_seed + len(plants))
-    walks = pipeline.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title)
-    score = partial(metrics.score, LossConfig())
-    return {name: metrics.stack_scores([*map(score, each)]) for name, each in walks.items()}
+    found = verdicts.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title=title)
+    return {name: metrics.stack_scores(scores) for name, scores in found.scores.items()}
 
 
 def million(x: Any) -> str:

@@ -1,12 +1,22 @@
-"""What the experiments share: how a report is written."""
+"""What the experiments share: walks that are kept in groups, and how a report is written."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from hector_jax.core.console import made_at
+import jax
+import numpy as np
+
+from hector_jax.core.console import bar, made_at
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_file, write_json
+from hector_jax.core.inputs import plural
+from hector_jax.core.trajectory import Trajectory
+from hector_jax.robot.model import Robot
+from hector_jax.runs.cache import cached, content_key
+from hector_jax.sim.walk import Job
+
+Tree = TypeVar("Tree")
 
 
 def write_report(
@@ -37,3 +47,51 @@ def write_report(
     write_json(path.parent / json_name, {"environment": about, **numbers})
     write_file(path, ("\n\n".join(text) + "\n").encode())
     return path
+
+
+def walk_groups(
+    groups: Mapping[str, Sequence[Job]],
+    walk: Callable[[Sequence[Job]], Iterator[Trajectory]],
+    score: Callable[[Trajectory], Tree],
+    *,
+    like: Tree,
+    kind: str,
+    robot: Robot,
+    folder: Path,
+    settings: tuple[Any, ...],
+    title: str = "",
+) -> dict[str, Tree]:
+    """Scores of the walks of groups of jobs, stacked by group; whole groups are kept.
+
+    Args:
+        groups: of jobs, by a name that may stand in a file's.
+        walk: walks jobs, in their order.
+        score: of a walk, a NamedTuple of arrays.
+        like: such a tuple, stacked.
+        kind: of the files.
+        robot: the body.
+        folder: of the files.
+        settings: what the walks follow from beside the jobs, see `content_key`; noted in the files.
+        title: for the person who waits, after the number of walks.
+    """
+    code = ("sim.walk", "sim.parallel", "runs.metrics")
+    paths = {
+        name: folder / f"{name}-{content_key(*settings, robot, tuple(jobs), code=code)}.npz"
+        for name, jobs in groups.items()
+    }
+
+    def make(missing: list[str], found: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
+        jobs = [job for name in missing for job in groups[name]]
+        with bar(f"{plural(len(jobs), 'walk')}{title}") as tell:
+            tell(0, len(jobs), "compiling")
+            walks, done = walk(jobs), 0
+            for name in missing:
+                rows = []
+                for _job in groups[name]:
+                    rows.append(score(next(walks)))
+                    done += 1
+                    tell(done, len(jobs), name)
+                yield name, jax.tree.map(lambda *x: np.stack(x), *rows)
+
+    about = {"settings": [repr(part) for part in settings]}
+    return cached(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)

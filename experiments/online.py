@@ -43,7 +43,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import pipeline
+from hector_jax.runs import nets
 from hector_jax.runs.cache import cached, content_key
 from hector_jax.sim.changes import Change
 from hector_jax.sim.loop import Job
@@ -255,7 +255,7 @@ def main() -> None:
     robot = jax.tree.map(np.asarray, load_robot())
     flags.out.mkdir(parents=True, exist_ok=True)
     with workers(flags.processes) as pool:
-        net = pipeline.ground(pool, robot, flags.data)
+        net = nets.ground(pool, robot, flags.data)
         effects = {"command": last_command, "net": as_effect(net.params)}
         effects = {name: jax.tree.map(np.asarray, effect) for name, effect in effects.items()}
         found = walk_cases(pool, flags, robot, effects, starts)

@@ -40,7 +40,7 @@ from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import pipeline
+from hector_jax.runs import nets, searches
 from hector_jax.runs.cache import content_key, robot_hash
 from hector_jax.search.cmaes import Generation, SearchConfig
 from hector_jax.search.race import Raced, Turn, lowest, race, walks
@@ -158,15 +158,15 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
     if not folder.exists():
         shutil.rmtree(part, ignore_errors=True)  # a cut would leave its seconds unknown
         begin = time.monotonic()
-        pipeline.collect(pool, pipeline.CollectConfig(), robot, part / "walks")  # see `ground`
+        nets.collect(pool, nets.CollectConfig(), robot, part / "walks")  # see `ground`
         collected = time.monotonic()
-        path = pipeline.net_path(part, TrainConfig().variant)
-        pipeline.train(TrainConfig(), robot, part / "walks", path)
+        path = nets.net_path(part, TrainConfig().variant)
+        nets.train(TrainConfig(), robot, part / "walks", path)
         took = {"collection": collected - begin, "training": time.monotonic() - collected}
         write_json(part / "seconds.json", took)
         part.rename(folder)
     took = json.loads((folder / "seconds.json").read_text())
-    return pipeline.ground(pool, robot, folder).params, took
+    return nets.ground(pool, robot, folder).params, took
 
 
 def on_model(
@@ -250,7 +250,9 @@ def run(
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
         every = {flags.traj: [weights for each in sets.values() for weights in each]}
-        told = pipeline.losses_on_hfs(pool, config, robot, engine, every, size)[flags.traj]
+        told = searches.losses_on_hfs(pool, config, robot, every, engine=engine, at_once=size)[
+            flags.traj
+        ]
         ends = np.cumsum([len(each) for each in sets.values()])
         return dict(zip(sets, np.split(told, ends[:-1]), strict=True))
 
@@ -306,7 +308,7 @@ def main() -> None:
     prices = Prices(
         walk,
         {name: course.iteration for name, course in courses.items()},
-        full * (pipeline.CollectConfig.walks * walk + 3 * plain.iterations * plain.iteration),
+        full * (nets.CollectConfig.walks * walk + 3 * plain.iterations * plain.iteration),
         took["training"] if took else 0.0,
     )
     groups = {
@@ -438,7 +440,7 @@ def _words(
         f"- **Walks.** Every walk counts but that of the start. The three that follow the model "
         "learn nothing from theirs: each iterate that they accept is walked once, to be judged. "
         "`its own last` is the loss of the iterate at which they end, without a choice by the "
-        f"simulator. The net has seen {pipeline.CollectConfig.walks} walks before, of all "
+        f"simulator. The net has seen {nets.CollectConfig.walks} walks before, of all "
         "trajectories, which are in the seconds and not in the walks.",
         f"- **Seconds** are of one core: a walk {prices.walk:.2f} s (MuJoCo C, the mean of three "
         "on this machine, whatever engine raced); what a method thought, measured; an iteration on "

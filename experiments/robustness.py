@@ -22,7 +22,7 @@ import jax
 import numpy as np
 import plots
 import tyro
-from lib import write_report
+from lib import walk_groups, write_report
 from scenes import (
     Cell,
     Level,
@@ -45,7 +45,7 @@ from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report.report import WORLDS
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import kept, metrics
+from hector_jax.runs import metrics
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
@@ -148,16 +148,15 @@ def main() -> None:
     }
     config, loss = WalkConfig(), LossConfig()
     with workers(flags.processes) as pool:
-        walked = kept.walk_groups(
+        walked = walk_groups(
             groups,
             partial(MUJOCO_C.walk, pool, config, robot),
             partial(metrics.score, loss),
-            metrics.score_like(0),
-            "robustness",
-            robot,
-            flags.out / "scores",
-            (config, loss),
-            "",
+            like=metrics.score_like(0),
+            kind="robustness",
+            robot=robot,
+            folder=flags.out / "scores",
+            settings=(config, loss),
         )
     scores = {
         (level, name): metrics.stack_scores([walked[group(level, name, seed)] for seed in seeds])

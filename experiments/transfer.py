@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import alignment
 import jax
+import lib
 import numpy as np
 import plots
 import tyro
@@ -54,7 +55,8 @@ from hector_jax.grfm.collection import walked_with
 from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import kept, pipeline
+from hector_jax.runs import nets, tunings
+from hector_jax.runs.tunings import Problem
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
@@ -146,7 +148,7 @@ def phis(
                 "A --data folder of its own gives this one nets"
             )
             return effects, None
-    net, paper = (pipeline.ground(pool, robot, data, name) for name in (None, "paper"))
+    net, paper = (nets.ground(pool, robot, data, name) for name in (None, "paper"))
     default = as_effect(net.params)
     effects |= {
         "linear": as_effect(net.linear),
@@ -168,11 +170,13 @@ def tuned_sets(
 ) -> dict[str, Weights]:
     """Weights after the paper's ten iterations by trajectory: given, stored or tuned now."""
     problems = {
-        name: (named_command(name), params) for name in flags.trajectories if name not in given
+        name: Problem(named_command(name), params)
+        for name in flags.trajectories
+        if name not in given
     }
     commit = environment().get("commit", "")
     title = "tuning, ten iterations"
-    found = pipeline.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
+    found = tunings.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
     return {**given, **{name: tuned.tuning.ten for name, tuned in found.items()}}
 
 
@@ -190,11 +194,17 @@ def walk_groups(
 ) -> tuple[dict[str, Walked], str]:
     """Walks of groups of jobs on the hfs, and their engine; a group that is on disk is taken."""
     engine = choose_engine("auto")
-    walk = partial(engine.walk, pool, config, robot)
-    like = Walked(np.zeros(0), np.zeros(0), np.zeros(0))
-    key = config, LossConfig(), engine.name
-    title = f" on the high-fidelity simulator, engine {engine.name}"
-    walked = kept.walk_groups(groups, walk, _walked, like, "transfer", robot, folder, key, title)
+    walked = lib.walk_groups(
+        groups,
+        partial(engine.walk, pool, config, robot),
+        _walked,
+        like=Walked(np.zeros(0), np.zeros(0), np.zeros(0)),
+        kind="transfer",
+        robot=robot,
+        folder=folder,
+        settings=(config, LossConfig(), engine.name),
+        title=f" on the high-fidelity simulator, engine {engine.name}",
+    )
     return walked, engine.name
 
 

@@ -30,8 +30,8 @@ from hector_jax.grfm.collection import collect
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import kept, pipeline
-from hector_jax.runs.pipeline import Journal
+from hector_jax.runs import nets, tunings, verdicts
+from hector_jax.runs.tunings import Journal, Problem
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
 from hector_jax.tuning.loss import Losses
@@ -57,19 +57,19 @@ def look(folder: Path, weights) -> Evaluation:
     return Evaluation(loss, Losses(loss, loss, loss), gradient, none, none)
 
 
-def tune_toys(folder: Path, pool, config, robot, problems, title, on_iteration):
-    """In the place of `pipeline._tunings`."""
+def tune_toys(folder: Path, pool, config, robot, start, problems, title, on_iteration):
+    """In the place of `tunings._tunings`."""
     for name in problems:
-        yield name, descend(config, nominal(), partial(look, folder), partial(on_iteration, name))
+        yield name, descend(config, start, partial(look, folder), partial(on_iteration, name))
 
 
 def tuning(folder: Path) -> None:
-    pipeline._tunings = partial(tune_toys, folder)
-    pipeline.tune(
+    tunings._tunings = partial(tune_toys, folder)
+    tunings.tune(
         ThreadPoolExecutor(1),
         TuneConfig(iterations=60),
         ROBOT,
-        {"toy": (S, None)},
+        {"toy": Problem(S, None)},
         folder,
         title="",
         journal=Journal(folder / "metrics.jsonl"),
@@ -95,7 +95,7 @@ def training(folder: Path) -> None:
         collect(walks, jobs, partial(walk_jobs, walks), robot=ROBOT)
     config = TrainConfig(os.environ.get("VARIANT", "paper"), epochs=60, batch=16)
     if not (folder / "net.npz").exists():
-        pipeline.train(config, ROBOT, walks, folder / "net.npz")
+        nets.train(config, ROBOT, walks, folder / "net.npz")
 
 
 def table(folder: Path) -> None:
@@ -104,15 +104,15 @@ def table(folder: Path) -> None:
             done(folder, f"{job.seed} {float(job.weights.Q.euler[0])}")
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
-    pipeline.walks_of, pipeline._tunings = walks_of, partial(tune_toys, folder)
+    verdicts.walk_jobs, tunings._tunings = walks_of, partial(tune_toys, folder)
     config, pool = TuneConfig(iterations=20), ThreadPoolExecutor(1)
-    problems = {"without": (S, None)}
+    problems = {"without": Problem(S, None)}
     with locked(folder):
-        tuned = pipeline.tune(pool, config, ROBOT, problems, folder / "s", title="")["without"]
+        tuned = tunings.tune(pool, config, ROBOT, problems, folder / "s", title="")["without"]
         sets = {"nominal": nominal(), "expert": expert(), "without": tuned.tuning.converged}
         seeds = range(WALKS // 2)
         plants = [hfs()] * len(seeds)
-        kept.judge(pool, config, ROBOT, sets, S, plants, seeds, folder / "s", "abc", "")
+        verdicts.judge(pool, config, ROBOT, sets, S, plants, seeds, title="", folder=folder / "s")
 
 
 JOBS = {job.__name__: job for job in (tuning, collection, training, table)}

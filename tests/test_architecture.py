@@ -85,7 +85,7 @@ def test_each_outside_package_has_its_door(package):
 
 def test_nothing_that_learns_or_searches_can_reach_the_stand_in():
     inside = {name for name, target in IMPORTS if target.startswith("hector_jax.sim.standin")}
-    assert inside == {"cli.asked"}
+    assert inside == {"cli.arguments"}
 
 
 def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():

@@ -25,9 +25,9 @@ from hector_jax.report import folder as runs
 from hector_jax.robot.description import Description, read_description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs
 from hector_jax.robot.model import describe, load_model, load_robot
-from hector_jax.runs import pipeline, replay
+from hector_jax.runs import nets, replay
 from hector_jax.runs.export import find_weights
-from hector_jax.runs.pipeline import CollectConfig
+from hector_jax.runs.nets import CollectConfig
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mjx_model import batched_model, find_places
 from hector_jax.sim.walk import walk
@@ -325,7 +325,7 @@ def test_strider_walks_with_its_joints_in_another_order(tmp_path):
 def test_strider_is_tuned_by_the_same_command(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
-    monkeypatch.setattr(pipeline, "CollectConfig", lambda: small)
+    monkeypatch.setattr(nets, "CollectConfig", lambda: small)
     flags = ("--traj", "straight", "--seeds", "1", "--iterations", "11", "--no-video")
     line = ["hector", "tune", "--robot", str(STRIDER), *flags, "--processes", "1"]
     monkeypatch.setattr(sys, "argv", line)

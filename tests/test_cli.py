@@ -15,11 +15,12 @@ import pytest
 from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
-from hector_jax.cli import asked, doctor, judging, study
+from hector_jax.cli import arguments, doctor, evaluate
+from hector_jax.cli import table as study
 from hector_jax.cli.flags import Command, Tune, command_name
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
-from hector_jax.control.weights import expert
+from hector_jax.control.weights import WEIGHT_NAMES, expert, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm.collection import load_walks, walked_with
@@ -27,8 +28,8 @@ from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
 from hector_jax.robot.model import MODEL_PATH, load_robot
-from hector_jax.runs import pipeline
-from hector_jax.runs.pipeline import CollectConfig
+from hector_jax.runs import nets, searches, tunings, verdicts
+from hector_jax.runs.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -81,7 +82,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
     residual = np.where(fallen, np.inf, 0.0)
     wrong = walk._replace(fallen=fallen, residual=residual)
-    monkeypatch.setattr(asked, "walked", lambda *args: wrong)
+    monkeypatch.setattr(arguments, "walked", lambda *args: wrong)
     assert call(monkeypatch, "walk") == 1
     out, err = capsys.readouterr()
     assert "nominal weights: ended after 0.20 s" in out
@@ -90,7 +91,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     found = json.loads(capsys.readouterr().out)
     assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
     assert found["residual"] is None
-    monkeypatch.setattr(asked, "walked", lambda *args: walk._replace(fallen=fallen))
+    monkeypatch.setattr(arguments, "walked", lambda *args: walk._replace(fallen=fallen))
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
 
@@ -98,7 +99,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
 def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):
     path = tmp_path / "two\nlines.json"
     save_weights(path, expert())
-    monkeypatch.setattr(asked, "walked", lambda *args: synthetic_walk(0, 30))
+    monkeypatch.setattr(arguments, "walked", lambda *args: synthetic_walk(0, 30))
     assert call(monkeypatch, "walk", "--weights", path) == 0
     assert "two lines.json weights: walked" in capsys.readouterr().out.splitlines()[0]
 
@@ -167,14 +168,14 @@ def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
 def test_collection_refuses_what_it_cannot_walk_at_once(
     monkeypatch, capsys, tmp_path, wrong, expected
 ):
-    monkeypatch.setattr(pipeline, "tuning_paths", None)  # nothing may be computed before
+    monkeypatch.setattr(nets, "tuning_paths", None)  # nothing may be computed before
     assert expected in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "walks", *wrong)
     assert not (tmp_path / "walks").exists()
 
 
 def test_collection_refuses_a_folder_it_cannot_write(monkeypatch, capsys, tmp_path):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr(pipeline, "tuning_paths", None)  # nothing may be computed before
+    monkeypatch.setattr(nets, "tuning_paths", None)  # nothing may be computed before
     assert "file" in refused(monkeypatch, capsys, "collect", "--out", tmp_path / "file" / "walks")
 
 
@@ -199,7 +200,7 @@ def test_curves_leave_a_gap_where_a_tick_is_no_sample():
 @pytest.mark.slow
 def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
     """Both leave shards of one layout; the card names the engine, and resuming keeps to it."""
-    monkeypatch.setattr(pipeline, "tuning_paths", lambda *args: [])
+    monkeypatch.setattr(nets, "tuning_paths", lambda *args: [])
     flags = ("collect", "--walks", "3", "--seconds", "0.1")
     found = {}
     for engine in ("c", "mjx"):
@@ -240,7 +241,7 @@ def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
 def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     path = tmp_path / "hector.xml"
     path.write_text(change(MODEL_PATH.read_text()))
-    monkeypatch.setattr(judging, "load_robot", lambda _: load_robot(path))
+    monkeypatch.setattr(evaluate, "load_robot", lambda _: load_robot(path))
     line = refused(monkeypatch, capsys, "walk")
     assert "hector.xml" in line
     assert expected in line
@@ -266,7 +267,7 @@ def test_a_search_refuses_wrong_input_before_it_makes_a_folder(
 def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch, capsys, tmp_path):
     """Two generations of short walks on all trajectories; the second call finds all done."""
     short = TuneConfig(rollout=RolloutConfig(ticks=20))
-    monkeypatch.setattr(asked, "TuneConfig", lambda rollout: short)
+    monkeypatch.setattr(arguments, "TuneConfig", lambda rollout: short)
     flags = ("search", "--traj", "all", "--budget", "9", "--population", "4", "--engine", "c")
     folders = ("--out", tmp_path / "found", "--record", tmp_path / "record", "--processes", "1")
     assert call(monkeypatch, *flags, *folders) == 0
@@ -293,7 +294,7 @@ def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch
 @pytest.mark.parametrize("asked", ["json", "words"])
 def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_path, asked):
     errors = {"raw": {"force": 2.0, "moment": 1.0}, "net": {"force": 0.5, "moment": 0.25}}
-    monkeypatch.setattr(pipeline, "train", lambda *args: SimpleNamespace(errors=errors, args=args))
+    monkeypatch.setattr(nets, "train", lambda *args: SimpleNamespace(errors=errors, args=args))
     more = ("--json",) if asked == "json" else ()
     assert call(monkeypatch, "train", "--out", tmp_path / "net.npz", *more) == 0
     out = capsys.readouterr().out
@@ -319,8 +320,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     """From nothing to a verdict, small: data, net, two tunings, one refresh, judges, report."""
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
-    monkeypatch.setattr(pipeline, "CollectConfig", lambda: small)
-    monkeypatch.setattr(pipeline, "REFRESH", replace(small, walks=4))
+    monkeypatch.setattr(nets, "CollectConfig", lambda: small)
+    monkeypatch.setattr(nets, "REFRESH", replace(small, walks=4))
     flags = ("--seeds", "2", "--iterations", "11", "--refresh", "1")
     assert call(monkeypatch, "tune", *flags, "--run", "run", "--json") == 0
     out = capsys.readouterr().out
@@ -359,20 +360,41 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
 
+    # one set for two trajectories, from those weights, on the same data
+    start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "10")
+    several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
+    assert call(monkeypatch, "tune", *flags, *several) == 0
+    out = capsys.readouterr().out
+    for title in ("straight, c, 1 plant", "straight, 1 plant", "c, 1 plant"):
+        assert f"\n{title} on the" in f"\n{out}"
+    result = json.loads(Path("both/result.json").read_text())
+    names = ["nominal", "expert", "start", "without_ten", "with_ten", "without", "with"]
+    assert list(result["sets"]) == names
+    each = result["trajectories"]
+    assert list(each) == ["straight", "c"]
+    means = [each[name]["sets"]["with"]["standin"]["L"]["mean"] for name in each]
+    assert result["sets"]["with"]["standin"]["L"]["mean"] == pytest.approx(np.mean(means))
+    assert result["sets"]["with"]["hfs"]["L"]["mean"] > 0.0
+    lines = [json.loads(line) for line in Path("both/metrics.jsonl").read_text().splitlines()]
+    assert lines[0]["weights"] == pytest.approx(
+        dict(zip(WEIGHT_NAMES, weights_to_vector(load_weights(start)).tolist(), strict=True))
+    )
+    assert "walking: straight, c" in Path("both/report.md").read_text()
+
 
 @pytest.mark.slow
 def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tmp_path):
     """One plant and one trajectory, really searched, tuned and walked; then all is taken up."""
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
-    monkeypatch.setattr(pipeline, "CollectConfig", lambda: small)
+    monkeypatch.setattr(nets, "CollectConfig", lambda: small)
     flags = ("--trajectories", "c", "--seeds", "1", "--rollouts", "10", "--iterations", "10")
     flags += ("--steps", "2", "--step-plants", "1")
     assert call(monkeypatch, "table", *flags) == 0
     first = (tmp_path / "runs/table/table.csv").read_bytes()
-    monkeypatch.setattr(pipeline, "walks_of", None)
-    monkeypatch.setattr(pipeline, "_tune_job", None)
-    monkeypatch.setattr(pipeline, "losses_on_hfs", None)
+    monkeypatch.setattr(verdicts, "walk_jobs", None)
+    monkeypatch.setattr(tunings, "_tune_job", None)
+    monkeypatch.setattr(searches, "losses_on_hfs", None)
     capsys.readouterr()
     assert call(monkeypatch, "table", *flags) == 0
     assert (tmp_path / "runs/table/table.csv").read_bytes() == first

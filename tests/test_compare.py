@@ -57,7 +57,7 @@ def run_folder(folder, flags=None, versions=None):
 def runs(tmp_path):
     return [
         run_folder(tmp_path / "c" / "one", versions={"seconds": "150", "commit": "aaa"}),
-        run_folder(tmp_path / "c" / "two", Tune(traj="c", seeds=32)),
+        run_folder(tmp_path / "c" / "two", Tune(traj=("c",), seeds=32)),
     ]
 
 
@@ -100,7 +100,7 @@ def test_the_command_prints_json_and_nothing_else(monkeypatch, capsys, runs):
 
 
 def test_what_a_run_wrote_can_be_asked_for_again(runs):
-    assert from_file(Tune, runs[1] / "config.json") == Tune(traj="c", seeds=32)
+    assert from_file(Tune, runs[1] / "config.json") == Tune(traj=("c",), seeds=32)
 
 
 @pytest.mark.parametrize(

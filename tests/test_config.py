@@ -34,8 +34,8 @@ def parsed(*words):
 def test_the_line_beats_the_file_and_the_file_beats_the_default(tmp_path):
     path = written(tmp_path, 'traj = "c"\nseeds = 3\nvideo = false\ndata = "mine"\n')
     found = parsed("tune", "--config", path, "--seeds", "5", "--video")
-    assert found == Tune(config=path, traj="c", seeds=5, video=True, data=Path("mine"))
-    assert parsed("tune", "--seeds", "5", f"--config={path}").traj == "c"
+    assert found == Tune(config=path, traj=("c",), seeds=5, video=True, data=Path("mine"))
+    assert parsed("tune", "--seeds", "5", f"--config={path}").traj == ("c",)
     assert parsed("tune").seeds == Tune().seeds
 
 

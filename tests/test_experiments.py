@@ -110,7 +110,7 @@ def test_a_race_on_another_engine_collects_as_every_run_does(tmp_path, monkeypat
     race, made = script("race"), []
     monkeypatch.setattr(race.pipeline, "collect", lambda pool, config, *rest: made.append(config))
     monkeypatch.setattr(race.pipeline, "train", lambda *rest: (tmp_path / "data.part").mkdir())
-    monkeypatch.setattr(race.pipeline, "ground", lambda pool, robot, folder: race.pipeline.Learned)
-    monkeypatch.setattr(race.pipeline.Learned, "params", None, raising=False)
+    monkeypatch.setattr(race.pipeline, "ground", lambda pool, robot, folder: race.nets.TrainedNet)
+    monkeypatch.setattr(race.nets.TrainedNet, "params", None, raising=False)
     race.prepare(None, race.Flags(engine="c", out=tmp_path), None)
-    assert made == [race.pipeline.CollectConfig()]  # what `ground` takes up
+    assert made == [race.nets.CollectConfig()]  # what `ground` takes up

@@ -22,7 +22,8 @@ from hector_jax.core import tree_file
 from hector_jax.core.runtime import workers
 from hector_jax.report.report import tuning_section
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import pipeline, replay
+from hector_jax.runs import replay, tunings
+from hector_jax.runs.tunings import Problem
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
 from hector_jax.tuning.loss import Losses
@@ -116,14 +117,14 @@ def params():
 def tune(folder, command, params, config=CONFIG, robot=ROBOT):
     """The tuning as a run does it; with the lines that it left."""
     with ThreadPoolExecutor(1) as pool, TemporaryDirectory() as kept:
-        found = pipeline.tune(
+        found = tunings.tune(
             pool,
             config,
             robot,
-            {"with": (command, params)},
+            {"with": Problem(command, params)},
             Path(kept),
             title="tuning",
-            journal=pipeline.Journal(Path(kept) / "metrics.jsonl"),
+            journal=tunings.Journal(Path(kept) / "metrics.jsonl"),
             dumps=folder,
         )
         lines = (Path(kept) / "metrics.jsonl").read_text().splitlines()
@@ -231,9 +232,9 @@ def test_a_dump_of_a_worker_is_reproduced_by_the_console_script(tmp_path, params
     command = Command(np.array([0.2, 9.0]), np.array([[0.5, 0.0], [9.0, 0.0]]), np.zeros(2))
     config = TuneConfig(rollout=RolloutConfig(ticks=80), iterations=10)
     with workers(2) as pool:
-        problems = {"with": (command, params)}
+        problems = {"with": Problem(command, params)}
         kept, dumps = tmp_path / "kept", tmp_path / "dumps"
-        told = pipeline.tune(pool, config, ROBOT, problems, kept, title="", dumps=dumps)
+        told = tunings.tune(pool, config, ROBOT, problems, kept, title="", dumps=dumps)
         found = told["with"].tuning
     path = min(dumps.iterdir())
     number = min(i.iteration for i in found.history if i.reason == "the robot fell")

@@ -7,12 +7,14 @@ import jax
 import numpy as np
 import pytest
 from pretend import pretend_history, pretend_walk
+from test_experiments import script
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import bounds, expert, nominal
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import kept, metrics, pipeline
+from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key
+from hector_jax.runs.tunings import Problem
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig, Tuning
@@ -31,14 +33,14 @@ def tuned(monkeypatch):
     """Names of the problems that are really tuned."""
     names = []
 
-    def tunings(pool, config, robot, problems, title, on_iteration):
+    def side_by_side(pool, config, robot, start, problems, title, on_iteration):
         for name in problems:
             names.append(name)
             for iteration in TUNING.history:
                 on_iteration(name, iteration)
             yield name, TUNING
 
-    monkeypatch.setattr(pipeline, "_tunings", tunings)
+    monkeypatch.setattr(tunings, "_tunings", side_by_side)
     return names
 
 
@@ -56,18 +58,21 @@ def walked(monkeypatch):
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0, fall_at=fall_at)
 
     walks_of.cut = None
-    monkeypatch.setattr(pipeline, "walks_of", walks_of)
+    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
     return seeds, walks_of
 
 
-def tune(folder, config=CONFIG, command=S):
-    problems = {"without": (command, None)}
-    return pipeline.tune(POOL, config, ROBOT, problems, folder, title="", commit="abc")["without"]
+def tune(folder, config=CONFIG, command=S, start=None):
+    problems = {"without": Problem(command, None)}
+    return tunings.tune(POOL, config, ROBOT, problems, folder, title="", commit="abc", start=start)[
+        "without"
+    ]
 
 
 def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
     plants = [plant or hfs()] * len(seeds)
-    return kept.judge(POOL, CONFIG, ROBOT, sets, S, plants, seeds, folder, commit, "")
+    notes = {"title": "", "folder": folder, "commit": commit}
+    return verdicts.judge(POOL, CONFIG, ROBOT, sets, S, plants, seeds, **notes)
 
 
 def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
@@ -82,26 +87,26 @@ def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
             assert one.iteration == other.iteration
             assert one.step == other.step
             same((one.weights, one.evaluation), (other.weights, other.evaluation))
-        assert [pipeline.as_line("a", i) for i in back.history] == [
-            pipeline.as_line("a", i) for i in TUNING.history
+        assert [tunings.as_line("a", i) for i in back.history] == [
+            tunings.as_line("a", i) for i in TUNING.history
         ]
     assert tuned == ["without"]
 
 
 def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned):
     """Of two tunings one had ended; the lines that the other had written come once."""
-    problems = {"without": (S, None), "with": (named_command("c"), None)}
+    problems = {"without": Problem(S, None), "with": Problem(named_command("c"), None)}
 
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
-        journal = pipeline.Journal(folder / "metrics.jsonl")
-        pipeline.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=journal)
+        journal = tunings.Journal(folder / "metrics.jsonl")
+        tunings.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=journal)
         return (folder / "metrics.jsonl").read_text()
 
     whole = lines(tmp_path / "whole", problems)
     half = lines(tmp_path / "cut", {"with": problems["with"]})
     with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
-        file.write(pipeline.as_line("without", TUNING.history[0]))
+        file.write(tunings.as_line("without", TUNING.history[0]))
     assert lines(tmp_path / "cut", problems) == whole
     assert whole.endswith(half)
     assert tuned == ["without", "with", "with", "without"]
@@ -113,7 +118,8 @@ def test_a_tuning_is_made_once_and_again_for_other_settings(tmp_path, tuned):
     same(first.tuning.converged, second.tuning.converged)
     tune(tmp_path, TuneConfig(iterations=20))
     tune(tmp_path, command=named_command("c"))
-    assert len(tuned) == 3
+    tune(tmp_path, start=expert())
+    assert len(tuned) == 4
 
 
 def test_a_damaged_tuning_is_made_anew(tmp_path, tuned, capsys):
@@ -131,7 +137,7 @@ def test_walks_that_are_kept_are_not_walked_again(tmp_path, walked):
     first, second = judge(tmp_path, sets), judge(tmp_path, sets, commit="def")
     assert len(seeds) == 6
     same([w[:3] for w in first.walks["expert"]], [w[:3] for w in second.walks["expert"]])
-    same(first.shown, second.shown)
+    same(first.first, second.first)
     assert {w.commit for w in second.walks["nominal"]} == {"abc"}
     more = judge(tmp_path, sets | {"mine": bounds()[1]}, seeds=(0, 1, 2, 3), commit="def")
     assert sorted(seeds[6:]) == [0, 1, 2, 3, 3, 3]
@@ -194,10 +200,16 @@ def test_groups_of_walks_are_kept_one_by_one(tmp_path):
             yield pretend_walk(job.seed, 0.02, 1.0)
 
     def scores(config=CONFIG):
-        tell = partial(metrics.score, config.loss)
-        like = jax.tree.map(lambda x: x[None][:0], kept._walked_like()[0])
-        known = (walk, tell, like, "test", ROBOT, tmp_path, (config,), "")
-        return kept.walk_groups(groups, *known)
+        return script("lib").walk_groups(
+            groups,
+            walk,
+            partial(metrics.score, config.loss),
+            like=metrics.score_like(0),
+            kind="test",
+            robot=ROBOT,
+            folder=tmp_path,
+            settings=(config,),
+        )
 
     walk.bad = {2}
     with pytest.raises(KeyboardInterrupt):

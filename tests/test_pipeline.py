@@ -3,6 +3,7 @@
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from queue import SimpleQueue
 
 import jax
 import numpy as np
@@ -13,7 +14,12 @@ from synthetic import synthetic_walk
 from hector_jax.cli import commands, flags
 from hector_jax.control.reference import named_command
 from hector_jax.control.walking import WalkConfig
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import (
+    expert,
+    nominal,
+    vector_to_weights,
+    weights_to_vector,
+)
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm import dataset
@@ -22,14 +28,15 @@ from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
 from hector_jax.grfm.paper import PaperParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import pipeline
+from hector_jax.runs import nets, searches, tunings
 from hector_jax.runs.metrics import score
-from hector_jax.runs.pipeline import CollectConfig
+from hector_jax.runs.nets import CollectConfig
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.difftune import Evaluation, TuneConfig, Tuning
+from hector_jax.tuning.loss import Losses
 from hector_jax.tuning.rollout import RolloutConfig
 
 
@@ -45,13 +52,13 @@ def gather(folder, robot, draw=0, **others):
         draw_jobs(draw, 5),
         lambda jobs: (synthetic_walk(10 * draw + job.seed, 12) for job in jobs),
         robot=robot,
-        settings=pipeline.collection_settings(CollectConfig(), robot) | others,
+        settings=nets.collection_settings(CollectConfig(), robot) | others,
         about={},
     )
 
 
 def ground(folder, robot, variant=None):
-    return pipeline.ground(ThreadPoolExecutor(1), robot, folder, variant)
+    return nets.ground(ThreadPoolExecutor(1), robot, folder, variant)
 
 
 @dataclass(frozen=True)
@@ -64,17 +71,17 @@ class Quick(TrainConfig):
 @pytest.fixture
 def quick(monkeypatch):
     """Nets are trained for one epoch, by every command."""
-    monkeypatch.setattr(pipeline, "TrainConfig", Quick)
+    monkeypatch.setattr(nets, "TrainConfig", Quick)
 
 
 def test_no_walk_is_in_two_parts(tmp_path, robot):
     gather(tmp_path, robot)
-    parts = pipeline.samples(robot, tmp_path)
+    parts = nets.samples(robot, tmp_path)
     walks = [set(np.unique(part.walk)) for part in parts[:3]]
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 5
-    net = pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
-    held = pipeline.held_out(robot, net)
+    net = nets.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
+    held = nets.held_out(robot, net)
     assert set(np.asarray(held.job.seed)) == walks[2]
 
 
@@ -101,7 +108,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
         made.append((config, folder))
         raise cut
 
-    monkeypatch.setattr(pipeline, "collect", collect)
+    monkeypatch.setattr(nets, "collect", collect)
     for command in (
         flags.Tune(iterations=10, data=tmp_path / "data", run=tmp_path / "run"),
         flags.Table(quick=True, data=tmp_path / "data", out=tmp_path / "table"),
@@ -134,13 +141,13 @@ def test_walks_of_other_settings_are_refused(tmp_path, robot, others, message):
 def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, robot, quick):
     path = tmp_path / "grfm.npz"
     gather(tmp_path / "walks", robot)
-    pipeline.train(TrainConfig(epochs=2), robot, tmp_path / "walks", path)
+    nets.train(TrainConfig(epochs=2), robot, tmp_path / "walks", path)
     written = path.read_bytes()
     with pytest.raises(InputError, match="grfm.npz: made with epochs 2, this command expects 1;"):
         ground(tmp_path, robot)
     assert path.read_bytes() == written
     gather(tmp_path / "others", robot, draw=1)
-    pipeline.train(TrainConfig(epochs=1), robot, tmp_path / "others", path)
+    nets.train(TrainConfig(epochs=1), robot, tmp_path / "others", path)
     with pytest.raises(InputError, match="grfm.npz: made with content"):
         ground(tmp_path, robot)
 
@@ -149,8 +156,8 @@ def test_what_was_held_out_stays_held_out_beside_other_walks(tmp_path, robot):
     one, two = tmp_path / "one", tmp_path / "two"
     gather(one, robot)
     gather(two, robot, draw=1)
-    alone = [pipeline.samples(robot, folder) for folder in (one, two)]
-    both = pipeline.samples(robot, one, two)
+    alone = [nets.samples(robot, folder) for folder in (one, two)]
+    both = nets.samples(robot, one, two)
     joined = jax.tree.map(lambda *x: np.concatenate(x), *(part[:3] for part in alone))
     jax.tree.map(np.testing.assert_array_equal, tuple(both[:3]), joined)
     assert both.dropped == sum(part.dropped for part in alone)
@@ -159,7 +166,7 @@ def test_what_was_held_out_stays_held_out_beside_other_walks(tmp_path, robot):
 def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, robot, monkeypatch):
     old, folder, few = tmp_path / "walks", tmp_path / "refresh-1", CollectConfig(5, engine="c")
     gather(old, robot)
-    before = pipeline.train(TrainConfig("paper", epochs=1), robot, old, tmp_path / "grfm.npz")
+    before = nets.train(TrainConfig("paper", epochs=1), robot, old, tmp_path / "grfm.npz")
     history = pretend_history(14, refused=(12,))
     tuning = Tuning(history, history[10].weights, history[-1].weights, "")
     walked, trained = [], []
@@ -173,17 +180,16 @@ def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, rob
         return before._replace(folders=(folder, *more))
 
     monkeypatch.setitem(ENGINES, "c", MUJOCO_C._replace(walk=toys))
-    monkeypatch.setattr(pipeline, "train", train)
+    monkeypatch.setattr(nets, "train", train)
     for _ in range(2):  # the second time takes up the walks
-        after, shift = pipeline.refresh(
+        after, shift = nets.refresh(
             ThreadPoolExecutor(1),
             few,
-            TuneConfig(),
             robot,
             named_command("s"),
             tuning,
-            before,
-            folder,
+            net=before,
+            folder=folder,
         )
     new = folder / "walks"
     path = jax.tree.map(lambda w: np.stack(4 * [w]), nominal())  # ten, 11, 13 and 14
@@ -200,7 +206,7 @@ def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, rob
 def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):
     gather(tmp_path / "walks", robot)
     path = tmp_path / "grfm.npz"
-    pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    nets.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
     written = path.read_bytes()
     with pytest.raises(InputError, match="grfm.npz: holds grfm-paper, expected grfm-residual"):
         ground(tmp_path, robot)
@@ -208,26 +214,57 @@ def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):
 
 
 def test_a_net_is_stored_by_its_variant(tmp_path, robot, quick, monkeypatch):
-    assert pipeline.net_path(tmp_path, "residual") == tmp_path / "grfm.npz"
-    path = pipeline.net_path(tmp_path, "paper")
+    assert nets.net_path(tmp_path, "residual") == tmp_path / "grfm.npz"
+    path = nets.net_path(tmp_path, "paper")
     assert path == tmp_path / "grfm-paper.npz"
     gather(tmp_path / "walks", robot)
-    pipeline.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
-    monkeypatch.setattr(pipeline, "_train", None)  # nothing is to be trained again
+    nets.train(TrainConfig("paper", epochs=1), robot, tmp_path / "walks", path)
+    monkeypatch.setattr(nets, "_train", None)  # nothing is to be trained again
     assert isinstance(ground(tmp_path, robot, "paper").params, PaperParams)
 
 
+def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, monkeypatch):
+    """Quadratics of the log-weights, of very different size."""
+    sizes = {"c": 1.0, "s": 1e3}
+    commands = [named_command(name)._replace(duration=np.array([k])) for name, k in sizes.items()]
+
+    def tune_step(config, robot, weights, command, anchor, effect):
+        vector = np.asarray(weights_to_vector(weights))
+        (size,) = command.duration
+        logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
+        gradient = vector_to_weights(2.0 * size * logs / vector)
+        loss = np.array(size * (logs @ logs))
+        return Evaluation(loss, Losses(loss, loss, loss), gradient, np.array(0.0), np.array(0.0))
+
+    monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
+    told, config = SimpleQueue(), TuneConfig(iterations=12)
+    for others in ((), (commands[1],)):
+        problem = tunings.Problem(commands[0], None, others)
+        found = tunings._tune_job(config, robot, nominal(), problem, "with", told)
+        first = found.history[0].evaluation
+        each = [tune_step(None, None, nominal(), c, None, None) for c in (commands[0], *others)]
+        mean = np.mean([one.loss for one in each])
+        assert first.loss == pytest.approx(mean, rel=1e-12)
+        scales = [one.loss / mean for one in each]
+        for i, gradient in enumerate(jax.tree.leaves(first.gradient)):
+            parts = [jax.tree.leaves(e.gradient)[i] / k for e, k in zip(each, scales, strict=True)]
+            np.testing.assert_allclose(gradient, np.mean(parts, axis=0), rtol=1e-12)
+        assert found.history[-1].evaluation.loss < first.loss
+        if not others:  # a single one to the last bit
+            jax.tree.map(np.testing.assert_array_equal, first, each[0])
+
+
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
-    def job(config, robot, command, params, name, heard):
+    def job(config, robot, start, problem, name, heard):
         if name == "with":
             raise InputError("the starting weights fall")
         time.sleep(30.0)
 
-    monkeypatch.setattr(pipeline, "_tune_job", job)
-    problems = dict.fromkeys(("without", "with"), (named_command("s"), None))
+    monkeypatch.setattr(tunings, "_tune_job", job)
+    problems = dict.fromkeys(("without", "with"), tunings.Problem(named_command("s"), None))
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
-        pipeline.tune(pool, TuneConfig(), robot, problems, tmp_path, title="tuning")
+        tunings.tune(pool, TuneConfig(), robot, problems, tmp_path, title="tuning")
     assert time.monotonic() - begin < 15.0
     pool.shutdown(wait=False)
 
@@ -238,7 +275,7 @@ def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine(robot
     sets = {"c": [nominal(), expert()], "s": [nominal()]}
     pool = ThreadPoolExecutor(1)
     told = {
-        name: pipeline.losses_on_hfs(pool, config, robot, engine, sets, at_once=3)
+        name: searches.losses_on_hfs(pool, config, robot, sets, engine=engine, at_once=3)
         for name, engine in ENGINES.items()
     }
     for name, each in sets.items():

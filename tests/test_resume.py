@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from killed import look
 
-from hector_jax.cli import flags, tuning
+from hector_jax.cli import flags, run_folder
+from hector_jax.cli import tune as command
 from hector_jax.control.weights import nominal
 from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
@@ -291,26 +292,26 @@ def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):
 @pytest.fixture
 def begun(tmp_path, monkeypatch):
     """A run that was cut at once."""
-    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: told.append(args))
+    monkeypatch.setattr(command, "_tune_in", lambda folder, args: told.append(args))
     told = []
-    tuning.tune(flags.Tune(traj="c", seeds=3, run=tmp_path / "run"))
+    command.tune(flags.Tune(traj=("c",), seeds=3, run=tmp_path / "run"))
     return tmp_path / "run", told
 
 
 def test_a_run_is_taken_up_with_the_flags_it_was_begun_with(begun):
     folder, told = begun
-    tuning.tune(flags.Tune(resume=folder, processes=1))
-    assert (told[-1].traj, told[-1].seeds, told[-1].processes) == ("c", 3, 1)
+    command.tune(flags.Tune(resume=folder, processes=1))
+    assert (told[-1].traj, told[-1].seeds, told[-1].processes) == (("c",), 3, 1)
 
 
 def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(tmp_path, monkeypatch):
     resumed = []
-    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: resumed.append(args))
+    monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append(args))
     own = {"video": False, "json": True, "processes": 1, "data": tmp_path / "data"}
-    tuning.tune(flags.Tune(run=tmp_path / "run", **own))
-    tuning.tune(flags.Tune(resume=tmp_path / "run"))
+    command.tune(flags.Tune(run=tmp_path / "run", **own))
+    command.tune(flags.Tune(resume=tmp_path / "run"))
     assert {name: getattr(resumed[-1], name) for name in own} == own
-    tuning.tune(flags.Tune(resume=tmp_path / "run", processes=3, data=tmp_path / "moved"))
+    command.tune(flags.Tune(resume=tmp_path / "run", processes=3, data=tmp_path / "moved"))
     assert (resumed[-1].processes, resumed[-1].data) == (3, tmp_path / "moved")
 
 
@@ -319,10 +320,10 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
     there = Path.cwd()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=f"^data: no data here; the run was begun in {there}: "):
-        tuning.tune(flags.Tune(resume=folder))
+        command.tune(flags.Tune(resume=folder))
     assert not (tmp_path / "data").exists()
     (tmp_path / "mine").mkdir()
-    tuning.tune(flags.Tune(resume=folder, data=Path("mine")))
+    command.tune(flags.Tune(resume=folder, data=Path("mine")))
     assert len(resumed) == 2
 
 
@@ -330,7 +331,7 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
     ("asked", "message"),
     [
         ({"iterations": 50}, "run: begun with --iterations 100, got 50"),
-        ({"traj": "s"}, "run: begun with --traj c, got s"),
+        ({"traj": ("s",)}, "run: begun with --traj c, got s"),
         ({"run": Path("other")}, "only one can be given"),
     ],
 )
@@ -338,7 +339,7 @@ def test_another_configuration_is_not_taken_up(begun, asked, message):
     folder, told = begun
     before = files(folder)
     with pytest.raises(ValueError, match=message):
-        tuning.tune(flags.Tune(**{"resume": folder, **asked}))
+        command.tune(flags.Tune(**{"resume": folder, **asked}))
     assert len(told) == 1
     assert files(folder) == before
 
@@ -347,16 +348,16 @@ def test_a_run_of_other_code_another_robot_or_none_is_not_taken_up(begun, monkey
     folder, _ = begun
     again = flags.Tune(resume=folder)
     with monkeypatch.context() as patch:
-        patch.setattr(tuning, "code_hash", lambda *modules: "another")
+        patch.setattr(run_folder, "code_hash", lambda *modules: "another")
         with pytest.raises(InputError, match="run: begun with other code or other versions"):
-            tuning.tune(again)
+            command.tune(again)
     with monkeypatch.context() as patch:
         other = ROBOT._replace(mass=np.asarray(13.0))
-        patch.setattr(tuning, "load_robot", lambda path=None: other)
+        patch.setattr(run_folder, "load_robot", lambda path=None: other)
         with pytest.raises(ValueError, match="run: begun with robot"):
-            tuning.tune(again)
+            command.tune(again)
     with pytest.raises(ValueError, match="none/config.json: cannot read a file of a run of"):
-        tuning.tune(flags.Tune(resume=folder / "none"))
+        command.tune(flags.Tune(resume=folder / "none"))
 
 
 @pytest.mark.slow
@@ -390,6 +391,8 @@ def test_killed_25_times_on_all_cores_it_ends_in_the_bytes_of_an_unbroken_run_on
 def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
     begun = {"command": {"velocity": [[0.3, 0.0]]}, "seconds": 2.0}
     with pytest.raises(ValueError, match="begun with velocity .*0.3.*, here is .*0.5"):
-        tuning._agree(tmp_path, begun, {"command": {"velocity": [[0.5, 0.0]]}, "seconds": 2.0})
+        run_folder.check_agreement(
+            tmp_path, begun, {"command": {"velocity": [[0.5, 0.0]]}, "seconds": 2.0}
+        )
     with pytest.raises(ValueError, match="config.json: tune: no settings: 5"):
-        tuning._agree(tmp_path, {"tune": 5}, {"tune": {"iterations": 10}})
+        run_folder.check_agreement(tmp_path, {"tune": 5}, {"tune": {"iterations": 10}})

@@ -1,20 +1,23 @@
 """The table from flags to files, on walks that no simulator made."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pretend import pretend_history, pretend_walk
 
-from hector_jax.cli import flags, study, tuning
+from hector_jax.cli import flags, tune
+from hector_jax.cli import table as study
 from hector_jax.cli.flags import Table
 from hector_jax.cli.parse import as_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
+from hector_jax.core.inputs import InputError
 from hector_jax.report.video import VideoUnavailable
-from hector_jax.runs import pipeline
-from hector_jax.runs.pipeline import Tuned
+from hector_jax.runs import nets, searches, tunings, verdicts
+from hector_jax.runs.tunings import Tuned
 from hector_jax.search.cmaes import Found, Generation
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import Tuning
@@ -29,13 +32,13 @@ def asked(monkeypatch):
     """What the steps that take long were asked for; nothing is walked, tuned or drawn in 3D."""
     told = {"walks": 0, "tunings": []}
 
-    def search(pool, config, tune, robot, starts, engine, folder):
+    def search(pool, config, tune, robot, starts, *, engine, folder):
         told["search"] = config
         generation = Generation(np.zeros((10, 18)), np.full(10, 2e6))
         one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(starts, one)
 
-    def tunings(pool, config, robot, problems, title, on_iteration):
+    def side_by_side(pool, config, robot, start, problems, title, on_iteration):
         told["tunings"].append((config.iterations, *problems))
         for name in problems:
             yield name, Tuning(pretend_history(12), nominal(), expert(), "done")
@@ -48,18 +51,18 @@ def asked(monkeypatch):
     def write_strip(*args):
         raise VideoUnavailable("no film: none here")
 
-    def tune_measured(pool, config, robot, weights, command, params, plants, folder, **notes):
+    def tune_measured(pool, config, robot, weights, command, params, *, plants, **notes):
         told["steps"] = config.iterations - 10, len(plants)
         return Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), "")
 
     class Net:
         params = None
 
-    monkeypatch.setattr(pipeline, "ground", lambda *args: Net)
-    monkeypatch.setattr(pipeline, "search", search)
-    monkeypatch.setattr(pipeline, "_tunings", tunings)
-    monkeypatch.setattr(pipeline, "tune_measured", tune_measured)
-    monkeypatch.setattr(pipeline, "walks_of", walks_of)
+    monkeypatch.setattr(nets, "ground", lambda *args: Net)
+    monkeypatch.setattr(searches, "search", search)
+    monkeypatch.setattr(tunings, "_tunings", side_by_side)
+    monkeypatch.setattr(tunings, "tune_measured", tune_measured)
+    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
     monkeypatch.setattr(study, "write_strip", write_strip)
     return told
 
@@ -163,16 +166,16 @@ def test_the_line_that_asks_again_names_what_is_not_default():
 def test_runs_of_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
     """Also those that look at the same moment and find nothing there."""
 
-    class Clock(tuning.datetime):
+    class Clock(tune.datetime):
         @classmethod
         def now(cls):
             return cls(2026, 11, 21, 9, 34, 59)
 
     begun = []
-    monkeypatch.setattr(tuning, "datetime", Clock)
-    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: begun.append(folder))
+    monkeypatch.setattr(tune, "datetime", Clock)
+    monkeypatch.setattr(tune, "_tune_in", lambda folder, args: begun.append(folder))
     for _ in range(3):
-        tuning.tune(flags.Tune(traj="s", runs=tmp_path))
+        tune.tune(flags.Tune(traj=("s",), runs=tmp_path))
     assert [folder.name for folder in begun] == [
         "20261121-093459",
         "20261121-093500",
@@ -182,12 +185,48 @@ def test_runs_of_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch
 
 def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(tuning, "_tune_in", lambda folder, args: asked.append((folder, args)))
-    tuning.tune(flags.Tune(traj="all", run=tmp_path / "run", seeds=2))
-    assert [one.traj for _, one in asked] == ["straight", "c", "s"]
+    monkeypatch.setattr(tune, "_tune_in", lambda folder, args: asked.append((folder, args)))
+    every = flags.Tune(traj=("all",), each=True)
+    tune.tune(replace(every, run=tmp_path / "run", seeds=2))
+    assert [one.traj for _, one in asked] == [("straight",), ("c",), ("s",)]
     assert [folder.name for folder, _ in asked] == ["straight", "c", "s"]
     assert {one.seeds for _, one in asked} == {2}
-    tuning.tune(flags.Tune(traj="all", resume=tmp_path / "run"))
+    tune.tune(replace(every, resume=tmp_path / "run"))
     assert [one.seeds for _, one in asked[3:]] == [2, 2, 2]
-    tuning.tune(flags.Tune(traj="all", runs=tmp_path / "runs"))
+    with pytest.raises(InputError, match="run: its trajectories were tuned one by one; add --each"):
+        tune.tune(flags.Tune(traj=("all",), resume=tmp_path / "run"))
+    tune.tune(replace(every, runs=tmp_path / "runs"))
     assert [folder.parent.name for folder, _ in asked[6:]] == ["straight", "c", "s"]
+
+
+def test_several_trajectories_are_one_run(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(tune, "_tune_in", lambda folder, args: asked.append((folder, args)))
+    tune.tune(flags.Tune(traj=("all",), runs=tmp_path, seeds=2))
+    tune.tune(flags.Tune(traj=("c", "all"), out=tmp_path / "out"))
+    tune.tune(flags.Tune(resume=tmp_path / "out"))
+    (auto, first), (named, second), again = asked
+    assert auto.parent == tmp_path / "straight-c-s"
+    assert first.traj == ("straight", "c", "s")
+    assert named == tmp_path / "out"
+    assert second.traj == ("c", "straight", "s")
+    assert again[1].traj == second.traj
+    begun = json.loads((auto / "config.json").read_text())["flags"]
+    assert begun["traj"] == ["straight", "c", "s"]
+    assert begun["out"] is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"run": Path("a"), "out": Path("b")}, "--out b and --run a: only one can be given"),
+        ({"traj": ("c", "s"), "refresh": 1}, "--refresh takes one trajectory, got 2; add --each"),
+        ({"traj": ("c", "short.toml")}, "of one length, got c 4 s, short 2 s; add --each"),
+    ],
+)
+def test_what_one_set_cannot_be_tuned_for_is_one_line(tmp_path, monkeypatch, changes, message):
+    monkeypatch.chdir(tmp_path)
+    Path("short.toml").write_text("[[segment]]\nseconds = 2.0\nahead = 0.2\n")
+    with pytest.raises(InputError, match=message):
+        tune.tune(flags.Tune(**changes))
+    assert [path.name for path in tmp_path.iterdir()] == ["short.toml"]

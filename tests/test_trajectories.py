@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hector_jax.cli import asked
+from hector_jax.cli import arguments
 from hector_jax.cli.main import main
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import (
@@ -155,7 +155,7 @@ def walked(monkeypatch):
         walks.append((command, seconds))
         raise InputError("walked")
 
-    monkeypatch.setattr(asked, "walk", pretend)
+    monkeypatch.setattr(arguments, "walk", pretend)
     return walks
 
 
@@ -179,8 +179,8 @@ def test_what_is_beyond_the_robot_is_walked_with_a_warning(monkeypatch, capsys, 
 
 def test_rollouts_are_as_long_as_the_file_says():
     config = TuneConfig()
-    assert asked.lasting(config, course(str(SLALOM))).rollout.ticks == 600
-    assert asked.lasting(config, course("c")) == config
+    assert arguments.lasting(config, course(str(SLALOM))).rollout.ticks == 600
+    assert arguments.lasting(config, course("c")) == config
 
 
 def test_a_refresh_of_too_many_segments_is_refused_before_anything(monkeypatch, capsys, tmp_path):

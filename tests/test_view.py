@@ -11,7 +11,7 @@ import pytest
 from browser import CHROMIUM, opened
 from pretend import elsewhere, pretend_history, pretend_walk
 
-from hector_jax.cli import asked
+from hector_jax.cli import arguments
 from hector_jax.cli.main import main
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
@@ -22,7 +22,7 @@ from hector_jax.report import pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import load_model, load_robot
-from hector_jax.runs import pipeline
+from hector_jax.runs import tunings
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def pretend_run(folder, iterations=12, weights=()):
 
 def write_metrics(folder, iterations, refused=()):
     lines = [
-        pipeline.as_line(name, iteration)
+        tunings.as_line(name, iteration)
         for name, pace in (("without", 5.0), ("with", 3.0))
         for iteration in pretend_history(iterations, pace, refused)
     ]
@@ -109,7 +109,7 @@ def test_metrics_are_read_back_as_they_were_written(tmp_path):
     assert list(found) == ["without", "with"]
     assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
     written = (tmp_path / "metrics.jsonl").read_text()
-    again = [pipeline.as_line(name, i) for name, history in found.items() for i in history]
+    again = [tunings.as_line(name, i) for name, history in found.items() for i in history]
     assert "".join(again) == written
     curve = runs.curves(found)["with"]
     assert np.isnan(curve[3])
@@ -188,7 +188,7 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     filmed = []
     for write in ("write_film", "write_strip"):
         monkeypatch.setattr(pictures, write, lambda *film: filmed.append(film))
-    monkeypatch.setattr(asked, "walked", lambda *_: pretend_walk(seconds=0.3))
+    monkeypatch.setattr(arguments, "walked", lambda *_: pretend_walk(seconds=0.3))
     monkeypatch.setattr(view, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]

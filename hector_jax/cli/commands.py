@@ -3,7 +3,7 @@
 from functools import singledispatch
 from typing import Any
 
-from hector_jax.cli import data, judging, looking, machines, tuning
+from hector_jax.cli import data, evaluate, export, search, table, tune, view
 
 
 @singledispatch
@@ -20,16 +20,16 @@ for _command in (
     data.collect,
     data.train,
     data.grfm,
-    tuning.tune,
-    tuning.search,
-    judging.evaluate,
-    judging.walk,
-    judging.table,
-    judging.compare,
-    looking.view_run,
-    looking.replay_dump,
-    looking.tensorboard,
-    machines.export_controller,
-    machines.examine,
+    tune.tune,
+    search.search,
+    evaluate.evaluate,
+    evaluate.walk,
+    evaluate.compare,
+    table.table,
+    view.view_run,
+    view.replay_dump,
+    view.tensorboard,
+    export.export_controller,
+    export.examine,
 ):
     run.register(_command)

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hector_jax.cli import asked
+from hector_jax.cli import arguments
 from hector_jax.cli.flags import Collect, Grfm, Train
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal
@@ -24,18 +24,18 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import write_fidelity
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import pipeline
+from hector_jax.runs import nets, verdicts
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import TuneConfig
 
 
 def collect(args: Collect) -> None:
     """Walk on the simulator with chance, and keep the walks."""
-    config = pipeline.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
+    config = nets.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     robot = load_robot(args.robot)
     with workers(args.processes) as pool:
-        out = asked.default_of(args.out, Collect.out, args.robot, robot)
-        pipeline.collect(pool, config, robot, out)
+        out = arguments.default_of(args.out, Collect.out, args.robot, robot)
+        nets.collect(pool, config, robot, out)
     say(f"the walks are in {out}")
 
 
@@ -43,9 +43,9 @@ def train(args: Train) -> None:
     """Train a net on walks."""
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     robot = load_robot(args.robot)
-    data = asked.default_of(args.data, Train.data, args.robot, robot)
-    path = args.out or pipeline.net_path(data.parent, args.variant)
-    found = pipeline.train(config, robot, data, path)
+    data = arguments.default_of(args.data, Train.data, args.robot, robot)
+    path = args.out or nets.net_path(data.parent, args.variant)
+    found = nets.train(config, robot, data, path)
     if args.json:
         print(as_json({"net": str(path), "errors": found.errors}))
     else:
@@ -64,10 +64,10 @@ def grfm(args: Grfm) -> None:
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, robot, args.data)
-        paper = pipeline.ground(pool, robot, args.data, "paper")
+        net = nets.ground(pool, robot, args.data)
+        paper = nets.ground(pool, robot, args.data, "paper")
         with say_if_slow("reading the walks that no training saw"):
-            worlds = {"hfs": pipeline.held_out(robot, net)}
+            worlds = {"hfs": nets.held_out(robot, net)}
         if args.seeds:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": as_effect(net.linear)}
@@ -108,8 +108,8 @@ def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -
         Job(weights, named_command(name), plant, seed=seed)
         for weights in (nominal(), expert())
         for name in COMMANDS
-        for seed, plant in enumerate(asked.plants("standin", range(count)))
+        for seed, plant in enumerate(arguments.plants("standin", range(count)))
     ]
-    return pipeline.walk_all(
+    return verdicts.walk_all(
         pool, config, robot, jobs, f"walking on {plural(count, 'stand-in plant')}, for information"
     )

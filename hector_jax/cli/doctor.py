@@ -20,7 +20,7 @@ from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report.motion import motions
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.model import MODEL_PATH, Robot, load_robot
-from hector_jax.runs.pipeline import walk_rigid_body
+from hector_jax.runs.verdicts import walk_rigid_body
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world

@@ -33,6 +33,7 @@ Engine = Literal["auto", "c", "mjx"]
 Robot = Annotated[Path | None, Source.ROBOT]
 Weights = Annotated[str, Source.WEIGHTS]
 Trajectory = Annotated[str, Source.TRAJECTORY]
+Trajectories = tuple[Trajectory, ...]
 Run = Annotated[Path, Source.RUN]
 Folder = Annotated[Path, Source.FOLDER]
 
@@ -92,12 +93,14 @@ class Grfm(Configured):
 
 @dataclass(frozen=True)
 class Tune(Configured):
-    """Tune the MPC weights for a trajectory, with and without the net, and evaluate them.
+    """Tune the MPC weights for trajectories, with and without the net, and evaluate them.
 
-    Example: hector tune --traj c --seeds 32
+    Example: hector tune --traj straight c s --seeds 32
     """
 
-    traj: Trajectory = "straight"  # straight, c, s, all (one after the other) or a TOML file
+    traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
+    each: bool = False  # tune the trajectories one by one, each in a run folder of its own
+    start: Weights = "nominal"  # where to start: nominal, expert or a weights file
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net
@@ -106,7 +109,8 @@ class Tune(Configured):
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, Source.FILE] = None  # file of another net, instead of that in DATA
     runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
-    run: Path | None = None  # the run folder itself, which must not exist (with all: RUN/TRAJ)
+    out: Path | None = None  # the run folder itself, which must not exist (with --each: OUT/TRAJ)
+    run: Path | None = None  # the older name of --out
     resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
     video: bool = True  # make a film of the nominal and the tuned weights
     processes: Processes = 2  # worker processes, one core each
@@ -174,6 +178,7 @@ class Evaluate(Configured):
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
     seeds: Plants = 8  # number of plants, in the worlds hfs-varied and standin
     first_seed: Seed = 0  # first plant
+    out: Path | None = None  # file for the result as JSON
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table
     robot: Robot = None  # TOML file of another biped; HECTOR by default
@@ -251,6 +256,7 @@ class Compare:
     """
 
     runs: tuple[Run, ...]  # folders of runs of `hector tune`, or `latest`
+    out: Path | None = None  # file for the comparison as JSON
     json: bool = False  # print JSON instead of the table
 
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import NAMED_WEIGHTS, Command, Source, command, command_name
+from hector_jax.cli.flags import NAMED_WEIGHTS, Command, Source, Tune, command, command_name
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import (
     SEED,
@@ -156,6 +156,8 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         if name == "config":
             raise InputError(f"{path}: config stands on the line only")
         values[name] = value
+    if kind is Tune and isinstance(values.get("traj"), str):
+        values["traj"] = [values["traj"]]  # older runs were tuned on one
     return from_table(str(path), kind, values)
 
 
@@ -171,7 +173,10 @@ def _flags_in(path: Path) -> dict[str, Any]:
 
 def as_table(flags: Any) -> dict[str, Any]:
     """The flags as values of JSON, those that came from a file included; `from_file` reads them."""
-    return {name: value for name, value in to_table(flags).items() if name != "config"}
+    table = {name: value for name, value in to_table(flags).items() if name != "config"}
+    if isinstance(table.get("traj"), list | tuple) and len(table["traj"]) == 1:
+        (table["traj"],) = table["traj"]  # a word, as it was when only one could be tuned on
+    return table
 
 
 def as_command(name: str, flags: Any) -> str:

@@ -148,7 +148,7 @@ def _read_collection(folder: Path) -> dict[str, Any]:
 
 
 def _load_file(path: Path, robot: Robot) -> Walks:
-    walks = load_tree(path, _layout(), kind="walks", robot=robot)[0]
+    walks = load_tree(path, walks_like(), kind="walks", robot=robot)[0]
     count, ticks = walks.trajectory.fallen.shape
     for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
         if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
@@ -174,7 +174,7 @@ def _load_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) ->
     return walks
 
 
-def _layout() -> Walks:
+def walks_like() -> Walks:
     """Shapes in a file; axes of length 0 are walks and ticks."""
     zeros = lambda *shape: np.zeros((0, *shape))  # noqa: E731
     state = State(*[zeros(0, 3)] * 4)

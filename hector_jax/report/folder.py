@@ -58,7 +58,7 @@ def load_run(folder: Path) -> Run:
 class Asked(NamedTuple):
     """What a run was asked for."""
 
-    trajectory: str
+    trajectory: str  # the first, where there are several
     loss: LossConfig
     data: Path  # folder of its net
     net: Path | None  # or the net itself
@@ -78,7 +78,7 @@ def read_asked(folder: Path) -> Asked:
         # a run that has only just begun knows its flags and nothing else
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return Asked(
-            trajectory=str(flags["traj"]),
+            trajectory=str(flags["traj"] if isinstance(flags["traj"], str) else flags["traj"][0]),
             loss=LossConfig(**loss),
             data=Path(flags["data"]),
             net=Path(flags["net"]) if flags.get("net") else None,
@@ -136,7 +136,7 @@ def _line(path: Path, number: int) -> Iterator[None]:
 
 
 def _iteration(row: Mapping[str, Any]) -> Iteration:
-    """What `pipeline.as_line` wrote; null, which stands for what is not finite, becomes NaN."""
+    """What `tunings.as_line` wrote; null, which stands for what is not finite, becomes NaN."""
     number = lambda x: np.array(np.nan if x is None else x, float)  # noqa: E731
     vector = lambda table: np.array([number(table[name]) for name in WEIGHT_NAMES])  # noqa: E731
     tree = lambda values: jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(values)))  # noqa: E731

@@ -76,7 +76,7 @@ class Report(NamedTuple):
     config: Mapping[str, Any]  # resolved, as JSON values
     environment: Mapping[str, str]
     command: str  # that makes this run again
-    shifts: Sequence[Mapping[str, Any]] = ()  # of each refresh: pipeline.refresh
+    shifts: Sequence[Mapping[str, Any]] = ()  # of each refresh: nets.refresh
 
 
 def _scale(largest: float) -> int:

@@ -1,7 +1,7 @@
-"""The whole table: search, tune and judge every set on every trajectory, and write what came out.
+"""`hector table`: search, tune and judge every set on every trajectory, and write the report.
 
-Each step takes up what is kept of it (kept.py, tuning/search.py), so that a run that was cut goes
-on where it was, and another set or more plants cost only what is new.
+Each step reads the artefacts that are there, so that a run that was cut goes on where it was, and
+another set or more plants cost only what is new.
 """
 
 import re
@@ -9,31 +9,42 @@ import tempfile
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-from hector_jax.cli import flags, parse
+from hector_jax.cli import arguments, flags, parse
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
-from hector_jax.core.files import locked, make_folder
+from hector_jax.core.files import as_json, locked, make_folder
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.grfm.network import Params
-from hector_jax.report import plots, table
+from hector_jax.report import plots
 from hector_jax.report.motion import motions
-from hector_jax.report.report import Picture
-from hector_jax.report.table import PAPER, Earlier, Fall, Search, Table
+from hector_jax.report.report import Picture, print_table
+from hector_jax.report.table import (
+    PAPER,
+    Earlier,
+    Fall,
+    Search,
+    Table,
+    load_earlier,
+    paper_change,
+    write_table,
+)
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import kept, metrics, pipeline
+from hector_jax.runs import metrics, nets, searches, tunings, verdicts
 from hector_jax.runs.cache import content_key
-from hector_jax.runs.kept import Judged
 from hector_jax.runs.metrics import BASELINES, Verdict
-from hector_jax.runs.pipeline import Tuned
+from hector_jax.runs.nets import TrainedNet
+from hector_jax.runs.tunings import Problem, Tuned
+from hector_jax.runs.verdicts import Judged
 from hector_jax.search.cmaes import Found, SearchConfig
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import Imperfections, hfs
@@ -94,7 +105,7 @@ def _plan(args: flags.Table) -> _Plan:
             for name in args.trajectories
             if (args.ceiling / f"{name}.json").exists()
         },
-        None if args.earlier is None else table.load_earlier(args.earlier, seeds),
+        None if args.earlier is None else load_earlier(args.earlier, seeds),
     )
 
 
@@ -126,69 +137,88 @@ def _long_search(card: Path) -> Search:
         raise InputError(f"{card}: not the card of a search: {error!r}") from None
 
 
+class _Bench(NamedTuple):
+    """What the steps of a table share."""
+
+    pool: Executor
+    plan: _Plan
+    robot: Robot
+    net: TrainedNet
+    kept: Path  # folder of the artefacts
+    commit: str
+
+
+def table(args: flags.Table) -> None:
+    """Make the table of all sets on all trajectories."""
+    report, found = make_table(args, partial(arguments.plants, "standin"))
+    if args.json:
+        results = {name: metrics.as_result(verdict) for name, verdict in found.items()}
+        print(as_json({"report": str(report), "trajectories": results}))
+    else:
+        for name, verdict in found.items():
+            print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
+    say(f"the report is {report}")
+
+
 def make_table(
     args: flags.Table, plants: Callable[[range], list[Imperfections]]
 ) -> tuple[Path, dict[str, Verdict]]:
     """Everything from the net to the files.
 
     Args:
-        args: what is asked for.
+        args: the flags.
         plants: those of the verdict, by their seeds.
 
     Returns:
         report.md, and the verdict of each trajectory.
 
     Raises:
-        InputError: the flags ask for what cannot be, or a file is damaged.
-        InputError: the folder cannot be written.
+        InputError: the flags ask for what cannot be, or a file is damaged, or the folder cannot be
+            written.
     """
-    asked = args
+    command = parse.as_command("table", args)
     if args.quick:
         args = replace(args, **{n: min(getattr(args, n), most) for n, most in _QUICK.items()})
     plan, out = _plan(args), args.out / "quick" if args.quick else args.out
     with locked(out):
-        return _make_table(args, asked, plan, out, plants)
+        return _make_table(args, plan, out, plants, command=command)
 
 
 def _make_table(
     args: flags.Table,
-    asked: flags.Table,
     plan: _Plan,
     out: Path,
     plants: Callable[[range], list[Imperfections]],
+    *,
+    command: str,
 ) -> tuple[Path, dict[str, Verdict]]:
     robot, shelf = load_robot(), args.kept or args.out / "kept"
     for folder in (out / "pictures", shelf):
         make_folder(folder)
     made_with = environment()
     with workers(args.processes) as pool:
-        net = pipeline.ground(pool, robot, args.data)
-        searches = _search(pool, plan, robot, shelf)
-        commit = made_with.get("commit", "")
-        tunings = {
-            name: _tune(pool, plan, robot, name, net.params, shelf / name, commit)
-            for name in plan.commands
-        }
+        net = nets.ground(pool, robot, args.data)
+        bench = _Bench(pool, plan, robot, net, shelf, made_with.get("commit", ""))
+        searched = _search(bench)
+        tuned = {name: _tune(bench, name) for name in plan.commands}
         # nothing that tunes or searches runs once the plants of the verdict are known
         judges = plants(plan.seeds)
         judged = {
-            name: _walk_sets(
-                pool, plan, robot, name, tuned, searches[name], judges, shelf / name, commit
-            )
-            for name, tuned in tunings.items()
+            name: _judge(bench, name, judges, _sets(plan, name, one, searched[name]))
+            for name, one in tuned.items()
         }
-    verdicts = {name: _verdict(plan, found) for name, found in judged.items()}
-    commits = {tuned.commit for each in tunings.values() for tuned in each.values()}
+    by_trajectory = {name: _verdict(plan, found) for name, found in judged.items()}
+    commits = {one.commit for each in tuned.values() for one in each.values()}
     commits |= {w.commit for found in judged.values() for ws in found.walks.values() for w in ws}
-    told = table.write_table(
+    report = write_table(
         out,
         Table(
-            verdicts,
+            by_trajectory,
             falls=[fall for name, one in judged.items() for fall in _falls(plan, name, one)],
-            tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tunings.items()},
-            searches={name: _told(plan, found) for name, found in searches.items()},
+            tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tuned.items()},
+            searches={name: _search_in_table(plan, found) for name, found in searched.items()},
             ceilings=plan.ceilings,
-            pictures=_draw(out, robot, verdicts, judged),
+            pictures=_draw(out, robot, by_trajectory, judged),
             config={
                 "flags": parse.as_table(args),
                 "tune": asdict(plan.tune),
@@ -196,70 +226,60 @@ def _make_table(
             },
             environment=made_with,
             commits=sorted(commits),
-            command=parse.as_command("table", asked),
+            command=command,
             earlier=plan.earlier,
         ),
     )
-    return told, verdicts
+    return report, by_trajectory
 
 
-def _search(pool: Executor, plan: _Plan, robot: Robot, shelf: Path) -> dict[str, Found]:
+def _search(bench: _Bench) -> dict[str, Found]:
     """The derivative-free baseline of all trajectories, in lock-step."""
+    plan, engine = bench.plan, choose_engine("auto")
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
-    engine, model = choose_engine("auto"), plan.tune.rollout
-    follows_from = engine.name, model, plan.tune.loss, settings, robot, hfs(), nominal()
-    key = content_key(*follows_from, code=pipeline.SEARCH_CODE)
-    starts = dict.fromkeys(plan.commands, nominal())
-    folder = shelf / f"search-{key}"
-    return pipeline.search(pool, plan.search, plan.tune, robot, starts, engine, folder)
+    model = engine.name, plan.tune.rollout, plan.tune.loss
+    key = content_key(*model, settings, bench.robot, hfs(), nominal(), code=searches.SEARCH_CODE)
+    return searches.search(
+        bench.pool,
+        plan.search,
+        plan.tune,
+        bench.robot,
+        dict.fromkeys(plan.commands, nominal()),
+        engine=engine,
+        folder=bench.kept / f"search-{key}",
+    )
 
 
-def _tune(
-    pool: Executor,
-    plan: _Plan,
-    robot: Robot,
-    name: str,
-    params: Params | None,
-    folder: Path,
-    commit: str,
-) -> dict[str, Tuned]:
+def _tune(bench: _Bench, name: str) -> dict[str, Tuned]:
     """The tunings of one trajectory."""
-    command = plan.commands[name]
-    problems = {"without": (command, None), "with": (command, params)}
+    pool, plan, robot, params = bench.pool, bench.plan, bench.robot, bench.net.params
+    command, folder = plan.commands[name], bench.kept / name
+    problems = {"without": Problem(command, None), "with": Problem(command, params)}
     title = f"tuning {name} without and with GRFM-Net"
-    tuned = pipeline.tune(pool, plan.tune, robot, problems, folder, title=title, commit=commit)
+    tuned = tunings.tune(pool, plan.tune, robot, problems, folder, title=title, commit=bench.commit)
     if plan.walks is not None:
         try:
-            tuned[WALKS] = pipeline.tune_measured(
+            tuned[WALKS] = tunings.tune_measured(
                 pool,
                 plan.walks,
                 robot,
                 tuned["with"].tuning.converged,
                 command,
                 params,
-                pipeline.measured_plants(plan.plants),
-                folder,
+                plants=tunings.measured_plants(plan.plants),
+                folder=folder,
                 title=f"tuning {name} further, along walks on the simulator",
-                commit=commit,
+                commit=bench.commit,
             )
         except InputError as error:  # a walk with the tuned weights falls
             say(f"{name}: no row {WALKS}: {error}")
     return tuned
 
 
-def _walk_sets(
-    pool: Executor,
-    plan: _Plan,
-    robot: Robot,
-    name: str,
-    tuned: Mapping[str, Tuned],
-    searched: Found,
-    plants: list[Imperfections],
-    folder: Path,
-    commit: str,
-) -> Judged:
-    """The walks of all sets of one trajectory."""
-    sets = {
+def _sets(
+    plan: _Plan, name: str, tuned: Mapping[str, Tuned], searched: Found
+) -> dict[str, Weights]:
+    return {
         "nominal": nominal(),
         "expert": expert(),
         "searched": searched.weights,
@@ -267,15 +287,28 @@ def _walk_sets(
         **{which: one.tuning.converged for which, one in tuned.items()},
         **plan.extra[name],
     }
-    title = f"evaluating {name} on {plural(len(plan.seeds), 'stand-in plant')}"
-    command, seeds = plan.commands[name], plan.seeds
-    known = (sets, command, plants, seeds, folder, commit, title)
-    return kept.judge(pool, plan.tune, robot, *known)
+
+
+def _judge(
+    bench: _Bench, name: str, plants: list[Imperfections], sets: Mapping[str, Weights]
+) -> Judged:
+    plan = bench.plan
+    return verdicts.judge(
+        bench.pool,
+        plan.tune,
+        bench.robot,
+        sets,
+        plan.commands[name],
+        plants,
+        plan.seeds,
+        title=f"evaluating {name} on {plural(len(plan.seeds), 'stand-in plant')}",
+        folder=bench.kept / name,
+        commit=bench.commit,
+    )
 
 
 def _verdict(plan: _Plan, judged: Judged) -> Verdict:
-    scores = {name: [walk.score for walk in walks] for name, walks in judged.walks.items()}
-    return metrics.make_verdict(plan.tune.loss, plan.seeds, scores)
+    return metrics.make_verdict(plan.tune.loss, plan.seeds, judged.scores)
 
 
 def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:
@@ -294,7 +327,7 @@ def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:
     ]
 
 
-def _told(plan: _Plan, found: Found) -> Search:
+def _search_in_table(plan: _Plan, found: Found) -> Search:
     walks = len(found.history) * plan.search.population
     return Search(walks, found.walk, found.loss, found.stop)
 
@@ -305,7 +338,7 @@ def _draw(
     """All pictures, in the order of the report."""
     say("drawing the pictures")
     paper = {
-        (trajectory, name, baseline): table.paper_change(trajectory, name, baseline)
+        (trajectory, name, baseline): paper_change(trajectory, name, baseline)
         for trajectory in verdicts
         for name in PAPER[trajectory]
         for baseline in BASELINES
@@ -315,18 +348,18 @@ def _draw(
     pictures = [Picture("pictures/changes.png", caption)]
     for name, found in judged.items():
         # the last one's footprints are drawn
-        walks = {key: walk for key, walk in found.shown.items() if key != "with"}
-        walks["with"] = found.shown["with"]
+        walks = {key: walk for key, walk in found.first.items() if key != "with"}
+        walks["with"] = found.first["with"]
         with tempfile.TemporaryDirectory() as folder:
-            strip = _snapshots(Path(folder), robot, found.shown)
+            strip = _snapshots(Path(folder), robot, found.first)
             file = f"pictures/{name}.png"
             pictures.append(Picture(file, f"{name}: {plots.collective(out / file, walks, strip)}"))
     return pictures
 
 
-def _snapshots(folder: Path, robot: Robot, shown: Mapping[str, Trajectory]) -> Path | None:
+def _snapshots(folder: Path, robot: Robot, walks: Mapping[str, Trajectory]) -> Path | None:
     """A strip of both walks; None, with one line, where nothing can be drawn here."""
-    pair = {name: shown[name] for name in ("nominal", "with")}
+    pair = {name: walks[name] for name in ("nominal", "with")}
     try:
         write_strip(folder / "strip.png", robot, motions(robot, pair), _SNAPSHOTS)
     except VideoUnavailable as error:

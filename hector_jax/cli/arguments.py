@@ -1,5 +1,6 @@
-"""What the flags mean that several commands share."""
+"""What flags that several commands share stand for: weights, robots, plants, trajectories."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.report.folder import Asked
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import pipeline
+from hector_jax.runs import verdicts
 from hector_jax.runs.cache import robot_hash
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
@@ -33,6 +34,22 @@ def weights(text: str, robot: Robot) -> Weights:
     """
     named = {"nominal": nominal, "expert": expert}
     return named[text](robot) if text in named else load_weights(Path(text))
+
+
+def short_names(texts: Sequence[str]) -> dict[str, str]:
+    """Names of weight sets for a table: of a file as much of its path as tells it from the others.
+
+    >>> short_names(["nominal", "runs/a/weights/with.json", "runs/b/other.json"])
+    {'nominal': 'nominal', 'runs/a/weights/with.json': 'with', 'runs/b/other.json': 'other'}
+    """
+    parts = {text: Path(text).with_suffix("").parts for text in texts}
+    names = {}
+    for text, own in parts.items():
+        others = [part for other, part in parts.items() if other != text]
+        tails = (own[-k:] for k in range(1, len(own) + 1))
+        found = (tail for tail in tails if not any(o[-len(tail) :] == tail for o in others))
+        names[text] = "/".join(next(found, (text,)))
+    return names
 
 
 def tune_config(robot: Robot, **others: Any) -> TuneConfig:
@@ -112,7 +129,7 @@ def walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) ->
     """One walk in the world of the flags."""
     lasts = seconds(args.seconds, wanted)
     if args.world == "srbm":
-        return pipeline.walk_rigid_body(robot, weights, wanted.command, lasts)
+        return verdicts.walk_rigid_body(robot, weights, wanted.command, lasts)
     plant = plants(args.world, range(args.seed, args.seed + 1))[0]
     job = Job(weights, wanted.command, plant, lasts, args.seed)
     return walk(walk_config(robot), robot, job)

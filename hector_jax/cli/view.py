@@ -6,7 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from hector_jax.cli import asked
+from hector_jax.cli import arguments
 from hector_jax.cli.flags import Replay, Tensorboard, View
 from hector_jax.control.walking import walk_config
 from hector_jax.core.console import Broken, say
@@ -21,7 +21,7 @@ from hector_jax.report.report import WORLDS
 from hector_jax.report.tensorboard import write_events
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, compile_model
-from hector_jax.runs import metrics, pipeline, replay
+from hector_jax.runs import metrics, nets, replay
 
 
 def view_run(args: View) -> None:
@@ -33,15 +33,15 @@ def view_run(args: View) -> None:
     else:
         check_film(folder / "film.mp4")
     begun = runs.read_asked(args.run)
-    robot = asked.robot_of(args.run, begun)
-    wanted = asked.course(begun.trajectory, robot)
+    robot = arguments.robot_of(args.run, begun)
+    wanted = arguments.course(begun.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
             raise InputError(f"--out must not be the folder of the run, got {folder}")
         make_folder(folder)
     sets = {name: runs.weights_of(args.run, name, robot) for name in args.sets}
-    data = asked.folder_of(args.data or begun.data, begun.robot, robot)
-    net = begun.net if args.data is None and begun.net else pipeline.net_path(data, begun.variant)
+    data = arguments.folder_of(args.data or begun.data, begun.robot, robot)
+    net = begun.net if args.data is None and begun.net else nets.net_path(data, begun.variant)
     effect = _phi_of(net, begun.variant, robot)
     shown: dict[str, view.ViewedWalk] = {}
 
@@ -50,7 +50,7 @@ def view_run(args: View) -> None:
         story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
-            walked = asked.walked(args, robot, wanted, weights)
+            walked = arguments.walked(args, robot, wanted, weights)
             loss = metrics.score(begun.loss, walked).L / 1e6
             story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
             say(f"  {story[-1]}")

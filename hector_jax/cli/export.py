@@ -1,6 +1,6 @@
 """A tuned controller for other machines, and how this one is."""
 
-from hector_jax.cli import asked, doctor
+from hector_jax.cli import arguments, doctor
 from hector_jax.cli.flags import Doctor, Export
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights_file import load_weights
@@ -19,14 +19,16 @@ def export_controller(args: Export) -> None:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
     path, config = export.find_weights(args.run, args.set)
     begun = runs.read_asked(args.run) if is_run else None
-    robot = asked.robot_of(args.run, begun) if begun else load_robot(args.robot)
-    wanted = asked.course(args.traj or (begun.trajectory if begun else "straight"), robot)
+    robot = arguments.robot_of(args.run, begun) if begun else load_robot(args.robot)
+    wanted = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
     say("exporting the controller and comparing it with the live one on a walk")
-    known = (config or walk_config(robot), robot, weights, wanted.command, folder)
+    controller = config or walk_config(robot)
     with locked(folder):
-        card = export.export(*known, name=name, seconds=args.seconds)
+        card = export.export(
+            controller, robot, weights, wanted.command, folder, name=name, seconds=args.seconds
+        )
     if args.json:
         print(as_json(card))
         return

@@ -1,18 +1,17 @@
 """Evaluation of weight sets, walks and runs."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from hector_jax.cli import asked, study
-from hector_jax.cli.flags import Compare, Evaluate, Table, Walk
+from hector_jax.cli import arguments
+from hector_jax.cli.flags import Compare, Evaluate, Walk
 from hector_jax.cli.parse import as_table
 from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, say
-from hector_jax.core.files import as_json
+from hector_jax.core.files import as_json, write_json
 from hector_jax.core.inputs import plural, printable
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import save_tree
@@ -22,7 +21,7 @@ from hector_jax.report import pictures
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, pipeline
+from hector_jax.runs import metrics, verdicts
 from hector_jax.runs.metrics import Score, Verdict
 from hector_jax.tuning.loss import LossConfig
 
@@ -30,29 +29,35 @@ from hector_jax.tuning.loss import LossConfig
 def evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
     robot = load_robot(args.robot)
-    wanted = asked.course(args.traj, robot)
-    seconds = asked.seconds(args.seconds, wanted)
+    wanted = arguments.course(args.traj, robot)
+    seconds = arguments.seconds(args.seconds, wanted)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
-    sets = {text: asked.weights(text, robot) for text in args.weights}
-    plants = asked.plants(args.world, seeds)
+    sets = {text: arguments.weights(text, robot) for text in args.weights}
+    plants = arguments.plants(args.world, seeds)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        known = (pool, asked.tune_config(robot), robot)
-        walks = pipeline.judge(*known, sets, wanted.command, plants, seeds, title, seconds)
-    scores = {n: [metrics.score(LossConfig(), walk) for walk in each] for n, each in walks.items()}
-    verdict = verdict_of(LossConfig(), seeds, scores)
+        config = arguments.tune_config(robot)
+        judged = verdicts.judge(
+            pool, config, robot, sets, wanted.command, plants, seeds, title=title, seconds=seconds
+        )
+    verdict = verdict_of(config.loss, seeds, judged.scores)
+    result = metrics.as_result(verdict, args.world)
+    if args.out is not None:
+        write_json(args.out, result)
     if args.json:
-        print(as_json(metrics.as_result(verdict, args.world)))
+        print(as_json(result))
     else:
-        print_table(verdict, f"{wanted.name}, {plural(count, 'plant')}", args.world)
+        names = arguments.short_names(args.weights)
+        named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
+        print_table(named, f"{wanted.name}, {plural(count, 'plant')}", args.world)
 
 
 def verdict_of(
     loss: LossConfig, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
 ) -> Verdict:
-    """`metrics.make_verdict`; says where a QP of the walks was not solved."""
+    """`metrics.make_verdict`, saying where a QP of the walks was not solved."""
     verdict = metrics.make_verdict(loss, seeds, scores)
     for name, score in verdict.scores.items():
         if score.residual.max() > SOLVED:
@@ -70,9 +75,9 @@ def walk(args: Walk) -> None:
     if args.video is not None:
         check_film(args.video)
     robot = load_robot(args.robot)
-    weights, wanted = asked.weights(args.weights, robot), asked.course(args.traj, robot)
+    weights, wanted = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = asked.walked(args, robot, wanted, weights)
+    trajectory = arguments.walked(args, robot, wanted, weights)
     found = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
@@ -107,22 +112,10 @@ def walk(args: Walk) -> None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
         say(f"walking with {beside} weights for the other half of the film")
         walks = {
-            beside: asked.walked(args, robot, wanted, other(robot)),
+            beside: arguments.walked(args, robot, wanted, other(robot)),
             Path(args.weights).stem: trajectory,
         }
         pictures.film(args.video, robot, walks)
-
-
-def table(args: Table) -> None:
-    """Make the table of all sets on all trajectories."""
-    told, verdicts = study.make_table(args, partial(asked.plants, "standin"))
-    if args.json:
-        results = {name: metrics.as_result(verdict) for name, verdict in verdicts.items()}
-        print(as_json({"report": str(told), "trajectories": results}))
-    else:
-        for name, verdict in verdicts.items():
-            print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
-    say(f"the report is {told}")
 
 
 def compare(args: Compare) -> None:
@@ -132,6 +125,8 @@ def compare(args: Compare) -> None:
         if finished and folder not in finished:
             say(f"{folder} is left out: it is not a finished run")
     told = runs.compare_runs([runs.load_run(folder) for folder in finished or args.runs])
+    if args.out is not None:
+        write_json(args.out, told)
     if args.json:
         print(as_json(told))
     else:

@@ -1,0 +1,357 @@
+"""`hector tune`: weights tuned with and without the net, judged and reported in a run folder."""
+
+import dataclasses
+import json
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from hector_jax.cli import arguments, run_folder
+from hector_jax.cli.evaluate import verdict_of
+from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
+from hector_jax.cli.parse import as_command
+from hector_jax.control.reference import COMMANDS
+from hector_jax.control.trajectories import Course
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights_file import save_weights, weights_tree
+from hector_jax.core.console import say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import as_json, locked, write_json
+from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.runtime import workers
+from hector_jax.core.tree_file import tree_hash
+from hector_jax.grfm.jobs import PIECES
+from hector_jax.grfm.network import Params, as_effect
+from hector_jax.report import fidelity, pictures
+from hector_jax.report.folder import read_json
+from hector_jax.report.report import Picture, Report, print_table, write_report
+from hector_jax.report.video import check_film
+from hector_jax.robot.model import Robot, load_robot
+from hector_jax.runs import metrics, nets, tunings, verdicts
+from hector_jax.runs.metrics import Verdict
+from hector_jax.runs.nets import TrainedNet
+from hector_jax.runs.tunings import Problem, Tuned
+from hector_jax.runs.verdicts import Judged
+from hector_jax.sim.world import hfs
+from hector_jax.tuning.difftune import TuneConfig, aligned
+from hector_jax.tuning.loss import Losses
+
+_FOLDERS = ("out", "run", "resume")  # flags that name the run folder
+
+
+def tune(args: Tune) -> None:
+    """Tune one weight set for all trajectories, or one for each, anew or where a run was left."""
+    given = [f"--{name} {getattr(args, name)}" for name in _FOLDERS if getattr(args, name)]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)}: only one can be given")
+    if args.video:
+        check_film(Path("film.mp4"))
+    base, robot = args.resume or args.out or args.run, load_robot(args.robot)
+    runs = _by_folder(args, base, robot)
+    if args.resume:
+        runs = {folder: run_folder.resume(folder, one) for folder, one in runs.items()}
+    else:
+        for folder, one in runs.items():
+            _trajectories(one, robot)
+            if base and folder.exists():
+                raise run_folder.taken(folder)
+        runs = {run_folder.begin(folder, one): one for folder, one in runs.items()}
+    for folder, one in runs.items():
+        with locked(folder):
+            _tune_in(folder, one)
+
+
+def _by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
+    """The flags of each run by its folder."""
+    texts = tuple(t for text in args.traj for t in (COMMANDS if text == "all" else (text,)))
+    texts = tuple(dict.fromkeys(texts))
+    if args.resume and not args.each and (args.resume / texts[0] / "config.json").exists():
+        raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
+    now = f"{datetime.now():{run_folder.TIME}}"
+    parent = arguments.folder_of(args.runs, args.robot, robot)
+    # beside --resume a trajectory that was not given is that of the run
+    shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=texts)
+    runs = {}
+    for one in [replace(args, traj=(text,)) for text in texts] if args.each else [shared]:
+        if base is None:
+            name = "-".join(arguments.course(text, robot).name for text in one.traj)
+            runs[parent / name / now] = one
+        else:
+            runs[base / one.traj[0] if args.each else base] = one
+    return runs
+
+
+def _trajectories(args: Tune, robot: Robot) -> tuple[Course, ...]:
+    """What a tuning is to walk.
+
+    Raises:
+        InputError: there is no such trajectory, they last differently, or --refresh cannot take
+            them.
+    """
+    found = tuple(arguments.course(text, robot) for text in args.traj)
+    first = found[0]
+    if len({one.seconds or Walk.seconds for one in found}) > 1:
+        lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in found)
+        raise InputError(f"--traj expects trajectories of one length, got {lasts}; add --each")
+    if args.refresh and args.net:
+        raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
+    if args.refresh and len(found) > 1:
+        raise InputError(f"--refresh takes one trajectory, got {len(found)}; add --each")
+    if args.refresh and len(first.command.duration) > PIECES:
+        raise InputError(
+            f"--refresh takes trajectories of at most {PIECES} segments, {first.name} has "
+            f"{len(first.command.duration)}"
+        )
+    return found
+
+
+class _Run(NamedTuple):
+    """What the steps of a run share."""
+
+    folder: Path
+    args: Tune
+    robot: Robot
+    start: Weights
+    trajectories: tuple[Course, ...]
+    seconds: float  # of each walk
+    config: TuneConfig
+    net: TrainedNet
+    commit: str
+
+    @property
+    def kept(self) -> Path:
+        """Folder of the artefacts."""
+        return self.folder / "kept"
+
+    @property
+    def name(self) -> str:
+        """What is walked."""
+        return ", ".join(one.name for one in self.trajectories)
+
+    def problem(self, params: Params | None) -> Problem:
+        """All trajectories, to be tuned through a net."""
+        command, *others = (one.command for one in self.trajectories)
+        return Problem(command, params, tuple(others))
+
+
+class _Tuned(NamedTuple):
+    """What the tunings of a run came to."""
+
+    tunings: dict[str, Tuned]
+    shifts: list[dict[str, Any]]  # of each refresh
+    sets: dict[str, Weights]
+
+
+def _tune_in(folder: Path, args: Tune) -> None:
+    """All of a run, taking up what is in its folder."""
+    begun, made_with = time.monotonic(), environment()
+    robot = load_robot(args.robot)
+    trajectories = _trajectories(args, robot)
+    config = arguments.tune_config(robot, iterations=args.iterations)
+    say(f"the run folder is {folder}")
+    with workers(args.processes) as pool:
+        run = _Run(
+            folder,
+            args,
+            robot,
+            arguments.weights(args.start, robot),
+            trajectories,
+            trajectories[0].seconds or Walk.seconds,
+            arguments.lasting(config, trajectories[0]),
+            _net(pool, args, robot),
+            made_with.get("commit", ""),
+        )
+        run, norms = _align(pool, run)
+        settings = _note_settings(run)
+        tuned = _tune_sets(pool, run)
+        judged = _judge(pool, run, tuned.sets)
+    result, by_name = _result(run, tuned, judged)
+    seconds = f"{time.monotonic() - begun:.0f}"
+    write_json(folder / "versions.json", made_with | {"seconds": seconds})
+    verdict, (standin, on_hfs) = by_name[run.name], judged[trajectories[0].name]
+    report = write_report(
+        folder,
+        Report(
+            trajectory=run.name,
+            verdict=verdict,
+            tunings={name: one.tuning for name, one in tuned.tunings.items()},
+            norms=norms,
+            errors=run.net.errors,
+            shifts=tuned.shifts,
+            pictures=_draw(run, tuned, standin, on_hfs),
+            film=_film(run, standin),
+            config=settings,
+            environment=made_with,
+            command=as_command("tune", run_folder.as_begun(args)),
+        ),
+    )
+    if args.json:
+        print(as_json({"run": str(folder), "traj": run.name, **result}))
+    else:
+        for name, one in by_name.items():
+            print_table(one, f"{name}, {plural(args.seeds, 'plant')}")
+    say(f"the report is {report}")
+
+
+def _net(pool: Executor, args: Tune, robot: Robot) -> TrainedNet:
+    if args.net is not None:
+        return nets.load_net(args.net, robot, args.variant)[0]
+    return nets.ground(pool, robot, arguments.folder_of(args.data, args.robot, robot), args.variant)
+
+
+def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, Losses]]:
+    """The run with its loss weights, and the norms of the gradients by set."""
+    problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
+    norms = tunings.gradient_norms(pool, run.config, run.robot, problems)
+    loss = run.config.loss
+    if run.args.alpha == "auto":
+        loss = aligned(loss, norms["with"])
+        say(f"loss weights alpha: {loss.euler:g} (Euler), {loss.position:g}")
+    return run._replace(config=replace(run.config, loss=loss)), norms
+
+
+def _note_settings(run: _Run) -> dict[str, Any]:
+    """Write what the run follows from beside its flags; InputError where it was otherwise."""
+    path = run.folder / "config.json"
+    begun = read_json(path)
+    commands = [
+        {name: np.asarray(x).tolist() for name, x in one.command._asdict().items()}
+        for one in run.trajectories
+    ]
+    now = {
+        "tune": dataclasses.asdict(run.config),
+        "net": tree_hash(run.net.params),
+        "command": commands[0] if len(commands) == 1 else commands,
+        "seconds": run.seconds,
+        "start": weights_tree(run.start),
+    }
+    run_folder.check_agreement(run.folder, begun, json.loads(as_json(now)))
+    write_json(path, {**begun, **now})
+    return {**begun, **now}
+
+
+def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
+    """Tune without and with the net, and again with it refreshed; writes the weights."""
+    options: dict[str, Any] = {
+        "start": run.start,
+        "commit": run.commit,
+        "journal": tunings.Journal(run.folder / "metrics.jsonl"),
+        "dumps": run.folder / "dumps",
+    }
+    step = partial(tunings.tune, pool, run.config, run.robot, folder=run.kept, **options)
+    problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
+    tuned = step(problems, title=f"tuning {run.name} without and with GRFM-Net")
+    net, name, shifts = run.net, "with", []
+    for count in range(1, run.args.refresh + 1):
+        net, shift = nets.refresh(
+            pool,
+            replace(nets.REFRESH, seed=count, seconds=run.seconds),
+            run.robot,
+            run.trajectories[0].command,
+            tuned[name].tuning,
+            net=net,
+            folder=run.folder / f"refresh-{count}",
+        )
+        shifts.append(shift)
+        name = "with_refreshed" + (str(count) if count > 1 else "")
+        title = f"tuning {run.name} with the net refreshed"
+        tuned |= step({name: run.problem(net.params)}, title=title)
+    sets = {
+        "nominal": nominal(run.robot),
+        "expert": expert(run.robot),
+        **({} if run.args.start in NAMED_WEIGHTS else {"start": run.start}),
+        **{f"{name}_ten": tuned[name].tuning.ten for name in problems},
+        **{name: one.tuning.converged for name, one in tuned.items()},
+    }
+    for name, weights in sets.items():
+        save_weights(run.folder / "weights" / f"{name}.json", weights)
+    return _Tuned(tuned, shifts, sets)
+
+
+def _judge(
+    pool: Executor, run: _Run, sets: Mapping[str, Weights]
+) -> dict[str, tuple[Judged, Judged]]:
+    """Walks of all sets on the stand-in plants and on the hfs, by trajectory."""
+    seeds = range(run.args.seeds)
+    judge = partial(verdicts.judge, pool, run.config, run.robot, sets)
+    options: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
+    judged = {}
+    for name, command, _ in run.trajectories:
+        where = f" {name}" if len(run.trajectories) > 1 else ""
+        standin = judge(
+            command,
+            arguments.plants("standin", seeds),
+            seeds,
+            title=f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}",
+            folder=run.kept / "standin",
+            **options,
+        )
+        on_hfs = judge(
+            command,
+            [hfs()],
+            [0],
+            title=f"walking{where} on the high-fidelity simulator",
+            folder=run.kept / "hfs",
+            **options,
+        )
+        judged[name] = standin, on_hfs
+    return judged
+
+
+def _result(
+    run: _Run, tuned: _Tuned, judged: Mapping[str, tuple[Judged, Judged]]
+) -> tuple[dict[str, Any], dict[str, Verdict]]:
+    """Write result.json; its content, and the verdicts: of all walks, and by trajectory."""
+
+    def verdict(names: Sequence[str], world: int) -> Verdict:
+        each = [judged[name][world] for name in names]
+        scores = {n: [s for one in each for s in one.scores[n]] for n in tuned.sets}
+        seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
+        return verdict_of(run.config.loss, seeds, scores)
+
+    def content(names: Sequence[str], found: Verdict) -> dict[str, Any]:
+        result = metrics.as_result(found)
+        for name, there in metrics.as_result(verdict(names, 1), "hfs")["sets"].items():
+            result["sets"][name] |= there
+        return result
+
+    names = list(judged)
+    found = {run.name: verdict(names, 0)}
+    result = content(names, found[run.name])
+    if len(names) > 1:
+        found |= {name: verdict([name], 0) for name in names}
+        result["trajectories"] = {name: content([name], found[name]) for name in names}
+    if tuned.shifts:
+        result["refresh"] = tuned.shifts
+    write_json(run.folder / "result.json", result)
+    return result, found
+
+
+def _draw(run: _Run, tuned: _Tuned, judged: Judged, on_hfs: Judged) -> list[Picture]:
+    net = run.net
+    effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
+    sampled = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
+    curves = fidelity.curves(run.robot, sampled, effects)
+    histories = {name: one.tuning for name, one in tuned.tunings.items()}
+    return pictures.of_run(
+        run.folder, run.config, tuned.sets, histories, judged.first, curves, net.course
+    )
+
+
+def _film(run: _Run, judged: Judged) -> Picture | str:
+    """The film of a run, or why there is none."""
+    if not run.args.video:
+        return "left out (--no-video)"
+    pair = {name: judged.first[name] for name in ("nominal", "with")}
+    film = run.folder / "film.mp4"
+    caption = "Nominal and tuned weights on the first stand-in plant."
+    told = pictures.film(film, run.robot, pair, run.folder / "film.png")
+    return told or Picture(film.name, caption)

@@ -1,0 +1,415 @@
+"""The step `tune`: gradient tunings in worker processes, each an artefact (cache.py).
+
+A tuning runs on one core, because a closed loop is one long chain of small operations; several run
+side by side.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from functools import partial
+from itertools import repeat
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
+from hector_jax.control.walking import WalkConfig, walk_config
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
+from hector_jax.core.console import bar
+from hector_jax.core.files import append_file, as_json, write_file
+from hector_jax.core.runtime import letters
+from hector_jax.core.tree import stack
+from hector_jax.grfm import network
+from hector_jax.grfm.network import Params
+from hector_jax.robot.model import Robot
+from hector_jax.runs import replay
+from hector_jax.runs.cache import cached, content_key
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
+from hector_jax.tuning import difftune, measured
+from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, Tuning
+from hector_jax.tuning.loss import Losses
+from hector_jax.tuning.measured import evaluate_walk
+from hector_jax.tuning.rollout import RolloutConfig
+
+# modules that decide the numbers, for `content_key`
+TUNING_CODE = ("tuning.difftune", "grfm.network")
+_KIND = "tuning"  # of a file
+
+
+class Problem(NamedTuple):
+    """What weights are tuned for."""
+
+    command: Command
+    params: Params | None  # of the net to tune through; None: the plain rigid body
+    others: tuple[Command, ...] = ()  # commands that the same weights are to walk as well
+
+    @property
+    def commands(self) -> tuple[Command, ...]:
+        """All commands."""
+        return self.command, *self.others
+
+
+class Tuned(NamedTuple):
+    """A tuning with its history."""
+
+    tuning: Tuning
+    commit: str  # at which it was made; empty where that is not known
+
+
+def as_line(name: str, iteration: Iteration) -> str:
+    """A line of metrics.jsonl."""
+    found = iteration.evaluation
+    gradient = jax.tree.map(np.multiply, found.gradient, iteration.weights)
+    vector = lambda tree: np.asarray(weights_to_vector(tree)).tolist()  # noqa: E731
+    row = {
+        "set": name,
+        "iteration": iteration.iteration,
+        "accepted": iteration.accepted,
+        "reason": iteration.reason,
+        "step": iteration.step,
+        "L": float(found.loss),
+        "L_Eul": float(found.parts.euler),
+        "L_pos": float(found.parts.position),
+        "L_ctrl": float(found.parts.control),
+        "fallen": float(found.fallen),
+        "residual": float(found.residual),
+        "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
+        "gradient_log": dict(zip(WEIGHT_NAMES, vector(gradient), strict=True)),
+    }
+    return as_json(row) + "\n"
+
+
+class Journal:
+    """metrics.jsonl, a line for each iteration: as they come; in order when tunings are over."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._histories: dict[str, Sequence[Iteration]] = {}
+
+    def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
+        """Write the file anew, with these tunings after or instead of those written before.
+
+        Raises:
+            WriteError: where the file cannot be written; the old one stays.
+        """
+        self._histories.update(histories)
+        lines = (as_line(name, i) for name, history in self._histories.items() for i in history)
+        write_file(self.path, "".join(lines).encode())
+
+    def add(self, name: str, iteration: Iteration) -> None:
+        """Write one line more.
+
+        Raises:
+            WriteError: where the file cannot be written.
+        """
+        append_file(self.path, as_line(name, iteration).encode())
+
+
+def _stored(tuned: Tuned) -> Any:
+    """A tuning as arrays, iterations stacked, as `_stored_like`."""
+    history = stack(tuned.tuning.history)
+    return Tuned(tuned.tuning._replace(history=history), tuned.commit)
+
+
+def _stored_like(_: Any) -> Any:
+    none, text = np.zeros(0), np.array("")
+    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), nominal())
+    seen = Evaluation(none, Losses(none, none, none), rows, none, none)
+    history: Any = Iteration(none, rows, seen, none, np.zeros(0, "U1"), none)  # pyright: ignore
+    return Tuned(Tuning(history, nominal(), nominal(), text), text)  # pyright: ignore
+
+
+def _restored(stored: Any) -> Tuned:
+    """What `_stored` was given."""
+    tuning, rows = stored.tuning, stored.tuning.history
+    history = [
+        Iteration(
+            int(rows.iteration[i]),
+            *jax.tree.map(lambda x, i=i: np.asarray(x[i]), (rows.weights, rows.evaluation)),
+            accepted=bool(rows.accepted[i]),
+            reason=str(rows.reason[i]),
+            step=float(rows.step[i]),
+        )
+        for i in range(len(rows.iteration))
+    ]
+    tuning = Tuning(history, tuning.ten, tuning.converged, str(tuning.stop))
+    return Tuned(tuning, str(stored.commit))
+
+
+def _tune_job(
+    config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, heard: Any
+) -> Tuning:
+    """One tuning in a worker; the queue `heard` is told of each iteration."""
+    evaluate = partial(_evaluate, config, robot, problem)
+    scales = np.ones(1)
+    if problem.others:
+        losses = np.array([one.loss for one in evaluate(start)])
+        scales = losses / losses.mean()
+    evaluate_mean = partial(_mean, evaluate, scales)
+    return difftune.descend(config, start, evaluate_mean, lambda one: heard.put((name, one)))
+
+
+def _evaluate(
+    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights
+) -> list[Evaluation]:
+    """One rollout on each command of a problem, with its gradient."""
+    anchor = standing_anchor(robot)
+    effect = network.effect_of(problem.params, config.rollout.walk.gait)
+    return [
+        difftune.tune_step(config, robot, weights, command, anchor, effect)
+        for command in problem.commands
+    ]
+
+
+def _mean(
+    evaluate: Callable[[Weights], list[Evaluation]],
+    scales: Float[np.ndarray, " commands"],
+    weights: Weights,
+) -> Evaluation:
+    """The mean over the commands, each divided by its scale, as one evaluation."""
+    each = jax.device_get(evaluate(weights))
+    whole = jax.tree.map(
+        lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
+    )
+    worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
+    return whole._replace(**worst)
+
+
+def _tunings(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    start: Weights,
+    problems: Mapping[str, Problem],
+    title: str,
+    on_iteration: Callable[[str, Iteration], None],
+) -> Iterator[tuple[str, Tuning]]:
+    """Tune several problems side by side; yields each tuning with its name when it has ended."""
+    done, total = 0, config.iterations * len(problems)
+    with letters() as heard, bar(title) as tell:
+        running: dict[Future[Tuning], str] = {
+            pool.submit(_tune_job, config, robot, start, problem, name, heard): name
+            for name, problem in problems.items()
+        }
+        tell(done, total, "compiling")
+        while running:
+            ended = wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done
+            while not heard.empty():  # also all that those told which have ended
+                name, iteration = heard.get()
+                done += iteration.iteration > 0
+                tell(done, total, f"{name}: L {float(iteration.evaluation.loss) / 1e6:.3f}e6")
+                on_iteration(name, iteration)
+            for future in ended:
+                yield running.pop(future), future.result()
+
+
+def tune(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    problems: Mapping[str, Problem],
+    folder: Path,
+    *,
+    title: str,
+    start: Weights | None = None,
+    commit: str = "",
+    journal: Journal | None = None,
+    dumps: Path | None = None,
+) -> dict[str, Tuned]:
+    """Tune several problems side by side; `folder` keeps the tunings that ended.
+
+    Of a problem with several commands the mean of the losses is lowered, each divided by its share
+    of the losses at the start, so that all count alike.
+
+    Args:
+        pool: worker processes.
+        config: how.
+        robot: the body.
+        problems: by name.
+        folder: of the tunings, a file for each; a tuning that is there is not tuned again.
+        start: where to start; the nominal weights by default.
+        title: for the person who waits.
+        commit: to note with what is tuned now.
+        journal: of the iterations.
+        dumps: folder for what was refused, see `replay.keep`; None: nothing is kept. Nothing is of
+            a problem with several commands, as a dump is of one rollout.
+
+    Raises:
+        InputError: the starting weights fall or cannot be solved on the model; the folder cannot be
+            written.
+    """
+    start = nominal(robot) if start is None else start
+    paths = {}
+    for name, problem in problems.items():
+        key = content_key(config, robot, start, *problem, code=TUNING_CODE)
+        paths[name] = folder / f"tuning-{name}-{key}.npz"
+
+    def on_iteration(name: str, iteration: Iteration) -> None:
+        if journal is not None:
+            journal.add(name, iteration)
+        command, params, others = problems[name]
+        if dumps is not None and not others:
+            anchor = standing_anchor(robot)
+            replay.keep(dumps, name, config, robot, command, anchor, params, iteration)
+
+    def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+        if journal is not None:
+            there = {name: _restored(one).tuning.history for name, one in found.items()}
+            journal.write({name: there.get(name, ()) for name in problems})  # in their order
+        asked = {name: problems[name] for name in missing}
+        for name, tuning in _tunings(pool, config, robot, start, asked, title, on_iteration):
+            yield name, _stored(Tuned(tuning, commit))
+
+    stored = cached(paths, make, like=_stored_like, kind=_KIND, robot=robot)
+    tuned = {name: _restored(one) for name, one in stored.items()}
+    if journal is not None:
+        journal.write({name: one.tuning.history for name, one in tuned.items()})
+    return tuned
+
+
+def measured_plants(count: int) -> list[Imperfections]:
+    """The hfs and plants drawn around it, which tunings on walks go by; others judge variants."""
+    return [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + count))]
+
+
+def _measured_job(
+    config: TuneConfig,
+    robot: Robot,
+    command: Command,
+    params: Params | None,
+    weights: Weights,
+    plant: Imperfections,
+) -> Evaluation:
+    seconds = config.rollout.ticks * config.rollout.walk.gait.tick
+    walked = walk(config.rollout.walk, robot, Job(weights, command, plant, seconds))
+    effect = network.effect_of(params, config.rollout.walk.gait)
+    return evaluate_walk(config, robot, weights, command, effect, walked)
+
+
+def tune_measured(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    params: Params | None,
+    *,
+    plants: Sequence[Imperfections],
+    folder: Path,
+    title: str,
+    commit: str = "",
+) -> Tuned:
+    """Tune on along walks on the high-fidelity simulator, one on each plant for every step.
+
+    Args:
+        pool: worker processes.
+        config: how.
+        robot: the body.
+        weights: where to start: those of a tuning on the model.
+        command: what to walk.
+        params: the net whose Jacobian is used; None: the plain rigid body.
+        plants: see `measured_plants`.
+        folder: of the tuning; one that is there is not tuned again.
+        title: for the person who waits.
+        commit: to note with what is tuned now.
+
+    Raises:
+        InputError: a walk with the starting weights falls or cannot be believed; the folder cannot
+            be written.
+    """
+    code = (*TUNING_CODE, "tuning.measured", "sim.walk")
+    key = content_key(config, robot, weights, command, params, *plants, code=code)
+    job = partial(_measured_job, config, robot, command, params)
+
+    def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+        with bar(title) as tell:
+            tell(0, config.iterations, "compiling")
+            tuning = measured.tune_measured(
+                config,
+                weights,
+                lambda trial: list(pool.map(job, repeat(trial), plants)),
+                lambda iteration: tell(
+                    iteration.iteration,
+                    config.iterations,
+                    f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6",
+                ),
+            )
+        yield "walks", _stored(Tuned(tuning, commit))
+
+    paths = {"walks": folder / f"tuning-walks-{key}.npz"}
+    return _restored(cached(paths, make, like=_stored_like, kind=_KIND, robot=robot)["walks"])
+
+
+def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> Losses:
+    anchor = standing_anchor(robot)
+    effect = network.effect_of(problem.params, config.rollout.walk.gait)
+    each = [
+        difftune.gradient_norms(config, robot, nominal(robot), command, anchor, effect)
+        for command in problem.commands
+    ]
+    return jax.tree.map(lambda *x: np.mean(x, axis=0), *jax.device_get(each))
+
+
+def gradient_norms(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    problems: Mapping[str, Problem],
+) -> dict[str, Losses]:
+    """Norms of the gradients of the loss's parts at nominal weights, means over the commands."""
+    with bar("norms of the gradients") as tell:
+        running = {
+            name: pool.submit(_norms_job, config, robot, problem)
+            for name, problem in problems.items()
+        }
+        tell(0, len(problems), "compiling")
+        return {name: future.result() for name, future in running.items()}
+
+
+def path_config(robot: Robot) -> TuneConfig:
+    """Settings of the tunings whose weights the data cover: the same whatever is tuned later."""
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)))
+
+
+def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
+    """Weights that plain tunings of the trajectories pass through, stacked: data covers them.
+
+    The tunings are kept in `folder`.
+    """
+    config = path_config(robot)
+    problems = {name: Problem(named_command(name), None) for name in COMMANDS}
+    title = "tuning paths on the rigid body, for the data"
+    tuned = tune(pool, config, robot, problems, folder, title=title)
+    stacked = []
+    for name in COMMANDS:
+        passed = [i.weights for i in tuned[name].tuning.history if i.accepted]
+        stacked.append(jax.tree.map(lambda *w: np.stack(w), *passed))
+    return stacked
+
+
+def _compile_tuning(config: TuneConfig, robot: Robot) -> None:
+    command, effect = named_command("straight"), network.effect_of(None, config.rollout.walk.gait)
+    difftune.tune_step(config, robot, nominal(robot), command, standing_anchor(robot), effect)
+
+
+def _compile_walking(config: WalkConfig, robot: Robot) -> None:
+    walk(config, robot, Job(nominal(robot), named_command("straight"), hfs(), config.gait.tick))
+
+
+def compile_programs(pool: Executor, robot: Robot) -> None:
+    """Compile what tunings and walks run, each program in one process; the others load it."""
+    config = path_config(robot)
+    with bar("compiling, once on a machine") as tell:
+        jobs = [
+            pool.submit(_compile_tuning, config, robot),
+            pool.submit(_compile_walking, config.rollout.walk, robot),
+        ]
+        for done, job in enumerate(jobs):
+            tell(done, len(jobs), "")
+            job.result()
+        tell(len(jobs), len(jobs), "")

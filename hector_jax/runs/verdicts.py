@@ -1,0 +1,168 @@
+"""The step `judge`: walks of weight sets on plants, each score an artefact (cache.py)."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.control.reference import Command, standing_anchor
+from hector_jax.control.walking import walk_config
+from hector_jax.control.weights import Weights
+from hector_jax.core.console import bar
+from hector_jax.core.inputs import plural
+from hector_jax.core.trajectory import State, Trajectory
+from hector_jax.core.tree import stack
+from hector_jax.grfm.collection import Walks, walks_like
+from hector_jax.grfm.dataset import at_interval
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import Robot
+from hector_jax.runs import metrics
+from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.metrics import Score
+from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import Imperfections
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.rollout import RolloutConfig, rollout
+
+_CODE = ("sim.walk", "runs.metrics")  # modules that decide the numbers, for `content_key`
+
+Case = tuple[str, int]
+"""A set and a seed."""
+
+
+class JudgedWalk(NamedTuple):
+    """What is kept of one walk."""
+
+    score: Score
+    upright: Float[np.ndarray, ""]  # [s] until a fall, or the whole walk
+    last: State  # the last one upright, or of the walk
+    commit: str  # at which it was walked; empty where that is not known
+
+
+class Judged(NamedTuple):
+    """Walks of several sets on the same plants."""
+
+    walks: dict[str, list[JudgedWalk]]  # by set, in the order of the plants
+    first: dict[str, Trajectory]  # by set, the walk on the first plant; empty where none is kept
+
+    @property
+    def scores(self) -> dict[str, list[Score]]:
+        """Scores by set, in the order of the plants."""
+        return {name: [walk.score for walk in walks] for name, walks in self.walks.items()}
+
+
+def walk_jobs(
+    pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
+) -> Iterator[Trajectory]:
+    """The walks of jobs, in order, as they come."""
+    with bar(title) as tell:
+        tell(0, len(jobs), "compiling")
+        for done, found in enumerate(MUJOCO_C.walk(pool, config.rollout.walk, robot, jobs), 1):
+            yield found
+            tell(done, len(jobs), "")
+
+
+def walk_all(
+    pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
+) -> Walks:
+    """Walks of jobs whose commands are alike, at the plan interval."""
+    walked = walk_jobs(pool, config, robot, jobs, title)
+    walks = [at_interval(walk, config.rollout.walk.gait.tick) for walk in walked]
+    return Walks(stack(jobs), stack(walks))
+
+
+def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
+    """A walk on the plain single rigid body, `seconds` long, from standing."""
+    controller = walk_config(robot)
+    config = RolloutConfig(controller, ticks=round(seconds / controller.gait.tick))
+    walked = jax.jit(rollout, static_argnums=0)
+    anchor = standing_anchor(robot)
+    return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
+
+
+def _judged(config: LossConfig, walk: Trajectory, commit: str) -> JudgedWalk:
+    up = int(np.sum(~np.asarray(walk.fallen)))
+    last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
+    upright = np.asarray(up * float(walk.period))
+    return JudgedWalk(metrics.score(config, walk), upright, last, commit)
+
+
+def _like(with_walk: bool) -> Any:
+    """Layout of the artefact of one walk, with its trajectory or without."""
+    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like().trajectory)
+    last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
+    one: Any = JudgedWalk(metrics.score_like(), np.zeros(()), last, np.array(""))  # pyright: ignore
+    return one, walk if with_walk else None
+
+
+def judge(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    sets: Mapping[str, Weights],
+    command: Command,
+    plants: Sequence[Imperfections],
+    seeds: Sequence[int],
+    *,
+    title: str,
+    seconds: float = 4.0,
+    folder: Path | None = None,
+    commit: str = "",
+) -> Judged:
+    """Walk every weight set on every plant and score the walks.
+
+    Args:
+        pool: worker processes.
+        config: controller and loss.
+        robot: nominal body.
+        sets: weights by name.
+        command: what to walk.
+        plants: of the seeds.
+        seeds: of the plants and of the estimators.
+        title: for the person who waits.
+        seconds: of each walk.
+        folder: of the scores, a file per walk; a walk that is there is not walked again. None:
+            nothing is kept.
+        commit: to note with what is walked now.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    walk_config = config.rollout.walk
+    jobs = {
+        (name, seed): Job(weights, command, plant, seconds, seed)
+        for plant, seed in zip(plants, seeds, strict=True)
+        for name, weights in sets.items()
+    }
+
+    def with_walk(case: Case) -> bool:
+        return folder is not None and case[1] == seeds[0]
+
+    def make(missing: list[Case], found: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
+        there = f"; {len(found)} of {plural(len(jobs), 'walk')} are there" if found else ""
+        walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
+        for case, walk in zip(missing, walks, strict=True):
+            kept = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
+            yield case, (_judged(config.loss, walk, commit), kept)
+
+    if folder is None:
+        found = dict(make(list(jobs), {}))
+    else:
+        paths = {}
+        for case, job in jobs.items():
+            what = "walk" if with_walk(case) else "score"
+            key = content_key(walk_config, config.loss, robot, job, code=_CODE)
+            paths[case] = folder / f"{what}-{case[0]}-{case[1]}-{key}.npz"
+        like = lambda case: _like(with_walk(case))  # noqa: E731
+        found = cached(paths, make, like=like, kind="walk", robot=robot)
+    walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in found.items()}
+    return Judged(
+        {name: [walks[name, seed] for seed in seeds] for name in sets},
+        {name: found[name, seeds[0]][1] for name in sets if with_walk((name, seeds[0]))},
+    )
