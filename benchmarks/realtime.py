@@ -16,8 +16,8 @@ if __name__ == "__main__":
 import jax
 import numpy as np
 
+from hector_jax.control.controller import WalkConfig, actuate, init_memory, step_plan
 from hector_jax.control.reference import anchor_at, named_command
-from hector_jax.control.walking import WalkConfig, actuate, init_memory, step_plan
 from hector_jax.control.weights import expert
 from hector_jax.core.runtime import setup_jax
 from hector_jax.robot.model import load_robot

@@ -73,8 +73,8 @@ PUBLIC = {  # of packages without `__all__`
         hector_jax.control.gait.GaitConfig hector_jax.control.footstep.FootstepConfig
         hector_jax.control.legs.LegConfig hector_jax.control.mpc.MpcConfig
         hector_jax.control.mpc.Horizon hector_jax.control.mpc.solve_mpc
-        hector_jax.control.walking.WalkConfig hector_jax.control.walking.Plan
-        hector_jax.control.walking.plan
+        hector_jax.control.controller.WalkConfig hector_jax.control.controller.Plan
+        hector_jax.control.controller.plan
     """,
     "hector_jax.sim": """
         hector_jax.sim.world.Imperfections hector_jax.sim.world.ideal hector_jax.sim.world.hfs

@@ -18,10 +18,10 @@ from oracles import exact_solution
 from scipy.spatial.transform import Rotation
 
 from hector_jax.cli.main import main
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
 from hector_jax.control.reference import named_command
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError

@@ -17,7 +17,7 @@ from hector_jax.cli import asked, judging
 from hector_jax.cli.flags import Search, Tune, Walk
 from hector_jax.cli.parse import as_command, as_table, from_file
 from hector_jax.control.reference import COMMANDS
-from hector_jax.control.trajectories import Course
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.console import say
@@ -158,7 +158,7 @@ def _agree(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> No
             raise InputError(f"{folder}: begun with {name} {begun[name]}, here is {value}")
 
 
-def _asked_for(args: Tune, robot: Robot) -> Course:
+def _asked_for(args: Tune, robot: Robot) -> NamedCommand:
     """What a tuning is to walk.
 
     Raises:

@@ -35,8 +35,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
-from hector_jax.control.walking import (
+from hector_jax.control.controller import (
     Feet,
     Measurement,
     Memory,
@@ -45,6 +44,7 @@ from hector_jax.control.walking import (
     actuate,
     step_plan,
 )
+from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import WEIGHTS, save_weights, weights_tree
 from hector_jax.core.console import Broken
@@ -265,8 +265,8 @@ def controller(
         memory, plan = jax.tree.unflatten(structure, carry)
         walking = (robot, weights, Command(**command), Anchor(**anchor), tick, memory, measurement)
 
-        def planned(slots: int) -> Callable[[], tuple[Memory, Plan]]:
-            return lambda: step_plan(config, *walking, slots=slots)
+        def planned(max_contacts: int) -> Callable[[], tuple[Memory, Plan]]:
+            return lambda: step_plan(config, *walking, max_contacts=max_contacts)
 
         both = (tick < moves) | config.gait.double_support
         branch = jnp.where(substep > 0, 0, jnp.where(both, 2, 1))

@@ -16,9 +16,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.core.console import bar, say_if_slow
 from hector_jax.core.environment import code_hash

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hector_jax.control.controller import Measurement, Memory, Plan, WalkConfig, actuate, step_plan
 from hector_jax.control.reference import Anchor, Command, reference_at
-from hector_jax.control.walking import Measurement, Memory, Plan, WalkConfig, actuate, step_plan
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
@@ -70,7 +70,7 @@ def plan_tick(
     reading: Float[Array, "43"],
     error: Float[Array, "22"],
     *,
-    slots: int,
+    max_contacts: int,
 ) -> tuple[Memory, Plan]:
     """Measure and solve the MPC, once a tick.
 
@@ -82,11 +82,19 @@ def plan_tick(
         yaw: a true yaw [rad] shortly before.
         reading: coordinates now.
         error: of the state estimate now.
-        slots: feet that may stand at once, from `slots_needed` (static).
+        max_contacts: feet that may stand at once, from `contacts_needed` (static).
     """
     measurement = measure(robot, reading, yaw, error)
     return step_plan(
-        config, robot, weights, command, anchor, tick, memory, measurement, slots=slots
+        config,
+        robot,
+        weights,
+        command,
+        anchor,
+        tick,
+        memory,
+        measurement,
+        max_contacts=max_contacts,
     )
 
 

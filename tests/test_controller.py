@@ -7,21 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.gait import GaitConfig
-from hector_jax.control.legs import stance_torques, trunk_position
-from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.reference import Anchor, named_command
-from hector_jax.control.walking import (
+from hector_jax.control.controller import (
     Measurement,
     WalkConfig,
     actuate,
+    contacts_needed,
     init_memory,
     measured_feet,
     plan,
     plan_horizon,
-    slots_needed,
     step_plan,
 )
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.legs import stance_torques, trunk_position
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.reference import Anchor, named_command
 from hector_jax.control.weights import expert
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State
@@ -39,10 +39,18 @@ ANCHOR = Anchor(jnp.array([0.0, 0.0, HEIGHT]), jnp.array(0.0), jnp.array(0))
 feet_of = jax.jit(lambda measurement: measured_feet(ROBOT, measurement))
 
 
-@partial(jax.jit, static_argnames="slots")
-def planned(tick, memory, measurement, slots=1):
+@partial(jax.jit, static_argnames="max_contacts")
+def planned(tick, memory, measurement, max_contacts=1):
     return step_plan(
-        CONFIG, ROBOT, expert(), STRAIGHT, ANCHOR, tick, memory, measurement, slots=slots
+        CONFIG,
+        ROBOT,
+        expert(),
+        STRAIGHT,
+        ANCHOR,
+        tick,
+        memory,
+        measurement,
+        max_contacts=max_contacts,
     )
 
 
@@ -59,10 +67,10 @@ def standing(yaw=0.0, x=0.0, lift=0.0):
     return Measurement(state, joints, jnp.zeros(10))
 
 
-def at(tick, measurement=None, memory=None, slots=1):
+def at(tick, measurement=None, memory=None, max_contacts=1):
     measurement = standing() if measurement is None else measurement
     memory = init_memory(ROBOT, measurement) if memory is None else memory
-    return planned(jnp.array(tick), memory, measurement, slots=slots)
+    return planned(jnp.array(tick), memory, measurement, max_contacts=max_contacts)
 
 
 # What it measures
@@ -132,7 +140,7 @@ def test_step_plan_is_plan_with_the_measured_feet():
 
 
 def test_before_the_gait_both_feet_share_the_weight():
-    _, decided = at(-110, slots=2)
+    _, decided = at(-110, max_contacts=2)
     assert decided.contact.tolist() == [True, True]
     assert decided.swing_ticks.tolist() == [0, 0]
     np.testing.assert_allclose(decided.wrench.force[:, 2], WEIGHT / 2, rtol=0.2)
@@ -176,9 +184,9 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
 
 
 def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():
-    assert [slots_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
+    assert [contacts_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
     double = WalkConfig(gait=GaitConfig(stance=24, swing=16))
-    assert slots_needed(double, 0) == 2
+    assert contacts_needed(double, 0) == 2
 
 
 # What it asks of the joints

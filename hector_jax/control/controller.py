@@ -106,7 +106,7 @@ class Retune(NamedTuple):
     step: Callable[[Any, int, Anchor, Measurement, Wrench], tuple[Any, Weights]]
 
 
-def slots_needed(config: WalkConfig, tick: int) -> int:
+def contacts_needed(config: WalkConfig, tick: int) -> int:
     """Feet that may stand at once in a plan: 2 before the gait starts or with double support."""
     return 2 if tick < config.gait.first_tick or config.gait.double_support else 1
 
@@ -185,7 +185,7 @@ def plan(
     state: State,
     feet: Feet,
     *,
-    slots: int = 1,
+    max_contacts: int = 1,
 ) -> Plan:
     """Solve the MPC for one tick. Returns the commanded wrench and the planned touchdowns.
 
@@ -195,12 +195,20 @@ def plan(
         tick: gait tick now.
         state: base now.
         feet: foot points now; of a foot in the air they are not used.
-        slots: from `slots_needed` (static).
+        max_contacts: from `contacts_needed` (static).
 
     Source: Eq. 3-6.
     """
     horizon, touchdown = plan_horizon(config, robot, command, anchor, tick, state, feet)
-    wrench, solution = solve_mpc(config.mpc, robot, weights, state, horizon, config.mpc_step, slots)
+    wrench, solution = solve_mpc(
+        config.mpc,
+        robot,
+        weights,
+        state=state,
+        horizon=horizon,
+        dt=config.mpc_step,
+        max_contacts=max_contacts,
+    )
     residual = jnp.maximum(
         jnp.maximum(solution.primal_residual, solution.dual_residual), solution.gap
     )
@@ -239,12 +247,20 @@ def step_plan(
     memory: Memory,
     measurement: Measurement,
     *,
-    slots: int = 1,
+    max_contacts: int = 1,
 ) -> tuple[Memory, Plan]:
     """`plan` from what is measured; remembers where the standing feet are. Once a tick."""
     feet = measured_feet(robot, measurement)
     decided = plan(
-        config, robot, weights, command, anchor, tick, measurement.state, feet, slots=slots
+        config,
+        robot,
+        weights,
+        command,
+        anchor,
+        tick,
+        measurement.state,
+        feet,
+        max_contacts=max_contacts,
     )
     stands = decided.contact
     liftoff = Feet(
