@@ -54,10 +54,19 @@ def measure(seconds: float = SECONDS) -> Report:
     def tick(robot, weights, command, anchor, number, memory, yaw, row):
         reading = sensing.unpack_reading(row)
         measurement, yaw = sensing.measure(robot, reading, yaw, no_error)
+        parameters = config.parameters(weights)
         memory, plan = step_plan(
-            config, robot, weights, command, anchor, number, memory, measurement
+            config,
+            robot,
+            parameters,
+            command=command,
+            anchor=anchor,
+            tick=number,
+            memory=memory,
+            measurement=measurement,
         )
-        torque = actuate(config, robot, plan, memory, np.array(0, np.int32), measurement)
+        now = {"substep": np.array(0, np.int32), "measurement": measurement}
+        torque = actuate(config, robot, parameters.legs, plan=plan, memory=memory, **now)
         return memory, yaw, torque, plan.status
 
     memory, state, yaw = begin(readings[0])

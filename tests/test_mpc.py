@@ -20,7 +20,7 @@ from hector_jax.control.contact import (
     Rows,
     StateConstraint,
 )
-from hector_jax.control.mpc import Horizon, MpcConfig, build_qp, solve_mpc
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.weights import (
     Weights,
     bounds,
@@ -46,16 +46,14 @@ FLIP, TURN = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of vecto
 
 @partial(jax.jit, static_argnums=(0, 5, 6))
 def solve(config, robot, weights, state, horizon, dt, contacts):
-    return solve_mpc(
-        config, robot, weights, state=state, horizon=horizon, dt=dt, max_contacts=contacts
-    )
+    problem = MpcProblem(robot, config.parameters(weights), state, horizon)
+    return solve_mpc(config, problem, dt=dt, max_contacts=contacts)
 
 
 @partial(jax.jit, static_argnums=(0, 5, 6))
 def write(config, robot, weights, state, horizon, dt, contacts):
-    return build_qp(
-        config, robot, weights, state=state, horizon=horizon, dt=dt, max_contacts=contacts
-    )
+    problem = MpcProblem(robot, config.parameters(weights), state, horizon)
+    return build_qp(config, problem, dt=dt, max_contacts=contacts)
 
 
 linearise = jax.jit(jax.vmap(lambda e, r: srbm.linearise(ROBOT, e, r, DT)))

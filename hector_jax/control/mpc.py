@@ -15,7 +15,7 @@ foot in the air has no M_z; and see `contact`.
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -44,9 +44,18 @@ from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
 
 
+class MpcParameters(NamedTuple):
+    """Numbers of the MPC."""
+
+    weights: Weights  # Q and R
+    friction: Any  # mu
+    max_force: Any  # [N] per foot
+    effort_reference: Any  # share of the robot's weight about which R prices the forces
+
+
 @dataclass(frozen=True)
 class MpcConfig:
-    """What the MPC is compiled for."""
+    """What the MPC is compiled for, and its numbers where no others are given."""
 
     horizon: int = 10  # steps N
     step_ticks: int = 3  # ticks per step: dt = 0.03 s
@@ -74,6 +83,11 @@ class MpcConfig:
         if not self.on("inputs"):
             raise InputError("MpcConfig.constraints must have one on the inputs, or feet can pull")
 
+    def parameters(self, weights: Weights) -> MpcParameters:
+        """The numbers, to be traced."""
+        effort_reference = float(self.effort_about == "weight")
+        return MpcParameters(weights, self.friction, self.max_force, effort_reference)
+
     @property
     def contact_model(self) -> ContactModel:
         """The value of `contact`."""
@@ -93,6 +107,15 @@ class Horizon(NamedTuple):
     lever: Float[Array, "N 2 3"]  # centre of mass to foot points [m]
     foot_yaw: Float[Array, "N 2"]  # [rad]
     contact: Bool[Array, "N 2"]
+
+
+class MpcProblem(NamedTuple):
+    """What is solved for in a tick."""
+
+    robot: Robot  # nominal body
+    parameters: MpcParameters
+    state: State  # base now, x_0
+    horizon: Horizon
 
 
 class Condensed(NamedTuple):
@@ -131,18 +154,11 @@ def _input_map(
     )
 
 
-def condense(
-    config: MpcConfig,
-    robot: Robot,
-    state: State,
-    *,
-    horizon: Horizon,
-    dt: float,
-    max_contacts: int,
-    dtype: jnp.dtype,
-) -> Condensed:
+def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int) -> Condensed:
     """Roll the dynamics out. Source: Eq. 4a."""
-    N = config.horizon
+    N, (robot, parameters, state, horizon) = config.horizon, problem
+    data = parameters.weights, state, horizon.lever
+    dtype = jnp.result_type(*jax.tree.leaves(data), jnp.float32)
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
     feet = jax.vmap(lambda c: _feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
     G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)
@@ -165,17 +181,13 @@ def condense(
 
 
 def cost(
-    config: MpcConfig,
-    robot: Robot,
-    weights: Weights,
-    *,
-    horizon: Horizon,
-    condensed: Condensed,
+    config: MpcConfig, problem: MpcProblem, condensed: Condensed
 ) -> tuple[Float[Array, "n n"], Float[Array, "N b"]]:
     """Half of P and of q. Source: Eq. 3."""
+    robot, parameters, _, horizon = problem
     feet, G, turn, push, angles, later, travel, free = condensed
     N, b, dtype = config.horizon, G.shape[-1], later.dtype
-    Q, R = weights.Q, pack_wrench(Wrench(*weights.R))
+    Q, R = parameters.weights.Q, pack_wrench(Wrench(*parameters.weights.R))
     error = jax.tree.map(lambda x, target, w: w * (x - target), free, horizon.reference, Q)
     effort = jnp.einsum("kui,u,kuj->kij", G, R, G)
     empty = jnp.repeat(1.0 - feet.sum(-1), config.contact_model.inputs, axis=-1)
@@ -192,21 +204,20 @@ def cost(
     torque = jnp.einsum("kjxy,kx->jy", angles, error.euler) + later.T @ error.ang_velocity
     force = travel.T @ error.position + later.T @ error.velocity
     q = jnp.einsum("jxb,jx->jb", turn, torque) + jnp.einsum("jxb,jx->jb", push, force)
-    if config.effort_about == "weight":
-        share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
-        weight = jnp.zeros((N, 12), dtype).at[:, 2].set(share).at[:, 5].set(share)
-        q = q - jnp.einsum("kui,u,ku->ki", G, R, weight)
+    share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
+    weight = jnp.zeros((N, 12), dtype).at[:, 2].set(share).at[:, 5].set(share)
+    q = q - parameters.effort_reference * jnp.einsum("kui,u,ku->ki", G, R, weight)
     return P, q
 
 
-def input_rows(config: MpcConfig, robot: Robot, *, horizon: Horizon, condensed: Condensed) -> Rows:
+def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
     """Rows of the constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
-    feet = condensed.feet
+    feet, (robot, parameters, _, horizon) = condensed.feet, problem
     selection = jnp.asarray(config.contact_model.selection, feet.dtype)
 
     def of_contact(yaw: Float[Array, ""]) -> Rows:
         contact = Contact(
-            selection[:3], selection[3:], yaw, robot, config.friction, config.max_force
+            selection[:3], selection[3:], yaw, robot, parameters.friction, parameters.max_force
         )
         parts = [rows(constraint, contact, feet) for constraint in config.on("inputs")]
         return Rows(*map(jnp.concatenate, zip(*parts, strict=True)))
@@ -218,7 +229,7 @@ def input_rows(config: MpcConfig, robot: Robot, *, horizon: Horizon, condensed: 
     return Rows(A.reshape(N, -1, condensed.inputs.shape[-1]), lower.ravel(), upper.ravel())
 
 
-def state_rows(config: MpcConfig, *, horizon: Horizon, condensed: Condensed) -> Rows:
+def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
     """Rows of the constraints on states, dense: A is (rows, n)."""
     _, _, turn, push, angles, later, travel, free = condensed
     later, travel = later[:, None, :, None], travel[:, None, :, None]
@@ -236,30 +247,20 @@ def state_rows(config: MpcConfig, *, horizon: Horizon, condensed: Condensed) -> 
         return Rows(C @ states, lower - known, upper - known)
 
     flat = states.reshape(*states.shape[:2], -1)
-    A, lower, upper = jax.vmap(of_step)(
-        (horizon.reference, horizon.contact, horizon.lever, flat, free)
-    )
+    horizon = problem.horizon
+    steps = horizon.reference, horizon.contact, horizon.lever, flat, free
+    A, lower, upper = jax.vmap(of_step)(steps)
     return Rows(A.reshape(-1, A.shape[-1]), lower.ravel(), upper.ravel())
 
 
 def build_qp(
-    config: MpcConfig,
-    robot: Robot,
-    weights: Weights,
-    *,
-    state: State,
-    horizon: Horizon,
-    dt: float,
-    max_contacts: int,
+    config: MpcConfig, problem: MpcProblem, *, dt: float, max_contacts: int
 ) -> tuple[QP, Float[Array, "12 b"]]:
     """The MPC as a condensed QP, and the map from the first step's inputs to u_0.
 
     Args:
         config: shape of the problem.
-        robot: nominal body.
-        weights: Q and R.
-        state: base now, x_0.
-        horizon: what to plan about.
+        problem: what is solved for.
         dt: MPC step [s].
         max_contacts: feet that may stand at once (static).
 
@@ -270,32 +271,20 @@ def build_qp(
 
     Source: Eq. 3, 4.
     """
-    dtype = jnp.result_type(*jax.tree.leaves((weights, state, horizon.lever)), jnp.float32)
-    condensed = condense(
-        config, robot, state, horizon=horizon, dt=dt, max_contacts=max_contacts, dtype=dtype
-    )
-    P, q = cost(config, robot, weights, horizon=horizon, condensed=condensed)
-    A, lower, upper = input_rows(config, robot, horizon=horizon, condensed=condensed)
+    condensed = condense(config, problem, dt, max_contacts)
+    P, q = cost(config, problem, condensed)
+    A, lower, upper = input_rows(config, problem, condensed)
     if config.on("states"):
-        on_states = state_rows(config, horizon=horizon, condensed=condensed)
-        parts = zip((block_diagonal(A), lower, upper), on_states, strict=True)
-        A, lower, upper = (jnp.concatenate(part) for part in parts)
+        more = state_rows(config, problem, condensed)
+        A = jnp.concatenate([block_diagonal(A), more.A])
+        lower, upper = (jnp.concatenate(b) for b in ((lower, more.lower), (upper, more.upper)))
     return QP(2.0 * P, 2.0 * q.reshape(-1), A, lower, upper), condensed.inputs[0]
 
 
 def solve_mpc(
-    config: MpcConfig,
-    robot: Robot,
-    weights: Weights,
-    *,
-    state: State,
-    horizon: Horizon,
-    dt: float,
-    max_contacts: int,
+    config: MpcConfig, problem: MpcProblem, *, dt: float, max_contacts: int
 ) -> tuple[Wrench, Solution]:
     """Wrench of the first step [N, N m], world frame, with the solution it was read from."""
-    qp, first = build_qp(
-        config, robot, weights, state=state, horizon=horizon, dt=dt, max_contacts=max_contacts
-    )
+    qp, first = build_qp(config, problem, dt=dt, max_contacts=max_contacts)
     solution = solve_qp(qp, config.qp)
     return unpack_wrench(first @ solution.x[: first.shape[1]]), solution

@@ -88,12 +88,12 @@ def plan_tick(
     return step_plan(
         config,
         robot,
-        weights,
-        command,
-        anchor,
-        tick,
-        memory,
-        measurement,
+        config.parameters(weights),
+        command=command,
+        anchor=anchor,
+        tick=tick,
+        memory=memory,
+        measurement=measurement,
         max_contacts=max_contacts,
     )
 
@@ -123,7 +123,8 @@ def motor_torques(
         error: of the state estimate now.
     """
     measurement, yaw = sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)
-    torque = actuate(config, robot, plan, memory, substep, measurement)
+    legs, now = config.legs.parameters, {"substep": substep, "measurement": measurement}
+    torque = actuate(config, robot, legs, plan=plan, memory=memory, **now)
     motors, applied = step_actuators(robot, imperfections, motors, torque)
     return motors, yaw, applied
 

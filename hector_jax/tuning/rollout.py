@@ -175,12 +175,12 @@ def step_carry(
     decided = plan(
         walk,
         robot,
-        weights,
-        command,
-        anchor,
-        tick,
-        seen,
-        standing,
+        walk.parameters(weights),
+        command=command,
+        anchor=anchor,
+        tick=tick,
+        state=seen,
+        feet=standing,
         max_contacts=contacts_needed(walk, 0),
     )
     commands = jax.tree.map(
