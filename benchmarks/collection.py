@@ -12,7 +12,7 @@ import time
 import jax
 
 from benchmarks.measuring import Check, Report, show
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.controller import WalkConfig
 from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.robot.model import load_robot

@@ -25,12 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import problems
+from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.core.console import say
 from hector_jax.core.runtime import setup_jax

@@ -27,8 +27,8 @@ from queue import SimpleQueue
 PARTS = {
     "control": (
         "control/footstep control/gait control/legs control/mpc control/reference"
-        " control/trajectories control/walking control/weights",
-        "gait footstep legs reference trajectories weights config mpc walking rollout export",
+        " control/trajectories control/controller control/weights",
+        "gait footstep legs reference trajectories weights config mpc controller rollout export",
     ),
     "qp": (
         "qp/problem qp/active_set qp/interior_point qp/certificates qp/method qp/derivative"

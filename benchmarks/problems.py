@@ -12,14 +12,14 @@ import numpy as np
 import scipy.linalg
 
 from hector_jax.control import gait
-from hector_jax.control.mpc import Horizon, write_qp
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.mpc import Horizon, MpcProblem, build_qp
 from hector_jax.control.weights import Weights, expert, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State
 from hector_jax.qp import QP
 from hector_jax.robot.model import Robot
 
-SLOTS = 1  # one foot stands at a time
+MAX_CONTACTS = 1  # one foot stands at a time
 INPUTS = 5  # of a stance foot: F_x, F_y, F_z, M_y, M_z
 
 
@@ -91,7 +91,8 @@ def pick(problems: Problem, index: int | slice) -> Problem:
 def layer_qp(config: WalkConfig, robot: Robot, problem: Problem) -> QP:
     """The condensed QP of a problem, rows block-diagonal by step; pure JAX."""
     weights, state, horizon, _ = problem
-    return write_qp(config.mpc, robot, weights, state, horizon, config.mpc_step, SLOTS)[0]
+    mpc = MpcProblem(robot, config.mpc.parameters(weights), state, horizon)
+    return build_qp(config.mpc, mpc, dt=config.mpc_step, max_contacts=MAX_CONTACTS)[0]
 
 
 def parameters(problem: Problem) -> jax.Array:

@@ -28,7 +28,7 @@ import numpy as np
 from benchmarks import exact
 from benchmarks.peers import Traced, compiled_peers, traced_peers
 from benchmarks.problems import INPUTS, Problem, Ready, condense, draw_problems, layer_qp, pick
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.controller import WalkConfig
 from hector_jax.core.runtime import setup_jax
 from hector_jax.core.trajectory import State
 from hector_jax.qp import QP, Status, solve_qp

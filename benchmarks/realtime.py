@@ -16,8 +16,8 @@ if __name__ == "__main__":
 import jax
 import numpy as np
 
+from hector_jax.control.controller import WalkConfig, actuate, init_memory, step_plan
 from hector_jax.control.reference import anchor_at, named_command
-from hector_jax.control.walking import WalkConfig, actuate, init_memory, step_plan
 from hector_jax.control.weights import expert
 from hector_jax.core.runtime import setup_jax
 from hector_jax.robot.model import load_robot
@@ -54,10 +54,19 @@ def measure(seconds: float = SECONDS) -> Report:
     def tick(robot, weights, command, anchor, number, memory, yaw, row):
         reading = sensing.unpack_reading(row)
         measurement, yaw = sensing.measure(robot, reading, yaw, no_error)
+        parameters = config.parameters(weights)
         memory, plan = step_plan(
-            config, robot, weights, command, anchor, number, memory, measurement
+            config,
+            robot,
+            parameters,
+            command=command,
+            anchor=anchor,
+            tick=number,
+            memory=memory,
+            measurement=measurement,
         )
-        torque = actuate(config, robot, plan, memory, np.array(0, np.int32), measurement)
+        now = {"substep": np.array(0, np.int32), "measurement": measurement}
+        torque = actuate(config, robot, parameters.legs, plan=plan, memory=memory, **now)
         return memory, yaw, torque, plan.status
 
     memory, state, yaw = begin(readings[0])

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.measuring import Check, Report, child, show, take_turns
 from benchmarks.problems import draw_problems, pick
 from benchmarks.qp_layer import layer, ours
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import nominal
 from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm.effect import last_command

@@ -14,7 +14,7 @@ from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import cached, content_key
-from hector_jax.sim.walk import Job
+from hector_jax.sim.loop import Job
 
 Tree = TypeVar("Tree")
 

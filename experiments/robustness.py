@@ -34,7 +34,7 @@ from scenes import (
     table,
 )
 
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import exit_code

@@ -32,10 +32,10 @@ import plots
 import tyro
 from lib import write_report
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import (
     DIRECTION_NAMES,
     Weights,

@@ -13,9 +13,9 @@ import pytest
 from pretend import pretend_history
 
 from hector_jax.cli import main as cli
+from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.trajectories import limits
-from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json

@@ -5,8 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.changes import Change, changed_world, worlds_by_step

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.grfm.effect import last_command

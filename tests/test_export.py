@@ -18,10 +18,10 @@ from oracles import exact_solution
 from scipy.spatial.transform import Rotation
 
 from hector_jax.cli.main import main
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
 from hector_jax.control.reference import named_command
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
@@ -184,7 +184,7 @@ def same_problem(seed):
 # toe and heel have changed places in their rows, and theirs hold by no friction each
 THEIRS = replace(CONFIG.mpc, line_friction=False, friction=0.5)
 SWAPPED = ROBOT._replace(toe=np.array(0.06), heel=np.array(0.09), gravity=np.array([0, 0, 9.81]))
-solve = jax.jit(solve_mpc, static_argnums=(0, 5, 6))
+solve = jax.jit(solve_mpc, static_argnames=("config", "dt", "max_contacts"))
 
 
 def both_minimisers(seed, factor=1.0, states=slice(None), inputs=slice(None)):
@@ -207,9 +207,9 @@ def both_minimisers(seed, factor=1.0, states=slice(None), inputs=slice(None)):
             contact,
         ),
     )
-    wrench, solution = solve(
-        THEIRS, SWAPPED, weights, jax.tree.map(jnp.asarray, state), each, dt, 1
-    )
+    now = jax.tree.map(jnp.asarray, state)
+    problem = MpcProblem(SWAPPED, THEIRS.parameters(weights), now, each)
+    wrench, solution = solve(THEIRS, problem, dt=dt, max_contacts=1)
     assert solution.status == Status.SOLVED
     active = np.abs(np.asarray(solution.y)) > 1e-9
     return np.asarray(pack_wrench(wrench)), theirs[:12], active.any()

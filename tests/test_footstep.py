@@ -14,7 +14,7 @@ RAIBERT, PAPER = FootstepConfig(), FootstepConfig(rule="paper")
 ROBOT = load_robot()
 STANCE = SWING = 0.2
 WAIT = jnp.array([0.3, 0.1])  # the left foot stands for another 0.1 s and then swings
-touchdown = jax.jit(touchdown_points, static_argnums=(0, 5, 6))
+touchdown = jax.jit(touchdown_points, static_argnames=("config", "stance", "swing"))
 
 
 def state(position=(0.0, 0.0, 0.5), velocity=(0.0, 0.0, 0.0), yaw=0.0, yaw_rate=0.0):
@@ -23,7 +23,8 @@ def state(position=(0.0, 0.0, 0.5), velocity=(0.0, 0.0, 0.0), yaw=0.0, yaw_rate=
 
 
 def feet(now, reference, config=RAIBERT, wait=WAIT):
-    return touchdown(config, ROBOT, now, reference, wait, STANCE, SWING)
+    times = {"remaining": wait, "stance": STANCE, "swing": SWING}
+    return touchdown(config, ROBOT, config.parameters, state=now, reference=reference, **times)
 
 
 def test_the_papers_rule_is_half_a_swing_ahead_of_the_centre_of_mass():

@@ -17,12 +17,12 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from scenes import SceneConfig
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.trajectories import load_course
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import did_you_mean, short_repr
@@ -265,7 +265,7 @@ def test_trajectories_are_taken_or_refused_in_one_line(folder, data):
         path.write_bytes(
             torn(data, "\n".join(f"{k} = {as_toml(v)}" for k, v in COURSE.items()).encode())
         )
-    found = refused_or(load_course, path)
+    found = refused_or(load_command, path)
     if found is not None:
         rows = len(found.command.duration)
         assert found.command.velocity.shape == (rows, 2)

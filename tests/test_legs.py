@@ -1,13 +1,17 @@
 """Torques and swing paths: virtual work, MuJoCo's statics, derivatives."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import (
     LegConfig,
+    Measurement,
     joint_torques,
     stance_torques,
     swing_joints,
@@ -26,15 +30,33 @@ WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
 STANDS = jnp.asarray(ROBOT.standing_joints)
 
 stance = jax.jit(lambda state, joints, wrench: stance_torques(ROBOT, state, joints, wrench))
-path = jax.jit(lambda start, end, s: swing_path(CONFIG, start, end, s))
+path = jax.jit(lambda start, end, s: swing_path(CONFIG.parameters, start, end, s))
 targets = jax.jit(
     lambda state, start, start_yaw, end, end_yaw, elapsed: swing_joints(
-        CONFIG, ROBOT, state, start, start_yaw, end, end_yaw, elapsed, SWING
+        ROBOT,
+        CONFIG.parameters,
+        state,
+        start=Feet(start, start_yaw),
+        end=Feet(end, end_yaw),
+        elapsed=elapsed,
+        swing=SWING,
     )
 )
-torques = jax.jit(
-    lambda config, *arguments: joint_torques(config, ROBOT, *arguments), static_argnums=0
-)
+
+
+@partial(jax.jit, static_argnums=0)
+def torques(config, state, joints, rates, contact, wrench, target, target_rates):
+    return joint_torques(
+        ROBOT,
+        config.parameters,
+        Measurement(state, joints, rates),
+        contact=contact,
+        wrench=wrench,
+        target=target,
+        target_rates=target_rates,
+    )
+
+
 poses = jax.jit(lambda joints: foot_poses(ROBOT, joints))
 
 

@@ -1,5 +1,10 @@
 """The condensed MPC against Eq. 3-4 written out: its cost, its constraints, its symmetries."""
 
+import json
+import pickle
+from dataclasses import asdict
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +12,15 @@ import pytest
 import scipy.linalg
 from oracles import exact_solution
 
-from hector_jax.control.mpc import Horizon, MpcConfig, _rows, solve_mpc, write_qp
+from hector_jax.control.contact import (
+    LINE_FOOT,
+    LINE_FRICTION,
+    Contact,
+    InputConstraint,
+    Rows,
+    StateConstraint,
+)
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.weights import (
     Weights,
     bounds,
@@ -17,6 +30,8 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.core.geometry import rot_z
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import from_table
 from hector_jax.core.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, Status
 from hector_jax.robot import srbm
@@ -28,8 +43,19 @@ N, DT = CONFIG.horizon, 0.03
 WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
 FLIP, TURN = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of vectors, of axial ones
 
-solve = jax.jit(solve_mpc, static_argnums=(0, 5, 6))
-write = jax.jit(write_qp, static_argnums=(0, 5, 6))
+
+@partial(jax.jit, static_argnums=(0, 5, 6))
+def solve(config, robot, weights, state, horizon, dt, contacts):
+    problem = MpcProblem(robot, config.parameters(weights), state, horizon)
+    return solve_mpc(config, problem, dt=dt, max_contacts=contacts)
+
+
+@partial(jax.jit, static_argnums=(0, 5, 6))
+def write(config, robot, weights, state, horizon, dt, contacts):
+    problem = MpcProblem(robot, config.parameters(weights), state, horizon)
+    return build_qp(config, problem, dt=dt, max_contacts=contacts)
+
+
 linearise = jax.jit(jax.vmap(lambda e, r: srbm.linearise(ROBOT, e, r, DT)))
 
 
@@ -74,13 +100,13 @@ def problem(seed, push=1.0, contact=None, yaw=0.5):
 BOTH = np.ones((N, 2), bool)
 
 
-def inputs(horizon, v, slots=1):
+def inputs(horizon, v, max_contacts=1):
     """The paper's u_k (N, 12), from the QP's variables, one foot at a time."""
     u = np.zeros((N, 2, 2, 3))  # step, force or moment, foot, axis
-    v = np.asarray(v).reshape(N, slots, 5)
+    v = np.asarray(v).reshape(N, max_contacts, 5)
     for k in range(N):
         for foot in np.flatnonzero(horizon.contact[k]):
-            fx, fy, fz, my, mz = v[k, foot if slots == 2 else 0]
+            fx, fy, fz, my, mz = v[k, foot if max_contacts == 2 else 0]
             u[k, 0, foot] = fx, fy, fz
             u[k, 1, foot] = np.asarray(rot_z(horizon.foot_yaw[k, foot])) @ [0.0, my, mz]
     return u.reshape(N, 12)
@@ -152,21 +178,24 @@ def sparse_problem(weights, state, horizon):
     return QP(P, q, *map(np.concatenate, (rows, lower, upper)))
 
 
-@pytest.mark.parametrize(("slots", "about"), [(1, "zero"), (2, "zero"), (2, "weight")])
-def test_the_condensed_cost_is_that_of_the_rolled_out_states(slots, about):
+@pytest.mark.parametrize(("max_contacts", "about"), [(1, "zero"), (2, "zero"), (2, "weight")])
+def test_the_condensed_cost_is_that_of_the_rolled_out_states(max_contacts, about):
     config = MpcConfig(effort_about=about)
-    weights, (state, horizon) = random_weights(1), problem(1, contact=BOTH if slots == 2 else None)
-    qp, _ = write(config, ROBOT, weights, state, horizon, DT, slots)
+    weights, (state, horizon) = (
+        random_weights(1),
+        problem(1, contact=BOTH if max_contacts == 2 else None),
+    )
+    qp, _ = write(config, ROBOT, weights, state, horizon, DT, max_contacts)
     rng = np.random.default_rng(2)
     share = np.tile([0.0, 0.0, WEIGHT / 2], 4)
     share[6:] = 0.0
 
     def both(v):
         found = 0.5 * v @ qp.P @ v + qp.q @ v
-        u = inputs(horizon, v, slots)
+        u = inputs(horizon, v, max_contacts)
         return found - cost(weights, state, horizon, u, share if about == "weight" else 0.0)
 
-    vs = rng.normal(size=(4, len(qp.q))) * np.tile([20, 20, 100, 3, 3], N * slots)
+    vs = rng.normal(size=(4, len(qp.q))) * np.tile([20, 20, 100, 3, 3], N * max_contacts)
     gaps = np.array([both(v) for v in vs])  # the same constant for every v
     np.testing.assert_allclose(gaps, gaps[0], rtol=1e-9)
 
@@ -223,9 +252,11 @@ def test_what_toe_and_heel_hold_across_a_foot_is_what_the_plants_hold(yaw):
     along, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
     # a force of one across the foot, and whatever toe and heel push against each other along it
     least = min(np.abs(across + push * along).sum() for push in np.linspace(-2, 2, 4001))
-    rows = np.asarray(_rows(CONFIG, ROBOT, jnp.asarray(yaw)))
+    six = jnp.asarray(LINE_FOOT.selection)
+    contact = Contact(six[:3], six[3:], jnp.asarray(yaw), ROBOT, CONFIG.friction, CONFIG.max_force)
+    rows = np.asarray(LINE_FRICTION.of(contact).A)
     load = np.array([0.0, 0.0, 1.0, 0.0, 0.0])  # shared by toe and heel
-    grip = (rows[8] - rows[7]) @ load / 2 / ROBOT.heel
+    grip = (rows[1] - rows[0]) @ load / 2 / ROBOT.heel
     assert grip == pytest.approx(CONFIG.friction / least, rel=1e-3)
 
 
@@ -237,6 +268,54 @@ def test_line_friction_can_be_left_to_the_pyramid():
     assert qp.A.shape == (N, 7, 5)
     assert full.A.shape == (N, 11, 5)
     np.testing.assert_array_equal(full.A[:, :7], qp.A)
+
+
+def velocities(state, horizon, u):
+    """Velocity at the end of each step (N, 3) under the inputs u (N, 12)."""
+    A, B = linearise(horizon.euler, horizon.lever)
+    x, found = np.asarray(pack_state(state, jnp.asarray(ROBOT.gravity))), []
+    for k in range(N):
+        x = np.asarray(A[k]) @ x + np.asarray(B[k]) @ u[k]
+        found.append(x[9:12])
+    return np.array(found)
+
+
+def test_a_plan_obeys_an_input_and_a_state_constraint_of_ones_own():
+    state, horizon = problem(3, push=2.0)
+    state = state._replace(velocity=state.velocity.at[2].set(-0.3))
+
+    def planned(config):
+        _, solution = solve(config, ROBOT, expert(), state, horizon, DT, 1)
+        assert solution.status == Status.SOLVED
+        u = inputs(horizon, solution.x)
+        twist = np.abs(u[:, 6:].reshape(N, 2, 3)[..., 2]).max()
+        return twist, velocities(state, horizon, u)[:, 2].min()
+
+    twist, fall = planned(CONFIG)
+    assert twist > 0.0 > fall
+
+    def gentle(contact):
+        return Rows(contact.moment[2:], -0.5 * twist, 0.5 * twist)
+
+    def slow(step):
+        return Rows(step.state.velocity[2:], 0.5 * fall, np.inf)
+
+    own = InputConstraint("gentle", of=gentle), StateConstraint("slow", of=slow)
+    less, slower = planned(MpcConfig(constraints=(*CONFIG.constraints, *own)))
+    assert less <= 0.5 * twist + 1e-6
+    assert slower >= 0.5 * fall - 1e-6
+
+
+def test_constraints_are_chosen_by_name_in_files():
+    names = ["friction", "unilateral_force", "line_pressure", "line_friction"]
+    table = {"contact": "line", "constraints": names}
+    assert from_table("robot.toml", MpcConfig, table) == CONFIG
+    assert from_table("config.json", MpcConfig, json.loads(json.dumps(asdict(CONFIG)))) == CONFIG
+    assert pickle.loads(pickle.dumps(CONFIG)) == CONFIG
+    assert [str(one) for one in MpcConfig(line_friction=False).constraints] == names[:3]
+    for wrong in ({"constraints": ["frictoin"]}, {"contact": "point"}, {"constraints": []}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            from_table("robot.toml", MpcConfig, wrong)
 
 
 def test_room_for_two_feet_changes_nothing_while_one_stands():
@@ -262,9 +341,9 @@ def standing():
 def test_two_feet_in_the_corner_of_the_box_have_no_unique_wrench():
     """R of 1e-7 beside Q of 1e4 hardly prices how two feet share a wrench."""
     weights = Weights(bounds()[1].Q, bounds()[0].R)
-    for slots, status in ((1, Status.SOLVED), (2, Status.NOT_UNIQUE)):
-        state, horizon = problem(1, contact=BOTH if slots == 2 else None)
-        _, solution = solve(CONFIG, ROBOT, weights, state, horizon, DT, slots)
+    for max_contacts, status in ((1, Status.SOLVED), (2, Status.NOT_UNIQUE)):
+        state, horizon = problem(1, contact=BOTH if max_contacts == 2 else None)
+        _, solution = solve(CONFIG, ROBOT, weights, state, horizon, DT, max_contacts)
         assert solution.status == status
         assert max(solution.primal_residual, solution.dual_residual, solution.gap) <= 1e-8
 

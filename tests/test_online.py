@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hector_jax.control.controller import Retune, WalkConfig
+from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.walking import Measurement, Retune, WalkConfig
 from hector_jax.control.weights import bounds, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State, zero_wrench
 from hector_jax.grfm.effect import last_command

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.model import MODEL_PATH, load_robot

@@ -12,14 +12,9 @@ from pretend import pretend_history
 from synthetic import synthetic_walk
 
 from hector_jax.cli import commands, flags
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.walking import WalkConfig
-from hector_jax.control.weights import (
-    expert,
-    nominal,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm import dataset

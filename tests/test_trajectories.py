@@ -7,6 +7,7 @@ import pytest
 
 from hector_jax.cli import arguments
 from hector_jax.cli.main import main
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import (
     COMMANDS,
@@ -16,8 +17,7 @@ from hector_jax.control.reference import (
     reference_at,
     standing_anchor,
 )
-from hector_jax.control.trajectories import beyond, course, limits, load_course
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.trajectories import beyond, command_of, limits, load_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
@@ -38,7 +38,7 @@ def written(tmp_path, text):
 
 
 def test_the_example_is_a_command_of_six_seconds():
-    found = course(str(SLALOM))
+    found = command_of(str(SLALOM))
     assert (found.name, found.seconds) == ("slalom", 6.0)
     np.testing.assert_array_equal(found.command.duration, [1.0, 1.0, 2.0, 1.0, 1.0])
     np.testing.assert_array_equal(found.command.yaw_rate, [0.0, 0.8, -0.8, 0.8, 0.0])
@@ -49,14 +49,14 @@ def test_the_example_is_a_command_of_six_seconds():
 
 def test_what_a_segment_leaves_out_is_zero_and_whole_numbers_will_do(tmp_path):
     path = written(tmp_path, 'name = "back"\n[[segment]]\nseconds = 2\nv_x = -1\n')
-    found = load_course(path)
+    found = load_command(path)
     np.testing.assert_array_equal(found.command.velocity, [[-1.0, 0.0]])
     assert found.command.velocity.dtype == float
     assert found.seconds == 2.0
 
 
 def test_a_built_in_trajectory_is_taken_by_its_name():
-    found = course("s")
+    found = command_of("s")
     assert (found.name, found.seconds) == ("s", None)
     for got, expected in zip(found.command, named_command("s"), strict=True):
         np.testing.assert_array_equal(got, expected)
@@ -95,7 +95,7 @@ HEAD = 'name = "mine"\n[[segment]]\nseconds = 1.0\n'
 )
 def test_wrong_files_are_refused_by_file_field_value_and_range(tmp_path, text, words):
     with pytest.raises(ValueError, match="mine.toml: ") as caught:
-        load_course(written(tmp_path, text))
+        load_command(written(tmp_path, text))
     message = str(caught.value)
     assert "\n" not in message
     for word in words:
@@ -104,9 +104,9 @@ def test_wrong_files_are_refused_by_file_field_value_and_range(tmp_path, text, w
 
 def test_missing_files_and_unknown_names_are_refused(tmp_path):
     with pytest.raises(ValueError, match="none.toml: cannot read a trajectory: No such file"):
-        course(str(tmp_path / "none.toml"))
+        command_of(str(tmp_path / "none.toml"))
     with pytest.raises(ValueError, match="'strait'; did you mean 'straight'"):
-        course("strait")
+        command_of("strait")
 
 
 def test_the_limits_are_those_that_the_robot_was_seen_to_have():
@@ -179,8 +179,8 @@ def test_what_is_beyond_the_robot_is_walked_with_a_warning(monkeypatch, capsys, 
 
 def test_rollouts_are_as_long_as_the_file_says():
     config = TuneConfig()
-    assert arguments.lasting(config, course(str(SLALOM))).rollout.ticks == 600
-    assert arguments.lasting(config, course("c")) == config
+    assert arguments.lasting(config, command_of(str(SLALOM))).rollout.ticks == 600
+    assert arguments.lasting(config, command_of("c")) == config
 
 
 def test_a_refresh_of_too_many_segments_is_refused_before_anything(monkeypatch, capsys, tmp_path):
@@ -203,7 +203,7 @@ def test_a_wrong_file_is_one_line_of_each_command(monkeypatch, capsys, tmp_path,
 
 @pytest.mark.slow
 def test_the_example_is_walked_on_the_simulator_within_centimetres():
-    found = course(str(SLALOM))
+    found = command_of(str(SLALOM))
     for weights in (nominal(), expert()):
         job = Job(weights, found.command, hfs(), found.seconds)
         walked = walk(WalkConfig(), ROBOT, job)

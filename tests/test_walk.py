@@ -5,8 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot

@@ -7,8 +7,8 @@ from typing import Any
 
 from hector_jax.cli.flags import View, Walk
 from hector_jax.control import trajectories
-from hector_jax.control.trajectories import Course, beyond, limits
-from hector_jax.control.walking import walk_config
+from hector_jax.control.controller import walk_config
+from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
@@ -89,19 +89,19 @@ def plants(world: str, seeds: range) -> list[Imperfections]:
     return [named_world(world, seed) for seed in seeds]
 
 
-def course(text: str, robot: Robot) -> Course:
+def course(text: str, robot: Robot) -> NamedCommand:
     """What to walk; one line says where a file asks for more than the robot may be able to.
 
     Raises:
         InputError: there is no such trajectory, or its file is wrong.
     """
-    found = trajectories.course(text)
+    found = trajectories.command_of(text)
     if found.seconds and (told := beyond(limits(robot, walk_config(robot).gait), found.command)):
         say(f"warning: {text}: {told}")
     return found
 
 
-def seconds(given: float, wanted: Course) -> float:
+def seconds(given: float, wanted: NamedCommand) -> float:
     """Length of a walk [s]: what the trajectory's file says, else what the flag does.
 
     Raises:
@@ -117,7 +117,7 @@ def seconds(given: float, wanted: Course) -> float:
     return wanted.seconds
 
 
-def lasting(config: TuneConfig, wanted: Course) -> TuneConfig:
+def lasting(config: TuneConfig, wanted: NamedCommand) -> TuneConfig:
     """The tuning with rollouts as long as the trajectory, where its file says how long."""
     if wanted.seconds is None:
         return config
@@ -125,7 +125,7 @@ def lasting(config: TuneConfig, wanted: Course) -> TuneConfig:
     return replace(config, rollout=replace(config.rollout, ticks=ticks))
 
 
-def walked(args: Walk | View, robot: Robot, wanted: Course, weights: Weights) -> Trajectory:
+def walked(args: Walk | View, robot: Robot, wanted: NamedCommand, weights: Weights) -> Trajectory:
     """One walk in the world of the flags."""
     lasts = seconds(args.seconds, wanted)
     if args.world == "srbm":

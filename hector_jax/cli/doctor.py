@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.walking import WalkConfig
 from hector_jax.control.weights import expert
 from hector_jax.core.environment import environment
 from hector_jax.core.inputs import one_line

@@ -8,7 +8,7 @@ import numpy as np
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Compare, Evaluate, Walk
 from hector_jax.cli.parse import as_table
-from hector_jax.control.walking import walk_config
+from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, say
 from hector_jax.core.files import as_json, write_json

@@ -2,7 +2,7 @@
 
 from hector_jax.cli import arguments, doctor
 from hector_jax.cli.flags import Doctor, Export
-from hector_jax.control.walking import walk_config
+from hector_jax.control.controller import walk_config
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import Broken, say
 from hector_jax.core.files import as_json, locked

@@ -19,7 +19,7 @@ from hector_jax.cli.evaluate import verdict_of
 from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.control.reference import COMMANDS
-from hector_jax.control.trajectories import Course
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import say
@@ -89,7 +89,7 @@ def _by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
     return runs
 
 
-def _trajectories(args: Tune, robot: Robot) -> tuple[Course, ...]:
+def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     """What a tuning is to walk.
 
     Raises:
@@ -120,7 +120,7 @@ class _Run(NamedTuple):
     args: Tune
     robot: Robot
     start: Weights
-    trajectories: tuple[Course, ...]
+    trajectories: tuple[NamedCommand, ...]
     seconds: float  # of each walk
     config: TuneConfig
     net: TrainedNet

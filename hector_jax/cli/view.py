@@ -8,7 +8,7 @@ import numpy as np
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Replay, Tensorboard, View
-from hector_jax.control.walking import walk_config
+from hector_jax.control.controller import walk_config
 from hector_jax.core.console import Broken, say
 from hector_jax.core.files import as_json, make_folder
 from hector_jax.core.inputs import InputError

@@ -6,6 +6,7 @@ a velocity feedback and the lean of a turn (Raibert's rule with the capture-poin
 """
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -16,9 +17,24 @@ from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot
 
 
+class Feet(NamedTuple):
+    """Foot points in the world and where they point."""
+
+    position: Float[Array, "*batch 2 3"]  # [m]
+    yaw: Float[Array, "*batch 2"]  # [rad]
+
+
+class FootstepParameters(NamedTuple):
+    """Numbers of the rule."""
+
+    width: Any  # [m] each foot beside the middle
+    feedback: Any  # [s] k_v, on the velocity error
+    turn: Any  # share of the lean (z/g) v x omega
+
+
 @dataclass(frozen=True)
 class FootstepConfig:
-    """The rule and its gains."""
+    """The rule, and its numbers where no others are given."""
 
     rule: str = "raibert"  # or "paper"
     width: float = 0.08  # [m] each foot beside the middle
@@ -28,21 +44,29 @@ class FootstepConfig:
     def __post_init__(self) -> None:
         check(self, rule=("raibert", "paper"), width=NOT_NEGATIVE)
 
+    @property
+    def parameters(self) -> FootstepParameters:
+        """The numbers, to be traced."""
+        return FootstepParameters(self.width, self.feedback, self.turn)
+
 
 def touchdown_points(
     config: FootstepConfig,
     robot: Robot,
+    parameters: FootstepParameters,
+    *,
     state: State,
     reference: State,
     remaining: Float[Array, "2"],
     stance: float,
     swing: float,
-) -> tuple[Float[Array, "2 3"], Float[Array, "2"]]:
-    """Foot points [m] and yaw [rad] at which the feet are to touch down, world frame.
+) -> Feet:
+    """Where the feet are to touch down, world frame.
 
     Args:
         config: the rule.
         robot: gravity, for the lean in a turn.
+        parameters: its numbers.
         state: base now.
         reference: where the base should be now, for the commanded velocity and yaw rate.
         remaining: time until each foot touches down [s].
@@ -54,9 +78,9 @@ def touchdown_points(
     if config.rule == "paper":
         point = state.position + state.velocity * swing / 2
         points = jnp.stack([point, point])
-        return points.at[:, 2].set(0.0), jnp.full(2, state.euler[2])
+        return Feet(points.at[:, 2].set(0.0), jnp.full(2, state.euler[2]))
     yaw = state.euler[2] + reference.ang_velocity[2] * (remaining + stance / 2)
-    side = config.width * jnp.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    side = parameters.width * jnp.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
     hips = jnp.stack([rot_z(yaw[0]) @ side[0], rot_z(yaw[1]) @ side[1]])
     lean = jnp.cross(state.velocity, reference.ang_velocity) * state.position[2] / robot.gravity[2]
     # Far ahead (a foot that still stands) the sway of this moment says nothing: the commanded
@@ -71,7 +95,7 @@ def touchdown_points(
         + hips
         + travel
         + stance / 2 * state.velocity
-        + config.feedback * (state.velocity - reference.velocity)
-        + config.turn * lean
+        + parameters.feedback * (state.velocity - reference.velocity)
+        + parameters.turn * lean
     )
-    return points.at[:, 2].set(0.0), yaw
+    return Feet(points.at[:, 2].set(0.0), yaw)

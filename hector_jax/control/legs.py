@@ -8,11 +8,14 @@ land.
 """
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hector_jax.control.footstep import Feet
 from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, check
@@ -21,9 +24,27 @@ from hector_jax.robot.kinematics import foot_jacobians, inverse_legs, leg_gravit
 from hector_jax.robot.model import Robot
 
 
+class Measurement(NamedTuple):
+    """What the robot knows of itself."""
+
+    state: State  # estimate of the base
+    joints: Float[Array, "*batch 10"]  # [rad], motor side
+    joint_rates: Float[Array, "*batch 10"]  # [rad/s]
+
+
+class LegParameters(NamedTuple):
+    """Numbers of the swing path and of the joints; the model of the tuner has neither."""
+
+    height: Any  # [m] apex of the swing foot
+    landing: Any  # [m] height aimed at
+    kp: Any  # (5,) [N m/rad] of the joints of a leg
+    kd: Any  # (5,) [N m s/rad]
+    gravity_compensation: Any  # share of the leg's own weight in the stance torque
+
+
 @dataclass(frozen=True)
 class LegConfig:
-    """Swing path and joint gains."""
+    """Swing path and joint gains, where no others are given."""
 
     height: float = 0.08  # [m] apex of the swing foot
     landing: float = -0.005  # [m] height aimed at
@@ -43,6 +64,12 @@ class LegConfig:
             if len(gains := getattr(self, name)) != 5:
                 raise InputError(f"LegConfig.{name} must be five gains, got {short_repr(gains)}")
 
+    @property
+    def parameters(self) -> LegParameters:
+        """The numbers, to be traced."""
+        kp, kd = np.array(self.kp), np.array(self.kd)
+        return LegParameters(self.height, self.landing, kp, kd, float(self.stance_weight))
+
 
 def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:
     """Trunk origin [m] of a base state: p_c less the constant offset of the centre of mass."""
@@ -60,26 +87,28 @@ def stance_torques(
 
 
 def swing_path(
-    config: LegConfig, start: Float[Array, "2 3"], end: Float[Array, "2 3"], s: Float[Array, "2"]
+    parameters: LegParameters,
+    start: Float[Array, "2 3"],
+    end: Float[Array, "2 3"],
+    s: Float[Array, "2"],
 ) -> Float[Array, "2 3"]:
     """Foot points [m] at share s of the swing: smooth in the plane, up and down to `landing`."""
     smooth = (s * s * (3.0 - 2.0 * s))[:, None]
     point = start + smooth * (end - start)
     half = jnp.where(s < 0.5, 2.0 * s, 2.0 - 2.0 * s)
     rise = half * half * (3.0 - 2.0 * half)
-    ends = jnp.where(s < 0.5, start[:, 2], end[:, 2] + config.landing)
-    apex = jnp.maximum(start[:, 2], end[:, 2]) + config.height
+    ends = jnp.where(s < 0.5, start[:, 2], end[:, 2] + parameters.landing)
+    apex = jnp.maximum(start[:, 2], end[:, 2]) + parameters.height
     return point.at[:, 2].set(ends + rise * (apex - ends))
 
 
 def swing_joints(
-    config: LegConfig,
     robot: Robot,
+    parameters: LegParameters,
     state: State,
-    start: Float[Array, "2 3"],
-    start_yaw: Float[Array, "2"],
-    end: Float[Array, "2 3"],
-    end_yaw: Float[Array, "2"],
+    *,
+    start: Feet,
+    end: Feet,
     elapsed: Float[Array, "2"],
     swing: float,
 ) -> tuple[Float[Array, "10"], Float[Array, "10"]]:
@@ -93,10 +122,10 @@ def swing_joints(
         s = jnp.clip((elapsed + time) / swing, 0.0, 1.0)
         R_wb = rotation_from_euler(state.euler)
         trunk = trunk_position(robot, state) + time * state.velocity
-        target = swing_path(config, start, end, s)
+        target = swing_path(parameters, start.position, end.position, s)
         local = (target - trunk) @ R_wb
-        turn = wrap_angle(end_yaw - start_yaw)
-        yaw = wrap_angle(start_yaw + s * s * (3.0 - 2.0 * s) * turn - state.euler[2])
+        turn = wrap_angle(end.yaw - start.yaw)
+        yaw = wrap_angle(start.yaw + s * s * (3.0 - 2.0 * s) * turn - state.euler[2])
         turns = robot.description.yaw_joint
         yaw = jnp.clip(yaw, robot.joint_lower[turns::5], robot.joint_upper[turns::5])
         up = R_wb[2]  # world z in the trunk
@@ -107,22 +136,21 @@ def swing_joints(
 
 
 def joint_torques(
-    config: LegConfig,
     robot: Robot,
-    state: State,
-    joints: Float[Array, "10"],
-    joint_rates: Float[Array, "10"],
+    parameters: LegParameters,
+    measurement: Measurement,
+    *,
     contact: Bool[Array, "2"],
     wrench: Wrench,
     target: Float[Array, "10"],
     target_rates: Float[Array, "10"],
 ) -> Float[Array, "10"]:
     """Torque commands [N m] within the limits: stance legs push, swing legs follow their target."""
+    state, joints, joint_rates = measurement
     weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
-    kp, kd = jnp.tile(jnp.array(config.kp), 2), jnp.tile(jnp.array(config.kd), 2)
+    kp, kd = (jnp.tile(jnp.asarray(gains), 2) for gains in (parameters.kp, parameters.kd))
     swing = kp * (target - joints) + kd * (target_rates - joint_rates) + weight
     stance = stance_torques(robot, state, joints, wrench)
-    if config.stance_weight:
-        stance = stance + weight
+    stance = stance + parameters.gravity_compensation * weight
     torque = jnp.where(jnp.repeat(contact, 5), stance, swing)
     return jnp.clip(torque, -robot.torque_limit, robot.torque_limit)

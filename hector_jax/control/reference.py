@@ -6,7 +6,7 @@ exact arc. Height, roll and pitch are constant.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,17 +21,17 @@ from hector_jax.robot.model import Robot
 class Command(NamedTuple):
     """Velocity command, constant on each of S pieces, repeated from the start after the last."""
 
-    duration: Float[Array, "*batch S"]  # [s]
-    velocity: Float[Array, "*batch S 2"]  # [m/s] ahead and to the left
-    yaw_rate: Float[Array, "*batch S"]  # [rad/s]
+    duration: Float[Any, "*batch S"]  # [s]
+    velocity: Float[Any, "*batch S 2"]  # [m/s] ahead and to the left
+    yaw_rate: Float[Any, "*batch S"]  # [rad/s]
 
 
 class Anchor(NamedTuple):
     """Where the reference starts, and when: t = 0 at gait tick `tick`."""
 
-    position: Float[Array, "*batch 3"]  # of the centre of mass [m]
-    yaw: Float[Array, "*batch"]  # [rad]
-    tick: Int[Array, "*batch"]
+    position: Float[Any, "*batch 3"]  # of the centre of mass [m]
+    yaw: Float[Any, "*batch"]  # [rad]
+    tick: Int[Any, "*batch"]
 
 
 def standing_anchor(robot: Robot, start_tick: int = 0) -> Anchor:

@@ -33,7 +33,7 @@ _MOST_BYTES = 100_000
 _SPEED = Range(-10.0, 10.0)  # [m/s], [rad/s]; more is another unit
 
 
-class Course(NamedTuple):
+class NamedCommand(NamedTuple):
     """What to walk."""
 
     name: str
@@ -78,7 +78,7 @@ class _File:
             )
 
 
-def load_course(path: Path) -> Course:
+def load_command(path: Path) -> NamedCommand:
     """The course of a TOML file, see the module.
 
     Raises:
@@ -100,19 +100,19 @@ def load_course(path: Path) -> Course:
         velocity=np.array([(one.v_x, one.v_y) for one in segments]),
         yaw_rate=np.array([one.yaw_rate for one in segments]),
     )
-    return Course(told.name, command, round(seconds / _GRID) * _GRID)
+    return NamedCommand(told.name, command, round(seconds / _GRID) * _GRID)
 
 
-def course(text: str) -> Course:
+def command_of(text: str) -> NamedCommand:
     """A trajectory by its name, or from the TOML file of that path.
 
     Raises:
-        InputError: `named_command` knows no such name, or see `load_course`.
+        InputError: `named_command` knows no such name, or see `load_command`.
     """
     if text.endswith(".toml"):
-        return load_course(Path(text))
+        return load_command(Path(text))
     try:
-        return Course(text, named_command(text))
+        return NamedCommand(text, named_command(text))
     except InputError as error:
         raise InputError(f"{error}, or a file NAME.toml") from None
 

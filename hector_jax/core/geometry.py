@@ -4,6 +4,8 @@ Euler angles are (roll, pitch, yaw) with R = Rz(yaw) Ry(pitch) Rx(roll), which t
 the world; quaternions are w, x, y, z as in MuJoCo.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,14 +15,18 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _CROSS[_i, _k, _j], _CROSS[_j, _k, _i] = 1.0, -1.0
 
 
+def _like(array: Array, *matrices: np.ndarray) -> Any:
+    """Constant matrices in the dtype of an array."""
+    return [np.asarray(M, jnp.result_type(array)) for M in matrices]
+
+
 def _about(axis: int, angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     # by constant matrices: a rotation written entry by entry is twenty operations to compile
     along = np.zeros((3, 3))
     along[axis, axis] = 1.0
-    kept, plane, turned = (
-        np.asarray(M, jnp.result_type(angle)) for M in (along, np.eye(3) - along, _CROSS[axis])
-    )
-    return kept + jnp.cos(angle) * plane + jnp.sin(angle) * turned
+    constants = (along, np.eye(3) - along, _CROSS[axis])
+    fixed, plane, turned = _like(angle, *constants)
+    return fixed + jnp.cos(angle) * plane + jnp.sin(angle) * turned
 
 
 def rot_x(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
@@ -48,7 +54,7 @@ def euler_rates(euler: Float[Array, "3"]) -> Float[Array, "3 3"]:
     roll = np.zeros((3, 3))
     roll[0, 0] = 1.0
     yaw = np.roll(roll, 2, axis=0)
-    roll, yaw, rest = (np.asarray(M, jnp.result_type(euler)) for M in (roll, yaw, np.eye(3) - roll))
+    roll, yaw, rest = _like(euler, roll, yaw, np.eye(3) - roll)
     by_heading = roll / jnp.cos(euler[1]) + yaw * jnp.tan(euler[1]) + rest
     return by_heading @ rot_z(euler[2]).T
 

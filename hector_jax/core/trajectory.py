@@ -1,11 +1,12 @@
 """What is walked: state, wrench and trajectory, and the one place that packs them into x and u.
 
 Frames: everything is in the world frame. A wrench is that of the ground on the robot, at the foot
-    point (on the sole, under the ankle axis), left foot then right. The paper's state is x = [e; p;
-    omega; v; g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3).
+point (on the sole, under the ankle axis), left foot then right. The paper's state is x = [e; p;
+omega; v; g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3). Arrays are
+of the host (numpy) or of a device.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,24 +23,24 @@ MAX_TILT = 0.8  # [rad] of roll or pitch; beyond it too
 class State(NamedTuple):
     """Floating base of the single rigid body, in the world frame."""
 
-    euler: Float[Array, "*batch 3"]  # roll, pitch, yaw [rad]; yaw is continuous, not wrapped
-    position: Float[Array, "*batch 3"]  # centre of mass [m]
-    ang_velocity: Float[Array, "*batch 3"]  # [rad/s]
-    velocity: Float[Array, "*batch 3"]  # [m/s]
+    euler: Float[Any, "*batch 3"]  # roll, pitch, yaw [rad]; yaw is continuous, not wrapped
+    position: Float[Any, "*batch 3"]  # centre of mass [m]
+    ang_velocity: Float[Any, "*batch 3"]  # [rad/s]
+    velocity: Float[Any, "*batch 3"]  # [m/s]
 
 
 class Wrench(NamedTuple):
     """Force and moment of the ground on each foot at its foot point, world frame."""
 
-    force: Float[Array, "*batch 2 3"]  # [N], left then right
-    moment: Float[Array, "*batch 2 3"]  # [N m]
+    force: Float[Any, "*batch 2 3"]  # [N], left then right
+    moment: Float[Any, "*batch 2 3"]  # [N m]
 
 
 class Load(NamedTuple):
     """Force on the centre of mass and torque about it."""
 
-    force: Float[Array, "*batch 3"]  # [N]
-    torque: Float[Array, "*batch 3"]  # [N m]
+    force: Float[Any, "*batch 3"]  # [N]
+    torque: Float[Any, "*batch 3"]  # [N m]
 
 
 class Trajectory(NamedTuple):
@@ -50,18 +51,18 @@ class Trajectory(NamedTuple):
     end, `reference` is what the state should be there.
     """
 
-    period: Float[Array, "*batch"]  # [s] between samples: 0.01 in srbm, 0.001 in the MuJoCo worlds
+    period: Float[Any, "*batch"]  # [s] between samples: 0.01 in srbm, 0.001 in the MuJoCo worlds
     initial: State  # true state at t = 0, batch axes only
     state: State  # (T, 3) each
     reference: State  # (T, 3) each
     command: Wrench  # (T, 2, 3) each, what the MPC asked for
     effect: Wrench  # (T, 2, 3) each, what the ground returned
-    contact: Bool[Array, "*batch T 2"]  # planned stance
-    feet: Float[Array, "*batch T 2 3"]  # foot points [m]
-    joints: Float[Array, "*batch T 10"]  # [rad] hip yaw, roll, pitch, knee, ankle; left, right
-    fallen: Bool[Array, "*batch T"]  # true from the sample of the fall on
-    legs_touch: Bool[Array, "*batch T"]  # one leg touched the other, which is no fall
-    residual: Float[Array, "*batch T"]  # worst relative KKT residual of the plan in force
+    contact: Bool[Any, "*batch T 2"]  # planned stance
+    feet: Float[Any, "*batch T 2 3"]  # foot points [m]
+    joints: Float[Any, "*batch T 10"]  # [rad] hip yaw, roll, pitch, knee, ankle; left, right
+    fallen: Bool[Any, "*batch T"]  # true from the sample of the fall on
+    legs_touch: Bool[Any, "*batch T"]  # one leg touched the other, which is no fall
+    residual: Float[Any, "*batch T"]  # worst relative KKT residual of the plan in force
 
 
 def from_start(walk: Trajectory) -> Trajectory:

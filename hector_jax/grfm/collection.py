@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from hector_jax.control.walking import walk_config
+from hector_jax.control.controller import walk_config
 from hector_jax.core.console import say
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, short_repr

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from hector_jax.control import gait
+from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.walking import walk_config
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn

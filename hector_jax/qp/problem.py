@@ -13,7 +13,7 @@ largest bound is none. Within the tolerance crossed bounds are an equality with 
 """
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -102,8 +102,8 @@ class Solution(NamedTuple):
     primal_residual: Float[Array, ""]
     dual_residual: Float[Array, ""]
     gap: Float[Array, ""]
-    iterations: Int[Array, ""]  # factorisations; with jaxopt its iterations and ours
-    status: Int[Array, ""]  # of Status
+    iterations: Int[Any, ""]  # factorisations; with jaxopt its iterations and ours
+    status: Int[Any, ""]  # of Status
 
 
 class Tolerances(NamedTuple):

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hector_jax.control import gait
+from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.walking import walk_config
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.grfm.dataset import Dataset, make_dataset

@@ -18,7 +18,7 @@ order above they are psi and theta.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,17 +33,17 @@ _LARGEST_STEP = 0.4  # [rad] of a joint in a Newton step
 _DAMPING = 0.1  # times the squared error
 
 
-class Feet(NamedTuple):
+class FootPoses(NamedTuple):
     """Both feet in the trunk frame, left then right."""
 
     position: Float[Array, "2 3"]  # foot points [m]
     rotation: Float[Array, "2 3 3"]  # takes foot vectors to the trunk frame
 
 
-def foot_poses(robot: Robot, joints: Float[Array, "10"]) -> Feet:
+def foot_poses(robot: Robot, joints: Float[Array, "10"]) -> FootPoses:
     """Foot points and foot axes of the joint angles [rad]."""
     chain = _chain(robot, joints)
-    return Feet(chain.foot, chain.rotation)
+    return FootPoses(chain.foot, chain.rotation)
 
 
 def foot_jacobians(
@@ -77,7 +77,7 @@ def inverse_legs(
         pitch: sum of the three pitch joints [rad], the foot's pitch against the leg's rolled frame.
     """
     knee = robot.description.pitch_joints[1]
-    leg = (
+    leg = _Leg(
         jnp.asarray(robot.joint_origin),
         jnp.asarray(robot.foot_point),
         jnp.asarray(robot.joint_lower).reshape(2, 5)[:, knee],
@@ -85,14 +85,14 @@ def inverse_legs(
     )
     axes = robot.description.axes
     if axes == HECTOR_AXES:
-        return jax.vmap(_inverse_leg)(*leg, position, yaw, pitch).reshape(10)
+        return jax.vmap(_inverse_leg)(leg, position, yaw, pitch).reshape(10)
     standing = jnp.asarray(robot.standing_joints).reshape(2, 5)
     search = jax.vmap(partial(_searched_leg, axes, knee))
-    return search(*leg, standing, position, yaw, pitch).reshape(10)
+    return search(leg, standing, position, yaw, pitch).reshape(10)
 
 
 def leg_gravity(
-    robot: Robot, joints: Float[Array, "10"], up: Float[Array, "3"]
+    robot: Robot, joints: Float[Array, "10"], up: Float[Any, "3"]
 ) -> Float[Array, "10"]:
     """Joint torques [N m] that hold the legs' own weight, with the trunk fixed.
 
@@ -108,6 +108,15 @@ def leg_gravity(
     lever = jnp.sum(mass[..., None] * (com[:, None] - chain.origin[:, :, None]), axis=2)
     moment = jnp.cross(lever, up)
     return jnp.sum(chain.axis * moment, axis=-1).reshape(10)
+
+
+class _Leg(NamedTuple):
+    """Constants of a leg."""
+
+    origin: Float[Array, "*legs 5 3"]
+    foot_point: Float[Array, "*legs 3"]
+    knee_lower: Float[Array, "*legs"]
+    knee_upper: Float[Array, "*legs"]
 
 
 class _Chain(NamedTuple):
@@ -159,14 +168,9 @@ def _leg_chain(
 
 
 def _inverse_leg(
-    origin: Float[Array, "5 3"],
-    foot_point: Float[Array, "3"],
-    knee_lower: Float[Array, ""],
-    knee_upper: Float[Array, ""],
-    position: Float[Array, "3"],
-    yaw: Float[Array, ""],
-    pitch: Float[Array, ""],
+    leg: _Leg, position: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]
 ) -> Float[Array, "5"]:
+    origin, foot_point, knee_lower, knee_upper = leg
     # target from the roll joint, in the yawed frame
     cy, sy = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = position - origin[0]
@@ -217,10 +221,7 @@ def _any_chain(
 def _searched_leg(
     axes: str,
     knee: int,
-    origin: Float[Array, "5 3"],
-    foot_point: Float[Array, "3"],
-    knee_lower: Float[Array, ""],
-    knee_upper: Float[Array, ""],
+    leg: _Leg,
     start: Float[Array, "5"],
     position: Float[Array, "3"],
     yaw: Float[Array, ""],
@@ -228,7 +229,7 @@ def _searched_leg(
 ) -> Float[Array, "5"]:
     def error(joints: Array, position: Array, yaw: Array, pitch: Array) -> Array:
         """Of the foot point [m] and of the foot's two directions; zero where all is met."""
-        chain = _any_chain(axes, origin, foot_point, joints)
+        chain = _any_chain(axes, leg.origin, leg.foot_point, joints)
         along = jnp.cos(yaw) * chain.rotation[0] + jnp.sin(yaw) * chain.rotation[1]
         across = jnp.cos(pitch) * along[2] - jnp.sin(pitch) * along[0]
         ahead = jnp.cos(pitch) * along[0] + jnp.sin(pitch) * along[2]
@@ -243,7 +244,7 @@ def _searched_leg(
 
     def improved(joints: Array, _: None) -> tuple[Array, None]:
         moved = joints + jnp.clip(step(joints, fixed), -_LARGEST_STEP, _LARGEST_STEP)
-        return moved.at[knee].set(jnp.clip(moved[knee], knee_lower, knee_upper)), None
+        return moved.at[knee].set(jnp.clip(moved[knee], leg.knee_lower, leg.knee_upper)), None
 
     target = (position, yaw, pitch)
     fixed = jax.lax.stop_gradient(target)

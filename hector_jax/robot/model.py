@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -167,11 +167,9 @@ def compile_model(description: Description) -> mujoco.MjModel:
 
 def _check_base(path: Path, model: mujoco.MjModel) -> None:
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    if len(free) != 1 or free[0] != 0:
-        raise InputError(
-            f"{path}: {len(free)} free joints, expected exactly one, the first; "
-            f"joints: {_listed(_joints(model))}"
-        )
+    joints = _listed(_joints(model))
+    text = f"{len(free)} free joints, expected exactly one, the first; joints: {joints}"
+    _expect(path, list(free) == [0], text)
 
 
 def _check_joints(description: Description, model: mujoco.MjModel) -> None:
@@ -180,94 +178,73 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
     for name in joints:
         _require(path, "joint", name, names)
     got = [name for name in names if name in joints]
-    if got != list(joints) or len(names) != 1 + len(joints):
-        raise InputError(
-            f"{path}: joints are {_listed(names)}; expected a free joint, then {_listed(joints)}"
-        )
+    expected = f"expected a free joint, then {_listed(joints)}"
+    right = got == list(joints) and len(names) == 1 + len(joints)
+    _expect(path, right, f"joints are {_listed(names)}; {expected}")
     for index, name in enumerate(joints):
         joint = model.joint(name)
-        which = index % 5
-        if joint.type[0] != mujoco.mjtJoint.mjJNT_HINGE:
-            raise InputError(f"{path}: joint {name!r} is not a hinge")
+        which, body, this = index % 5, joint.bodyid[0], f"joint {name!r}"
+        _expect(path, joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE, f"{this} is not a hinge")
         axis = _AXES[description.axes[which]]
-        if not np.allclose(joint.axis, axis, atol=_SAME):
-            raise InputError(f"{path}: axis of joint {name!r} is {joint.axis}, expected {axis}")
-        if not joint.limited[0]:
-            raise InputError(f"{path}: joint {name!r} has no range, expected limits in radians")
-        body = joint.bodyid[0]
+        right = np.allclose(joint.axis, axis, atol=_SAME)
+        _expect(path, right, f"axis of {this} is {joint.axis}, expected {axis}")
+        _expect(path, joint.limited[0], f"{this} has no range, expected limits in radians")
         parent = model.body_parentid[body]
-        expected = _trunk(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
-        if parent != expected:
-            raise InputError(
-                f"{path}: joint {name!r} is on body {model.body(parent).name!r}, "
-                f"expected {model.body(expected).name!r}"
-            )
-        if np.abs(joint.pos).max() > _SAME or abs(model.body_quat[body][0]) < 1 - _SAME:
-            raise InputError(
-                f"{path}: joint {name!r} is off its body's origin or its body is turned, "
-                "expected neither pos on the joint nor an orientation on the body"
-            )
+        above = _trunk(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
+        on, expected = model.body(parent).name, model.body(above).name
+        _expect(path, parent == above, f"{this} is on body {on!r}, expected {expected!r}")
+        right = np.abs(joint.pos).max() <= _SAME and abs(model.body_quat[body][0]) >= 1 - _SAME
+        expected = "expected neither pos on the joint nor an orientation on the body"
+        _expect(path, right, f"{this} is off its body's origin or its body is turned, {expected}")
         # Two parallel links in one plane: what the closed-form inverse kinematics solves.
+        at = model.body_pos[body]
         closed = description.axes == HECTOR_AXES and which >= 3
-        if closed and (model.body_pos[body][0] != 0.0 or model.body_pos[body][2] >= 0.0):
-            raise InputError(
-                f"{path}: body of joint {name!r} is at {model.body_pos[body]}, "
-                "expected x = 0 and z < 0"
-            )
+        right = not closed or (at[0] == 0.0 and at[2] < 0.0)
+        _expect(path, right, f"body of {this} is at {at}, expected x = 0 and z < 0")
 
 
 def _check_motors(description: Description, model: mujoco.MjModel) -> None:
     path, joints = description.model, description.joints
-    if model.nu != len(joints):
-        raise InputError(
-            f"{path}: {model.nu} actuators, expected {len(joints)}, "
-            f"one per joint: {_listed(joints)}"
-        )
+    expected = f"expected {len(joints)}, one per joint: {_listed(joints)}"
+    _expect(path, model.nu == len(joints), f"{model.nu} actuators, {expected}")
     for index, name in enumerate(joints):
         motor = model.actuator(index)
-        driven = model.joint(motor.trnid[0]).name
-        if driven != name:
-            raise InputError(f"{path}: actuator {index} drives joint {driven!r}, expected {name!r}")
-        if not motor.ctrllimited[0] or motor.ctrlrange[1] <= 0 or motor.gear[0] != 1.0:
-            raise InputError(
-                f"{path}: actuator of joint {name!r} has ctrlrange {motor.ctrlrange} and gear "
-                f"{motor.gear[0]}, expected a torque range and gear 1"
-            )
+        driven, limits, gear = model.joint(motor.trnid[0]).name, motor.ctrlrange, motor.gear[0]
+        text = f"actuator {index} drives joint {driven!r}, expected {name!r}"
+        _expect(path, driven == name, text)
+        text = f"actuator of joint {name!r} has ctrlrange {limits} and gear {gear}"
+        right = motor.ctrllimited[0] and limits[1] > 0 and gear == 1.0
+        _expect(path, right, f"{text}, expected a torque range and gear 1")
 
 
 def _check_feet(description: Description, model: mujoco.MjModel) -> None:
     path, toes, heels = description.model, description.toes, description.heels
-    if description.standing not in (keys := [model.key(i).name for i in range(model.nkey)]):
-        raise InputError(f"{path}: {_missing('keyframe', description.standing, keys)}")
+    _require(path, "keyframe", description.standing, [model.key(i).name for i in range(model.nkey)])
     sites = [model.site(i).name for i in range(model.nsite)]
     geoms = [model.geom(i).name for i in range(model.ngeom)]
     for side, foot in enumerate(description.foot_points):
         _require(path, "site", foot, sites)
-        body = model.joint(description.joints[5 * side + 4]).bodyid[0]
-        point = model.site(foot).pos
-        if model.site(foot).bodyid[0] != body:
-            raise InputError(
-                f"{path}: site {foot!r} is not on the foot, body {model.body(body).name!r}"
-            )
-        for name, ahead in ((toes[side], 1), (heels[side], -1)):
-            _require(path, "geom", name, geoms)
-            geom = model.geom(name)
-            if geom.bodyid[0] != body or geom.type[0] != mujoco.mjtGeom.mjGEOM_SPHERE:
-                raise InputError(
-                    f"{path}: geom {name!r} is not a sphere on body {model.body(body).name!r}"
-                )
-            reach = geom.pos - [0, 0, geom.size[0]] - point
-            if ahead * reach[0] <= 0 or np.abs(reach[1:]).max() > 1e-3:
-                raise InputError(
-                    f"{path}: lowest point of geom {name!r} is {reach} from site {foot!r}, "
-                    f"expected it {'ahead' if ahead > 0 else 'behind'} on the same sole"
-                )
+        body, site = model.joint(description.joints[5 * side + 4]).bodyid[0], model.site(foot)
+        name = model.body(body).name
+        _expect(path, site.bodyid[0] == body, f"site {foot!r} is not on the foot, body {name!r}")
+        for end, ahead in ((toes[side], 1), (heels[side], -1)):
+            _require(path, "geom", end, geoms)
+            geom = model.geom(end)
+            right = geom.bodyid[0] == body and geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
+            _expect(path, right, f"geom {end!r} is not a sphere on body {name!r}")
+            reach = geom.pos - [0, 0, geom.size[0]] - site.pos
+            expected = f"expected it {'ahead' if ahead > 0 else 'behind'} on the same sole"
+            text = f"lowest point of geom {end!r} is {reach} from site {foot!r}, {expected}"
+            _expect(path, ahead * reach[0] > 0 and np.abs(reach[1:]).max() <= 1e-3, text)
     for names in (toes, heels):
         left, right = (model.geom(name).pos[0] for name in names)
-        if abs(left - right) > _SAME:
-            raise InputError(
-                f"{path}: {names[0]} at x = {left}, {names[1]} at x = {right}, expected the same"
-            )
+        text = f"{names[0]} at x = {left}, {names[1]} at x = {right}, expected the same"
+        _expect(path, abs(left - right) <= _SAME, text)
+
+
+def _expect(path: Path, right: Any, message: str) -> None:
+    if not right:
+        raise InputError(f"{path}: {message}")
 
 
 def _composite_inertia(
@@ -291,14 +268,9 @@ def _joints(model: mujoco.MjModel) -> list[str]:
 
 
 def _require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
-    if name not in names:
-        raise InputError(f"{path}: {_missing(kind, name, names)}")
-
-
-def _missing(kind: str, name: str, names: Sequence[str]) -> str:
     near = difflib.get_close_matches(name, names, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
-    return f"no {kind} {name!r}{hint}; {kind}s: {_listed(names)}"
+    _expect(path, name in names, f"no {kind} {name!r}{hint}; {kind}s: {_listed(names)}")
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -35,16 +35,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
+from hector_jax.control.footstep import Feet
+from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
-from hector_jax.control.walking import (
-    Feet,
-    Measurement,
-    Memory,
-    Plan,
-    WalkConfig,
-    actuate,
-    step_plan,
-)
 from hector_jax.control.weights import Weights
 from hector_jax.control.weights_file import WEIGHTS, save_weights, weights_tree
 from hector_jax.core.console import Broken
@@ -263,18 +257,28 @@ def controller(
         joints, rates = told.pop("joints"), told.pop("joint_rates")
         measurement = Measurement(State(**told), joints, rates)
         memory, plan = jax.tree.unflatten(structure, carry)
-        walking = (robot, weights, Command(**command), Anchor(**anchor), tick, memory, measurement)
 
-        def planned(slots: int) -> Callable[[], tuple[Memory, Plan]]:
-            return lambda: step_plan(config, *walking, slots=slots)
+        def planned(max_contacts: int) -> Callable[[], tuple[Memory, Plan]]:
+            return lambda: step_plan(
+                config,
+                robot,
+                config.parameters(weights),
+                command=Command(**command),
+                anchor=Anchor(**anchor),
+                tick=tick,
+                memory=memory,
+                measurement=measurement,
+                max_contacts=max_contacts,
+            )
 
         both = (tick < moves) | config.gait.double_support
         branch = jnp.where(substep > 0, 0, jnp.where(both, 2, 1))
         memory, plan = lax.switch(branch, [lambda: (memory, plan), planned(1), planned(2)])
+        legs, now = config.legs.parameters, {"substep": substep, "measurement": measurement}
         out = {
             "force": plan.wrench.force,
             "moment": plan.wrench.moment,
-            "torque": actuate(config, robot, plan, memory, substep, measurement),
+            "torque": actuate(config, robot, legs, plan=plan, memory=memory, **now),
             "contact": plan.contact,
             "status": plan.status,
             "residual": plan.residual,

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import Command
-from hector_jax.control.walking import walk_config
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import bar, say_if_slow
 from hector_jax.core.environment import code_hash

@@ -15,8 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.walking import WalkConfig, walk_config
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.core.console import bar
 from hector_jax.core.files import append_file, as_json, write_file

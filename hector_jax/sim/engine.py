@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import jax
 
-from hector_jax.control.walking import WalkConfig
+from hector_jax.control.controller import WalkConfig
 from hector_jax.core.settings import choose
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
+from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, reference_at
-from hector_jax.control.walking import Measurement, Memory, Plan, WalkConfig, actuate, step_plan
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
@@ -70,7 +71,7 @@ def plan_tick(
     reading: Float[Array, "43"],
     error: Float[Array, "22"],
     *,
-    slots: int,
+    max_contacts: int,
 ) -> tuple[Memory, Plan]:
     """Measure and solve the MPC, once a tick.
 
@@ -82,11 +83,19 @@ def plan_tick(
         yaw: a true yaw [rad] shortly before.
         reading: coordinates now.
         error: of the state estimate now.
-        slots: feet that may stand at once, from `slots_needed` (static).
+        max_contacts: feet that may stand at once, from `contacts_needed` (static).
     """
     measurement = measure(robot, reading, yaw, error)
     return step_plan(
-        config, robot, weights, command, anchor, tick, memory, measurement, slots=slots
+        config,
+        robot,
+        config.parameters(weights),
+        command=command,
+        anchor=anchor,
+        tick=tick,
+        memory=memory,
+        measurement=measurement,
+        max_contacts=max_contacts,
     )
 
 
@@ -115,7 +124,8 @@ def motor_torques(
         error: of the state estimate now.
     """
     measurement, yaw = sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)
-    torque = actuate(config, robot, plan, memory, substep, measurement)
+    legs, now = config.legs.parameters, {"substep": substep, "measurement": measurement}
+    torque = actuate(config, robot, legs, plan=plan, memory=memory, **now)
     motors, applied = step_actuators(robot, imperfections, motors, torque)
     return motors, yaw, applied
 

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hector_jax.control.controller import Memory, Plan, WalkConfig, init_memory
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
-from hector_jax.control.walking import Memory, Plan, WalkConfig, init_memory
 from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
 from hector_jax.core.tree import stack, where
@@ -173,11 +173,13 @@ def _sample(
 
 
 def _plan(
-    program: _Program, walk: _Walk, tick: Int[Array, ""], carry: _Carry, *, slots: int
+    program: _Program, walk: _Walk, tick: Int[Array, ""], carry: _Carry, *, max_contacts: int
 ) -> tuple[Memory, Plan]:
     job, reading = walk.job, _read(program, walk, carry.physics)
     asked = carry.anchor, tick, carry.memory, carry.yaw, reading, walk.error
-    return loop.plan_tick(program.config, walk.robot, job.weights, job.command, *asked, slots=slots)
+    return loop.plan_tick(
+        program.config, walk.robot, job.weights, job.command, *asked, max_contacts=max_contacts
+    )
 
 
 def _tick(
@@ -186,7 +188,9 @@ def _tick(
     gait, start_tick, count = program.config.gait, walk.job.start_tick, program.substeps
     anchor = anchor_at(walk.robot, carry.last.state, start_tick)
     carry = carry._replace(anchor=where(tick == start_tick, anchor, carry.anchor))
-    plan_both, plan_one = (partial(_plan, program, walk, tick, slots=slots) for slots in (2, 1))
+    plan_both, plan_one = (
+        partial(_plan, program, walk, tick, max_contacts=max_contacts) for max_contacts in (2, 1)
+    )
     if gait.double_support:
         memory, plan = plan_both(carry)
     else:
@@ -207,7 +211,7 @@ def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     memory = init_memory(robot, loop.measure(robot, reading, yaw, walk.error))
     asked = anchor, tick, memory, yaw, reading, walk.error
     shapes = jax.eval_shape(
-        lambda: loop.plan_tick(config, robot, job.weights, job.command, *asked, slots=2)[1]
+        lambda: loop.plan_tick(config, robot, job.weights, job.command, *asked, max_contacts=2)[1]
     )
     known = robot, job.command, anchor, 1.0 * tick, yaw, reading
     touches = Touches(never, never)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.control.walking import Measurement
+from hector_jax.control.legs import Measurement
 from hector_jax.core.geometry import euler_from_rotation, rotation_from_quaternion, wrap_angle
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import State, Wrench

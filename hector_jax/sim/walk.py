@@ -17,8 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hector_jax.control.controller import (
+    Memory,
+    Plan,
+    Retune,
+    WalkConfig,
+    contacts_needed,
+    init_memory,
+)
 from hector_jax.control.reference import anchor_at, standing_anchor
-from hector_jax.control.walking import Memory, Plan, Retune, WalkConfig, init_memory, slots_needed
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
@@ -53,7 +60,7 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     return SimpleNamespace(
         begin=jax.jit(begin),
         measure=jax.jit(loop.measure),
-        plan=jax.jit(partial(loop.plan_tick, config), static_argnames="slots"),
+        plan=jax.jit(partial(loop.plan_tick, config), static_argnames="max_contacts"),
         torques=jax.jit(partial(loop.motor_torques, config)),
         samples=jax.jit(samples),
     )
@@ -164,9 +171,9 @@ def _walk_ticks(
             measurement = programs.measure(body, told[1], yaw, error[0])
             carry, weights = retune.step(carry, tick, anchor, measurement, plan.wrench)
             weights = jax.device_put(weights)
-        slots = slots_needed(config, tick)
+        max_contacts = contacts_needed(config, tick)
         memory, plan = programs.plan(
-            body, weights, command, anchor, now, memory, *told, slots=slots
+            body, weights, command, anchor, now, memory, *told, max_contacts=max_contacts
         )
         for i in range(count):
             held = imperfections, memory, plan, motors, yaw, numbers[i]

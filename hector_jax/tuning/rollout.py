@@ -19,8 +19,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax import qp
 from hector_jax.control import gait
+from hector_jax.control.controller import WalkConfig, contacts_needed, plan
+from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
-from hector_jax.control.walking import Feet, WalkConfig, plan, slots_needed
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
@@ -173,7 +174,15 @@ def step_carry(
         # the legs know where the feet are from the body, not from the world
         standing = feet._replace(position=feet.position + error.position)
     decided = plan(
-        walk, robot, weights, command, anchor, tick, seen, standing, slots=slots_needed(walk, 0)
+        walk,
+        robot,
+        walk.parameters(weights),
+        command=command,
+        anchor=anchor,
+        tick=tick,
+        state=seen,
+        feet=standing,
+        max_contacts=contacts_needed(walk, 0),
     )
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), decided.wrench, carry.commands

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.walking import Feet
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot

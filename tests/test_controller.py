@@ -7,23 +7,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.gait import GaitConfig
-from hector_jax.control.legs import stance_torques, trunk_position
-from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.reference import Anchor, named_command
-from hector_jax.control.walking import (
-    Measurement,
+from hector_jax.control.controller import (
     WalkConfig,
     actuate,
+    contacts_needed,
     init_memory,
     measured_feet,
     plan,
     plan_horizon,
-    slots_needed,
     step_plan,
 )
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.legs import Measurement, stance_torques, trunk_position
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.parameters import BY_NAME, FEEDBACK, THETA, tunables
+from hector_jax.control.reference import Anchor, named_command
 from hector_jax.control.weights import expert
 from hector_jax.core.geometry import rot_z
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.qp import Status
 from hector_jax.robot.kinematics import foot_poses
@@ -39,16 +40,25 @@ ANCHOR = Anchor(jnp.array([0.0, 0.0, HEIGHT]), jnp.array(0.0), jnp.array(0))
 feet_of = jax.jit(lambda measurement: measured_feet(ROBOT, measurement))
 
 
-@partial(jax.jit, static_argnames="slots")
-def planned(tick, memory, measurement, slots=1):
+@partial(jax.jit, static_argnames="max_contacts")
+def planned(tick, memory, measurement, max_contacts=1):
     return step_plan(
-        CONFIG, ROBOT, expert(), STRAIGHT, ANCHOR, tick, memory, measurement, slots=slots
+        CONFIG,
+        ROBOT,
+        CONFIG.parameters(expert()),
+        command=STRAIGHT,
+        anchor=ANCHOR,
+        tick=tick,
+        memory=memory,
+        measurement=measurement,
+        max_contacts=max_contacts,
     )
 
 
 @jax.jit
 def commanded(decided, memory, substep, measurement):
-    return actuate(CONFIG, ROBOT, decided, memory, substep, measurement)
+    legs, now = CONFIG.legs.parameters, {"substep": substep, "measurement": measurement}
+    return actuate(CONFIG, ROBOT, legs, plan=decided, memory=memory, **now)
 
 
 def standing(yaw=0.0, x=0.0, lift=0.0):
@@ -59,10 +69,10 @@ def standing(yaw=0.0, x=0.0, lift=0.0):
     return Measurement(state, joints, jnp.zeros(10))
 
 
-def at(tick, measurement=None, memory=None, slots=1):
+def at(tick, measurement=None, memory=None, max_contacts=1):
     measurement = standing() if measurement is None else measurement
     memory = init_memory(ROBOT, measurement) if memory is None else memory
-    return planned(jnp.array(tick), memory, measurement, slots=slots)
+    return planned(jnp.array(tick), memory, measurement, max_contacts=max_contacts)
 
 
 # What it measures
@@ -124,15 +134,67 @@ def test_step_plan_is_plan_with_the_measured_feet():
     _, decided = at(3, measurement)
     direct = jax.jit(
         lambda state, feet: plan(
-            CONFIG, ROBOT, expert(), STRAIGHT, ANCHOR, jnp.array(3), state, feet
+            CONFIG,
+            ROBOT,
+            CONFIG.parameters(expert()),
+            command=STRAIGHT,
+            anchor=ANCHOR,
+            tick=jnp.array(3),
+            state=state,
+            feet=feet,
         )
     )(measurement.state, feet_of(measurement))
     np.testing.assert_allclose(decided.wrench.force, direct.wrench.force, atol=1e-6)
     np.testing.assert_allclose(decided.touchdown.position, direct.touchdown.position)
 
 
+def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing():
+    compiled = []
+    moving = standing(x=-0.3).state._replace(velocity=jnp.array([0.3, 0.0, 0.0]))
+
+    @jax.jit
+    def slope(parameters, moved):
+        compiled.append(1)
+
+        def force(parameters):
+            decided = plan(
+                CONFIG,
+                ROBOT,
+                parameters,
+                command=named_command("c"),
+                anchor=ANCHOR,
+                tick=jnp.array(3),
+                state=moving,
+                feet=feet_of(standing()),
+            )
+            return decided.wrench.force, decided.touchdown.position
+
+        return jax.jvp(force, (parameters,), (moved,))[1]
+
+    parameters = CONFIG.parameters(expert())
+    parameters = jax.tree.map(lambda x: np.asarray(x, float), parameters)
+    still = jax.tree.map(np.zeros_like, parameters)
+    felt = {
+        name: bool(
+            sum(jnp.abs(d).max() for d in slope(parameters, one.write(still, np.ones(())))) > 1e-9
+        )
+        for name, one in BY_NAME.items()
+        if not name.startswith("k")
+    }
+    unfelt = {"gravity_compensation", "foot_height"}
+    assert felt == {name: name not in unfelt for name in felt}
+    slope(FEEDBACK.write(parameters, np.array(0.3)), still)
+    assert len(compiled) == 1
+    assert THETA[0].read(parameters) is parameters.mpc.weights.Q
+    for name in ("foot_height", "kp"):
+        with pytest.raises(InputError, match=f"{name} cannot be tuned by gradients"):
+            tunables([name])
+    with pytest.raises(InputError, match="did you mean 'turn_lead'"):
+        tunables(["turn_laed"])
+
+
 def test_before_the_gait_both_feet_share_the_weight():
-    _, decided = at(-110, slots=2)
+    _, decided = at(-110, max_contacts=2)
     assert decided.contact.tolist() == [True, True]
     assert decided.swing_ticks.tolist() == [0, 0]
     np.testing.assert_allclose(decided.wrench.force[:, 2], WEIGHT / 2, rtol=0.2)
@@ -165,7 +227,14 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
     walking = jax.tree.map(jnp.asarray, standing())
     state = walking.state._replace(velocity=jnp.array([0.5, 0.0, 0.0]))
     horizon, touchdown = plan_horizon(
-        config, ROBOT, STRAIGHT, ANCHOR, jnp.array(0), state, feet_of(walking)
+        config,
+        ROBOT,
+        config.footstep.parameters,
+        command=STRAIGHT,
+        anchor=ANCHOR,
+        tick=jnp.array(0),
+        state=state,
+        feet=feet_of(walking),
     )
     stands = np.asarray(horizon.contact)
     assert stands.sum(axis=1).tolist() == [1] * 15
@@ -176,9 +245,9 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
 
 
 def test_room_for_two_feet_is_needed_before_the_gait_and_in_double_support():
-    assert [slots_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
+    assert [contacts_needed(CONFIG, tick) for tick in (-110, -81, -80, 0, 400)] == [2, 2, 1, 1, 1]
     double = WalkConfig(gait=GaitConfig(stance=24, swing=16))
-    assert slots_needed(double, 0) == 2
+    assert contacts_needed(double, 0) == 2
 
 
 # What it asks of the joints

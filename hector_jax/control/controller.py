@@ -7,17 +7,19 @@ the nominal robot only, never the plant's own numbers.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from hector_jax.control import gait
-from hector_jax.control.footstep import FootstepConfig, touchdown_points
+from hector_jax.control import gait, legs
+from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters, touchdown_points
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.legs import LegConfig, joint_torques, swing_joints, trunk_position
-from hector_jax.control.mpc import Horizon, MpcConfig, solve_mpc
+from hector_jax.control.legs import LegConfig, LegParameters, Measurement
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
+from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
@@ -45,6 +47,12 @@ class WalkConfig:
                 f"got tick {self.gait.tick} s and step {self.mpc_step} s"
             )
 
+    def parameters(self, weights: Weights) -> Parameters:
+        """The controller's numbers, to be traced: these weights, else those of this config."""
+        return Parameters(
+            self.mpc.parameters(weights), self.footstep.parameters, self.legs.parameters
+        )
+
     @property
     def mpc_step(self) -> float:
         """MPC step dt [s]."""
@@ -66,21 +74,6 @@ def walk_config(robot: Robot) -> WalkConfig:
     return from_table(str(robot.description.path), WalkConfig, given)
 
 
-class Feet(NamedTuple):
-    """Foot points in the world and where they point."""
-
-    position: Float[Array, "*batch 2 3"]  # [m]
-    yaw: Float[Array, "*batch 2"]  # [rad]
-
-
-class Measurement(NamedTuple):
-    """What the robot knows of itself."""
-
-    state: State  # estimate of the base
-    joints: Float[Array, "*batch 10"]  # [rad], motor side
-    joint_rates: Float[Array, "*batch 10"]  # [rad/s]
-
-
 class Memory(NamedTuple):
     """What the controller remembers: where each foot last stood."""
 
@@ -95,7 +88,7 @@ class Plan(NamedTuple):
     touchdown: Feet  # where each foot next comes down
     swing_ticks: Int[Array, "*batch 2"]  # since lift-off
     residual: Float[Array, "*batch"]  # worst relative KKT residual of the QP
-    status: Int[Array, "*batch"]  # of the QP, see control.qp
+    status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
 
 
 class Retune(NamedTuple):
@@ -106,7 +99,7 @@ class Retune(NamedTuple):
     step: Callable[[Any, int, Anchor, Measurement, Wrench], tuple[Any, Weights]]
 
 
-def slots_needed(config: WalkConfig, tick: int) -> int:
+def contacts_needed(config: WalkConfig, tick: int) -> int:
     """Feet that may stand at once in a plan: 2 before the gait starts or with double support."""
     return 2 if tick < config.gait.first_tick or config.gait.double_support else 1
 
@@ -114,6 +107,8 @@ def slots_needed(config: WalkConfig, tick: int) -> int:
 def plan_horizon(
     config: WalkConfig,
     robot: Robot,
+    parameters: FootstepParameters,
+    *,
     command: Command,
     anchor: Anchor,
     tick: Int[Array, ""],
@@ -123,7 +118,7 @@ def plan_horizon(
     """What the MPC is to plan about, and where each foot next comes down.
 
     Args:
-        config, robot: the controller.
+        config, robot, parameters: the controller.
         command, anchor: what to walk.
         tick: gait tick now.
         state: base now.
@@ -140,18 +135,10 @@ def plan_horizon(
     middles = jnp.concatenate([tick[None], steps[1:-1] + config.mpc.step_ticks // 2])
     count = gait.touchdowns(ticks, tick, middles)
     wait = gait.ticks_to_touchdown(ticks, tick)
+    times = {"stance": ticks.tick * ticks.stance, "swing": ticks.tick * ticks.swing}
+    touch = partial(touchdown_points, config.footstep, robot, parameters, **times)
     touchdowns = [
-        Feet(
-            *touchdown_points(
-                config.footstep,
-                robot,
-                state,
-                now,
-                ticks.tick * (wait + number * ticks.cycle),
-                ticks.tick * ticks.stance,
-                ticks.tick * ticks.swing,
-            )
-        )
+        touch(state=state, reference=now, remaining=ticks.tick * (wait + number * ticks.cycle))
         for number in range(config.touchdowns)
     ]
     foot_points, foot_yaw = feet
@@ -178,40 +165,43 @@ def plan_horizon(
 def plan(
     config: WalkConfig,
     robot: Robot,
-    weights: Weights,
+    parameters: Parameters,
+    *,
     command: Command,
     anchor: Anchor,
     tick: Int[Array, ""],
     state: State,
     feet: Feet,
-    *,
-    slots: int = 1,
+    max_contacts: int = 1,
 ) -> Plan:
     """Solve the MPC for one tick. Returns the commanded wrench and the planned touchdowns.
 
     Args:
-        config, robot, weights: the controller.
+        config, robot, parameters: the controller.
         command, anchor: what to walk.
         tick: gait tick now.
         state: base now.
         feet: foot points now; of a foot in the air they are not used.
-        slots: from `slots_needed` (static).
+        max_contacts: from `contacts_needed` (static).
 
     Source: Eq. 3-6.
     """
-    horizon, touchdown = plan_horizon(config, robot, command, anchor, tick, state, feet)
-    wrench, solution = solve_mpc(config.mpc, robot, weights, state, horizon, config.mpc_step, slots)
-    residual = jnp.maximum(
-        jnp.maximum(solution.primal_residual, solution.dual_residual), solution.gap
+    horizon, touchdown = plan_horizon(
+        config,
+        robot,
+        parameters.footstep,
+        command=command,
+        anchor=anchor,
+        tick=tick,
+        state=state,
+        feet=feet,
     )
-    return Plan(
-        wrench=wrench,
-        contact=gait.contact(config.gait, tick),
-        touchdown=touchdown,
-        swing_ticks=gait.swing_ticks(config.gait, tick),
-        residual=residual,
-        status=solution.status,
-    )
+    problem = MpcProblem(robot, parameters.mpc, state, horizon)
+    wrench, solution = solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
+    residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
+    residual, stands = jnp.maximum(residual, solution.gap), gait.contact(config.gait, tick)
+    since = gait.swing_ticks(config.gait, tick)
+    return Plan(wrench, stands, touchdown, since, residual, solution.status)
 
 
 def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
@@ -220,7 +210,7 @@ def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
     local = foot_poses(robot, measurement.joints)
     axes = R_wb @ local.rotation[:, :, 0].T  # the feet's x axes, as columns
     offset = wrap_angle(jnp.arctan2(axes[1], axes[0]) - measurement.state.euler[2])
-    position = trunk_position(robot, measurement.state) + local.position @ R_wb.T
+    position = legs.trunk_position(robot, measurement.state) + local.position @ R_wb.T
     return Feet(position, measurement.state.euler[2] + offset)
 
 
@@ -232,19 +222,27 @@ def init_memory(robot: Robot, measurement: Measurement) -> Memory:
 def step_plan(
     config: WalkConfig,
     robot: Robot,
-    weights: Weights,
+    parameters: Parameters,
+    *,
     command: Command,
     anchor: Anchor,
     tick: Int[Array, ""],
     memory: Memory,
     measurement: Measurement,
-    *,
-    slots: int = 1,
+    max_contacts: int = 1,
 ) -> tuple[Memory, Plan]:
     """`plan` from what is measured; remembers where the standing feet are. Once a tick."""
     feet = measured_feet(robot, measurement)
     decided = plan(
-        config, robot, weights, command, anchor, tick, measurement.state, feet, slots=slots
+        config,
+        robot,
+        parameters,
+        command=command,
+        anchor=anchor,
+        tick=tick,
+        state=measurement.state,
+        feet=feet,
+        max_contacts=max_contacts,
     )
     stands = decided.contact
     liftoff = Feet(
@@ -257,32 +255,38 @@ def step_plan(
 def actuate(
     config: WalkConfig,
     robot: Robot,
-    decided: Plan,
+    parameters: LegParameters,
+    *,
+    plan: Plan,
     memory: Memory,
     substep: Int[Array, ""],
     measurement: Measurement,
 ) -> Float[Array, "10"]:
-    """Joint torque commands [N m], every ms, `substep` ms after the plan. Source: Eq. 5."""
-    elapsed = decided.swing_ticks * config.gait.tick + 1e-3 * substep
-    target, target_rates = swing_joints(
-        config.legs,
+    """Joint torque commands [N m] of a millisecond.
+
+    Args:
+        config, robot, parameters: the controller.
+        plan, memory: of the tick.
+        substep: whole milliseconds since the plan.
+        measurement: of this millisecond.
+
+    Source: Eq. 5.
+    """
+    target, target_rates = legs.swing_joints(
         robot,
+        parameters,
         measurement.state,
-        memory.liftoff.position,
-        memory.liftoff.yaw,
-        decided.touchdown.position,
-        decided.touchdown.yaw,
-        elapsed,
-        config.gait.tick * config.gait.swing,
+        start=memory.liftoff,
+        end=plan.touchdown,
+        elapsed=plan.swing_ticks * config.gait.tick + 1e-3 * substep,
+        swing=config.gait.tick * config.gait.swing,
     )
-    return joint_torques(
-        config.legs,
+    return legs.joint_torques(
         robot,
-        measurement.state,
-        measurement.joints,
-        measurement.joint_rates,
-        decided.contact,
-        decided.wrench,
-        target,
-        target_rates,
+        parameters,
+        measurement,
+        contact=plan.contact,
+        wrench=plan.wrench,
+        target=target,
+        target_rates=target_rates,
     )
