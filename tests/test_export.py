@@ -40,9 +40,8 @@ from hector_jax.runs.export import (
     find_weights,
     load_controller,
     record,
-    weights_cpp,
-    weights_schema,
 )
+from hector_jax.runs.export_weights import weights_cpp, weights_schema
 
 ROBOT, CONFIG = load_robot(), WalkConfig()
 EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"
@@ -242,9 +241,12 @@ def test_another_factor_or_order_would_be_noticed(spoilt):
     assert np.abs(ours - theirs).max() > 0.1
 
 
-def test_the_header_says_what_the_cpp_controller_lacks():
+def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers():
     text = weights_cpp(nominal(), CONFIG, ROBOT, "nominal")
+    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
     for fact in ("0.04 s", "9.0 kg", "footholds", "toe and heel swapped", "0.01 N m", "M_z"):
+        assert fact in page
+    for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export.md"):
         assert fact in text
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_about="weight"))

@@ -24,7 +24,7 @@ from hector_jax.core.console import bar, say_if_slow
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import append_file, as_json, locked, write_file
 from hector_jax.core.inputs import InputError, plural, short_repr
-from hector_jax.core.runtime import letters
+from hector_jax.core.runtime import message_queue
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, check, from_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
@@ -190,7 +190,7 @@ def _tunings(
 ) -> Iterator[tuple[str, Tuning]]:
     """Tune several problems side by side; yields each tuning with its name when it has ended."""
     done, total = 0, config.iterations * len(problems)
-    with letters() as heard, bar(title) as tell:
+    with message_queue() as heard, bar(title) as tell:
         running: dict[Future[Tuning], str] = {
             pool.submit(_tune_job, config, robot, command, params, name, heard): name
             for name, (command, params) in problems.items()
