@@ -105,7 +105,7 @@ def check_jax(on_cpu: bool = False) -> None:
 def setup_jax() -> None:
     """Turn on 64 bits, full precision and the compilation cache; call before the first array.
 
-    Python's garbage collector is told to look less often.
+    Python's garbage collector runs less often.
     """
     import jax
 

@@ -230,9 +230,11 @@ def _with_shapes(texts: Any, values: Any) -> Any:
     return {"is": texts, **(arrays[0] if len(arrays) == 1 else {"arrays": arrays})}
 
 
-def _constants(robot: Robot) -> dict[str, Any]:
-    """What the robot's own code needs to know of the model."""
+def _constants(config: WalkConfig, robot: Robot, lead: int) -> dict[str, Any]:
+    """Numbers that the robot's own code needs."""
     return {
+        "milliseconds_per_plan": substeps(config),
+        "millisecond_of_tick_0": lead,
         "joint_names": list(robot.description.joints),
         "standing_joints": robot.standing_joints.tolist(),
         "standing_height": float(robot.standing_height),
@@ -263,19 +265,18 @@ def export(
     """Write everything that goes to the robot; files that are there already are replaced.
 
     Args:
-        config, robot, weights: the controller that the weights were tuned for, its body, and they.
+        config, robot, weights: the controller, its body and the weights to export.
         command, seconds: to walk for the check; from t = 0 on.
         folder: where to.
         name: of the weights, for the files.
 
     Returns:
-        The card, also in `controller.json`: files with their sha256, the signature with shapes and
-        units, constants that the robot's own code needs, weights, settings, and the check.
+        The card, also in `controller.json`: sha256 of the files, signature, constants, weights,
+        settings and the check.
 
     Raises:
         InputError: as `record` and `export_controller`; or the folder cannot be written.
-        Broken: the exported controller differs from the live one by more than TOLERANCE; nothing
-            is written.
+        Broken: it differs from the live controller by more than TOLERANCE; nothing is written.
     """
     make_folder(folder)
     blobs = {place: export_controller(config, robot, weights, place) for place in PLATFORMS}
@@ -287,23 +288,18 @@ def export(
     (folder / "controller.json").unlink(missing_ok=True)
     save_weights(folder / "weights.json", weights, SCHEMA)
     write_json(folder / SCHEMA, weights_schema())
-    write_file(folder / "weights.cpp", weights_cpp(weights, config, robot, name).encode())
-    for place, blob in blobs.items():
-        write_file(folder / f"controller-{place}.jaxexport", blob)
-    rows = io.BytesIO()
-    np.savez(rows, **as_arrays(walked))
-    write_file(folder / "check.npz", rows.getvalue())
-    names = (*(f"controller-{place}.jaxexport" for place in PLATFORMS), "check.npz")
-    names += ("weights.json", SCHEMA, "weights.cpp")
+    np.savez(rows := io.BytesIO(), **as_arrays(walked))
+    contents = {f"controller-{place}.jaxexport": blob for place, blob in blobs.items()}
+    contents["weights.cpp"] = weights_cpp(weights, config, robot, name).encode()
+    contents["check.npz"] = rows.getvalue()
+    for file, content in contents.items():
+        write_file(folder / file, content)
+    files = (*contents, "weights.json", SCHEMA)
     card = {
         "name": name,
-        "sha256": {one: hashlib.sha256((folder / one).read_bytes()).hexdigest() for one in names},
+        "sha256": {one: hashlib.sha256((folder / one).read_bytes()).hexdigest() for one in files},
         "signature": _with_shapes(_SIGNATURE, dict(zip(_SIGNATURE, example, strict=False))),
-        "constants": {
-            "milliseconds_per_plan": substeps(config),
-            "millisecond_of_tick_0": walked.lead,
-            **_constants(robot),
-        },
+        "constants": _constants(config, robot, walked.lead),
         "weights": weights_tree(weights),
         "controller": to_table(config),
         "robot": tree_hash(robot),
