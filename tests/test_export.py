@@ -25,6 +25,7 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import check
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.qp import QP, Status
 from hector_jax.robot.model import load_robot
@@ -33,16 +34,13 @@ from hector_jax.runs.export import (
     PLATFORMS,
     SCHEMA,
     TOLERANCE,
-    Check,
-    check,
     controller,
     export_controller,
     find_weights,
     load_controller,
-    record,
-    weights_cpp,
-    weights_schema,
 )
+from hector_jax.runs.export_check import Check, record
+from hector_jax.runs.export_weights import weights_cpp, weights_schema
 
 ROBOT, CONFIG = load_robot(), WalkConfig()
 EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"
@@ -242,9 +240,12 @@ def test_another_factor_or_order_would_be_noticed(spoilt):
     assert np.abs(ours - theirs).max() > 0.1
 
 
-def test_the_header_says_what_the_cpp_controller_lacks():
+def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers():
     text = weights_cpp(nominal(), CONFIG, ROBOT, "nominal")
+    page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
     for fact in ("0.04 s", "9.0 kg", "footholds", "toe and heel swapped", "0.01 N m", "M_z"):
+        assert fact in page
+    for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export.md"):
         assert fact in text
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_about="weight"))

@@ -1,4 +1,4 @@
-"""What this machine offers, and whether the program works on it."""
+"""The command `hector doctor`: what this machine has, and whether the program works on it."""
 
 import os
 import tempfile
@@ -35,45 +35,45 @@ _EXTRAS = {  # by name, the package that it needs and what it is for
 
 
 def examine() -> tuple[dict[str, str], list[str]]:
-    """Look over the machine and walk a little.
+    """Examine the machine, and walk a little on it.
 
     Returns:
-        What there is, a line by name, and what is broken, empty on a sound machine. A missing
-        extra or video back end is told but breaks nothing: runs go on without.
+        Facts, a line by name, and faults, empty on a sound machine. A missing extra or video back
+        end is a fact, not a fault: runs go on without.
     """
     faults: list[str] = []
-    told = {name: text for name, text in environment().items() if name != "device"}
-    if told.get("mujoco") != told.get("mujoco-mjx"):
+    facts = {name: text for name, text in environment().items() if name != "device"}
+    if facts.get("mujoco") != facts.get("mujoco-mjx"):
         faults.append("mujoco and mujoco-mjx are of different releases")
-    told["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in jax.devices())
+    facts["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in jax.devices())
     if jnp.asarray(0.0).dtype != jnp.float64:
         faults.append("JAX computes in 32 bits")
-    told["cache"] = str(cache_folder())
-    told["extras"] = ", ".join(
+    facts["cache"] = str(cache_folder())
+    facts["extras"] = ", ".join(
         f"{name}: {'yes' if find_spec(package) else 'no'} (for {use})"
         for name, (package, use) in _EXTRAS.items()
     )
     try:
         robot = load_robot()
-        told["robot"] = f"{MODEL_PATH}, {float(robot.mass):.2f} kg"
+        facts["robot"] = f"{MODEL_PATH}, {float(robot.mass):.2f} kg"
         start = time.monotonic()
         walks = _walks(robot)
-        told["self-test"] = f"walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s"
+        facts["self-test"] = f"walks in {' and '.join(walks)}: {time.monotonic() - start:.1f} s"
     except (ValueError, OSError, RuntimeError) as error:
         faults.append(f"self-test: {one_line(error)}")
-        return told, faults
+        return facts, faults
     faults += [
         f"self-test: the robot does not walk in {world}"
-        for world, found in walks.items()
-        if found.fallen.any() or not found.residual.max() <= SOLVED
+        for world, walked in walks.items()
+        if walked.fallen.any() or not walked.residual.max() <= SOLVED
     ]
     try:
-        told["video"] = f"works ({_film(robot, walks['ideal'])})"
+        facts["video"] = f"works ({_film(robot, walks['ideal'])})"
     except VideoUnavailable as error:
-        told["video"] = str(error)
+        facts["video"] = str(error)
         if "MUJOCO_GL" in os.environ:  # a back end was asked for
             faults.append(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}")
-    return told, faults
+    return facts, faults
 
 
 def _walks(robot: Robot) -> dict[str, Trajectory]:

@@ -1,7 +1,7 @@
 """A command with its flags from the words of a line or from a file, checked, and written again.
 
 tyro reads the line; a TOML file, or the `config.json` of a run, has the same flags by name. All of
-it happens before the slow imports: a wrong word is told at once, in one line.
+it happens before the slow imports: a wrong word ends in one line at once.
 """
 
 import io

@@ -1,6 +1,5 @@
 """Weights to JSON and back."""
 
-import difflib
 import json
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 
 from hector_jax.control.weights import Weights
 from hector_jax.core.files import write_file
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.settings import Range, read_json, validation_error
 from hector_jax.core.trajectory import State, Wrench
 
@@ -77,9 +76,8 @@ def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
         raise InputError(f"{path}: {where} must be an object; {expected}")
     for key in tree:
         if key not in names:
-            near = difflib.get_close_matches(key, names, n=1)
-            hint = f'did you mean "{prefix}{near[0]}"?' if near else expected
-            raise InputError(f"{path}: unknown weight {json.dumps(prefix + key[:40])}; {hint}")
+            message = unknown("weight", prefix + key, [prefix + name for name in names])
+            raise InputError(f"{path}: {message}")
     for name in names:
         if name not in tree:
             raise InputError(f'{path}: missing weight "{prefix}{name}"; {expected}')

@@ -1,4 +1,4 @@
-"""What a person sees while waiting: one line or one bar on stderr; stdout carries results only."""
+"""Messages and progress on stderr, and the exit code of a program; stdout carries results only."""
 
 import errno
 import os
@@ -48,7 +48,7 @@ def bar(title: str) -> Iterator[Tell]:
     """A progress bar for anything longer than two seconds; plain lines where there is no terminal.
 
     Yields:
-        Function to be told how many are done of how many, with a short remark.
+        Function of how many are done, of how many, and a short remark.
     """
     if console.is_terminal:
         columns = (
@@ -84,7 +84,7 @@ def bar(title: str) -> Iterator[Tell]:
 
 
 class Broken(RuntimeError):  # noqa: N818, it is no fault of the program
-    """What was to be found out is bad news, such as a machine that fails the doctor's tests."""
+    """The result is bad news, such as a machine that fails the doctor's tests."""
 
 
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
@@ -159,9 +159,9 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
 
     Args:
         name: of the program, before the line.
-        work: `InputError` is bad input (2); `Broken`, a full disk and a worker process that was
-            killed are told as such (1), SIGINT (130) and SIGTERM (143) too; a second signal does
-            not wait. Where nobody reads standard output any more, it ends without a word (141). Any
+        work: `InputError` is bad input (2); `Broken`, a full disk and a killed worker process end
+            in a line of their own (1), SIGINT (130) and SIGTERM (143) too; a second signal does not
+            wait. Where nobody reads standard output any more, it ends without a word (141). Any
             other exception is a fault of the program: it goes on to the caller with its traceback,
             which for a script means exit code 1.
     """

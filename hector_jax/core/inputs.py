@@ -1,4 +1,4 @@
-"""What a person hands in: the exception for it, the words of its message, and files as text."""
+"""Wrong input: the exception, the words of its message, and files read as text."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """What a person handed in is wrong; the one line says what came and what was expected.
+    """Input is wrong; the one line says what came and what was expected.
 
     The programs end with exit code 2 and that line. Every other exception is a fault of the program
     and keeps its traceback.

@@ -14,12 +14,13 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, suppress
-from multiprocessing.connection import Connection
+from contextlib import contextmanager
+from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.managers import SyncManager
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hector_jax.core.inputs import InputError, one_line
 
@@ -87,9 +88,9 @@ def check_jax(on_cpu: bool = False) -> None:
             errors="replace",
         )
         if done.returncode:
-            said = done.stderr.strip().rpartition("\n")[2].rpartition("] ")[2]
-            raise InputError(f"XLA_FLAGS={os.environ['XLA_FLAGS']}: {one_line(said)}")
-    asked = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if name[:4] == "JAX_"]
+            reason = done.stderr.strip().rpartition("\n")[2].rpartition("] ")[2]
+            raise InputError(f"XLA_FLAGS={os.environ['XLA_FLAGS']}: {one_line(reason)}")
+    variables = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if name[:4] == "JAX_"]
     try:
         import jax
 
@@ -97,14 +98,14 @@ def check_jax(on_cpu: bool = False) -> None:
             jax.config.update("jax_platforms", "cpu")
         jax.devices()
     except Exception as error:  # of several kinds, some without a word
-        told = f"JAX does not start{' with ' if asked else ''}{', '.join(asked)}"
-        raise InputError(f"{told}: {one_line(error) or 'no such device here'}") from None
+        what = f"JAX does not start{' with ' if variables else ''}{', '.join(variables)}"
+        raise InputError(f"{what}: {one_line(error) or 'no such device here'}") from None
 
 
 def setup_jax() -> None:
     """Turn on 64 bits, full precision and the compilation cache; call before the first array.
 
-    Python's garbage collector is told to look less often.
+    Python's garbage collector runs less often.
     """
     import jax
 
@@ -154,45 +155,35 @@ class _Spawn(SpawnContext):
     Process = _Process
 
 
-@contextmanager
-def _lifeline() -> Iterator[tuple[Connection, Connection]]:
-    """A pipe whose first end is for processes that are to live no longer than its second end."""
-    theirs, ours = _Spawn().Pipe(duplex=False)
-    with theirs, ours:
-        yield theirs, ours
-
-
-def _leave_with(lifeline: Connection) -> None:
-    """End this process when the other end of its lifeline is closed, by whatever end of its parent.
+def _leave_with_parent() -> None:
+    """End this process when its parent ends, by whatever end.
 
     Without it workers outlive a parent that was killed: each holds the queue open that it waits on.
     """
 
     def watch() -> None:
-        with suppress(EOFError, OSError):
-            lifeline.recv_bytes()
+        cast(BaseProcess, parent_process()).join()
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager
-def letters() -> Iterator[Any]:
-    """A queue that jobs of worker processes can be handed."""
+def message_queue() -> Iterator[Any]:
+    """A queue that can be an argument of jobs in worker processes."""
     manager = SyncManager(ctx=_Spawn())
-    with _lifeline() as (theirs, _):
-        manager.start(_leave_with, (theirs,))
-        with manager:
-            yield manager.Queue()
+    manager.start(_leave_with_parent)
+    with manager:
+        yield manager.Queue()
 
 
-def start_worker(cores: Any, lifeline: Connection) -> None:
+def start_worker(cores: Any) -> None:
     """Set up a worker process as its parent is, with interrupts and accelerators left to it.
 
     Several workers stay on a core each, the next of the queue `cores`: XLA's threads of one would
     otherwise wait for those of the others, which costs several times the work.
     """
-    _leave_with(lifeline)
+    _leave_with_parent()
     core = cores.get()
     if core is not None:
         os.sched_setaffinity(0, {core})
@@ -223,19 +214,15 @@ def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
     """
     if processes < 1:
         raise ValueError(f"the number of processes must be at least 1, got {processes}")
-    spawn = _Spawn()
+    spawn, others = _Spawn(), active_children()
     cores = spawn.SimpleQueue()
     for core in _cores(processes):
         cores.put(core)
-    with (
-        _lifeline() as (theirs, ours),
-        ProcessPoolExecutor(
-            processes, spawn, initializer=start_worker, initargs=(cores, theirs)
-        ) as pool,
-    ):
+    with ProcessPoolExecutor(processes, spawn, initializer=start_worker, initargs=(cores,)) as pool:
         try:
             yield pool
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            ours.close()
+            for worker in set(active_children()) - set(others):
+                worker.kill()
             raise

@@ -1,4 +1,4 @@
-"""Settings from JSON and TOML and back; whatever is wrong is told in one line.
+"""Settings from JSON and TOML and back; a fault is an InputError of one line.
 
 Settings are frozen dataclasses that call `check` when they are made. msgspec converts values to the
 types of the fields; the ranges and the words of the messages are here: the field, what was

@@ -1,4 +1,4 @@
-"""Robot descriptions from anywhere, looked at before MuJoCo opens them.
+"""The check of a robot's MJCF, from anywhere, before MuJoCo opens it.
 
 A description is one MJCF file of at most 1 MB that says everything itself, meshes and pictures
 apart, which lie in its folder or below. What would reach outside of it (includes, other files),
@@ -20,41 +20,22 @@ _MOST_BYTES = 1_000_000
 _MOST_MESH_BYTES = 20_000_000
 _DEEPEST = 100
 _MOST_BODIES = 200
-_PARTS_FROM_ELSEWHERE = (
-    "include",
-    "attach",
-    "model",
-    "replicate",
-    "composite",
-    "flexcomp",
-    "plugin",
-)
+_REFUSED = ("include", "attach", "model", "replicate", "composite", "flexcomp", "plugin")
 _FOLDERS = ("assetdir", "meshdir", "texturedir")
 
 _COUNT = Range(-1, 1_000_000)  # -1: as many as it takes
-_PIXELS = Range(0, 8192)
+_NOT_NEGATIVE = "mass density armature damping frictionloss friction margin size"
+_PIXELS = "width height offwidth offheight nrow ncol shadowsize"
+_COUNTS = "njmax nconmax nkey nstack nuserdata "
+_COUNTS += "nuser_body nuser_jnt nuser_geom nuser_site nuser_actuator"
 _RANGES: Mapping[str, Range] = {
-    "mass": NOT_NEGATIVE,
-    "density": NOT_NEGATIVE,
     "diaginertia": POSITIVE,
-    "armature": NOT_NEGATIVE,
-    "damping": NOT_NEGATIVE,
-    "frictionloss": NOT_NEGATIVE,
-    "friction": NOT_NEGATIVE,
-    "margin": NOT_NEGATIVE,
-    "size": NOT_NEGATIVE,
     "iterations": Range(1, 1000),
     "ls_iterations": Range(1, 1000),
-    "width": _PIXELS,
-    "height": _PIXELS,
-    "offwidth": _PIXELS,
-    "offheight": _PIXELS,
-    "nrow": _PIXELS,
-    "ncol": _PIXELS,
-    "shadowsize": _PIXELS,
     "offsamples": Range(0, 64),
-    **dict.fromkeys(("njmax", "nconmax", "nkey", "nstack", "nuserdata"), _COUNT),
-    **dict.fromkeys((f"nuser_{x}" for x in ("body", "jnt", "geom", "site", "actuator")), _COUNT),
+    **dict.fromkeys(_NOT_NEGATIVE.split(), NOT_NEGATIVE),
+    **dict.fromkeys(_PIXELS.split(), Range(0, 8192)),
+    **dict.fromkeys(_COUNTS.split(), _COUNT),
 }
 _RANGES_OF = {("inertial", "mass"): POSITIVE, ("numeric", "size"): _COUNT}
 _PAIRS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange")
@@ -69,9 +50,8 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         InputError: one line naming the file and what is wrong in it.
     """
     text = read_text(path, "the robot description", _MOST_BYTES)
-    found = re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE)
-    if found:
-        raise InputError(f"{path}: {found[1].upper()} is not accepted, expected plain MJCF")
+    if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
@@ -80,16 +60,16 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco>")
     bodies = 0
     for element, label in _labelled(path, root):
-        if element.tag in _PARTS_FROM_ELSEWHERE:
+        if element.tag in _REFUSED:
             of = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
             raise InputError(
                 f"{path}: <{element.tag}>{of} is not accepted, expected one self-contained file"
             )
         bodies += element.tag == "body"
         for name, value in element.attrib.items():
-            told = _problem(element.tag, name, value)
-            if told:
-                raise InputError(f"{path}: {label}: {name} is {short_repr(value)}, expected {told}")
+            if expected := _expected(element.tag, name, value):
+                what = f"{name} is {short_repr(value)}, expected {expected}"
+                raise InputError(f"{path}: {label}: {what}")
     if bodies > _MOST_BODIES:
         raise InputError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
     _check_files(path, root)
@@ -97,7 +77,7 @@ def read_mjcf(path: Path) -> ElementTree.Element:
 
 
 def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception) -> InputError:
-    """What MuJoCo says of a description, on one line, with the nearest name that it would know.
+    """MuJoCo's error in one line, with the nearest name that it would know.
 
     Args:
         path: the file.
@@ -105,16 +85,16 @@ def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception
         schema: words of MJCF.
         error: MuJoCo's.
     """
-    told = one_line(error)
+    message = one_line(error)
     names = {element.get("name", "") for element in root.iter()} | set(re.findall(r"\w+", schema))
     # MuJoCo quotes what it does not know and what the matter is about: the first unknown one counts
-    unknown = [word for word in re.findall(r"'([^']*)'", told) if word not in names]
+    unknown = [word for word in re.findall(r"'([^']*)'", message) if word not in names]
     hint = did_you_mean(unknown[0], names) if unknown else ""
-    return InputError(f"{path}: MuJoCo refuses it: {told}{hint}")
+    return InputError(f"{path}: MuJoCo refuses it: {message}{hint}")
 
 
 def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:
-    """Each element with what a message calls it."""
+    """Each element with its name in a message."""
     depth = {root: 1}
     yield root, "<mujoco>"
     for parent in root.iter():
@@ -131,8 +111,8 @@ def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTr
             yield child, label
 
 
-def _problem(tag: str, name: str, value: str) -> str | None:
-    """What is expected of an attribute that is not so."""
+def _expected(tag: str, name: str, value: str) -> str | None:
+    """What an attribute should be, if it is something else."""
     if name == "name":
         return None
     numbers = _numbers(value)
@@ -189,11 +169,11 @@ def _check_files(path: Path, root: ElementTree.Element) -> None:
 
 def _inside(path: Path, home: Path, place: Path, label: str, value: str) -> Path:
     try:
-        found = (place / value).resolve()
+        resolved = (place / value).resolve()
     except (OSError, ValueError):  # too long, or a loop of links
-        found = Path("/")
-    if not found.is_relative_to(home):
+        resolved = Path("/")
+    if not resolved.is_relative_to(home):
         raise InputError(
             f"{path}: {label} refers to {short_repr(value)}, expected a file in its own folder"
         )
-    return found
+    return resolved

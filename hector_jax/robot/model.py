@@ -9,7 +9,6 @@ Frames: the trunk's is at the trunk body's origin, x ahead, y left, z up; a link
 joint that moves it, parallel to the trunk's when all joints are zero.
 """
 
-import difflib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, did_you_mean
 from hector_jax.robot.description import (
     DESCRIPTION_PATH,
     HECTOR_AXES,
@@ -268,9 +267,11 @@ def _joints(model: mujoco.MjModel) -> list[str]:
 
 
 def _require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
-    _expect(path, name in names, f"no {kind} {name!r}{hint}; {kind}s: {_listed(names)}")
+    _expect(path, name in names, _missing(kind, name, names))
+
+
+def _missing(kind: str, name: str, names: Sequence[str]) -> str:
+    return f"no {kind} {name!r}{did_you_mean(name, names)}; {kind}s: {_listed(names)}"
 
 
 def _listed(names: Sequence[str]) -> str:

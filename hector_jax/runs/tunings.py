@@ -20,7 +20,7 @@ from hector_jax.control.reference import COMMANDS, Command, named_command, stand
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
 from hector_jax.core.console import bar
 from hector_jax.core.files import append_file, as_json, write_file
-from hector_jax.core.runtime import letters
+from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
 from hector_jax.grfm.network import Params
@@ -191,7 +191,7 @@ def _tunings(
 ) -> Iterator[tuple[str, Tuning]]:
     """Tune several problems side by side; yields each tuning with its name when it has ended."""
     done, total = 0, config.iterations * len(problems)
-    with letters() as heard, bar(title) as tell:
+    with message_queue() as heard, bar(title) as tell:
         running: dict[Future[Tuning], str] = {
             pool.submit(_tune_job, config, robot, start, problem, name, heard): name
             for name, problem in problems.items()

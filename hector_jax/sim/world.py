@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, did_you_mean, short_repr
+from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import compile_model, quiet_mujoco
@@ -155,10 +155,7 @@ def named_world(name: str, seed: int = 0) -> Imperfections:
         InputError: the name is none of WORLDS.
     """
     if name not in WORLDS:
-        raise InputError(
-            f"unknown world {short_repr(name)}{did_you_mean(name, WORLDS)}; "
-            f"known: {', '.join(WORLDS)}"
-        )
+        raise InputError(unknown("world", name, WORLDS))
     return {"ideal": ideal, "hfs": hfs, "hfs-varied": lambda: hfs_varied(seed)}[name]()
 
 
