@@ -73,7 +73,7 @@ def _walk_mjx(
     with redirect_stdout(sys.stderr):  # MJX takes a second to import and prints what it misses
         from hector_jax.sim.parallel import walk_batch
 
-    filled = [*jobs, *jobs[-1:] * (batch - len(jobs))]
+    filled = [*jobs, *list(jobs[-1:]) * (batch - len(jobs))]
     walks = walk_batch(config, robot, filled, fine=exact, single=_mjx_bits(exact) == 32)
     return (walk for _, walk in zip(jobs, walks, strict=False))
 

@@ -217,5 +217,8 @@ def walk_many(
 ) -> Iterator[Trajectory]:
     """Walk all jobs in a pool (`runtime.workers`); gives the walks in order, as they come."""
     host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
-    sent = [Job(*map(host, job[:3]), *job[3:]) for job in jobs]
+    sent = [
+        Job(host(weights), host(command), host(plant), *rest)
+        for weights, command, plant, *rest in jobs
+    ]
     yield from pool.map(walk, repeat(config), repeat(host(robot)), sent)
