@@ -64,7 +64,7 @@ class WalkBatch(NamedTuple):
     command: Command
     plant: Imperfections
     push: Push
-    start_tick: Int[Array | np.ndarray, "*batch"]
+    start_tick: Int[Array, "*batch"]
     model: dict[str, Any]  # leaves of the MJX model
 
 
@@ -329,7 +329,7 @@ def walk_batch(
         command=stack([job.command for job in jobs]),
         plant=stack([job.imperfections for job in jobs]),
         push=stack([job.push for job in jobs]),
-        start_tick=starts,
+        start_tick=jnp.asarray(starts),
         model=varied,
     )
     program = _Program(
