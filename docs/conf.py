@@ -59,8 +59,8 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "robot": "Robot load_robot Description foot_poses foot_jacobians inverse_legs linearise",
     "control": """Weights nominal expert Command Anchor named_command standing_anchor reference_at
         GaitConfig FootstepConfig LegConfig MpcConfig Horizon solve_mpc WalkConfig Plan plan""",
-    "sim": "Imperfections ideal hfs hfs_varied standin Job walk walk_many",
-    "grfm": "Window Effect as_effect load_net save_net load_walks TrainConfig train",
+    "sim": "Imperfections ideal hfs hfs_varied standin Job walk Engine choose_engine",
+    "grfm": "Window Effect Phi as_effect load_net save_net load_walks TrainConfig train",
     "tuning": """RolloutConfig rollout LossConfig losses TuneConfig Evaluation Tuning tune descend
         tune_measured OnlineConfig""",
     "search": "SearchConfig search",

@@ -65,6 +65,27 @@ class Trajectory(NamedTuple):
     residual: Float[Any, "*batch T"]  # worst relative KKT residual of the plan in force
 
 
+def no_samples(*batch: int) -> Trajectory:
+    """Walks of no samples (numpy), with leading axes `batch`: the layout of walks in a file."""
+    zeros = lambda *shape: np.zeros((*batch, *shape))  # noqa: E731
+    state = State(*[zeros(0, 3)] * 4)
+    wrench = Wrench(zeros(0, 2, 3), zeros(0, 2, 3))
+    return Trajectory(
+        period=zeros(),
+        initial=State(*[zeros(3)] * 4),
+        state=state,
+        reference=state,
+        command=wrench,
+        effect=wrench,
+        contact=zeros(0, 2),
+        feet=zeros(0, 2, 3),
+        joints=zeros(0, 10),
+        fallen=zeros(0),
+        legs_touch=zeros(0),
+        residual=zeros(0),
+    )
+
+
 def from_start(walk: Trajectory) -> Trajectory:
     """The same walk in the frame of its start: at the origin, facing along x (numpy, no batch).
 

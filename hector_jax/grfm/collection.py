@@ -19,7 +19,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.core.console import say
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import Trajectory, no_samples
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings, load_tree, read_card, save_tree
 from hector_jax.grfm.dataset import at_interval
@@ -75,16 +75,16 @@ def collect(
     """
     interval = walk_config(robot).gait.tick if interval is None else interval
     # as it is read back
-    settings = json.loads(json.dumps({"interval": interval, **(settings or {})}))
+    made_with = json.loads(json.dumps({"interval": interval, **(settings or {})}))
     facts = {
         "units": _UNITS,
         "frames": "world; wrench of the ground on the foot at its foot point, left then right",
-        "settings": settings,
+        "settings": made_with,
         **(about or {}),
     }
     paths = [Path(folder) / f"walk-{i:05d}.npz" for i in range(len(jobs))]
     each = zip(paths, jobs, strict=True)
-    walks = [_load_sound(path, stack([job]), robot, settings) for path, job in each]
+    walks = [_load_sound(path, stack([job]), robot, made_with) for path, job in each]
     missing = [i for i, walk in enumerate(walks) if walk is None]
     done = len(jobs) - len(missing)
     progress(done, len(jobs))
@@ -176,22 +176,5 @@ def _load_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) ->
 
 def walks_like() -> Walks:
     """Shapes in a file; axes of length 0 are walks and ticks."""
-    zeros = lambda *shape: np.zeros((0, *shape))  # noqa: E731
-    state = State(*[zeros(0, 3)] * 4)
-    wrench = Wrench(zeros(0, 2, 3), zeros(0, 2, 3))
-    trajectory = Trajectory(
-        period=zeros(),
-        initial=State(*[zeros(3)] * 4),
-        state=state,
-        reference=state,
-        command=wrench,
-        effect=wrench,
-        contact=zeros(0, 2),
-        feet=zeros(0, 2, 3),
-        joints=zeros(0, 10),
-        fallen=zeros(0),
-        legs_touch=zeros(0),
-        residual=zeros(0),
-    )
     (job,) = draw_jobs(0, 1)
-    return Walks(jax.tree.map(lambda x: zeros(*np.shape(x)), job), trajectory)
+    return Walks(jax.tree.map(lambda x: np.zeros((0, *np.shape(x))), job), no_samples(0))

@@ -20,7 +20,6 @@ from jaxtyping import Array, Float, Int, Key
 
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED, check
-from hector_jax.core.trajectory import Wrench
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +54,19 @@ NO_EPOCHS = History(*np.zeros((4, 0)))
 Progress = Callable[[int, History], None]  # called after each epoch, from 1, with the errors so far
 
 
+class Pair(NamedTuple):
+    """Something of the force nets and of the moment nets: parameters, samples, errors."""
+
+    force: Any
+    moment: Any
+
+
 class Samples(NamedTuple):
     """What the nets are trained on, n samples."""
 
-    x: Wrench  # inputs of the force net and of the moment net, (n, ..., inputs) each
-    y: Wrench  # standardised labels, (n, ..., outputs) each
-    trust: Array  # (n, ..., 1) factor of what the nets add
+    x: Pair  # inputs (n, ..., inputs)
+    y: Pair  # standardised labels (n, ..., outputs)
+    trust: Any  # (n, ..., 1) factor of what the nets add
 
 
 class Net(nn.Module):
@@ -80,11 +86,11 @@ class Net(nn.Module):
 
 def init_nets(
     key: Key[Array, ""], hidden: tuple[int, ...], inputs: int, *, outputs: int, members: int
-) -> Wrench:
+) -> Pair:
     """Fresh parameters of force nets and moment nets, `members` of each stacked."""
     net, x = Net(hidden, outputs), jnp.zeros(inputs)
     draw = jax.jit(jax.vmap(lambda k: net.init(k, x)["params"]))
-    return Wrench(*(draw(jax.random.split(k, members)) for k in jax.random.split(key)))
+    return Pair(*(draw(jax.random.split(k, members)) for k in jax.random.split(key)))
 
 
 def widths(net: dict[str, Any]) -> tuple[int, ...]:
@@ -96,7 +102,8 @@ def apply_net(params: dict[str, Any], x: Float[Array, "*batch n"]) -> Float[Arra
     """Standardised outputs of one net."""
     hidden = widths(params)
     outputs = params[f"Dense_{len(hidden)}"]["kernel"].shape[-1]
-    return Net(hidden, outputs).apply({"params": params}, x)
+    y: Any = Net(hidden, outputs).apply({"params": params}, x)
+    return y
 
 
 class _Rates(NamedTuple):
@@ -107,23 +114,23 @@ class _Rates(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    nets: Wrench  # parameters of force and moment nets, members stacked
+    nets: Pair  # parameters of force and moment nets, members stacked
     optimiser: Any
-    best: Wrench  # of each member those of the epoch with the least validation error
-    least: Wrench  # that error, by member
+    best: Pair  # of each member those of the epoch with the least validation error
+    least: Pair  # that error, by member
 
 
 def fit_nets(
     config: FitConfig,
     key: Key[Array, ""],
-    nets: Wrench,
+    nets: Pair,
     *,
     training: Samples,
     validation: Samples,
-    scale: Wrench,
+    scale: Pair,
     output: Callable[[Array, Array], Array],
     progress: Progress,
-) -> tuple[Wrench, History]:
+) -> tuple[Pair, History]:
     """Train force nets and moment nets in 32 bits.
 
     Args:
@@ -145,7 +152,7 @@ def fit_nets(
     members = len(jax.tree.leaves(nets)[0])
     infinite = jnp.full(members, jnp.inf, jnp.float32)
     rates, rows = _Rates(config.learning_rate, config.l2), []
-    carry = _Carry(nets, _optimiser(rates).init(nets), nets, Wrench(infinite, infinite))
+    carry = _Carry(nets, _optimiser(rates).init(nets), nets, Pair(infinite, infinite))
     for epoch, key_epoch in enumerate(jax.random.split(key, config.epochs), start=1):
         carry, row = _train_epoch(
             output, config.batch, rates, scale, training, validation, carry, key_epoch
@@ -166,7 +173,7 @@ def _optimiser(rates: _Rates) -> optax.GradientTransformation:
     )
 
 
-def _squares(output: Callable[[Array, Array], Array], nets: Wrench, samples: Samples) -> Wrench:
+def _squares(output: Callable[[Array, Array], Array], nets: Pair, samples: Samples) -> Pair:
     """Mean square of the standardised error per member and output."""
 
     def square(net: Any, x: Array, y: Array) -> Array:
@@ -174,7 +181,7 @@ def _squares(output: Callable[[Array, Array], Array], nets: Wrench, samples: Sam
         return jnp.mean(error**2, axis=tuple(range(y.ndim - 1)))
 
     by_member = jax.vmap(square, in_axes=(0, None, None))
-    return Wrench(*map(by_member, nets, samples.x, samples.y))
+    return Pair(*map(by_member, nets, samples.x, samples.y))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -182,7 +189,7 @@ def _train_epoch(
     output: Callable[[Array, Array], Array],
     size: int,
     rates: _Rates,
-    scale: Wrench,
+    scale: Pair,
     training: Samples,
     validation: Samples,
     carry: _Carry,
@@ -193,13 +200,11 @@ def _train_epoch(
     order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
     optimiser = _optimiser(rates)
 
-    def loss(nets: Wrench, chosen: Samples) -> tuple[Float[Array, ""], Wrench]:
+    def loss(nets: Pair, chosen: Samples) -> tuple[Float[Array, ""], Pair]:
         squares = _squares(output, nets, chosen)
         return squares.force.mean(axis=1).sum() + squares.moment.mean(axis=1).sum(), squares
 
-    def step(
-        state: tuple[Wrench, Any], rows: Int[Array, " batch"]
-    ) -> tuple[tuple[Wrench, Any], Wrench]:
+    def step(state: tuple[Any, Any], rows: Int[Array, " batch"]) -> tuple[tuple[Any, Any], Pair]:
         nets, memory = state
         chosen = jax.tree.map(lambda a: a[rows], training)
         gradient, squares = jax.grad(loss, has_aux=True)(nets, chosen)
@@ -210,7 +215,7 @@ def _train_epoch(
     variance = jax.tree.map(jnp.square, scale)
     physical = partial(jax.tree.map, lambda square, v: jnp.mean(square * v, axis=-1))
     error = physical(_squares(output, nets, validation), variance)
-    best = Wrench(
+    best = Pair(
         *(
             jax.tree.map(partial(jax.vmap(jnp.where), now < least), new, old)
             for now, least, new, old in zip(error, carry.least, nets, carry.best, strict=True)

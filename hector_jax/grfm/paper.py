@@ -21,7 +21,7 @@ from hector_jax.core.trajectory import Wrench, zero_wrench
 from hector_jax.grfm import nets
 from hector_jax.grfm.dataset import Dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, ground_effect, in_dtype_of
-from hector_jax.grfm.nets import NO_EPOCHS, FitConfig, History, Progress, Samples
+from hector_jax.grfm.nets import NO_EPOCHS, FitConfig, History, Pair, Progress, Samples
 
 _INPUTS = 6 * HISTORY
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
@@ -89,7 +89,8 @@ def init(key: Key[Array, ""], hidden: tuple[int, ...] = (64, 64, 64)) -> PaperPa
     """Fresh networks without statistics, in 32 bits."""
     fresh = nets.init_nets(key, hidden, _INPUTS, outputs=6, members=1)
     scaling = Scaling(zero_wrench(), zero_wrench())
-    params = PaperParams(*jax.tree.map(lambda p: p[0], fresh), scaling, scaling)
+    force, moment = jax.tree.map(lambda p: p[0], fresh)
+    params = PaperParams(force, moment, scaling, scaling)
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 
@@ -103,8 +104,8 @@ def with_statistics(params: PaperParams, dataset: Dataset) -> PaperParams:
 def _samples(params: PaperParams, dataset: Dataset) -> Samples:
     label = _standardised(params.outputs, dataset.label)
     samples = Samples(
-        x=_features(params.inputs, dataset.window.commands),
-        y=jax.tree.map(lambda w: w.reshape(-1, 6), label),
+        x=Pair(*_features(params.inputs, dataset.window.commands)),
+        y=Pair(*(w.reshape(-1, 6) for w in label)),
         trust=np.ones((len(dataset.walk), 1)),
     )
     return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
@@ -125,10 +126,10 @@ def fit(
     best, history = nets.fit_nets(
         config,
         key_shuffle,
-        jax.tree.map(lambda p: p[None], Wrench(params.force, params.moment)),
+        jax.tree.map(lambda p: p[None], Pair(params.force, params.moment)),
         training=_samples(params, training),
         validation=_samples(params, validation),
-        scale=jax.tree.map(lambda w: w.reshape(6), params.outputs.scale),
+        scale=Pair(*(w.reshape(6) for w in params.outputs.scale)),
         output=_output,
         progress=progress,
     )

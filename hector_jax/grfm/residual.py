@@ -15,12 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hector_jax.control.gait import GaitConfig, since_switch
-from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm import gated, nets
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import Effect, Phi, Window, in_dtype_of
 from hector_jax.grfm.gated import CHANGES, GATES, MOTION, GatedMap, View, hats, views
-from hector_jax.grfm.nets import FitConfig, History, Progress, Samples
+from hector_jax.grfm.nets import FitConfig, History, Pair, Progress, Samples
 
 HIDDEN = (32, 32)
 MEMBERS = 4  # nets of each kind
@@ -50,10 +49,10 @@ class ResidualParams(NamedTuple):
 def init(key: Key[Array, ""], hidden: tuple[int, ...] = HIDDEN) -> ResidualParams:
     """Fresh networks without statistics, in 32 bits; the axis of ticks has length 0."""
     inputs = _TERMS + len(GATES) + 1
-    fresh = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS)
+    force, moment = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS)
     table = jnp.zeros((2, 0, _TERMS))
     stats = FeatureStats(table, table, jnp.zeros(()))
-    params = ResidualParams(gated.init(key), *fresh, stats, jnp.zeros(6))
+    params = ResidualParams(gated.init(key), force, moment, stats, jnp.zeros(6))
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 
@@ -127,8 +126,8 @@ def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
     window = jax.tree.map(jnp.asarray, dataset.window)
     ground, z, trust = jax.jit(jax.vmap(one))(window)
     residual = (gated.labels_in_view(dataset)[0] - ground) / params.residual_rms
-    y = Wrench(residual[..., :3], residual[..., 3:])
-    samples = Samples(Wrench(z, z), y, trust[..., None])
+    y = Pair(residual[..., :3], residual[..., 3:])
+    samples = Samples(Pair(z, z), y, trust[..., None])
     return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
 
 
@@ -141,10 +140,10 @@ def fit(
     best, history = nets.fit_nets(
         config,
         key_shuffle,
-        Wrench(params.force, params.moment),
+        Pair(params.force, params.moment),
         training=_samples(params, training),
         validation=_samples(params, validation),
-        scale=Wrench(params.residual_rms[:3], params.residual_rms[3:]),
+        scale=Pair(params.residual_rms[:3], params.residual_rms[3:]),
         output=_output,
         progress=progress,
     )

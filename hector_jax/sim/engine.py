@@ -38,20 +38,7 @@ class Engine(NamedTuple):
     bits: Callable[[bool], int]  # of the physics, by `exact`
 
 
-def _walk_c(
-    pool: Executor,
-    config: WalkConfig,
-    robot: Robot,
-    jobs: Sequence[Job],
-    *,
-    exact: bool = True,
-    batch: int = 0,
-) -> Iterator[Trajectory]:
-    del exact, batch
-    return walk_many(pool, config, robot, jobs)
-
-
-MUJOCO_C = Engine("c", _walk_c, lambda exact: 64)
+MUJOCO_C = Engine("c", walk_many, lambda exact: 64)
 """MuJoCo C, one walk per process."""
 
 
@@ -69,11 +56,10 @@ def _walk_mjx(
     exact: bool = True,
     batch: int = 0,
 ) -> Iterator[Trajectory]:
-    del pool
     with redirect_stdout(sys.stderr):  # MJX takes a second to import and prints what it misses
         from hector_jax.sim.parallel import walk_batch
 
-    filled = [*jobs, *jobs[-1:] * (batch - len(jobs))]
+    filled = [*jobs, *list(jobs[-1:]) * (batch - len(jobs))]
     walks = walk_batch(config, robot, filled, fine=exact, single=_mjx_bits(exact) == 32)
     return (walk for _, walk in zip(jobs, walks, strict=False))
 

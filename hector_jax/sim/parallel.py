@@ -64,7 +64,7 @@ class WalkBatch(NamedTuple):
     command: Command
     plant: Imperfections
     push: Push
-    start_tick: Int[Array | np.ndarray, "*batch"]
+    start_tick: Int[Array, "*batch"]
     model: dict[str, Any]  # leaves of the MJX model
 
 
@@ -323,10 +323,17 @@ def walk_batch(
     worlds = build_worlds([job.imperfections for job in jobs], robot.description)
     model, varied = mjx_model.batched_model(worlds, single)
     qpos = jnp.asarray(standing_qpos(worlds[0], robot.standing_joints, float(robot.trunk_height)))
-    each = (stack(values) for values in zip(*((*job[:3], job.push) for job in jobs), strict=True))
     starts = np.array([job.start_tick for job in jobs], np.int32)
+    batch = WalkBatch(
+        weights=stack([job.weights for job in jobs]),
+        command=stack([job.command for job in jobs]),
+        plant=stack([job.imperfections for job in jobs]),
+        push=stack([job.push for job in jobs]),
+        start_tick=jnp.asarray(starts),
+        model=varied,
+    )
     program = _Program(
         config, mjx_model.find_places(worlds[0]), int(starts.max()), ticks, fine, single
     )
     walk = partial(_walk_all, program, robot, model, qpos)
-    return _in_chunks(WalkBatch(*each, starts, varied), chunk, walk)
+    return _in_chunks(batch, chunk, walk)

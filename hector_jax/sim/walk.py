@@ -213,9 +213,21 @@ def _trajectory(
 
 
 def walk_many(
-    pool: Executor, config: WalkConfig, robot: Robot, jobs: Sequence[Job]
+    pool: Executor,
+    config: WalkConfig,
+    robot: Robot,
+    jobs: Sequence[Job],
+    *,
+    exact: bool = True,
+    batch: int = 0,
 ) -> Iterator[Trajectory]:
-    """Walk all jobs in a pool (`runtime.workers`); gives the walks in order, as they come."""
+    """Walk all jobs in a pool (`runtime.workers`); gives the walks in order, as they come.
+
+    `exact` and `batch` are those of an `Engine`: this one is always exact and compiles no batch.
+    """
     host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
-    sent = [Job(*map(host, job[:3]), *job[3:]) for job in jobs]
+    sent = [
+        Job(host(weights), host(command), host(plant), *rest)
+        for weights, command, plant, *rest in jobs
+    ]
     yield from pool.map(walk, repeat(config), repeat(host(robot)), sent)
