@@ -4,12 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from matplotlib.artist import setp
 
 from hector_jax.core.trajectory import LEFT, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, named, widen
+from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, named, set_all, widen
 
 
 def wrenches(
@@ -44,7 +43,7 @@ def wrenches(
             panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
             panel.set_ylabel(label)
             widen(panel, 5.0 if "[N]" in label else 0.5)
-        setp(panels[-1], xlabel="time [s]")
+        set_all(panels[-1], xlabel="time [s]")
     return (
         f"Wrench of the ground on the {('left', 'right')[foot]} foot over the first two steps; "
         "the line is the switch of stance."
@@ -66,7 +65,7 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
                 row[1].plot(drift.time, np.rad2deg(drift.euler), **CURVES[name])
             row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
             row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))
-        setp(panels[-1], xlabel="time ahead [s]")
+        set_all(panels[-1], xlabel="time ahead [s]")
     return (
         "How far a rigid body under recorded commands strays from the robot, RMS over starts in "
         "all phases of the step. `measured` moves it by the measured wrench itself, without what "
