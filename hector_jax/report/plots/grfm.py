@@ -8,7 +8,16 @@ import numpy as np
 from hector_jax.core.trajectory import LEFT, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, named, set_all, widen
+from hector_jax.report.plots.style import (
+    CURVES,
+    ORANGE,
+    SETS,
+    drawing,
+    looks_of,
+    named,
+    set_all,
+    widen,
+)
 
 
 def wrenches(
@@ -60,9 +69,10 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
     with drawing(path, 7.0, 2.6 * len(worlds) + 0.3, legend_columns=3) as figure:
         panels = figure.subplots(len(worlds), 2, squeeze=False, sharex=True)
         for row, (world, drifts) in zip(panels, worlds.items(), strict=True):
-            for name, drift in drifts.items():
-                row[0].plot(drift.time, 100 * drift.position, label=named(name), **CURVES[name])
-                row[1].plot(drift.time, np.rad2deg(drift.euler), **CURVES[name])
+            for name, look in looks_of(drifts, CURVES).items():
+                time, position, euler = drifts[name]
+                row[0].plot(time, 100 * position, label=named(name), **look.line)
+                row[1].plot(time, np.rad2deg(euler), **look.line)
             row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
             row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))
         set_all(panels[-1], xlabel="time ahead [s]")

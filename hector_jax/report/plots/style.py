@@ -1,6 +1,6 @@
 """Style of all pictures: figure and legend, axes, and the line and marker of each weight set."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -60,7 +60,7 @@ _NAMES = {
 
 
 class Look(NamedTuple):
-    """How a weight set is drawn."""
+    """How a weight set or a curve is drawn."""
 
     line: dict[str, Any]  # arguments of plot: colour, style and, unless it is the default, width
     marker: str
@@ -76,12 +76,12 @@ class Look(NamedTuple):
         return {"linestyle": "none", "color": self.color, "marker": self.marker}
 
 
-def looks_of(names: Iterable[str]) -> dict[str, Look]:
-    """How each weight set is drawn; sets of the user's own take the spare looks in turn."""
+def looks_of(names: Iterable[str], known: Mapping[str, Any] = SETS) -> dict[str, Look]:
+    """How each weight set (or curve, of `CURVES`) is drawn; others take spare looks in turn."""
     looks, spare = {}, cycle(_SPARE)
     for name in names:
-        if name in SETS:
-            looks[name] = Look(SETS[name], _MARKER.get(name, "^"))
+        if name in known:
+            looks[name] = Look(known[name], _MARKER.get(name, "^"))
         else:
             color, marker = next(spare)
             looks[name] = Look({"color": color, **_SPARE_STYLE}, marker)
