@@ -8,16 +8,8 @@ import numpy as np
 from hector_jax.core.trajectory import LEFT, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.plots.style import (
-    CURVES,
-    ORANGE,
-    SETS,
-    drawing,
-    looks_of,
-    named,
-    set_all,
-    widen,
-)
+from hector_jax.report.plots import style
+from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, looks_of, named
 
 
 def wrenches(
@@ -51,8 +43,8 @@ def wrenches(
         for panel, label in zip(panels.flat, labels, strict=True):
             panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
             panel.set_ylabel(label)
-            widen(panel, 5.0 if "[N]" in label else 0.5)
-        set_all(panels[-1], xlabel="time [s]")
+            style.widen(panel, 5.0 if "[N]" in label else 0.5)
+        style.set_all(panels[-1], xlabel="time [s]")
     return (
         f"Wrench of the ground on the {('left', 'right')[foot]} foot over the first two steps; "
         "the line is the switch of stance."
@@ -75,7 +67,7 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
                 row[1].plot(time, np.rad2deg(euler), **look.line)
             row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
             row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))
-        set_all(panels[-1], xlabel="time ahead [s]")
+        style.set_all(panels[-1], xlabel="time ahead [s]")
     return (
         "How far a rigid body under recorded commands strays from the robot, RMS over starts in "
         "all phases of the step. `measured` moves it by the measured wrench itself, without what "
