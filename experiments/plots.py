@@ -2,26 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.artist import setp
 
-from hector_jax.report.plots.style import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PURPLE,
-    SETS,
-    category_axis,
-    drawing,
-    log_axis,
-    looks_of,
-    named,
-    weight_label,
-)
+from hector_jax.report.plots import style
+from hector_jax.report.plots.style import SETS, category_axis, drawing, log_axis, looks_of, named
 
 
 def ratios(
@@ -34,11 +21,11 @@ def ratios(
         columns: the trajectories.
         sets: by name, a ratio per trajectory.
     """
-    at, width = np.arange(len(columns)), 0.7 / max(len(sets), 1)
+    width = 0.7 / max(len(sets), 1)
     with drawing(path, 7.5, 3.2) as figure:
         axes, looks = figure.subplots(), looks_of(sets)
         for i, (name, values) in enumerate(sets.items()):
-            x = at + width * (i - (len(sets) - 1) / 2)
+            x = np.arange(len(columns)) + width * (i - (len(sets) - 1) / 2)
             axes.plot(x, values, markersize=6, label=named(name), **looks[name].dot)
         axes.axhline(1.0, color="black", linewidth=0.8)
         category_axis(axes, columns)
@@ -58,8 +45,8 @@ def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> st
         axes = figure.subplots()
         for name, look in looks_of(sets).items():
             share = 100 * (np.arange(len(sets[name])) + 0.5) / len(sets[name])
-            style = {"marker": look.marker, "label": named(name), **look.line}
-            axes.plot(share, np.sort(sets[name]) / 1e6, **style)
+            line = {"marker": look.marker, "label": named(name), **look.line}
+            axes.plot(share, np.sort(sets[name]) / 1e6, **line)
         log_axis(axes, "y")
         axes.set(xlabel="plants [%], by their loss", ylabel="L [10$^6$]", xlim=(0, 100))
     return "Loss on each plant, in rising order for each set: the right end is the tail."
@@ -84,7 +71,7 @@ def front(
         for panel, (world, values) in zip(panels, worlds.items(), strict=True):
             finite = np.isfinite(values).all(axis=1)
             points, factors = values[finite] / 1e6, prices[finite]
-            panel.plot(*points.T, "o-", color=GREEN, label="tuned")
+            panel.plot(*points.T, "o-", color=style.GREEN, label="tuned")
             if world == list(worlds)[-1]:
                 for name, look in looks_of(others).items():
                     panel.plot(*np.divide(others[name], 1e6), label=named(name), **look.dot)
@@ -120,10 +107,9 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
             label = {0: "from nominal", 1: "from elsewhere"}.get(i)
             left.plot(accepted, row[accepted] / 1e6, label=label, **look)
             ends.append(row[accepted[-1]] / 1e6)
-        order = np.sort(ends)
-        share = 100 * (np.arange(len(ends)) + 0.5) / len(ends)
+        order, share = np.sort(ends), 100 * (np.arange(len(ends)) + 0.5) / len(ends)
         right.plot(share, order, "o", color="0.5", markersize=3)
-        right.plot(share[np.searchsorted(order, ends[0])], ends[0], "o", color=GREEN)
+        right.plot(share[np.searchsorted(order, ends[0])], ends[0], "o", color=style.GREEN)
         log_axis(left, "y")
         left.set(xlabel="iteration", ylabel="L on the model [10$^6$]", title="on the way")
         left.xaxis.get_major_locator().set_params(integer=True)
@@ -163,8 +149,8 @@ def while_walking(
                 label, look = _ARMS[arm]
                 panel.plot(times, np.median(losses, axis=0) / 1e6, **look, label=label)
             panel.set(title=f"{trajectory}, from {start}", ylim=(0, 1.05 * panel.get_ylim()[1]))
-        setp(panels[-1], xlabel="time [s]")
-        setp(panels[:, 0], ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
+        style.set_all(panels[-1], xlabel="time [s]")
+        style.set_all(panels[:, 0], ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
     return "Loss along the walk, median over the plants; the line is where the plant changes."
 
 
@@ -187,26 +173,32 @@ def weight_histories(
         histories: ratios by trajectory; a walk that ended early has fewer steps.
         count: how many weights to draw in each panel.
     """
-    colors, marks = (BLUE, ORANGE, GREEN, PURPLE, "0.35", "black"), "osD^vP"
+    looks = list(
+        zip(
+            (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, "0.35", "black"),
+            "osD^vP",
+            strict=True,
+        )
+    )
     single = [i for i, name in enumerate(names) if not name.endswith("_right")]
     with drawing(path, 3.3 * len(histories) + 0.2, 3.4, legend_columns=0) as figure:
         panels = figure.subplots(1, len(histories), squeeze=False)[0]
         for panel, (trajectory, ratios) in zip(panels, histories.items(), strict=True):
             panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
             moved = np.abs(np.log(ratios[:, single])).max(axis=0)
-            for i, color, mark in zip(np.argsort(-moved)[:count], colors, marks, strict=False):
-                label = weight_label(names[single[i]].removesuffix("_left"))
+            for i, (color, mark) in zip(np.argsort(-moved)[:count], looks, strict=False):
+                label = style.weight_label(names[single[int(i)]].removesuffix("_left"))
                 look = {"color": color, "marker": mark, "markersize": 2.6, "label": label}
                 panel.plot(times[: len(ratios)], ratios[:, single[i]], **look)
             panel.set(title=trajectory, xlabel="time [s]")
             log_axis(panel, "y")
-            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18)}
-            panel.legend(ncols=3, columnspacing=1.2, **below)
+            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "columnspacing": 1.2}
+            panel.legend(ncols=3, **below)
         panels[0].set_ylabel("weight / its start")
     return f"The {count} weights that moved most; both feet share one R."
 
 
-METHODS = {
+METHODS = {  # words for the ways of tuning that race
     "without": "DiffTune without net",
     "with": "DiffTune with net",
     "adam": "Adam with net",
@@ -216,7 +208,6 @@ METHODS = {
     "bayes near": "Bayesian, near the start",
     "random": "random",
 }
-"""Names of the ways of tuning that race."""
 
 _METHOD_LINES = {
     "without": SETS["without"],
@@ -224,9 +215,9 @@ _METHOD_LINES = {
     "adam": {"color": "#63b89f", "linestyle": (0, (3, 1.2))},
     "differences": {"color": "black", "linestyle": (0, (5, 1.5)), "linewidth": 1.1},
     "cma-es": SETS["searched"],
-    "bayes": {"color": BLUE, "linestyle": (0, (5, 1.5))},
-    "bayes near": {"color": BLUE, "linestyle": "-"},
-    "random": {"color": GREY, "linestyle": "-"},
+    "bayes": {"color": style.BLUE, "linestyle": (0, (5, 1.5))},
+    "bayes near": {"color": style.BLUE, "linestyle": "-"},
+    "random": {"color": style.GREY, "linestyle": "-"},
 }
 
 
@@ -301,10 +292,10 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
     """
     angles = np.deg2rad(45.0 * np.arange(9))
     with drawing(path, 4.6, 4.4, legend_columns=3) as figure:
-        axes = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
+        axes: Any = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
         for name, look in looks_of(endured).items():
-            style = {"marker": look.marker, "markersize": 3.5, "label": named(name), **look.line}
-            axes.plot(angles, np.append(endured[name], endured[name][0]), **style)
+            line = {"marker": look.marker, "markersize": 3.5, "label": named(name), **look.line}
+            axes.plot(angles, np.append(endured[name], endured[name][0]), **line)
         axes.set_rmin(0.0)
         axes.set_rlabel_position(22.5)
         axes.yaxis.set_major_formatter(lambda force, _: f"{force:g} N")
@@ -316,20 +307,12 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
     )
 
 
-class _PhiLook(NamedTuple):
-    """How results of one phi are drawn."""
-
-    color: str
-    marker: str
-    hatch: str | None = None  # of bars
-
-
-_PHI = {
-    "command": _PhiLook("black", "."),
-    "linear": _PhiLook(PURPLE, "^", "//////"),
-    "paper": _PhiLook(ORANGE, "x"),
-    "net": _PhiLook(GREEN, "o"),
-    "net without legs": _PhiLook(BLUE, "s", "......"),
+_PHI = {  # colour, marker, and hatch of bars
+    "command": ("black", ".", None),
+    "linear": (style.PURPLE, "^", "//////"),
+    "paper": (style.ORANGE, "x", None),
+    "net": (style.GREEN, "o", None),
+    "net without legs": (style.BLUE, "s", "......"),
 }
 
 
@@ -361,11 +344,11 @@ def gradients(
         low, high = simulator.min(axis=0) / size, simulator.max(axis=0) / size
         axes.vlines(at - 0.45, low, high, color="black", linewidth=2.0, zorder=3)
         for i, (name, rows) in enumerate(models.items()):
-            x = at + width * (i - (len(models) - 1) / 2)
-            look = {"color": _PHI[name].color, "hatch": _PHI[name].hatch}
-            bars(x, rows, 0.8 * width, name, **look, edgecolor="white", linewidth=0.0)
+            x, (color, _, hatch) = at + width * (i - (len(models) - 1) / 2), _PHI[name]
+            look = {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.0}
+            bars(x, rows, 0.8 * width, name, **look)
         axes.axhline(0.0, color="black", linewidth=0.8)
-        category_axis(axes, [weight_label(name) for name in names], 3)
+        category_axis(axes, [style.weight_label(name) for name in names], 3)
         axes.set_ylabel("dL / d log weight, unit length")
     return (
         "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "
@@ -396,9 +379,10 @@ def ranks(
         for (trajectory, factor), truth in simulator.items():
             panel = panels[factors.index(factor), trajectories.index(trajectory)]
             for name, losses in models[trajectory, factor].items():
-                look = {"color": _PHI[name].color, "marker": _PHI[name].marker, **hollow}
+                color, marker, _ = _PHI[name]
                 label = f"{name}: {correlations[trajectory, factor][name]:.2f}"
-                panel.plot(truth / 1e6, losses / 1e6, **look, label=label)
+                look = {"color": color, "marker": marker, "label": label, **hollow}
+                panel.plot(truth / 1e6, losses / 1e6, **look)
             panel.legend(loc="upper left", handlelength=1.0, borderaxespad=0.2)
             panel.set_title(f"{trajectory}, within x/{factor}")
             log_axis(panel, "x")
@@ -406,6 +390,6 @@ def ranks(
             low, high = panel.get_ylim()
             panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
             log_axis(panel, "y")
-        setp(panels[-1], xlabel="L on the hfs [10$^6$]")
-        setp(panels[:, 0], ylabel="L on the model [10$^6$]")
+        style.set_all(panels[-1], xlabel="L on the hfs [10$^6$]")
+        style.set_all(panels[:, 0], ylabel="L on the model [10$^6$]")
     return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."

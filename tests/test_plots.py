@@ -199,7 +199,7 @@ def test_the_epoch_of_the_least_error_on_the_validation_walks_is_marked(tmp_path
 
 def test_open_loop_errors_have_a_row_for_each_world(tmp_path, drawn):
     time = np.linspace(0.01, 0.4, 40)
-    names = ("raw", "linear", "paper", "residual", "gated", "measured")
+    names = ("raw", "linear", "paper", "residual", "gated", "measured", "mine")
     found = {n: Drift(time, 0.1 * time**2 / i, time / i) for i, n in enumerate(names, 1)}
     plots.open_loop(tmp_path / "a.png", {"hfs": found, "hardware stand-in": found})
     rows = [axes.get_title() for axes in drawn[0].axes]

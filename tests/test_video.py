@@ -46,13 +46,13 @@ def test_a_film_shows_the_state_of_its_time_whatever_the_walks_rate(robot):
     slow, fast = (pretend_walk(seconds=1.0, period=p) for p in (0.01, 0.001))
     one, other = motions(robot, {"a": slow, "b": fast}).values()
     times = 0.04 * np.arange(26)
-    assert one.index(times)[[0, 10, 25]].tolist() == [0, 39, 99]
-    assert other.index(times)[[0, 10, 25]].tolist() == [0, 399, 999]
+    assert one.sample_at(times)[[0, 10, 25]].tolist() == [0, 39, 99]
+    assert other.sample_at(times)[[0, 10, 25]].tolist() == [0, 399, 999]
     np.testing.assert_allclose(
-        one.path[one.index(times)], other.path[other.index(times)], atol=0.01
+        one.path[one.sample_at(times)], other.path[other.sample_at(times)], atol=0.01
     )
     trunk = poses(robot, State(*(x[39:40] for x in slow.state)), slow.joints[39:40])
-    np.testing.assert_allclose(one.qpos[one.index(times)[10]], trunk[0])
+    np.testing.assert_allclose(one.qpos[one.sample_at(times)[10]], trunk[0])
     for each in (one, other):
         assert len(each.path[:: render._spacing(each.period)]) == 50
 
@@ -145,11 +145,11 @@ def test_no_back_end_costs_one_line(robot, tmp_path, monkeypatch):
 def test_the_plot_of_a_frame_is_pale_where_time_has_not_come_yet(robot, count):
     walks = {"a": pretend_walk(seconds=1.0), "b": pretend_walk(seconds=1.0)}
     scene = scene_of(robot, walks, np.linspace(0.0, 1.0, 5)[:count])
-    scene = scene._replace(plot_box=(20, 10, 120, 40))
+    box = (20, 10, 120, 40)
     black = np.zeros((60, 140, 3), np.uint8)
     half = np.zeros((100, 70, 3), np.uint8)
     for k in range(count):
-        below = np.asarray(render._frame(scene, black, [half, half], k))[100:, :, 0]
+        below = np.asarray(render._frame(scene, black, box, [half, half], k))[100:, :, 0]
         assert below.shape == (60, 140)
         past = below[10:40, 20:121].max(axis=0) == 0
         assert past.tolist() == [True] * (25 * k) + [False] * (101 - 25 * k)

@@ -44,7 +44,7 @@ class Motion(NamedTuple):
         """Distance of the centre of mass from its reference in the plane [m]."""
         return np.linalg.norm((self.path - self.reference)[:, :2], axis=1)
 
-    def index(self, times: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+    def sample_at(self, times: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
         """Indices of the samples at some times [s]."""
         return np.clip(np.round(times / self.period).astype(int) - 1, 0, len(self.qpos) - 1)
 
@@ -73,8 +73,8 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
         period=float(walk.period),
         qpos=poses(robot, state, joints),
         path=state.position,
-        reference=walk.reference.position,
-        contact=walk.contact,
+        reference=np.asarray(walk.reference.position),
+        contact=np.asarray(walk.contact),
         feet=feet,
         R_yaw=R_yaw,
         wrenches={

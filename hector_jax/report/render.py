@@ -1,6 +1,6 @@
 """The child process of a film: draws a `video.Scene` with MuJoCo and writes the film or strip.
 
-It runs in a folder that holds `scene.pickle` and, for a film, `plot.png`, which stands below it.
+It runs in a folder that holds `scene.pickle`.
 """
 
 import pickle
@@ -16,6 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from hector_jax.core.headless import mujoco
 from hector_jax.report.motion import COLOURS, INK
+from hector_jax.report.plots.walks import distances
 from hector_jax.report.video import Scene
 
 _WINDOW = 4.0  # [s] of the reference that a film keeps in view
@@ -35,8 +36,9 @@ def main() -> None:
     if scene.strip:
         _strip(scene, list(views)).save(scene.file)
     else:
+        box = distances(Path("plot.png"), scene.motions, width, height // 4)
         plot = np.asarray(Image.open("plot.png").convert("RGB"))
-        frames = (_frame(scene, plot, halves, k) for k, halves in enumerate(views))
+        frames = (_frame(scene, plot, box, halves, k) for k, halves in enumerate(views))
         _encode(scene.file, frames, (width, height), scene.config.rate)
 
 
@@ -50,10 +52,11 @@ def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndar
     accent = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, "accent")
     seconds = _STRIP_WINDOW if scene.strip else _WINDOW
     cameras = _cameras(scene, model.vis.global_.fovy, width / height, seconds)
+    both = list(scene.motions.values())
     with mujoco.Renderer(model, height, width) as renderer:
 
         def view(i: int, now: int, camera: mujoco.MjvCamera) -> np.ndarray:
-            motion, colour = scene.motions[i], _rgba(COLOURS[i])
+            motion, colour = both[i], _rgba(COLOURS[i])
             if accent >= 0:
                 model.mat_rgba[accent] = colour
             data.qpos[:] = motion.qpos[now]
@@ -69,7 +72,7 @@ def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndar
                 _line(renderer.scene, ends, 2.5, 0.005, _rgba(INK))
             return renderer.render()
 
-        samples = np.stack([motion.index(scene.times) for motion in scene.motions], axis=1)
+        samples = np.stack([motion.sample_at(scene.times) for motion in both], axis=1)
         for now, camera in zip(samples, cameras, strict=True):
             yield [view(i, now[i], camera) for i in range(2)]
 
@@ -84,7 +87,7 @@ def _spacing(period: float) -> int:
 
 
 def _floor_reference(scene: Scene) -> Float[np.ndarray, "n 3"]:
-    last = scene.motions[-1]
+    last = list(scene.motions.values())[-1]
     return last.reference[:: _spacing(last.period)]
 
 
@@ -103,7 +106,7 @@ def _cameras(scene: Scene, fovy: float, aspect: float, seconds: float) -> list[m
 
     A walk that lasts no longer is seen by a camera that does not move.
     """
-    last, top = scene.motions[-1], scene.top
+    last, top = list(scene.motions.values())[-1], scene.top
     reference = _floor_reference(scene) * [1.0, 1.0, 0.0]
     way = reference[-1] - reference[0]
     heading = np.arctan2(way[1], way[0]) if np.linalg.norm(way) > top else 0.0
@@ -116,7 +119,7 @@ def _cameras(scene: Scene, fovy: float, aspect: float, seconds: float) -> list[m
     half = np.tan(np.deg2rad(fovy) / 2) * np.array([aspect, 1.0])
     count = min(len(reference), round(seconds / _SAMPLE))
     middles, distances = [], []
-    for sample in last.index(scene.times) // _spacing(last.period):
+    for sample in last.sample_at(scene.times) // _spacing(last.period):
         first = int(np.clip(sample - count // 2, 0, len(reference) - count))
         floor = reference[first : first + count]
         body = np.concatenate([floor, floor + [0.0, 0.0, top]]) @ axes
@@ -137,26 +140,25 @@ def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rat
         lasts = [1000 // rate] * len(rest) + [_LAST]
         first.save(file, save_all=True, append_images=rest, duration=lasts, loop=0, quality=75)
         return
-    writer = imageio_ffmpeg.write_frames(
-        file,
-        size,
-        fps=rate,
-        codec="libx264",
-        macro_block_size=2,
-        quality=None,
-        ffmpeg_log_level="error",
-        output_params=["-crf", "19", "-preset", "fast", "-movflags", "+faststart"],
-    )
+    how: dict[str, Any] = {"codec": "libx264", "macro_block_size": 2, "quality": None}
+    how["output_params"] = ["-crf", "19", "-preset", "fast", "-movflags", "+faststart"]
+    writer = imageio_ffmpeg.write_frames(file, size, fps=rate, ffmpeg_log_level="error", **how)
     writer.send(None)
     for frame in frames:
         writer.send(frame.tobytes())
     writer.close()
 
 
-def _frame(scene: Scene, plot: np.ndarray, halves: list[np.ndarray], k: int) -> Image.Image:
+def _frame(
+    scene: Scene,
+    plot: np.ndarray,
+    box: tuple[int, int, int, int],
+    halves: list[np.ndarray],
+    k: int,
+) -> Image.Image:
     """Join both halves, their labels, and the plot below, pale where time has not come yet."""
-    time, last = scene.times[k], max(motion.times[-1] for motion in scene.motions)
-    left, top, right, bottom = scene.plot_box
+    time, last = scene.times[k], max(motion.times[-1] for motion in scene.motions.values())
+    left, top, right, bottom = box
     now = round(left + (right - left) * time / last)
     plot = plot.copy()
     future = plot[top:bottom, now : right + 1]
@@ -164,7 +166,7 @@ def _frame(scene: Scene, plot: np.ndarray, halves: list[np.ndarray], k: int) -> 
     picture = Image.fromarray(np.concatenate([np.concatenate(halves, axis=1), plot]))
     draw = ImageDraw.Draw(picture, "RGBA")
     height, half, _ = halves[0].shape
-    for i, (motion, label) in enumerate(zip(scene.motions, scene.labels, strict=True)):
+    for i, (label, motion) in enumerate(scene.motions.items()):
         _text(draw, (i * half + 12, 12), label, COLOURS[i])
         if time >= motion.fall_time:
             _text(draw, (i * half + 12, 40), f"fell at {motion.fall_time:.2f} s", COLOURS[0])
@@ -179,7 +181,7 @@ def _strip(scene: Scene, columns: list[list[np.ndarray]]) -> Image.Image:
     picture = Image.fromarray(np.concatenate([np.concatenate(c) for c in columns], axis=1))
     draw = ImageDraw.Draw(picture, "RGBA")
     high, wide, _ = columns[0][0].shape
-    for i, label in enumerate(scene.labels):
+    for i, label in enumerate(scene.motions):
         _text(draw, (12, i * high + 12), label, COLOURS[i])
         for k, time in enumerate(scene.times):
             place = (wide * (k + 1) - 10, high * (i + 1) - 10)

@@ -23,11 +23,10 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.console import Broken
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
 from hector_jax.report.motion import Motion
 from hector_jax.report.plots.style import named
-from hector_jax.report.plots.walks import distances
 from hector_jax.robot.model import Robot
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
@@ -68,10 +67,8 @@ class Scene(NamedTuple):
     config: VideoConfig
     model: str  # path of the body's MJCF
     top: float  # of the robot above the floor [m]
-    motions: list[Motion]  # before and after
-    labels: list[str]  # words above them
+    motions: dict[str, Motion]  # before and after, by the words above them
     times: Float[np.ndarray, " K"]  # of the frames [s]
-    plot_box: tuple[int, int, int, int] | None  # axes in plot.png: left, top, right, bottom [pixel]
 
 
 def check_film(path: Path) -> None:
@@ -114,8 +111,8 @@ def write_film(
         try:
             imageio_ffmpeg.get_ffmpeg_exe()
         except RuntimeError as error:
-            raise VideoUnavailable(f"no film: no video encoder ({_one_line(str(error))})") from None
-    return _write(make_scene(path, robot, motions, config, strip=False), motions, path)
+            raise VideoUnavailable(f"no film: no video encoder ({one_line(error)})") from None
+    return _write(make_scene(path, robot, motions, config, strip=False), path)
 
 
 def write_strip(
@@ -125,8 +122,8 @@ def write_strip(
 
     Args, returns and raises as `write_film`; the path is that of a PNG.
     """
-    scene = make_scene(path, robot, motions, config or VideoConfig(), strip=True)
-    return _write(scene, motions, path)
+    config = config or VideoConfig()
+    return _write(make_scene(path, robot, motions, config, strip=True), path)
 
 
 def make_scene(
@@ -141,13 +138,11 @@ def make_scene(
         strip=strip,
         config=config,
         model=str(robot.description.model.resolve()),
-        top=_TOP * robot.standing_height,
-        motions=[*motions.values()],
-        labels=[named(name) for name in motions],
+        top=_TOP * float(robot.standing_height),
+        motions={named(name): motion for name, motion in motions.items()},
         times=_snapshot_times(next(iter(motions.values())), seconds, config.tiles)
         if strip
         else np.arange(0.0, seconds + 1e-9, 1.0 / config.rate),
-        plot_box=None,
     )
 
 
@@ -160,13 +155,10 @@ def _snapshot_times(motion: Motion, seconds: float, tiles: int) -> Float[np.ndar
     return cycle * (whole + np.arange(tiles) / tiles)
 
 
-def _write(scene: Scene, motions: Mapping[str, Motion], path: Path) -> str:
+def _write(scene: Scene, path: Path) -> str:
     """Draw a scene with the first back end that works; returns it."""
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder, failures = Path(name), []
-        if not scene.strip:
-            size = scene.config.width, scene.config.height // 4
-            scene = scene._replace(plot_box=distances(folder / "plot.png", motions, *size))
         (folder / "scene.pickle").write_bytes(pickle.dumps(scene))
         chosen = os.environ.get("MUJOCO_GL")
         for back_end in (chosen,) if chosen else BACK_ENDS:
@@ -176,11 +168,6 @@ def _write(scene: Scene, motions: Mapping[str, Motion], path: Path) -> str:
                 return back_end
             failures.append(f"{back_end}: {failure}")
     raise VideoUnavailable(f"no film: MuJoCo cannot draw here ({'; '.join(failures)})")
-
-
-def _one_line(text: str, longest: int = 100) -> str:
-    words = " ".join(text.split())
-    return words if len(words) <= longest else words[: longest - 3] + "..."
 
 
 def _draw_in_child(folder: Path, back_end: str) -> str:
@@ -209,4 +196,4 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
     # the end of the first traceback; those that follow are of what it left open
     first = done.stderr.split("Traceback (most recent call last):")[:2][-1]
     faults = [line for line in first.splitlines() if line.strip() and line[0] != " "]
-    return _one_line(faults[0]) if faults else f"ended with code {done.returncode}"
+    return one_line(faults[0])[:100] if faults else f"ended with code {done.returncode}"

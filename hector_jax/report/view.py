@@ -35,12 +35,11 @@ _APART = 0.8  # [m] between the two walks
 _SCALES = {"force": 0.35 / 120.0, "moment": 0.35 / 12.0}
 _MIN_ARROW = 0.03  # [m]; shorter ones are not drawn
 _RADII = {"force": 0.008, "moment": 0.014}  # [m] of their shafts
-# lines of plots, for before, after and what else there is: told apart by dashes too
+# colours and dashes of lines in plots, for before, after and what else there is
 _STROKES = (
-    (f"rgb{COLOURS[0]}", [6, 4]),
-    (f"rgb{COLOURS[1]}", []),
-    ("rgb(0, 114, 178)", [2, 3]),
-    ("rgb(122, 62, 157)", [10, 3, 2, 3]),
+    *zip(COLOURS, ([6, 4], []), strict=True),
+    ((0, 114, 178), [2, 3]),
+    ((122, 62, 157), [10, 3, 2, 3]),
 )
 _NO_CURVES = {"no iteration yet": np.full(1, np.nan)}  # viser refuses a plot without a line
 
@@ -261,21 +260,17 @@ class Page:
                 for body, mesh in body_meshes(self._model, colour).items()
             },
             "arrows": {
-                (kind, source): (
-                    scene.add_arrows(
-                        f"{root}/{kind}/{source}",
-                        np.zeros((1, 2, 3), np.float32),
-                        _SOURCES[source].colour,
-                        shaft_radius=_RADII[kind],
-                        head_radius=2.3 * _RADII[kind],
-                        head_length=0.035,
-                    ),
-                    arrows(one, kind, source),
-                )
+                (kind, source): (self._add_arrows(root, kind, source), arrows(one, kind, source))
                 for source in one.wrenches
                 for kind in _SCALES
             },
         }
+
+    def _add_arrows(self, root: str, kind: str, source: str) -> Any:
+        size = {"shaft_radius": _RADII[kind], "head_radius": 2.3 * _RADII[kind]}
+        none, colour = np.zeros((1, 2, 3), np.float32), _SOURCES[source].colour
+        place = f"{root}/{kind}/{source}"
+        return self._server.scene.add_arrows(place, none, colour, head_length=0.035, **size)
 
     def _draw(self, tick: int) -> None:
         aim = self._motions[0].reference[tick] * [1.0, 1.0, 0.0]
@@ -315,31 +310,22 @@ class Page:
 
 def _plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
     """A plot in the panel."""
-    return gui.add_uplot(
-        (x, *lines.values()),
-        _series(x_name, lines),
-        title=title,
-        scales={"x": {"time": False}},
-        axes=({"label": x_name}, {}),
-        aspect=2.0,
-    )
+    axes = {"scales": {"x": {"time": False}}, "axes": ({"label": x_name}, {}), "aspect": 2.0}
+    return gui.add_uplot((x, *lines.values()), _series(x_name, lines), title=title, **axes)
 
 
 def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
     looks = zip(names, cycle(_STROKES), strict=False)
-    lines = ({"label": n, "stroke": s, "dash": d, "width": 2} for n, (s, d) in looks)
+    lines = ({"label": n, "stroke": f"rgb{c}", "dash": d, "width": 2} for n, (c, d) in looks)
     return ({"label": x_name}, *lines)
 
 
 def _legend(sources: Iterable[str]) -> str:
     """Colours of the sources and the scale, as HTML."""
-    marks = [
-        f'<span style="color:rgb{_SOURCES[source].colour}">&#9650;</span>&nbsp;'
-        f"{_SOURCES[source].words}"
-        for source in sources
-    ]
+    mark = '<span style="color:rgb{1}">&#9650;</span>&nbsp;{0}'
+    marks = " &ensp;".join(mark.format(*_SOURCES[source]) for source in sources)
     scale = "thin: forces, 35 cm are 120 N; thick: moments, 35 cm are 12 N m"  # see _SCALES
-    return f'<div style="padding:0 1em; font-size:smaller">{" &ensp;".join(marks)}<br>{scale}</div>'
+    return f'<div style="padding:0 1em; font-size:smaller">{marks}<br>{scale}</div>'
 
 
 def _pale(colour: tuple[int, int, int]) -> tuple[int, ...]:
@@ -364,12 +350,24 @@ def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int
         accent: colour for the material of that name.
     """
     import trimesh
+    from trimesh.creation import box, capsule, cylinder, icosphere
 
+    kinds = mujoco.mjtGeom
+    solids = {  # from MuJoCo's sizes
+        kinds.mjGEOM_BOX: lambda size: box(extents=2.0 * size),
+        kinds.mjGEOM_CYLINDER: lambda size: cylinder(radius=size[0], height=2.0 * size[1]),
+        kinds.mjGEOM_CAPSULE: lambda size: capsule(radius=size[0], height=2.0 * size[1]),
+        kinds.mjGEOM_SPHERE: lambda size: icosphere(subdivisions=2, radius=size[0]),
+        kinds.mjGEOM_ELLIPSOID: lambda size: icosphere(subdivisions=2).apply_scale(size),
+    }
     meshes: dict[int, list[Any]] = {}
     for i in np.nonzero((model.geom_bodyid > 0) & (model.geom_group <= 2))[0]:
-        mesh = _geom_mesh(int(model.geom_type[i]), model.geom_size[i])
-        if mesh is None:
+        kind = kinds(model.geom_type[i])
+        if kind not in solids:
             continue
+        mesh = solids[kind](model.geom_size[i])
+        if kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER):
+            mesh.unmerge_vertices()  # sharp edges
         material = model.geom_matid[i]
         rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[i]
         if material >= 0 and model.material(material).name == "accent":
@@ -380,23 +378,3 @@ def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int
         mesh.visual.vertex_colors = np.round(255.0 * np.asarray(rgba)).astype(np.uint8)
         meshes.setdefault(int(model.geom_bodyid[i]), []).append(mesh)
     return {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}
-
-
-def _geom_mesh(kind: int, size: Float[np.ndarray, "3"]) -> Any:
-    """Mesh of a geom about its own centre; None for kinds that have no volume."""
-    from trimesh import creation
-
-    kinds = mujoco.mjtGeom
-    if kind == kinds.mjGEOM_CAPSULE:
-        return creation.capsule(radius=size[0], height=2.0 * size[1])
-    if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
-        ball = creation.icosphere(subdivisions=2)
-        return ball.apply_scale(size if kind == kinds.mjGEOM_ELLIPSOID else size[0])
-    if kind == kinds.mjGEOM_BOX:
-        mesh = creation.box(extents=2.0 * size)
-    elif kind == kinds.mjGEOM_CYLINDER:
-        mesh = creation.cylinder(radius=size[0], height=2.0 * size[1])
-    else:
-        return None
-    mesh.unmerge_vertices()  # sharp edges
-    return mesh

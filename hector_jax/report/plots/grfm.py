@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from matplotlib.artist import setp
 
 from hector_jax.core.trajectory import LEFT, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, named, widen
+from hector_jax.report.plots import style
+from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, looks_of, named
 
 
 def wrenches(
@@ -43,8 +43,8 @@ def wrenches(
         for panel, label in zip(panels.flat, labels, strict=True):
             panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
             panel.set_ylabel(label)
-            widen(panel, 5.0 if "[N]" in label else 0.5)
-        setp(panels[-1], xlabel="time [s]")
+            style.widen(panel, 5.0 if "[N]" in label else 0.5)
+        style.set_all(panels[-1], xlabel="time [s]")
     return (
         f"Wrench of the ground on the {('left', 'right')[foot]} foot over the first two steps; "
         "the line is the switch of stance."
@@ -61,12 +61,13 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
     with drawing(path, 7.0, 2.6 * len(worlds) + 0.3, legend_columns=3) as figure:
         panels = figure.subplots(len(worlds), 2, squeeze=False, sharex=True)
         for row, (world, drifts) in zip(panels, worlds.items(), strict=True):
-            for name, drift in drifts.items():
-                row[0].plot(drift.time, 100 * drift.position, label=named(name), **CURVES[name])
-                row[1].plot(drift.time, np.rad2deg(drift.euler), **CURVES[name])
+            for name, look in looks_of(drifts, CURVES).items():
+                time, position, euler = drifts[name]
+                row[0].plot(time, 100 * position, label=named(name), **look.line)
+                row[1].plot(time, np.rad2deg(euler), **look.line)
             row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
             row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))
-        setp(panels[-1], xlabel="time ahead [s]")
+        style.set_all(panels[-1], xlabel="time ahead [s]")
     return (
         "How far a rigid body under recorded commands strays from the robot, RMS over starts in "
         "all phases of the step. `measured` moves it by the measured wrench itself, without what "

@@ -1,6 +1,6 @@
 """Style of all pictures: figure and legend, axes, and the line and marker of each weight set."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -11,26 +11,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-
-_STYLE = {
-    "font.size": 8.5,
-    "axes.titlesize": 9,
-    "axes.labelsize": 8.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.7,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "0.9",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.3,
-    "lines.markersize": 4,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "legend.handlelength": 2.8,
-    "savefig.dpi": "figure",
-    "svg.hashsalt": "hector_jax",  # the same picture gives the same bytes
-}
 
 # from dark to light in grey: green, purple, blue, grey, orange
 GREEN, PURPLE, BLUE, GREY, ORANGE = "#00563f", "#7a3e9d", "#1480c4", "0.55", "#e07c24"
@@ -80,7 +60,7 @@ _NAMES = {
 
 
 class Look(NamedTuple):
-    """How a weight set is drawn."""
+    """How a weight set or a curve is drawn."""
 
     line: dict[str, Any]  # arguments of plot: colour, style and, unless it is the default, width
     marker: str
@@ -91,17 +71,17 @@ class Look(NamedTuple):
         return self.line["color"]
 
     @property
-    def dot(self) -> dict[str, str]:
+    def dot(self) -> dict[str, Any]:
         """The marker in its colour, for sets drawn as points."""
         return {"linestyle": "none", "color": self.color, "marker": self.marker}
 
 
-def looks_of(names: Iterable[str]) -> dict[str, Look]:
-    """How each weight set is drawn; sets of the user's own take the spare looks in turn."""
+def looks_of(names: Iterable[str], known: Mapping[str, Any] = SETS) -> dict[str, Look]:
+    """How each weight set (or curve, of `CURVES`) is drawn; others take spare looks in turn."""
     looks, spare = {}, cycle(_SPARE)
     for name in names:
-        if name in SETS:
-            looks[name] = Look(SETS[name], _MARKER.get(name, "^"))
+        if name in known:
+            looks[name] = Look(known[name], _MARKER.get(name, "^"))
         else:
             color, marker = next(spare)
             looks[name] = Look({"color": color, **_SPARE_STYLE}, marker)
@@ -131,7 +111,7 @@ def drawing(
         dpi: pixels per inch.
         legend_columns: most labels beside each other; 0 for a figure without a common legend.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(fname=Path(__file__).with_name("hector.mplstyle")):
         figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
         yield figure
         handles: dict[str, Any] = {}
@@ -152,6 +132,12 @@ def widen(axes: Axes, least: float) -> None:
     low, high = axes.get_ylim()
     if high - low < 2 * least:
         axes.set_ylim((low + high) / 2 - least, (low + high) / 2 + least)
+
+
+def set_all(panels: Iterable[Axes], **properties: Any) -> None:
+    """Set the same properties of several axes."""
+    for panel in panels:
+        panel.set(**properties)
 
 
 def weight_label(name: str) -> str:
@@ -175,7 +161,7 @@ def log_axis(axes: Axes, which: str) -> None:
     axis = getattr(axes, f"{which}axis")
     low, high = axis.get_view_interval()
     for span, digits in (
-        (2, np.arange(1, 10, 0.5)),
+        (2, [x / 2 for x in range(2, 20)]),
         (4, (1, 1.5, *range(2, 10))),
         (30, (1, 1.5, 2, 3, 5, 7)),
         (1e3, (1, 2, 5)),

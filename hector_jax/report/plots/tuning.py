@@ -7,15 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 
-from hector_jax.report.plots.style import (
-    SETS,
-    category_axis,
-    drawing,
-    log_axis,
-    looks_of,
-    named,
-    weight_label,
-)
+from hector_jax.report.plots import style
+from hector_jax.report.plots.style import SETS, drawing, log_axis, looks_of, named
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
 from hector_jax.tuning.loss import LossConfig
@@ -95,7 +88,7 @@ def weights(
         axes.axhline(1.0, color="black", linewidth=0.8)
         log_axis(axes, "y")
         labels = {"rotation": 60, "ha": "right", "va": "center", "rotation_mode": "anchor"}
-        category_axis(axes, [weight_label(name) for name in names], 3, **labels)
+        style.category_axis(axes, [style.weight_label(name) for name in names], 3, **labels)
         axes.set_ylabel("weight / nominal")
     return "Tuned weights as ratios to the nominal ones (1); diamonds are the expert's."
 

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from matplotlib.image import imread
 
 from hector_jax.core.trajectory import Trajectory, from_start
 from hector_jax.report.motion import COLOURS, Motion
-from hector_jax.report.plots.style import CURVES, drawing, looks_of, named, widen
+from hector_jax.report.plots.style import CURVES, drawing, looks_of, named, set_all, widen
 
 _FRAME = "Each walk is seen from where it stood and faced at t = 0, so that all have one reference."
 _MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be told apart
@@ -58,7 +57,7 @@ def _draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
     for panel in panels.flat:
         panel.axhline(0.0, color="black", linewidth=0.8)
         widen(panel, 1.0)
-    setp(panels[-1], xlabel="time [s]")
+    set_all(panels[-1], xlabel="time [s]")
 
 
 def distances(
