@@ -76,24 +76,17 @@ def tuning_section(name: str, tuning: Tuning) -> str:
     refused = [i for i in history if not i.accepted]
     early = [i for i in accepted if i.iteration <= PAPER_ITERATIONS]
 
-    def loss(iteration: Iteration) -> str:
-        return f"{float(iteration.evaluation.loss) / 1e6:.3f}e6"
-
     return render(
         "tuning.md.j2",
         name=name,
-        count=len(history) - 1,
-        refused=len(refused),
-        reasons=_reasons(refused),
-        stop=tuning.stop,
+        tuning=tuning,
         whole=history[0].iteration < PAPER_ITERATIONS,
         paper=PAPER_ITERATIONS,
-        start=loss(history[0]),
-        early=loss(early[-1]) if early else "",
-        end=loss(accepted[-1]),
-        bounds_ten=_at_bounds(tuning.ten),
-        bounds_end=_at_bounds(tuning.converged),
-        residual=f"{max(float(i.evaluation.residual) for i in accepted):.1e}",
+        reasons=_reasons(refused),
+        refused=len(refused),
+        losses=[float(i.evaluation.loss) / 1e6 for i in (history[0], *early[-1:], accepted[-1])],
+        at_bounds=_at_bounds,
+        residual=max(float(i.evaluation.residual) for i in accepted),
     )
 
 
@@ -107,10 +100,11 @@ def _reasons(refused: Sequence[Iteration]) -> list[str]:
     return [f"{reason} (iteration {', '.join(which)})" for reason, which in iterations.items()]
 
 
-def _at_bounds(weights: Weights) -> list[str]:
+def _at_bounds(weights: Weights) -> str:
     vector, *box = (np.asarray(weights_to_vector(w)) for w in (weights, *bounds()))
     close = np.any([np.isclose(vector, bound, rtol=1e-9) for bound in box], axis=0)
-    return [f"`{name}`" for name, hit in zip(WEIGHT_NAMES, close, strict=True) if hit]
+    names = [f"`{name}`" for name, hit in zip(WEIGHT_NAMES, close, strict=True) if hit]
+    return ", ".join(names) or "none"
 
 
 def _norms_table(loss: Sequence[Term], alpha: LossConfig, norms: Mapping[str, Losses]) -> str:

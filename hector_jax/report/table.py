@@ -109,10 +109,16 @@ class Table(NamedTuple):
     earlier: Earlier | None = None
 
 
-def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float:
-    """Change [%] of a part of the loss in the paper's table, from its rounded losses."""
+def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float | None:
+    """Change [%] of a part of the loss in the paper's table, from its rounded losses.
+
+    None for a baseline against itself, and for a set that is not in that table.
+    """
+    sets = PAPER.get(trajectory, {})
+    if name == baseline or name not in sets:
+        return None
     at = PARTS.index(part)
-    return 100.0 * (PAPER[trajectory][name][at] / PAPER[trajectory][baseline][at] - 1.0)
+    return 100.0 * (sets[name][at] / sets[baseline][at] - 1.0)
 
 
 def summaries(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Summary]:
@@ -238,9 +244,9 @@ def _paper_comparison(trajectories: Sequence[str], sets: Summaries) -> str:
         row = [f"`{name}` against {baseline}"]
         for t in trajectories:
             ours = sets[t, name].against.get(baseline) if (t, name) in sets else None
-            in_paper = name in PAPER.get(t, {})
+            paper = paper_change(t, name, baseline)
             row.append(change_text(ours) if ours else "")
-            row.append(f"{paper_change(t, name, baseline):+.1f}" if in_paper else "")
+            row.append("" if paper is None else f"{paper:+.1f}")
         rows.append(row)
     return markdown_table(["", *(cell for t in trajectories for cell in (t, "paper"))], rows)
 
@@ -263,9 +269,7 @@ def _csv(table: Table, sets: Summaries) -> str:
                 wins = one.wins if one and part == "L" else ""
                 row += [*one.change[part], wins, one.counts] if one else [""] * 5
             row.append(paper[PARTS.index(part)] if paper else "")
-            for baseline in BASELINES:
-                in_paper = paper and name != baseline
-                row.append(paper_change(trajectory, name, baseline, part) if in_paper else "")
+            row += [paper_change(trajectory, name, baseline, part) for baseline in BASELINES]
             rows.append([_csv_number(cell) if isinstance(cell, float) else cell for cell in row])
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows(rows)
@@ -360,8 +364,7 @@ def _tex(verdicts: Mapping[str, Verdict], sets: Summaries) -> str:
             for baseline in BASELINES:
                 one = summary.against.get(baseline)
                 wins = f"{round(one.wins * len(seeds))}/{len(seeds)}" if one else "--"
-                in_paper = name in PAPER.get(trajectory, {}) and name != baseline
-                paper = paper_change(trajectory, name, baseline) if in_paper else None
+                paper = paper_change(trajectory, name, baseline)
                 cells += [_tex_change(one) if one else "--", wins]
                 cells.append("--" if paper is None else f"${paper:+.1f}$")
             rows.append(cells)
