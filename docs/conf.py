@@ -64,8 +64,8 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "tuning": """RolloutConfig rollout LossConfig losses TuneConfig Evaluation Tuning tune descend
         tune_measured OnlineConfig""",
     "search": "SearchConfig search",
-    "runs": "Score score Verdict make_verdict export",
-    "report": "load_run compare_runs write_film write_events",
+    "runs": "Score score Verdict make_verdict load_run export",
+    "report": "compare_runs write_film write_events",
 }
 _ROLE = re.compile(r"\{(?:func|class|mod|meth)\}`(hector_jax[\w.]*)`")
 logger = logging.getLogger(__name__)

@@ -96,8 +96,8 @@ def compare(
         cosines.append(bootstrap(agreement, m, s))
         gains.append(None if command is None else bootstrap(gain, m, b, s))
     means = model.mean(axis=0), simulator.mean(axis=0)
-    sizes = tuple(float(np.linalg.norm(mean)) for mean in means)
-    a, b = (mean / size for mean, size in zip(means, sizes, strict=True))
+    sizes = float(np.linalg.norm(means[0])), float(np.linalg.norm(means[1]))
+    a, b = means[0] / sizes[0], means[1] / sizes[1]
     apart = (a - b) ** 2  # sums to 2 (1 - cosine)
     worst = int(np.argmax(apart))
     return Row(
@@ -118,7 +118,7 @@ def rank_correlation(
     finite = np.isfinite(model + simulator)
     if finite.sum() < 3:
         return float("nan")
-    return float(spearmanr(model[finite], simulator[finite]).statistic)
+    return float(spearmanr(model[finite], simulator[finite])[0])
 
 
 def _text(value: Interval | None) -> str:

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 import plots
 import tyro
+from lib import write_report
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, expert, nominal, sample_weights
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.console import bar, exit_code, made_at
-from hector_jax.core.environment import environment
-from hector_jax.core.files import make_folder, write_file, write_json
+from hector_jax.core.console import bar, exit_code
+from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
 from hector_jax.grfm.effect import last_command
@@ -192,32 +192,30 @@ def million(x: Any) -> str:
     return f"{float(x) / 1e6:.3f}"
 
 
-def written(
+def write(
     flags: Flags,
     sets: Mapping[str, Weights],
-    told: Mapping[str, Any],
+    numbers: Mapping[str, Any],
     paragraphs: Sequence[str],
     picture: tuple[str, str],
 ) -> None:
-    """Write weights, numbers and report."""
+    """Write weights, numbers and report; the first paragraph is its title."""
     out = flags.out  # pyright: ignore
     make_folder(out / "weights")
     for name, weights in sets.items():
         save_weights(out / "weights" / f"{name.replace(' ', '-')}.json", weights)
     plain = {name: str(x) if isinstance(x, Path) else x for name, x in vars(flags).items()}
-    made = environment()
-    write_json(out / "result.json", {"flags": plain, "environment": made, **told})
     model = f"through {flags.net.name}" if flags.net else "on the plain rigid body"
     about = f"Tuned {model}, at most {flags.iterations} iterations. Losses in 1e6."
-    name, caption = picture
-    text = [
-        paragraphs[0],
-        made_at(made),
-        about,
-        *paragraphs[1:],
-        f"![{caption}]({name})\n\n{caption}",
-    ]
-    write_file(out / "report.md", ("\n\n".join(text) + "\n").encode())
+    title, *rest = paragraphs
+    write_report(
+        out / "report.md",
+        title,
+        [about, *rest],
+        numbers={"flags": plain, **numbers},
+        json_name="result.json",
+        pictures=dict([picture]),
+    )
     print(out / "report.md")
 
 
@@ -262,14 +260,14 @@ def shared(flags: Shared) -> None:
     ends = [f"{n} alone: {ended(flags, alone, i)}" for i, n in enumerate(names)]
     ends += [f"{n}: {ended(flags, together, i)}" for i, n in enumerate(tails)]
     text = [
-        "# One weight set for several trajectories",
+        "One weight set for several trajectories",
         "Each trajectory's loss is divided by that of its nominal walk before the mean, or the "
         "worst, of all is lowered. Judged by one walk on the high-fidelity simulator (hfs) each; "
         "in brackets the change to nominal. `unseen` was tuned on by none.",
         markdown_table(head, [row(n) for n in sets]),
         "\n".join(f"- {line}" for line in ends),
     ]
-    written(flags, sets, {"hfs": loss, "falls": fell}, text, ("shared.png", caption))
+    write(flags, sets, {"hfs": loss, "falls": fell}, text, ("shared.png", caption))
 
 
 def drawn_variations(count: int, noise: bool) -> list[Variation]:
@@ -319,7 +317,7 @@ def robust(flags: Robust) -> None:
     make_folder(flags.out)
     caption = plots.by_plant(flags.out / "robust.png", {n: s.L for n, s in scores.items()})
     text = [
-        f"# Tuned over variations of the model: {flags.traj}",
+        f"Tuned over variations of the model: {flags.traj}",
         f"{flags.variations} variations: mass within 4 %, inertia 20 %, centre of mass 1 cm, "
         "friction 0.6 to 1, effects late by up to 5 ms"
         + (
@@ -336,8 +334,7 @@ def robust(flags: Robust) -> None:
             for n, found, i in [("as it is", plain, 0), ("mean", varied, 0), ("CVaR", varied, 1)]
         ),
     ]
-    told = {"hfs-varied": as_numbers(scores)}
-    written(flags, sets, told, text, ("robust.png", caption))
+    write(flags, sets, {"hfs-varied": as_numbers(scores)}, text, ("robust.png", caption))
 
 
 def plant_table(scores: Mapping[str, Score], base: str) -> str:
@@ -406,13 +403,13 @@ def front(flags: Front) -> None:
         "end",
     ]
     text = [
-        f"# Tracking against smoothness: {flags.traj}",
+        f"Tracking against smoothness: {flags.traj}",
         "Both alphas are multiplied by one price; tracking is alpha_1 L_Eul + alpha_2 L_pos with "
         "the paper's alphas, whatever the price.",
         markdown_table(head, rows),
     ]
-    told = {"prices": prices.tolist(), "model": model.tolist(), "hfs": there}
-    written(flags, sets, told, text, ("front.png", caption))
+    numbers = {"prices": prices.tolist(), "model": model.tolist(), "hfs": there}
+    write(flags, sets, numbers, text, ("front.png", caption))
 
 
 def starts(flags: Starts) -> None:
@@ -430,8 +427,7 @@ def starts(flags: Starts) -> None:
     curves = np.where(accepted & ran, found.course.loss, np.nan)[sound]
     at = lambda x: [million(q) for q in np.quantile(x, (0, 0.25, 0.5, 0.75, 1))]  # noqa: E731
     rows = [["at the start", *at(first)], ["at the end", *at(last)]]
-    kept = min(len(last), 3)
-    best = np.flatnonzero(sound)[np.argsort(last)[:kept]]
+    best = np.flatnonzero(sound)[np.argsort(last)[:3]]
     sets = {"from nominal": one_of(found.converged, 0)}
     sets |= {f"best {i + 1}": one_of(found.converged, row) for i, row in enumerate(best)}
     with workers(flags.processes) as pool:
@@ -439,7 +435,7 @@ def starts(flags: Starts) -> None:
     make_folder(flags.out)
     caption = plots.starts(flags.out / "starts.png", curves)
     text = [
-        f"# How much the start matters: {flags.traj}",
+        f"How much the start matters: {flags.traj}",
         f"{flags.starts} starts, the first at nominal, the others log-uniform within "
         f"x/{flags.factor:g} of it; {int((~sound).sum())} are refused at their "
         "first walk: a fall, a plan that is not solved, or numbers that are not finite.",
@@ -451,8 +447,8 @@ def starts(flags: Starts) -> None:
             [[n, million(s.L[0]), "yes" if s.fallen.any() else "no"] for n, s in scores.items()],
         ),
     ]
-    told = {"first": first.tolist(), "last": last.tolist(), "refused": int((~sound).sum())}
-    written(flags, sets, told | {"hfs": as_numbers(scores)}, text, ("starts.png", caption))
+    numbers = {"first": first.tolist(), "last": last.tolist(), "refused": int((~sound).sum())}
+    write(flags, sets, numbers | {"hfs": as_numbers(scores)}, text, ("starts.png", caption))
 
 
 def verdict(flags: Verdict) -> None:
@@ -468,17 +464,15 @@ def verdict(flags: Verdict) -> None:
         title = f"{flags.traj} on the hardware stand-in"
         scores = judged(pool, load_robot(), sets, command, plants, title, flags.first_seed)
     last = flags.first_seed + flags.seeds - 1
-    made = environment()
-    text = [
-        f"# On the hardware stand-in: {flags.traj}",
-        made_at(made),
-        f"Seeds {flags.first_seed} to {last}. Losses in 1e6.",
-        plant_table(scores, "nominal"),
-    ]
-    name = f"verdict-{flags.traj}"
-    write_file(flags.out / f"{name}.md", ("\n\n".join(text) + "\n").encode())
-    write_json(flags.out / f"{name}.json", {"environment": made, "standin": as_numbers(scores)})
-    print(flags.out / f"{name}.md")
+    about = f"Seeds {flags.first_seed} to {last}. Losses in 1e6."
+    path = write_report(
+        flags.out / f"verdict-{flags.traj}.md",
+        f"On the hardware stand-in: {flags.traj}",
+        [about, plant_table(scores, "nominal")],
+        numbers={"standin": as_numbers(scores)},
+        json_name=f"verdict-{flags.traj}.json",
+    )
+    print(path)
 
 
 def main() -> None:

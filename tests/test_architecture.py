@@ -31,6 +31,7 @@ DOORS = {
     "sklearn": ("search.rivals",),
     "matplotlib": ("report.plots",),
     "tensorboardX": ("report.tensorboard",),
+    "jinja2": ("report.report",),
     "tyro": ("cli.parse",),
 }
 

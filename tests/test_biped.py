@@ -21,10 +21,10 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json
 from hector_jax.core.trajectory import State, has_fallen
 from hector_jax.grfm.collection import load_walks
-from hector_jax.report import folder as runs
 from hector_jax.robot.description import Description, read_description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs
 from hector_jax.robot.model import describe, load_model, load_robot
+from hector_jax.runs import folder as runs
 from hector_jax.runs import nets, replay
 from hector_jax.runs.export import find_weights
 from hector_jax.runs.nets import CollectConfig
@@ -224,7 +224,7 @@ def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tm
     save_weights(tmp_path / "weights" / "with.json", expert(strider))
     weights = tmp_path / "weights" / "with.json"
     assert find_weights(tmp_path, "with") == (weights, walk_config(strider))
-    assert runs.read_asked(tmp_path).robot == STRIDER
+    assert runs.read_request(tmp_path).robot == STRIDER
     found, _ = runs.weights_of(tmp_path, "nominal", strider)
     jax.tree.map(np.testing.assert_array_equal, found, nominal(strider))
 

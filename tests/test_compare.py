@@ -11,8 +11,9 @@ from rich.console import Console
 from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.report.folder import compare_runs, load_run, print_comparison, read_metrics
+from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.tensorboard import write_events
+from hector_jax.runs.folder import load_run, read_metrics
 
 
 def change(median, counts=True):

@@ -108,9 +108,9 @@ def test_batch_sets_up_its_devices_and_refuses_a_missing_net(tmp_path):
 
 def test_a_race_on_another_engine_collects_as_every_run_does(tmp_path, monkeypatch):
     race, made = script("race"), []
-    monkeypatch.setattr(race.pipeline, "collect", lambda pool, config, *rest: made.append(config))
-    monkeypatch.setattr(race.pipeline, "train", lambda *rest: (tmp_path / "data.part").mkdir())
-    monkeypatch.setattr(race.pipeline, "ground", lambda pool, robot, folder: race.nets.TrainedNet)
+    monkeypatch.setattr(race.nets, "collect", lambda pool, config, *rest: made.append(config))
+    monkeypatch.setattr(race.nets, "train", lambda *rest: (tmp_path / "data.part").mkdir())
+    monkeypatch.setattr(race.nets, "ground", lambda pool, robot, folder: race.nets.TrainedNet)
     monkeypatch.setattr(race.nets.TrainedNet, "params", None, raising=False)
     race.prepare(None, race.Flags(engine="c", out=tmp_path), None)
     assert made == [race.nets.CollectConfig()]  # what `ground` takes up

@@ -20,7 +20,7 @@ from hector_jax.control.reference import Command
 from hector_jax.control.weights import bounds, nominal, weights_to_vector
 from hector_jax.core import tree_file
 from hector_jax.core.runtime import workers
-from hector_jax.report.report import tuning_section
+from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import replay, tunings
 from hector_jax.runs.tunings import Problem

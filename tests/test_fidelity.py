@@ -14,7 +14,7 @@ from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.training import errors, report
 from hector_jax.report import fidelity
-from hector_jax.report.report import Picture, write_fidelity
+from hector_jax.report.report import Picture
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
@@ -99,7 +99,7 @@ def test_the_report_holds_every_world_and_phi(tmp_path, robot, samples, walks):
         fidelity.drifts(robot, effects, walks, np.zeros(1, int)),
     )
     worlds = {"hfs": found, "standin": found}
-    text = write_fidelity(tmp_path, worlds, [Picture("a.png", "A picture.")]).read_text()
+    text = fidelity.write_report(tmp_path, worlds, [Picture("a.png", "A picture.")]).read_text()
     assert "## hfs" in text
     assert "## hardware stand-in" in text
     assert "![A picture.](a.png)" in text
@@ -122,7 +122,7 @@ def test_what_nothing_was_measured_of_is_null_and_a_dash(tmp_path, robot, sample
         fidelity.by_phase(effects, some),
         fidelity.drifts(robot, effects, fell, np.zeros(1, int)),
     )
-    text = write_fidelity(tmp_path, {"hfs": found}, []).read_text()
+    text = fidelity.write_report(tmp_path, {"hfs": found}, []).read_text()
     assert "| last 50 ms, stance, F [N^2] | - |" in text
     assert "nan" not in text
     told = json.loads((tmp_path / "result.json").read_text())["hfs"]

@@ -11,7 +11,8 @@ from rich.console import Console
 from hector_jax.control.weights import bounds
 from hector_jax.core.environment import environment
 from hector_jax.report import report
-from hector_jax.report.report import Picture, Report, print_table, write_report
+from hector_jax.report.report import Picture, print_table
+from hector_jax.report.run import Report, write_report
 from hector_jax.runs.metrics import Verdict
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import LossConfig, Losses
@@ -118,7 +119,7 @@ def test_one_plant_is_told_in_the_singular_and_without_an_interval():
     ("largest", "power"), [(0.0, 0), (0.5, 0), (12.0, 0), (7e5, 3), (2e6, 6), (0.02, -3)]
 )
 def test_scales_are_powers_of_a_thousand(largest, power):
-    assert report._scale(largest) == power
+    assert report.column("L", largest).power == power
 
 
 def test_the_report_tells_everything_that_was_promised(tmp_path):

@@ -76,7 +76,7 @@ def test_a_scene_becomes_the_walk_of_a_set_on_a_plant():
     ("wrong", "message"),
     [
         ({"phases": 0}, "phases must be a whole number of at least 1, got 0"),
-        ({"forces": (50.0, -1.0)}, "forces must be a number above 0, got -1.0 in"),
+        ({"forces": (50.0, -1.0)}, r"forces must be a list, each a number above 0, got \(50.0, -1"),
         ({"frictions": ()}, "frictions must differ, at least one, got"),
     ],
 )

@@ -17,12 +17,11 @@ from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError
-from hector_jax.report import folder as runs
 from hector_jax.report import pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import load_model, load_robot
-from hector_jax.runs import tunings
+from hector_jax.runs import folder as runs
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +53,7 @@ def pretend_run(folder, iterations=12, weights=()):
 
 def write_metrics(folder, iterations, refused=()):
     lines = [
-        tunings.as_line(name, iteration)
+        runs.as_line(name, iteration)
         for name, pace in (("without", 5.0), ("with", 3.0))
         for iteration in pretend_history(iterations, pace, refused)
     ]
@@ -109,9 +108,9 @@ def test_metrics_are_read_back_as_they_were_written(tmp_path):
     assert list(found) == ["without", "with"]
     assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
     written = (tmp_path / "metrics.jsonl").read_text()
-    again = [tunings.as_line(name, i) for name, history in found.items() for i in history]
+    again = [runs.as_line(name, i) for name, history in found.items() for i in history]
     assert "".join(again) == written
-    curve = runs.curves(found)["with"]
+    curve = runs.loss_curves(found)["with"]
     assert np.isnan(curve[3])
     assert curve[6] < curve[0]
 

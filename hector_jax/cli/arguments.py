@@ -14,10 +14,10 @@ from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.report.folder import Asked
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.cache import robot_hash
+from hector_jax.runs.folder import RunRequest
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
@@ -62,7 +62,7 @@ def folder_of(folder: Path, path: Path | None, robot: Robot) -> Path:
     return folder if path is None else folder / robot.description.name
 
 
-def robot_of(run: Path, begun: Asked) -> Robot:
+def robot_of(run: Path, begun: RunRequest) -> Robot:
     """The robot that a run was tuned for.
 
     Raises:

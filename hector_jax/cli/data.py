@@ -22,7 +22,6 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.report import write_fidelity
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import nets, verdicts
 from hector_jax.sim.loop import Job
@@ -94,7 +93,7 @@ def grfm(args: Grfm) -> None:
     trainings = {"training": net.course, "training_paper": paper.course}
     tick = config.rollout.walk.gait.tick
     drawn = pictures.of_nets(args.out, tick, curves, drifts, trainings)
-    told = write_fidelity(args.out, found, drawn)
+    told = fidelity.write_report(args.out, found, drawn)
     if args.json:
         print(as_json({"report": str(told), "worlds": found}))
     else:

@@ -16,12 +16,13 @@ from hector_jax.core.inputs import plural, printable
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm.dataset import SOLVED
-from hector_jax.report import folder as runs
 from hector_jax.report import pictures
+from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, verdicts
+from hector_jax.runs.folder import RESULT, load_run
 from hector_jax.runs.metrics import Score, Verdict
 from hector_jax.tuning.loss import LossConfig
 
@@ -120,14 +121,14 @@ def walk(args: Walk) -> None:
 
 def compare(args: Compare) -> None:
     """Put finished runs side by side."""
-    finished = [folder for folder in args.runs if (folder / runs.RESULT).exists()]
+    finished = [folder for folder in args.runs if (folder / RESULT).exists()]
     for folder in args.runs:
         if finished and folder not in finished:
             say(f"{folder} is left out: it is not a finished run")
-    told = runs.compare_runs([runs.load_run(folder) for folder in finished or args.runs])
+    told = compare_runs([load_run(folder) for folder in finished or args.runs])
     if args.out is not None:
         write_json(args.out, told)
     if args.json:
         print(as_json(told))
     else:
-        runs.print_comparison(told)
+        print_comparison(told)

@@ -7,9 +7,9 @@ from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import Broken, say
 from hector_jax.core.files import as_json, locked
 from hector_jax.core.inputs import InputError
-from hector_jax.report import folder as runs
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import export
+from hector_jax.runs.folder import read_request
 
 
 def export_controller(args: Export) -> None:
@@ -18,7 +18,7 @@ def export_controller(args: Export) -> None:
     if is_run and args.robot:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
     path, config = export.find_weights(args.run, args.set)
-    begun = runs.read_asked(args.run) if is_run else None
+    begun = read_request(args.run) if is_run else None
     robot = arguments.robot_of(args.run, begun) if begun else load_robot(args.robot)
     wanted = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"

@@ -14,9 +14,9 @@ from hector_jax.cli.parse import as_table, from_file
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.report.folder import read_json
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.cache import robot_hash
+from hector_jax.runs.folder import read_json
 from hector_jax.runs.nets import COLLECTION_CODE
 
 TIME = "%Y%m%d-%H%M%S"  # names a run

@@ -338,11 +338,12 @@ def _draw(
     """All pictures, in the order of the report."""
     say("drawing the pictures")
     paper = {
-        (trajectory, name, baseline): paper_change(trajectory, name, baseline)
+        (trajectory, name, baseline): change
         for trajectory in verdicts
         for name in PAPER[trajectory]
         for baseline in BASELINES
         if name not in BASELINES
+        and (change := paper_change(trajectory, name, baseline)) is not None
     }
     caption = plots.changes(out / "pictures" / "changes.png", verdicts, paper)
     pictures = [Picture("pictures/changes.png", caption)]

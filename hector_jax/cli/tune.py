@@ -31,11 +31,12 @@ from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.jobs import PIECES
 from hector_jax.grfm.network import Params, as_effect
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.folder import read_json
-from hector_jax.report.report import Picture, Report, print_table, write_report
+from hector_jax.report.report import Picture, print_table
+from hector_jax.report.run import Report, write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
+from hector_jax.runs.folder import read_json
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned

@@ -15,13 +15,13 @@ from hector_jax.core.inputs import InputError
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.report import fidelity, pictures, plots, view
-from hector_jax.report import folder as runs
 from hector_jax.report.motion import Motion, motion
 from hector_jax.report.report import WORLDS
 from hector_jax.report.tensorboard import write_events
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, compile_model
 from hector_jax.runs import metrics, nets, replay
+from hector_jax.runs.folder import read_histories, read_request, weights_of
 
 
 def view_run(args: View) -> None:
@@ -32,14 +32,14 @@ def view_run(args: View) -> None:
         view.check_viser()
     else:
         check_film(folder / "film.mp4")
-    begun = runs.read_asked(args.run)
+    begun = read_request(args.run)
     robot = arguments.robot_of(args.run, begun)
     wanted = arguments.course(begun.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
             raise InputError(f"--out must not be the folder of the run, got {folder}")
         make_folder(folder)
-    sets = {name: runs.weights_of(args.run, name, robot) for name in args.sets}
+    sets = {name: weights_of(args.run, name, robot) for name in args.sets}
     data = arguments.folder_of(args.data or begun.data, begun.robot, robot)
     net = begun.net if args.data is None and begun.net else nets.net_path(data, begun.variant)
     effect = _phi_of(net, begun.variant, robot)
@@ -67,7 +67,7 @@ def view_run(args: View) -> None:
 
     if folder is not None:
         walk()
-        pictures.of_view(folder, robot, runs.read_histories(args.run), begun.loss, shown)
+        pictures.of_view(folder, robot, read_histories(args.run), begun.loss, shown)
         say(f"the film and the pictures are in {folder}")
         return
     model = compile_model(robot.description)

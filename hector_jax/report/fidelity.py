@@ -1,12 +1,14 @@
-"""How well a phi tells what the ground returns, and where the body goes.
+"""How well a phi predicts what the ground returns, and where the body goes.
 
 Errors of the wrench by axis and by the phase of the step; and open-loop prediction: from recorded
 states, the rigid body is moved for up to 0.4 s under the recorded commands through phi, and
-compared with where the robot was. The row `measured` moves it by the wrench that was measured: what
-is left there is no matter of the ground, but of a rigid body standing for a robot with legs.
+compared with where the robot was. The row `measured` moves it by the measured wrench: the error
+that is left there is not due to the ground, but to a rigid body standing for a robot with legs.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -17,11 +19,13 @@ from jaxtyping import Array, Float, Int
 from hector_jax.control import gait
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
+from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.grfm.dataset import Dataset, make_dataset
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.grfm.training import predict
+from hector_jax.report.report import WORLDS, Picture, markdown_table, render
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
 
@@ -32,6 +36,10 @@ PHASES = {  # time [s] since the switch of stance
 }
 HORIZONS = (0.2, 0.4)  # [s]
 FIRST, APART = 5, 35  # ticks: of the first prediction in a walk, and from one to the next
+
+_AXES = {"F_x": "N^2", "F_y": "N^2", "F_z": "N^2"}
+_AXES |= {"M_x": "(N m)^2", "M_y": "(N m)^2", "M_z": "(N m)^2"}
+_CONTACTS = ("stance", "swing")
 
 
 class Drift(NamedTuple):
@@ -57,21 +65,19 @@ def by_phase(
         sample is in the phase.
     """
     since, stands = dataset.window.since_switch, np.asarray(dataset.window.contact)
-    told: dict[str, dict[str, dict[str, list[float]]]] = {}
+    errors: dict[str, dict[str, dict[str, list[float]]]] = {}
     for name, effect in effects.items():
         guess = predict(effect, jax.tree.map(jnp.asarray, dataset.window))
-        wrong = np.concatenate(
-            [np.square(np.asarray(g) - y) for g, y in zip(guess, dataset.label, strict=True)],
-            axis=-1,
-        )
-        told[name] = {}
+        pairs = zip(guess, dataset.label, strict=True)
+        square = np.concatenate([np.square(np.asarray(g) - y) for g, y in pairs], axis=-1)
+        errors[name] = {}
         for phase, (low, high) in PHASES.items():
             inside = ((since > low - 1e-6) & (since < high - 1e-6))[:, None]
-            told[name][phase] = {
-                "stance": _mean(wrong[inside & stands]).tolist(),
-                "swing": _mean(wrong[inside & ~stands]).tolist(),
+            errors[name][phase] = {
+                "stance": _mean(square[inside & stands]).tolist(),
+                "swing": _mean(square[inside & ~stands]).tolist(),
             }
-    return told
+    return errors
 
 
 def _ahead(
@@ -97,8 +103,8 @@ def _ahead(
                 since_switch=gait.since_switch(config, start_tick + j),
                 base=from_yaw_frame(state),
             )
-            found = effect(window)
-            returned, push = turn(found.wrench, yaw), turn(found.legs, yaw)
+            effects = effect(window)
+            returned, push = turn(effects.wrench, yaw), turn(effects.legs, yaw)
         feet = 0.5 * (walk.feet[j - 1] + walk.feet[j])
         moved = srbm.step(robot, state, returned, feet, config.tick, push)
         return moved, moved
@@ -166,7 +172,7 @@ def drifts(
 def as_result(
     whole: Mapping[str, Mapping[str, Any]],
     phases: Mapping[str, Any],
-    found: Mapping[str, Drift],
+    drifts: Mapping[str, Drift],
 ) -> dict[str, Any]:
     """All errors of one world as JSON values; `whole` is `training.report`."""
     ahead = {
@@ -177,7 +183,7 @@ def as_result(
             }
             for horizon in HORIZONS
         }
-        for name, one in found.items()
+        for name, one in drifts.items()
     }
     return {"errors": dict(whole), "phases": dict(phases), "open_loop": ahead}
 
@@ -199,7 +205,7 @@ def curves(
     samples, _ = make_dataset(robot, one)
     window = jax.tree.map(jnp.asarray, samples.window)
     names = {"linear": "linear", "paper": "paper", "residual": "predicted"}
-    found = {
+    wrenches = {
         "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
         "measured": samples.label,
         **{names[n]: predict(effect, window) for n, effect in effects.items() if n in names},
@@ -211,4 +217,84 @@ def curves(
         rows[samples.tick] = values
         return rows
 
-    return {name: jax.tree.map(by_tick, wrench) for name, wrench in found.items()}
+    return {name: jax.tree.map(by_tick, wrench) for name, wrench in wrenches.items()}
+
+
+def write_report(
+    folder: Path, worlds: Mapping[str, Mapping[str, Any]], pictures: Sequence[Picture]
+) -> Path:
+    """Write report.md on the nets' fidelity, and the same numbers as result.json.
+
+    Args:
+        folder: where the pictures are.
+        worlds: by their names, the values of `as_result`.
+        pictures: to show.
+
+    Returns:
+        report.md.
+    """
+    sections = {
+        WORLDS.get(name, name): {
+            "errors": _error_table(world["errors"]),
+            "phases": _phase_table(world["phases"]),
+            "open_loop": _drift_table(world["open_loop"]),
+        }
+        for name, world in worlds.items()
+    }
+    path = folder / "report.md"
+    write_file(path, render("fidelity.md.j2", worlds=sections, pictures=pictures).encode())
+    write_json(folder / "result.json", worlds)
+    return path
+
+
+def error_rows(errors: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
+    """Mean square errors, labelled: of force and moment, then by contact and axis.
+
+    Args:
+        errors: of several phis, as `training.report` has them.
+    """
+    rows = [
+        (f"{kind}, all [{unit}]", [one[kind] for one in errors])
+        for kind, unit in (("force", "N^2"), ("moment", "(N m)^2"))
+    ]
+    return rows + [
+        (f"{axis}, {contact} [{unit}]", [one[contact][i] for one in errors])
+        for contact in _CONTACTS
+        for i, (axis, unit) in enumerate(_AXES.items())
+    ]
+
+
+def _number(x: float, form: str = ".3g") -> str:
+    """A number of a table; a dash where nothing was there to measure."""
+    return format(x, form) if math.isfinite(x) else "-"
+
+
+def _error_table(errors: Mapping[str, Mapping[str, Any]]) -> str:
+    rows = [[label, *map(_number, values)] for label, values in error_rows([*errors.values()])]
+    return markdown_table(("mean square error", *errors), rows)
+
+
+def _phase_table(phases: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> str:
+    rows = [
+        [
+            f"{phase}, {contact}, {part} [{unit}]",
+            *(_number(float(np.mean(one[phase][contact][axes]))) for one in phases.values()),
+        ]
+        for phase in PHASES
+        for contact in _CONTACTS
+        for part, unit, axes in (("F", "N^2", slice(3)), ("M", "(N m)^2", slice(3, 6)))
+    ]
+    return markdown_table(("mean over the axes", *phases), rows)
+
+
+def _drift_table(drifts: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
+    units = (("position", "cm", 100.0), ("euler", "deg", 180.0 / np.pi))
+    rows = [
+        [
+            f"{part} after {horizon} [{unit}]",
+            *(_number(scale * one[horizon][part], ".2f") for one in drifts.values()),
+        ]
+        for horizon in next(iter(drifts.values()))
+        for part, unit, scale in units
+    ]
+    return markdown_table(("", *drifts), rows)

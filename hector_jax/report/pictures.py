@@ -11,12 +11,12 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.folder import Histories
 from hector_jax.report.motion import motions
 from hector_jax.report.report import WORLDS, Picture
 from hector_jax.report.video import VideoUnavailable, write_film, write_strip
 from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
+from hector_jax.runs.folder import Histories
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import LossConfig
 

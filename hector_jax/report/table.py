@@ -1,14 +1,13 @@
 """The paper's table, made again: all sets on three trajectories, with intervals and every fall.
 
-One result is told four times, as report.md, table.csv, table.json and table.tex; the paper's own
-losses stand beside it. The paper measured on a robot with other errors, so its losses are not to be
+One result is written four times, as report.md, table.csv, table.json and table.tex, beside the
+paper's own losses. The paper measured on a robot with other errors, so its losses are not to be
 compared with ours, but its changes in % are.
 """
 
 import csv
 import io
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,22 +19,17 @@ from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import read_json
 from hector_jax.report.report import (
-    STAND_IN,
-    UNITS,
-    VOID,
     Picture,
     change_text,
-    errors_of_tracking,
-    legend,
+    column,
     markdown_table,
-    parts_table,
-    percent,
+    render,
     seeds_text,
-    tuning_section,
-    verdict_table,
+    wins_text,
 )
+from hector_jax.report.run import tuning_section
 from hector_jax.runs import metrics
-from hector_jax.runs.metrics import BASELINES, PARTS, Comparison, Interval, Verdict
+from hector_jax.runs.metrics import BASELINES, Comparison, Summary, Verdict
 from hector_jax.tuning.difftune import Tuning
 
 PAPER = {
@@ -60,21 +54,15 @@ PAPER = {
 }
 """L_Eul, L_pos, L_ctrl and L by trajectory and set: the paper's table of losses in experiments."""
 
-_ORDER = ("L_Eul", "L_pos", "L_ctrl", "L")  # the paper's
-_RIVALS = ("without", "searched", "ceiling")  # that `with` is held against besides the baselines
-_TRAJECTORIES = {"straight": "Straight line", "c": "C curve", "s": "S curve"}
+PARTS = ("L_Eul", "L_pos", "L_ctrl", "L")  # in that order
+TITLES = {"straight": "Straight line", "c": "C curve", "s": "S curve"}
+OTHERS = {  # sets that a set is compared with besides the baselines
+    "with": ("without", "searched", "ceiling"),
+    "with_ten": ("without_ten",),
+    "with_walks": ("with", "ceiling"),
+}
 
-
-_SETS = """What the sets are, and what each costs in walks on the simulator:
-
-- `nominal`, `expert`: flat weights that walk; those that the robot's laboratory published.
-- `without_ten`, `without`: DiffTune from nominal on the plain rigid body, ten iterations and to
-  convergence; no walk.
-- `with_ten`, `with`: the same through GRFM-Net, which learned from 64 walks for all trajectories.
-- `with_walks`: `with`, stepped further along measured walks, a few on each step; to be compared
-  with searches by its walks too.
-- `searched`: the best of a short CMA-ES search; `ceiling`: that of a long one. Their walks are
-  told under "Search and tuning"."""
+Summaries = Mapping[tuple[str, str], Summary]  # by trajectory and set
 
 
 class Fall(NamedTuple):
@@ -90,7 +78,7 @@ class Fall(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What a search without derivatives did."""
+    """A search without derivatives."""
 
     walks: int  # on the high-fidelity simulator
     best_at: int  # the walk that was the best
@@ -102,11 +90,11 @@ class Earlier(NamedTuple):
     """An earlier table, on other plants, to hold the order of the sets against."""
 
     seeds: str
-    rankings: Mapping[str, Sequence[str]]  # by trajectory, see `ranking`
+    rankings: Mapping[str, Sequence[str]]  # by trajectory, best first
 
 
 class Table(NamedTuple):
-    """All that is told."""
+    """All that the four files contain."""
 
     verdicts: Mapping[str, Verdict]  # by trajectory
     falls: Sequence[Fall]
@@ -116,106 +104,30 @@ class Table(NamedTuple):
     pictures: Sequence[Picture]
     config: Mapping[str, Any]  # resolved, as JSON values
     environment: Mapping[str, str]
-    commits: Sequence[str]  # at which the results were made that are told
+    commits: Sequence[str]  # at which the results were made
     command: str  # that makes this table again
     earlier: Earlier | None = None
 
 
-class Line(NamedTuple):
-    """One set on one trajectory."""
+def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float | None:
+    """Change [%] of a part of the loss in the paper's table, from its rounded losses.
 
-    means: dict[str, Interval]  # by part
-    falls: int
-    seeds: int
-    against: dict[str, Comparison]  # by the other set
-
-
-class Bar(NamedTuple):
-    """Something the table has to show."""
-
-    trajectory: str
-    text: str
-    measured: str
-    holds: bool | None  # None where a set it needs was not walked, or too few plants
+    None for a baseline against itself, and for a set that is not in that table.
+    """
+    sets = PAPER.get(trajectory, {})
+    if name == baseline or name not in sets:
+        return None
+    at = PARTS.index(part)
+    return 100.0 * (sets[name][at] / sets[baseline][at] - 1.0)
 
 
-def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float:
-    """Change [%] of a part of the loss in the paper's table, from its rounded losses."""
-    at = _ORDER.index(part)
-    return 100.0 * (PAPER[trajectory][name][at] / PAPER[trajectory][baseline][at] - 1.0)
-
-
-def lines(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Line]:
-    """Each set on each trajectory, against the baselines; `with` against its rivals too."""
-    found = {}
-    for trajectory, verdict in verdicts.items():
-        for name in verdict.scores:
-            others = [*BASELINES, *(_RIVALS if name == "with" else ())]
-            others += ["without_ten"] if name == "with_ten" else []
-            others += ["with", "ceiling"] if name == "with_walks" else []
-            found[trajectory, name] = Line(
-                {part: metrics.mean(verdict, name, part) for part in _ORDER},
-                int(verdict.scores[name].fallen.sum()),
-                len(verdict.seeds),
-                {
-                    other: metrics.compare(verdict, name, other)
-                    for other in others
-                    if other in verdict.scores and other != name
-                },
-            )
-    return found
-
-
-def _bar(
-    line: Line | None, trajectory: str, text: str, other: str, most: float, part: str = "L"
-) -> Bar:
-    """Whether the median change [%] against another set is `most` or less."""
-    if line is None or other not in line.against:
-        return Bar(trajectory, text, "not walked", None)
-    comparison = line.against[other]
-    change = comparison.change[part]
-    void = "" if comparison.counts else ", void: the falls differ"
-    holds = comparison.counts and change.value <= most
-    return Bar(trajectory, text, f"{change_text(change)} %{void}", holds)
-
-
-def bars(found: Mapping[tuple[str, str], Line]) -> list[Bar]:
-    """What the converged `with` has to show on each trajectory, and whether it does."""
-    told = []
-    for t in dict.fromkeys(trajectory for trajectory, _ in found):
-        line, expert = found.get((t, "with")), found.get((t, "expert"))
-        clear = _bar(line, t, "`with` below `without`, interval clear of zero", "without", 0.0)
-        if line is not None and clear.holds:
-            high = line.against["without"].change["L"].high
-            clear = clear._replace(holds=None if math.isnan(high) else high < 0.0)
-        told += [
-            _bar(line, t, "`with` at least 60 % below nominal", "nominal", -60.0),
-            _bar(line, t, "`with` at least 40 % below expert", "expert", -40.0),
-            _bar(line, t, "L_ctrl of `with` at most 9 % above expert", "expert", 9.0, "L_ctrl"),
-            clear,
-            _bar(line, t, "`with` at most 15 % above `ceiling`", "ceiling", 15.0),
-        ]
-        text = "`with` falls no more often than expert"
-        if line is None or expert is None:
-            told.append(Bar(t, text, "not walked", None))
-        else:
-            measured = f"{line.falls} against {expert.falls} of {line.seeds}"
-            told.append(Bar(t, text, measured, line.falls <= expert.falls))
-    return told
-
-
-def aims(found: Mapping[tuple[str, str], Line]) -> list[Bar]:
-    """What is hoped for beyond the bars: the paper's figures after ten iterations, 70 and 45 %."""
-    told = []
-    for t in dict.fromkeys(trajectory for trajectory, _ in found):
-        for baseline in BASELINES:
-            paper = paper_change(t, "with_ten", baseline)
-            text = f"`with_ten` further below {baseline} than the paper's {-paper:.1f} %"
-            told.append(_bar(found.get((t, "with_ten")), t, text, baseline, paper))
-        for baseline, aim in zip(BASELINES, (70.0, 45.0), strict=True):
-            text = f"`with` at least {aim:.0f} % below {baseline}"
-            told.append(_bar(found.get((t, "with")), t, text, baseline, -aim))
-    return told
+def summaries(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Summary]:
+    """Each set on each trajectory, against the baselines and its `OTHERS`."""
+    return {
+        (trajectory, name): metrics.summarize(verdict, name, (*BASELINES, *OTHERS.get(name, ())))
+        for trajectory, verdict in verdicts.items()
+        for name in verdict.scores
+    }
 
 
 def ranking(verdict: Verdict) -> list[str]:
@@ -225,13 +137,18 @@ def ranking(verdict: Verdict) -> list[str]:
 
 
 def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
-    """The order of the sets in a table.json of other plants than those of `seeds`.
+    """Read the order of the sets from a table.json of other plants than those of `seeds`.
 
     Raises:
         InputError: one line naming the file, where it cannot be read, is no such file, or is of the
             same plants, on which the order would be the same by itself.
     """
-    earlier = _load_earlier(path)
+    table = read_json(path, "a table.json", 100_000_000)
+    try:
+        rankings = {name: list(one["ranking"]) for name, one in table["trajectories"].items()}
+        earlier = Earlier(str(table["seeds"]), rankings)
+    except (TypeError, KeyError, AttributeError) as error:
+        raise InputError(f"{path}: not a table.json of `hector table`: {error!r}") from error
     if earlier.seeds == seeds_text(seeds):
         raise InputError(
             f"{path}: a table of the same plants, seeds {earlier.seeds}; expected others, to "
@@ -240,35 +157,17 @@ def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
     return earlier
 
 
-def _load_earlier(path: Path) -> Earlier:
-    told = read_json(path, "a table.json", 100_000_000)
-    try:
-        rankings = {name: list(one["ranking"]) for name, one in told["trajectories"].items()}
-        return Earlier(str(told["seeds"]), rankings)
-    except (TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: not a table.json of `hector table`: {error!r}") from error
-
-
-def same_order(verdicts: Mapping[str, Verdict], earlier: Earlier) -> list[Bar]:
-    """Whether the sets that both tables have stand in the same order."""
-    told = []
-    for trajectory, verdict in verdicts.items():
-        text = f"sets in the same order as on seeds {earlier.seeds}"
-        before = earlier.rankings.get(trajectory)
-        if before is None:
-            told.append(Bar(trajectory, text, "not walked", None))
-            continue
-        now = [name for name in ranking(verdict) if name in before]
-        before = [name for name in before if name in now]
-        pairs = itertools.combinations(before, 2)
-        swapped = [f"`{a}` and `{b}`" for a, b in pairs if now.index(a) > now.index(b)]
-        measured = f"changed places: {', '.join(swapped)}" if swapped else f"all {len(now)}"
-        told.append(Bar(trajectory, text, measured, not swapped))
-    return told
-
-
-def _all_bars(table: Table, found: Mapping[tuple[str, str], Line]) -> list[Bar]:
-    return bars(found) + (same_order(table.verdicts, table.earlier) if table.earlier else [])
+def swapped_sets(
+    verdicts: Mapping[str, Verdict], earlier: Earlier
+) -> dict[str, list[tuple[str, str]] | None]:
+    """Pairs of sets in another order than in an earlier table, by trajectory; None: not there."""
+    pairs: dict[str, list[tuple[str, str]] | None] = dict.fromkeys(verdicts)
+    for trajectory in verdicts.keys() & earlier.rankings.keys():
+        now = ranking(verdicts[trajectory])
+        before = [name for name in earlier.rankings[trajectory] if name in now]
+        couples = itertools.combinations(before, 2)
+        pairs[trajectory] = [(a, b) for a, b in couples if now.index(a) > now.index(b)]
+    return pairs
 
 
 def write_table(folder: Path, table: Table) -> Path:
@@ -276,7 +175,7 @@ def write_table(folder: Path, table: Table) -> Path:
 
     Args:
         folder: where the pictures are.
-        table: what to tell.
+        table: its contents.
 
     Returns:
         report.md.
@@ -284,217 +183,96 @@ def write_table(folder: Path, table: Table) -> Path:
     Raises:
         WriteError: a file cannot be written.
     """
-    found = lines(table.verdicts)
-    write_file(folder / "table.csv", _csv(found).encode())
-    write_json(folder / "table.json", _result(table, found))
-    write_file(folder / "table.tex", _tex(table.verdicts, found).encode())
-    write_file(folder / "report.md", _report(table, found).encode())
+    sets = summaries(table.verdicts)
+    write_file(folder / "table.csv", _csv(table, sets).encode())
+    write_json(folder / "table.json", _result(table, sets))
+    write_file(folder / "table.tex", _tex(table.verdicts, sets).encode())
+    write_file(folder / "report.md", _report(table, sets).encode())
     return folder / "report.md"
 
 
-def _report(table: Table, found: Mapping[tuple[str, str], Line]) -> str:
-    first = next(iter(table.verdicts.values()))
-    sections = [
-        f"# The paper's table: {', '.join(table.verdicts)}, {plural(len(first.seeds), 'plant')}",
-        _summary(found),
-        STAND_IN,
-        _SETS,
-        "## What it had to show",
-        _checklist(_all_bars(table, found)),
-        "Beyond that it was hoped for:",
-        _checklist(aims(found)),
-    ]
-    for trajectory, verdict in table.verdicts.items():
-        sections += [
-            f"## {_TRAJECTORIES.get(trajectory, trajectory)}",
-            verdict_table(verdict),
-            f"From the best to the worst, by the median against nominal: {_order(verdict)}.",
-            *(line.replace(VOID, "\\" + VOID) for line in legend(verdict)),
-            parts_table(verdict),
-            errors_of_tracking(verdict),
-        ]
-    sections += [
-        "## With the net against its rivals",
-        "Change in %, median over plants of the paired ratio [95 % bootstrap interval].",
-        _rivals(found),
-        "## Beside the paper",
-        "Change of L in %. The paper tunes for ten iterations; its figures were measured on the "
-        "robot and bear no intervals, ours on simulated plants. The losses themselves are those of "
-        "other errors and not to be compared.",
-        _beside(found),
-        f"L_ctrl of the paper's `with_ten` against its expert: {_paper_control()} %.",
-        "The paper's own table:",
-        _paper_table(),
-        "## Falls",
-        _falls(table),
-        "## Pictures",
-        *(f"![{p.caption}]({p.file})\n\n*{p.caption}*" for p in table.pictures),
-        "## Search and tuning",
-        _searches(table),
-    ]
-    for trajectory, tunings in table.tunings.items():
-        for name, tuning in tunings.items():
-            sections.append(tuning_section(f"{trajectory}, {name}", tuning))
-    sections += [
-        "## What was run",
-        _made_at(table),
-        markdown_table(("what", "version"), list(table.environment.items())),
-        "```json\n" + json.dumps(table.config, indent=2) + "\n```",
-        "## How to reproduce",
-        f"```\n{table.command}\n```\n\n`table.json` holds every score by seed, `table.csv` the "
-        "same numbers as this report in columns, `table.tex` a tabular for LaTeX.",
-    ]
-    return "\n\n".join(sections) + "\n"
-
-
-def _order(verdict: Verdict) -> str:
-    return ", ".join(f"`{name}`" for name in ranking(verdict))
-
-
-def _summary(found: Mapping[tuple[str, str], Line]) -> str:
-    told = []
-    for (trajectory, name), line in found.items():
-        if name != "with":
-            continue
-        against = ", ".join(
-            f"{change_text(line.against[baseline].change['L'])} % against {baseline}"
-            for baseline in BASELINES
-            if baseline in line.against
-        )
-        fell = f"{plural(line.falls, 'fall')} on {plural(line.seeds, 'plant')}"
-        told.append(f"- {trajectory}: {against}; {fell}")
-    return "Loss of the weights tuned through the net (`with`):\n\n" + "\n".join(told)
-
-
-def _checklist(told: Sequence[Bar]) -> str:
-    word = {True: "holds", False: "falls short", None: "open"}
-    return "\n".join(
-        f"- [{'x' if bar.holds else ' '}] {bar.trajectory}: {bar.text}: {bar.measured}: "
-        f"**{word[bar.holds]}**"
-        for bar in told
-    )
-
-
-def _marked(comparison: Comparison, part: str = "L") -> str:
-    return change_text(comparison.change[part]) + ("" if comparison.counts else " \\" + VOID)
-
-
-def _rivals(found: Mapping[tuple[str, str], Line]) -> str:
-    rows = []
-    for (trajectory, name), line in found.items():
-        for other, comparison in line.against.items():
-            if other in BASELINES:
-                continue
-            cells = [_marked(comparison, part) for part in _ORDER]
-            wins = f"{round(comparison.wins * line.seeds)} / {line.seeds}"
-            rows.append([f"{trajectory}: `{name}` against `{other}`", *cells, wins])
-    return markdown_table(("", *_ORDER, "wins (L)"), rows) if rows else "No rival was walked."
-
-
-def _beside(found: Mapping[tuple[str, str], Line]) -> str:
-    trajectories = list(dict.fromkeys(trajectory for trajectory, _ in found))
-    rows = []
-    for name in ("without_ten", "with_ten", "without", "with"):
-        for baseline in BASELINES:
-            cells = []
-            for t in trajectories:
-                line = found.get((t, name))
-                ours = line.against.get(baseline) if line else None
-                paper = PAPER.get(t, {}).get(name)
-                cells.append("" if ours is None else _marked(ours))
-                cells.append("" if paper is None else f"{paper_change(t, name, baseline):+.1f}")
-            rows.append([f"`{name}` against {baseline}", *cells])
-    head = [cell for t in trajectories for cell in (t, "paper")]
-    return markdown_table(("", *head), rows)
-
-
-def _paper_control() -> str:
-    told = (f"{paper_change(t, 'with_ten', 'expert', 'L_ctrl'):+.1f} ({t})" for t in PAPER)
-    return ", ".join(told)
-
-
-def _paper_table() -> str:
-    head = ("", *(f"{part} [{UNITS[part]}]" if UNITS[part] else part for part in _ORDER))
-    rows = [
-        [f"{trajectory}: {name}", *(f"{x:.3g}".replace("e+0", "e") for x in losses)]
-        for trajectory, sets in PAPER.items()
-        for name, losses in sets.items()
-    ]
-    return markdown_table(head, rows)
-
-
-def _falls(table: Table) -> str:
-    walks = sum(len(v.seeds) * len(v.scores) for v in table.verdicts.values())
-    if not table.falls:
-        return f"None of the {plural(walks, 'walk')} ended in a fall."
-    rows = [
-        [
-            f"{fall.trajectory}: {fall.name}",
-            str(fall.seed),
-            f"{fall.upright:.2f}",
-            f"{100 * fall.height:.1f}",
-            f"{math.degrees(fall.roll):.1f}",
-            f"{math.degrees(fall.pitch):.1f}",
-        ]
-        for fall in table.falls
-    ]
-    head = ("set", "plant", "upright [s]", "height [cm]", "roll [deg]", "pitch [deg]")
-    return (
-        f"{len(table.falls)} of {plural(walks, 'walk')} ended in a fall. Height of the centre of "
-        "mass, roll and pitch are those of the last millisecond before it.\n\n"
-        + markdown_table(head, rows)
-    )
-
-
-def _searches(table: Table) -> str:
-    kinds = {"searched": table.searches, "ceiling": table.ceilings}
-    rows = [
-        [f"{name}: `{kind}`", str(s.walks), str(s.best_at), f"{s.loss / 1e6:.3f}", s.stop]
-        for kind, searches in kinds.items()
-        for name, s in searches.items()
-    ]
-    head = ("", "walks", "best at", "L x1e6 there", "ended")
-    return (
-        "`searched` and `ceiling` are CMA-ES in the log-weights from nominal, on the "
-        "high-fidelity simulator that the net learned from.\n\n" + markdown_table(head, rows)
-    )
-
-
-def _made_at(table: Table) -> str:
-    known = ", ".join(f"`{commit}`" if commit else "unknown" for commit in table.commits)
+def _report(table: Table, sets: Summaries) -> str:
     scores = [score for verdict in table.verdicts.values() for score in verdict.scores.values()]
-    worst = max(float(score.residual.max()) for score in scores)
-    return (
-        f"Tunings and walks were made at {known}. "
-        f"Worst relative KKT residual of a plan in any walk: {worst:.0e}."
+    return render(
+        "table.md.j2",
+        **table._asdict(),
+        PAPER=PAPER,
+        TITLES=TITLES,
+        degrees=math.degrees,
+        paper_change=paper_change,
+        ranking=ranking,
+        units=_units(table.verdicts),
+        sets=sets,
+        plants=plural(_seeds(table), "plant"),
+        swapped=table.earlier and swapped_sets(table.verdicts, table.earlier),
+        others_table=_others_table(table, sets),
+        paper_comparison=_paper_comparison(list(table.verdicts), sets),
+        walks=plural(_seeds(table) * len(sets), "walk"),
+        sections=[
+            tuning_section(f"{trajectory}, {name}", tuning)
+            for trajectory, tunings in table.tunings.items()
+            for name, tuning in tunings.items()
+        ],
+        residual=f"{max(float(score.residual.max()) for score in scores):.0e}",
     )
 
 
-def _csv(found: Mapping[tuple[str, str], Line]) -> str:
+def _seeds(table: Table) -> int:
+    return len(next(iter(table.verdicts.values())).seeds)
+
+
+def _units(verdicts: Mapping[str, Verdict]) -> dict[str, str]:
+    return {term.name: term.unit for term in next(iter(verdicts.values())).loss}
+
+
+def _others_table(table: Table, sets: Summaries) -> str:
+    rows = []
+    for (trajectory, name), summary in sets.items():
+        for other, one in summary.against.items():
+            if other not in BASELINES:
+                changes = (change_text(one, part) for part in PARTS)
+                label = f"{trajectory}: `{name}` against `{other}`"
+                rows.append([label, *changes, wins_text(one, _seeds(table))])
+    return markdown_table(("", *PARTS, "wins (L)"), rows) if rows else ""
+
+
+def _paper_comparison(trajectories: Sequence[str], sets: Summaries) -> str:
+    rows = []
+    for name, baseline in itertools.product(
+        ("without_ten", "with_ten", "without", "with"), BASELINES
+    ):
+        row = [f"`{name}` against {baseline}"]
+        for t in trajectories:
+            ours = sets[t, name].against.get(baseline) if (t, name) in sets else None
+            paper = paper_change(t, name, baseline)
+            row.append(change_text(ours) if ours else "")
+            row.append("" if paper is None else f"{paper:+.1f}")
+        rows.append(row)
+    return markdown_table(["", *(cell for t in trajectories for cell in (t, "paper"))], rows)
+
+
+def _csv(table: Table, sets: Summaries) -> str:
     """One row per trajectory, set and part of the loss; changes in %."""
-    others = (*BASELINES, *_RIVALS, "without_ten", "with")
+    others = list(dict.fromkeys((*BASELINES, *itertools.chain(*OTHERS.values()))))
     head = ["trajectory", "set", "part", "unit", "mean", "mean_low", "mean_high", "falls", "seeds"]
     for other in others:
         head += [f"{key}_{other}" for key in ("median", "low", "high", "wins", "counts")]
-    head += ["paper", *(f"paper_{baseline}" for baseline in BASELINES)]
-    rows: list[list[Any]] = [head]
-    for (trajectory, name), line in found.items():
+    units = _units(table.verdicts)
+    rows: list[list[Any]] = [[*head, "paper", *(f"paper_{baseline}" for baseline in BASELINES)]]
+    for (trajectory, name), summary in sets.items():
         paper = PAPER.get(trajectory, {}).get(name)
-        for part in _ORDER:
-            row = [trajectory, name, part, UNITS[part], *line.means[part], line.falls, line.seeds]
+        for part in PARTS:
+            row = [trajectory, name, part, units.get(part, ""), *summary.means[part]]
+            row += [summary.falls, _seeds(table)]
             for other in others:
-                one = line.against.get(other)
-                wins = "" if one is None or part != "L" else one.wins
-                row += [""] * 5 if one is None else [*one.change[part], wins, one.counts]
-            row.append("" if paper is None else paper[_ORDER.index(part)])
-            for baseline in BASELINES:
-                known = paper is not None and name != baseline
-                row.append(paper_change(trajectory, name, baseline, part) if known else "")
-            rows.append(row)
+                one = summary.against.get(other)
+                wins = one.wins if one and part == "L" else ""
+                row += [*one.change[part], wins, one.counts] if one else [""] * 5
+            row.append(paper[PARTS.index(part)] if paper else "")
+            row += [paper_change(trajectory, name, baseline, part) for baseline in BASELINES]
+            rows.append([_csv_number(cell) if isinstance(cell, float) else cell for cell in row])
     out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows(
-        [_csv_number(cell) if isinstance(cell, float) else cell for cell in row] for row in rows
-    )
+    csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue()
 
 
@@ -502,42 +280,41 @@ def _csv_number(x: float) -> str:
     return f"{x:.6g}" if math.isfinite(x) else ""
 
 
-def _result(table: Table, found: Mapping[tuple[str, str], Line]) -> dict[str, Any]:
-    """The table as JSON values, every score by seed among them."""
-    told = {}
+def _result(table: Table, sets: Summaries) -> dict[str, Any]:
+    """The table as JSON values, with every score by seed."""
+    trajectories = {}
     for trajectory, verdict in table.verdicts.items():
-        one = metrics.as_result(verdict)
+        result = metrics.as_result(verdict)
         for name, score in verdict.scores.items():
-            by_seed = {part: score.losses[part].tolist() for part in PARTS}
+            by_seed = {part: losses.tolist() for part, losses in score.losses.items()}
             by_seed["fallen"] = score.fallen.astype(bool).tolist()
-            one["sets"][name]["standin"]["by_seed"] = by_seed
-        one["against"] = {
-            f"{name} against {other}": metrics.change_result(comparison)
-            for (t, name), line in found.items()
-            for other, comparison in line.against.items()
-            if t == trajectory and other not in BASELINES
+            result["sets"][name]["standin"]["by_seed"] = by_seed
+        result["against"] = {
+            f"{name} against {other}": metrics.change_result(one)
+            for name in verdict.scores
+            for other, one in sets[trajectory, name].against.items()
+            if other not in BASELINES
         }
-        one["ranking"] = ranking(verdict)
-        one["tunings"] = {
+        result["ranking"] = ranking(verdict)
+        result["tunings"] = {
             name: {"iterations": len(tuning.history) - 1, "stop": tuning.stop}
             for name, tuning in table.tunings.get(trajectory, {}).items()
         }
         for key, searches in (("search", table.searches), ("ceiling", table.ceilings)):
             if trajectory in searches:
-                one[key] = searches[trajectory]._asdict()
-        told[trajectory] = one
+                result[key] = searches[trajectory]._asdict()
+        trajectories[trajectory] = result
     return {
         "command": table.command,
         "environment": dict(table.environment),
         "commits": list(table.commits),
         "seeds": seeds_text(next(iter(table.verdicts.values())).seeds),
         "config": dict(table.config),
-        "bars": [bar._asdict() for bar in _all_bars(table, found)],
-        "aims": [bar._asdict() for bar in aims(found)],
+        "swapped": swapped_sets(table.verdicts, table.earlier) if table.earlier else None,
         "falls": [fall._asdict() for fall in table.falls],
-        "trajectories": told,
+        "trajectories": trajectories,
         "paper": {
-            trajectory: {name: dict(zip(_ORDER, losses, strict=True)) for name, losses in s.items()}
+            trajectory: {name: dict(zip(PARTS, losses, strict=True)) for name, losses in s.items()}
             for trajectory, s in PAPER.items()
         },
     }
@@ -552,7 +329,7 @@ _TEX = {
 
 
 def tex(text: str) -> str:
-    """Plain words for LaTeX."""
+    """Escape words for LaTeX."""
     return "".join(_TEX.get(character, character) for character in text)
 
 
@@ -562,60 +339,42 @@ def _tex_number(x: float) -> str:
     return f"{x:.{max(digits, 0)}f}"
 
 
-def _tex_change(comparison: Comparison | None) -> str:
-    if comparison is None:
-        return "--"
-    value, *ends = comparison.change["L"].text(percent).split(" ", 1)
-    told = " ".join(f"${text}$" for text in (value, *ends))
-    return told + ("" if comparison.counts else "$^{*}$")
+def _tex_change(comparison: Comparison) -> str:
+    value, *ends = comparison.change["L"].text().split(" ", 1)
+    void = "" if comparison.counts else "$^{*}$"
+    return " ".join(f"${text}$" for text in (value, *ends)) + void
 
 
-def _tex(verdicts: Mapping[str, Verdict], found: Mapping[tuple[str, str], Line]) -> str:
-    """A tabular that asks for no package; the smallest mean of a trajectory is bold."""
-    scales = {"L_Eul": 1.0, "L_pos": 1.0, "L_ctrl": 1e-3, "L": 1e-6}
-    first = next(iter(verdicts.values()))
-    seeds = seeds_text(first.seeds)
-    head = [
-        "",
-        r"$L_\mathrm{Eul}$ [rad$^2$]",
-        r"$L_\mathrm{pos}$ [m$^2$]",
-        r"$L_\mathrm{ctrl}$ [$10^3$]",
-        r"$L$ [$10^6$]",
-        "falls",
-        *(cell for b in BASELINES for cell in (rf"against {b} [\%]", "wins", "paper")),
-    ]
-    rows = [
-        f"% Means over {plural(len(first.seeds), 'plant')} of the hardware stand-in "
-        f"(seeds {seeds}); change of L: median of the paired",
-        "% ratio [95 % bootstrap interval]; * does not count, the falls differ. paper: its own "
-        "table, ten iterations.",
-        rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
-        r"\hline",
-        " & ".join(head) + r" \\",
-    ]
+def _tex(verdicts: Mapping[str, Verdict], sets: Summaries) -> str:
+    """A tabular that needs no package; the smallest mean of a trajectory is bold."""
+    seeds = next(iter(verdicts.values())).seeds
+    powers = {p: column(p, max(s.means[p].value for s in sets.values())).power for p in PARTS}
+    sections = {}
     for trajectory, verdict in verdicts.items():
-        title = tex(_TRAJECTORIES.get(trajectory, trajectory))
-        rows += [r"\hline", rf"\multicolumn{{{len(head)}}}{{l}}{{{title}}} \\"]
-        least = {
-            part: min(found[trajectory, name].means[part].value for name in verdict.scores)
-            for part in _ORDER
-        }
-        for name in verdict.scores:
-            line = found[trajectory, name]
+        of = {name: sets[trajectory, name] for name in verdict.scores}
+        least = {part: min(s.means[part].value for s in of.values()) for part in PARTS}
+        rows = []
+        for name, summary in of.items():
             cells = [tex(name)]
-            for part in _ORDER:
-                value = line.means[part].value
-                text = _tex_number(scales[part] * value)
+            for part in PARTS:
+                value = summary.means[part].value
+                text = _tex_number(value / 10.0 ** powers[part])
                 cells.append(rf"\textbf{{{text}}}" if value == least[part] else text)
-            cells.append(f"{line.falls}/{line.seeds}")
+            cells.append(f"{summary.falls}/{len(seeds)}")
             for baseline in BASELINES:
-                one = line.against.get(baseline)
-                known = name in PAPER.get(trajectory, {}) and name != baseline
-                cells += [
-                    _tex_change(one),
-                    "--" if one is None else f"{round(one.wins * line.seeds)}/{line.seeds}",
-                    f"${paper_change(trajectory, name, baseline):+.1f}$" if known else "--",
-                ]
-            rows.append(" & ".join(cells) + r" \\")
-    rows += [r"\hline", r"\end{tabular}"]
-    return "\n".join(rows) + "\n"
+                one = summary.against.get(baseline)
+                wins = f"{round(one.wins * len(seeds))}/{len(seeds)}" if one else "--"
+                paper = paper_change(trajectory, name, baseline)
+                cells += [_tex_change(one) if one else "--", wins]
+                cells.append("--" if paper is None else f"${paper:+.1f}$")
+            rows.append(cells)
+        sections[tex(TITLES.get(trajectory, trajectory))] = rows
+    return render(
+        "table.tex.j2",
+        plants=plural(len(seeds), "plant"),
+        seeds=seeds_text(seeds),
+        units=_units(verdicts),
+        powers=powers,
+        baselines=BASELINES,
+        sections=sections,
+    )

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hector_jax.core.inputs import InputError
-from hector_jax.report.folder import read_metrics
+from hector_jax.runs.folder import read_metrics
 
 
 def write_events(folder: Path, out: Path) -> list[Path]:

@@ -23,8 +23,8 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
-from hector_jax.report.folder import METRICS, RESULT, as_sentence, curves, read_histories
 from hector_jax.report.motion import COLOURS, INK, Motion
+from hector_jax.runs.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
 
 HOST, PORT = "127.0.0.1", 8080
 
@@ -300,12 +300,12 @@ class Page:
             return
         self._read = now
         histories = read_histories(self._folder)
-        lines = curves(histories) or _NO_CURVES
+        lines = loss_curves(histories) or _NO_CURVES
         iterations = np.arange(float(len(next(iter(lines.values())))))
         with self._server.atomic():
             self._losses.series = _series("iteration", lines)
             self._losses.data = (iterations, *lines.values())
-            self._progress.content = as_sentence(histories, done)
+            self._progress.content = progress_sentence(histories, done)
 
 
 def _plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:

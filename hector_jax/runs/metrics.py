@@ -49,6 +49,11 @@ class Score(NamedTuple):
         return self.losses["L"]
 
 
+def percent(x: float) -> str:
+    """A change in %, in two digits."""
+    return f"{x:+.1f}" if abs(x) < 9.95 else f"{x:+.0f}"
+
+
 class Interval(NamedTuple):
     """A value with the ends of its 95 % bootstrap interval, NaN where there is none."""
 
@@ -56,7 +61,7 @@ class Interval(NamedTuple):
     low: float
     high: float
 
-    def text(self, write: Callable[[float], str]) -> str:
+    def text(self, write: Callable[[float], str] = percent) -> str:
         """`value [low, high]`, each formatted by `write`; without an interval the value alone."""
         ends = f" [{write(self.low)}, {write(self.high)}]" if np.isfinite(self.low) else ""
         return write(self.value) + ends
@@ -70,12 +75,30 @@ class Comparison(NamedTuple):
     counts: bool  # neither falls more often than the other allows
 
 
+class Term(NamedTuple):
+    """A part of the loss."""
+
+    name: str
+    unit: str
+    weight: float
+
+
 class Verdict(NamedTuple):
     """All sets on the same seeds of one world."""
 
     seeds: Int[np.ndarray, " seeds"]
     scores: dict[str, Score]  # by set, stacked over seeds
     alpha: LossConfig
+
+    @property
+    def loss(self) -> tuple[Term, ...]:
+        """The parts of the loss."""
+        return terms(self.alpha)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts of the loss, and of their sum."""
+        return (*(term.name for term in self.loss), "L")
 
 
 class Summary(NamedTuple):
@@ -84,6 +107,12 @@ class Summary(NamedTuple):
     means: dict[str, Interval]  # over seeds, by part
     falls: int  # seeds on which it falls
     against: dict[str, Comparison]  # by the other set
+
+
+def terms(alpha: LossConfig) -> tuple[Term, ...]:
+    """The parts of the loss with their units and weights, in the order of `Losses`."""
+    weights = map(float, alpha.as_arrays())
+    return tuple(map(Term, UNITS, UNITS.values(), weights))
 
 
 def score(config: LossConfig, walk: Trajectory) -> Score:
@@ -200,7 +229,7 @@ def compare(verdict: Verdict, name: str, baseline: str) -> Comparison:
     """Compare a set with a baseline, seed by seed."""
     ours, theirs = verdict.scores[name], verdict.scores[baseline]
     change = {}
-    for part in PARTS:
+    for part in verdict.parts:
         # a walk that falls at once has no L_ctrl: keep its ratio a number
         ratio = (ours.losses[part] + _TINY) / (theirs.losses[part] + _TINY)
         median = _cached_bootstrap(ratio.tobytes(), np.median)
@@ -213,7 +242,7 @@ def summarize(verdict: Verdict, name: str, others: Sequence[str] = BASELINES) ->
     """Means and falls of a set, compared with those of some others that are in the verdict."""
     against = [other for other in others if other in verdict.scores and other != name]
     return Summary(
-        {part: mean(verdict, name, part) for part in PARTS},
+        {part: mean(verdict, name, part) for part in verdict.parts},
         int(verdict.scores[name].fallen.sum()),
         {other: compare(verdict, name, other) for other in against},
     )
@@ -262,7 +291,6 @@ def rms(verdict: Verdict, name: str) -> tuple[Float[np.ndarray, "3"], Float[np.n
     """RMS error over all seeds: roll, pitch, yaw [rad], and x, y, z [m]."""
     scores = verdict.scores[name]
     # walks that fell at once have no errors
-    euler, position = (
-        _rms(x, np.isfinite(x).all(axis=-1)) for x in (scores.rms_euler, scores.rms_position)
-    )
+    errors = scores.rms_euler, scores.rms_position
+    euler, position = (_rms(x, np.asarray(np.isfinite(x).all(axis=-1))) for x in errors)
     return euler, position

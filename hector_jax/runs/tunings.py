@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
-from hector_jax.control.weights import WEIGHT_NAMES, Weights, nominal, weights_to_vector
+from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
-from hector_jax.core.files import append_file, as_json, write_file
+from hector_jax.core.files import append_file, write_file
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
@@ -27,6 +27,7 @@ from hector_jax.grfm.network import Params
 from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
 from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.folder import as_line
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
@@ -59,29 +60,6 @@ class Tuned(NamedTuple):
 
     tuning: Tuning
     commit: str  # at which it was made; empty where that is not known
-
-
-def as_line(name: str, iteration: Iteration) -> str:
-    """A line of metrics.jsonl."""
-    found = iteration.evaluation
-    gradient = jax.tree.map(np.multiply, found.gradient, iteration.weights)
-    vector = lambda tree: np.asarray(weights_to_vector(tree)).tolist()  # noqa: E731
-    row = {
-        "set": name,
-        "iteration": iteration.iteration,
-        "accepted": iteration.accepted,
-        "reason": iteration.reason,
-        "step": iteration.step,
-        "L": float(found.loss),
-        "L_Eul": float(found.parts.euler),
-        "L_pos": float(found.parts.position),
-        "L_ctrl": float(found.parts.control),
-        "fallen": float(found.fallen),
-        "residual": float(found.residual),
-        "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
-        "gradient_log": dict(zip(WEIGHT_NAMES, vector(gradient), strict=True)),
-    }
-    return as_json(row) + "\n"
 
 
 class Journal:

@@ -1,0 +1,137 @@
+"""Several finished runs side by side: as JSON values, and as a table on the terminal."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from hector_jax.core.inputs import InputError
+from hector_jax.report.report import VOID, plain_console
+from hector_jax.runs.folder import RESULT, Run
+from hector_jax.runs.metrics import BASELINES, Interval
+
+
+def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
+    """Compare several runs, as JSON values.
+
+    `runs` is a list of `run`, `seconds` (null where the run has none), `sets.<name>` (as the
+    verdict on the stand-in in result.json, with the number of seeds), `versions` and
+    `tuning.<name>.{iterations, refused}`; `differ.settings` and `differ.versions` hold what is not
+    the same in all, a value for each run, null where a run has none.
+
+    Raises:
+        InputError: no run, or one without a verdict on the stand-in.
+    """
+    if not runs:
+        raise InputError("expected at least one run folder, got none")
+    versions = [{k: v for k, v in run.made_with.items() if k != "seconds"} for run in runs]
+    return {
+        "runs": [
+            {
+                "run": run.name,
+                "seconds": float(run.made_with["seconds"]) if "seconds" in run.made_with else None,
+                "sets": {name: _verdict(run, name) for name in run.result["sets"]},
+                "tuning": _iterations(run.metrics),
+                "versions": dict(run.made_with),
+            }
+            for run in runs
+        ],
+        "differ": {
+            "settings": _differing([run.settings for run in runs]),
+            "versions": _differing(versions),
+        },
+    }
+
+
+def _verdict(run: Run, name: str) -> dict[str, Any]:
+    try:
+        verdict = run.result["sets"][name]["standin"]
+        for part in ("L", "L_ctrl"):  # used below: a file without them is refused here
+            float(verdict[part]["mean"])
+        for change in verdict["change"].values():
+            _ = [change[key] for key in ("median", "low", "high", "counts")]
+        return {**verdict, "seeds": len(verdict["seeds"]), "falls": int(verdict["falls"])}
+    except (KeyError, TypeError, AttributeError, ValueError):
+        raise InputError(
+            f"{Path(run.name) / RESULT}: set {name} has no verdict on the stand-in"
+        ) from None
+
+
+def _iterations(metrics: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    counts: dict[str, dict[str, int]] = {}
+    for line in metrics:
+        one = counts.setdefault(line["set"], {"iterations": 0, "refused": 0})
+        one["iterations"] = max(one["iterations"], int(line["iteration"]))
+        one["refused"] += not line["accepted"]
+    return counts
+
+
+def _differing(each: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    names = dict.fromkeys(name for one in each for name in one)
+    columns = {name: [one.get(name) for one in each] for name in names}
+    return {name: values for name, values in columns.items() if any(v != values[0] for v in values)}
+
+
+def print_comparison(comparison: Mapping[str, Any], console: Console | None = None) -> None:
+    """Print what `compare_runs` returned as a table with a column for each run.
+
+    Args:
+        comparison: of `compare_runs`.
+        console: where to print; None takes stdout.
+    """
+    runs = comparison["runs"]
+    console = plain_console(console, width=60 + 60 * len(runs))
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column("on the hardware stand-in", no_wrap=True)
+    for run in runs:
+        table.add_column(Text("/".join(Path(run["run"]).parts[-2:])), justify="right")
+
+    def add(title: str, cells: Sequence[str | None]) -> None:
+        table.add_row(Text(title), *(Text(cell or "-") for cell in cells))
+
+    for name in dict.fromkeys(name for run in runs for name in run["sets"]):
+        columns = [_cells(run["sets"][name]) if name in run["sets"] else {} for run in runs]
+        for title in max(columns, key=len):
+            add(title.format(name), [column.get(title) for column in columns])
+        table.add_section()
+    for name in dict.fromkeys(name for run in runs for name in run["tuning"]):
+        counts = [run["tuning"].get(name) for run in runs]
+        texts = [one and f"{one['iterations']} ({one['refused']})" for one in counts]
+        add(f"{name}: iterations (refused)", texts)
+    seconds = [run["seconds"] for run in runs]
+    add("time [s]", [None if s is None else f"{s:.0f}" for s in seconds])
+    commits = [run["versions"].get("commit", "-").split() for run in runs]
+    add("commit", [" ".join([one[0][:10], *one[1:]]) for one in commits])
+    for kind, rows in comparison["differ"].items():
+        table.add_section()
+        for name, values in rows.items():
+            if name != "commit":
+                texts = [None if value is None else str(value) for value in values]
+                add(f"{kind}: {name}", texts)
+    console.print(table)
+    if len(runs) > 1 and not any(comparison["differ"].values()):
+        console.print("All settings and versions are the same.")
+    note = (
+        "L and L_ctrl are means over the plants, changes medians of L with 95 % intervals; "
+        f"{VOID} falls make a comparison void."
+    )
+    console.print(Text(note, style="dim"))
+
+
+def _cells(verdict: Mapping[str, Any]) -> dict[str, str]:
+    """One weight set of one run, by the title of the row."""
+    cells = {"{}: L [1e6]": f"{verdict['L']['mean'] / 1e6:.3f}"}
+    for baseline in BASELINES:
+        if change := verdict["change"].get(baseline):
+            # null where there is no interval
+            ends = (math.nan if change[key] is None else change[key] for key in ("low", "high"))
+            text = Interval(change["median"], *ends).text()
+            cells[f"  against {baseline} [%]"] = text + VOID * (not change["counts"])
+    cells["  L_ctrl [1e6]"] = f"{verdict['L_ctrl']['mean'] / 1e6:.3f}"
+    cells["  falls"] = f"{verdict['falls']} of {verdict['seeds']}"
+    return cells
