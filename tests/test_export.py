@@ -189,7 +189,7 @@ def both_minimisers(seed, factor=1.0, states=slice(None), inputs=slice(None)):
     """Our first wrench (12,), theirs with the weights as pasted or spoilt, and if a limit binds."""
     weights, (state, lever, foot_yaw, reference, contact) = random_weights(seed), same_problem(seed)
     N, dt = CONFIG.mpc.horizon, CONFIG.mpc_step
-    text = weights_cpp(weights, CONFIG, ROBOT, "random")
+    text = weights_cpp(weights, CONFIG, ROBOT, name="random")
     Q, Alpha = pasted(text, "Q")[states], factor * pasted(text, "Alpha")[inputs]
     known = (state, lever, foot_yaw, reference, contact, dt, ROBOT.mass, ROBOT.inertia)
     qp, stands = their_qp(Q, Alpha, *known)
@@ -241,7 +241,7 @@ def test_another_factor_or_order_would_be_noticed(spoilt):
 
 
 def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers():
-    text = weights_cpp(nominal(), CONFIG, ROBOT, "nominal")
+    text = weights_cpp(nominal(), CONFIG, ROBOT, name="nominal")
     page = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
     for fact in ("0.04 s", "9.0 kg", "footholds", "toe and heel swapped", "0.01 N m", "M_z"):
         assert fact in page
@@ -249,7 +249,7 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
         assert fact in text
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_about="weight"))
-    assert "ATTENTION" in weights_cpp(nominal(), about_weight, ROBOT, "nominal")
+    assert "ATTENTION" in weights_cpp(nominal(), about_weight, ROBOT, name="nominal")
     code = [line for line in text.splitlines() if not line.startswith("//")]
     assert code[0] == "double Q[12] = {"
     assert max(map(len, text.splitlines())) <= 100
@@ -266,7 +266,7 @@ def loaded():
 
 
 def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
-    walked = record(CONFIG, ROBOT, expert(), named_command("s"), 0.4)
+    walked = record(CONFIG, ROBOT, expert(), command=named_command("s"), seconds=0.4)
     found = check(CONFIG, *loaded, walked)
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0
@@ -275,14 +275,16 @@ def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
 
 
 def test_the_check_notices_other_weights(loaded):
-    found = check(CONFIG, *loaded, record(CONFIG, ROBOT, nominal(), named_command("s"), 0.1))
+    found = check(
+        CONFIG, *loaded, record(CONFIG, ROBOT, nominal(), command=named_command("s"), seconds=0.1)
+    )
     assert found.force > 1.0
 
 
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_only_custom_calls_with_a_guarantee_are_in_it(platform):
     exported = jax.export.deserialize(
-        bytearray(export_controller(CONFIG, ROBOT, expert(), platform))
+        bytearray(export_controller(CONFIG, ROBOT, expert(), platform=platform))
     )
     assert exported.platforms == (platform,)
     assert not exported.disabled_safety_checks
@@ -294,7 +296,7 @@ def test_only_custom_calls_with_a_guarantee_are_in_it(platform):
 def test_weights_that_fall_are_not_exported():
     limp = nominal()._replace(Q=jax.tree.map(lambda w: 1e-6 * w, nominal().Q))
     with pytest.raises(ValueError, match="fall"):
-        record(CONFIG, ROBOT, limp, named_command("straight"), 0.2)
+        record(CONFIG, ROBOT, limp, command=named_command("straight"), seconds=0.2)
 
 
 def test_another_device_is_refused(monkeypatch):
@@ -360,7 +362,7 @@ def test_the_command_writes_files_that_run_without_us(monkeypatch, capsys, run):
 
 def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsys, run):
     for part in ("export_controller", "record", "load_controller"):
-        monkeypatch.setattr(export, part, lambda *known: None)
+        monkeypatch.setattr(export, part, lambda *args, **named: None)
     found = Check(2e-6, 0.0, 0.0, 0, {}, {})
     monkeypatch.setattr(export, "check", lambda *known: found)
     assert call(monkeypatch, run) == 1

@@ -93,8 +93,16 @@ def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, P
     still = Measurement(State(*np.zeros((4, 3))), np.zeros(10), np.zeros(10))
     memory = Memory(Feet(np.zeros((2, 3)), np.zeros(2)))
     command = Command(np.ones(2), np.zeros((2, 2)), np.zeros(2))
-    inputs = (weights, command, standing_anchor(robot), np.int32(0), memory, still)
-    shapes = jax.eval_shape(partial(step_plan, config), robot, *inputs)
+    shapes = jax.eval_shape(
+        partial(step_plan, config),
+        robot,
+        config.parameters(weights),
+        command=command,
+        anchor=standing_anchor(robot),
+        tick=np.int32(0),
+        memory=memory,
+        measurement=still,
+    )
     return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes)
 
 
@@ -153,12 +161,17 @@ def controller(
         }
         return tuple(jax.tree.leaves((memory, plan))), out
 
+    return control, (tuple(idle), np.int32(0), *_standing(robot))
+
+
+def _standing(robot: Robot) -> tuple[dict[str, Any], ...]:
+    """Measurement, command and anchor of a robot that stands."""
     position = np.append(robot.com_offset[:2], robot.standing_height)
     still = State(np.zeros(3), position, np.zeros(3), np.zeros(3))
     measured = still._asdict() | {"joints": robot.standing_joints, "joint_rates": np.zeros(10)}
     command = Command(np.ones(2), np.zeros((2, 2)), np.zeros(2))
     anchor = jax.tree.map(np.asarray, standing_anchor(robot))
-    return control, (tuple(idle), np.int32(0), measured, command._asdict(), anchor._asdict())
+    return measured, command._asdict(), anchor._asdict()
 
 
 _SIGNATURE = {
@@ -195,7 +208,7 @@ _SIGNATURE = {
 
 
 def export_controller(
-    config: WalkConfig, robot: Robot, weights: Weights, platform: str = "cpu"
+    config: WalkConfig, robot: Robot, weights: Weights, *, platform: str = "cpu"
 ) -> bytes:
     """The controller as a file's content for `jax.export.deserialize`, of 64-bit numbers.
 
@@ -283,8 +296,10 @@ def export(
         Broken: it differs from the live controller by more than TOLERANCE; nothing is written.
     """
     make_folder(folder)
-    blobs = {place: export_controller(config, robot, weights, place) for place in PLATFORMS}
-    walked = record(config, robot, weights, command, seconds)
+    blobs = {
+        place: export_controller(config, robot, weights, platform=place) for place in PLATFORMS
+    }
+    walked = record(config, robot, weights, command=command, seconds=seconds)
     _, example = controller(config, robot, weights)
     result = check(config, load_controller(blobs["cpu"]), example, walked)
     _require_same(result)
@@ -294,7 +309,7 @@ def export(
     write_json(folder / SCHEMA, weights_schema())
     np.savez(rows := io.BytesIO(), **as_arrays(walked))
     contents = {f"controller-{place}.jaxexport": blob for place, blob in blobs.items()}
-    contents["weights.cpp"] = weights_cpp(weights, config, robot, name).encode()
+    contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
     contents["check.npz"] = rows.getvalue()
     for file, content in contents.items():
         write_file(folder / file, content)

@@ -42,7 +42,7 @@ class Record(NamedTuple):
 
 
 def record(
-    config: WalkConfig, robot: Robot, weights: Weights, command: Command, seconds: float
+    config: WalkConfig, robot: Robot, weights: Weights, *, command: Command, seconds: float
 ) -> Record:
     """Walk in the ideal world and record the inputs and outputs of the controller.
 

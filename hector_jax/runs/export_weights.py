@@ -73,7 +73,7 @@ _ATTENTION = """\
 """
 
 
-def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, name: str) -> str:
+def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str) -> str:
     """The weights as the two lines of the open HECTOR C++ controller.
 
     Args:
