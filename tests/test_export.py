@@ -25,7 +25,6 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
-from hector_jax.core.settings import check
 from hector_jax.core.trajectory import State, pack_wrench
 from hector_jax.qp import QP, Status
 from hector_jax.robot.model import load_robot
@@ -39,7 +38,7 @@ from hector_jax.runs.export import (
     find_weights,
     load_controller,
 )
-from hector_jax.runs.export_check import Check, record
+from hector_jax.runs.export_check import Check, check, record
 from hector_jax.runs.export_weights import weights_cpp, weights_schema
 
 ROBOT, CONFIG = load_robot(), WalkConfig()
