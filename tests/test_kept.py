@@ -12,7 +12,7 @@ from test_experiments import script
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import bounds, expert, nominal
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, tunings, verdicts
+from hector_jax.runs import journal, metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.loop import Job
@@ -87,8 +87,8 @@ def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
             assert one.iteration == other.iteration
             assert one.step == other.step
             same((one.weights, one.evaluation), (other.weights, other.evaluation))
-        assert [tunings.as_line("a", i) for i in back.history] == [
-            tunings.as_line("a", i) for i in TUNING.history
+        assert [journal.as_line("a", i) for i in back.history] == [
+            journal.as_line("a", i) for i in TUNING.history
         ]
     assert tuned == ["without"]
 
@@ -99,14 +99,14 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
 
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
-        journal = tunings.Journal(folder / "metrics.jsonl")
-        tunings.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=journal)
+        lines_of = journal.Journal(folder / "metrics.jsonl")
+        tunings.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=lines_of)
         return (folder / "metrics.jsonl").read_text()
 
     whole = lines(tmp_path / "whole", problems)
     half = lines(tmp_path / "cut", {"with": problems["with"]})
     with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
-        file.write(tunings.as_line("without", TUNING.history[0]))
+        file.write(journal.as_line("without", TUNING.history[0]))
     assert lines(tmp_path / "cut", problems) == whole
     assert whole.endswith(half)
     assert tuned == ["without", "with", "with", "without"]

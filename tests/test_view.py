@@ -22,7 +22,7 @@ from hector_jax.report import pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
 from hector_jax.robot.model import load_model, load_robot
-from hector_jax.runs import tunings
+from hector_jax.runs import journal
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def pretend_run(folder, iterations=12, weights=()):
 
 def write_metrics(folder, iterations, refused=()):
     lines = [
-        tunings.as_line(name, iteration)
+        journal.as_line(name, iteration)
         for name, pace in (("without", 5.0), ("with", 3.0))
         for iteration in pretend_history(iterations, pace, refused)
     ]
@@ -109,7 +109,7 @@ def test_metrics_are_read_back_as_they_were_written(tmp_path):
     assert list(found) == ["without", "with"]
     assert [i.accepted for i in found["with"]] == [k != 3 for k in range(7)]
     written = (tmp_path / "metrics.jsonl").read_text()
-    again = [tunings.as_line(name, i) for name, history in found.items() for i in history]
+    again = [journal.as_line(name, i) for name, history in found.items() for i in history]
     assert "".join(again) == written
     curve = runs.curves(found)["with"]
     assert np.isnan(curve[3])

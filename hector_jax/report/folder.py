@@ -136,7 +136,7 @@ def _line(path: Path, number: int) -> Iterator[None]:
 
 
 def _iteration(row: Mapping[str, Any]) -> Iteration:
-    """What `tunings.as_line` wrote; null, which stands for what is not finite, becomes NaN."""
+    """What `journal.as_line` wrote; null, which stands for what is not finite, becomes NaN."""
     number = lambda x: np.array(np.nan if x is None else x, float)  # noqa: E731
     vector = lambda table: np.array([number(table[name]) for name in WEIGHT_NAMES])  # noqa: E731
     tree = lambda values: jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(values)))  # noqa: E731
