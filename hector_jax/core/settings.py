@@ -114,7 +114,7 @@ def _expected(kind: Any, rule: Rule | None = None) -> str:
     """What a type allows, in words."""
     inner = get_args(kind)
     if get_origin(kind) is Annotated:
-        return _expected(*inner[:2])
+        return _expected(inner[0], next((note for note in inner if isinstance(note, Range)), None))
     if get_origin(kind) is Literal:
         *others, last = map(repr, inner)
         return f"{', '.join(others)} or {last}" if others else last
