@@ -13,8 +13,8 @@ from hector_jax.tuning.difftune import Iteration
 
 def as_line(name: str, iteration: Iteration) -> str:
     """A line of metrics.jsonl."""
-    found = iteration.evaluation
-    gradient = jax.tree.map(np.multiply, found.gradient, iteration.weights)
+    evaluation = iteration.evaluation
+    gradient = jax.tree.map(np.multiply, evaluation.gradient, iteration.weights)
     vector = lambda tree: np.asarray(weights_to_vector(tree)).tolist()  # noqa: E731
     row = {
         "set": name,
@@ -22,12 +22,12 @@ def as_line(name: str, iteration: Iteration) -> str:
         "accepted": iteration.accepted,
         "reason": iteration.reason,
         "step": iteration.step,
-        "L": float(found.loss),
-        "L_Eul": float(found.parts.euler),
-        "L_pos": float(found.parts.position),
-        "L_ctrl": float(found.parts.control),
-        "fallen": float(found.fallen),
-        "residual": float(found.residual),
+        "L": float(evaluation.loss),
+        "L_Eul": float(evaluation.parts.euler),
+        "L_pos": float(evaluation.parts.position),
+        "L_ctrl": float(evaluation.parts.control),
+        "fallen": float(evaluation.fallen),
+        "residual": float(evaluation.residual),
         "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
         "gradient_log": dict(zip(WEIGHT_NAMES, vector(gradient), strict=True)),
     }
