@@ -77,10 +77,10 @@ def controllers() -> dict[str, WalkConfig]:
     return {
         "default": default,
         "no line friction": replace(default, mpc=MpcConfig(line_friction=False)),
-        "effort about the weight": replace(default, mpc=MpcConfig(effort_about="weight")),
+        "effort about the weight": replace(default, mpc=MpcConfig(effort_reference="gravity")),
         "paper's footholds": replace(default, footstep=PAPER_FOOTHOLDS),
         "double support": replace(default, gait=DOUBLE_SUPPORT),
-        "leg weight": replace(default, legs=LegConfig(stance_weight=True)),
+        "leg weight": replace(default, legs=LegConfig(gravity_compensation=True)),
         "jaxopt": replace(default, mpc=MpcConfig(qp=QpConfig(solver="jaxopt"))),
     }
 

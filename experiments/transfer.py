@@ -250,8 +250,10 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
     """Evaluate gradients and losses on the model and on the hfs."""
     robot = jax.tree.map(np.asarray, load_robot())
     walk = WalkConfig(
-        mpc=MpcConfig(effort_about=flags.effort_about),
-        legs=LegConfig(stance_weight=flags.stance_weight),
+        mpc=MpcConfig(
+            effort_reference="gravity" if flags.effort_about == "weight" else flags.effort_about
+        ),
+        legs=LegConfig(gravity_compensation=flags.stance_weight),
     )
     configs = {
         f", lead {lead}" if lead else "": TuneConfig(

@@ -247,7 +247,7 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
     for fact in ("steps of 0.03 s, 10 of them", "F_z <= M_y <=", "docs/export.md"):
         assert fact in text
     assert "ATTENTION" not in text
-    about_weight = WalkConfig(mpc=MpcConfig(effort_about="weight"))
+    about_weight = WalkConfig(mpc=MpcConfig(effort_reference="gravity"))
     assert "ATTENTION" in weights_cpp(nominal(), about_weight, ROBOT, name="nominal")
     code = [line for line in text.splitlines() if not line.startswith("//")]
     assert code[0] == "double Q[12] = {"
@@ -403,7 +403,7 @@ def test_the_example_knows_nothing_of_us():
 def test_a_run_is_exported_with_its_own_controller(run):
     own = replace(CONFIG, gait=GaitConfig(stance=24, swing=16), mpc=MpcConfig(friction=0.4))
     kept = asdict(own)
-    del kept["mpc"]["effort_about"]  # of a run from before there was such a setting
+    del kept["mpc"]["effort_reference"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
     assert find_weights(run, "with") == (run / "weights" / "with.json", own)
     hash(find_weights(run, "with")[1])

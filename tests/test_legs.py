@@ -241,7 +241,9 @@ def test_the_weight_of_a_stance_leg_is_added_on_request():
     _, wrench = statics(0.5)
     still, stands = jnp.zeros(10), jnp.ones(2, bool)
     plain, loaded = (
-        torques(LegConfig(stance_weight=w), base(), STANDS, still, stands, wrench, STANDS, still)
+        torques(
+            LegConfig(gravity_compensation=w), base(), STANDS, still, stands, wrench, STANDS, still
+        )
         for w in (False, True)
     )
     weight = leg_gravity(ROBOT, STANDS, jnp.asarray(ROBOT.gravity))

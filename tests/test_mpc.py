@@ -178,9 +178,9 @@ def sparse_problem(weights, state, horizon):
     return QP(P, q, *map(np.concatenate, (rows, lower, upper)))
 
 
-@pytest.mark.parametrize(("max_contacts", "about"), [(1, "zero"), (2, "zero"), (2, "weight")])
+@pytest.mark.parametrize(("max_contacts", "about"), [(1, "zero"), (2, "zero"), (2, "gravity")])
 def test_the_condensed_cost_is_that_of_the_rolled_out_states(max_contacts, about):
-    config = MpcConfig(effort_about=about)
+    config = MpcConfig(effort_reference=about)
     weights, (state, horizon) = (
         random_weights(1),
         problem(1, contact=BOTH if max_contacts == 2 else None),
@@ -193,7 +193,7 @@ def test_the_condensed_cost_is_that_of_the_rolled_out_states(max_contacts, about
     def both(v):
         found = 0.5 * v @ qp.P @ v + qp.q @ v
         u = inputs(horizon, v, max_contacts)
-        return found - cost(weights, state, horizon, u, share if about == "weight" else 0.0)
+        return found - cost(weights, state, horizon, u, share if about == "gravity" else 0.0)
 
     vs = rng.normal(size=(4, len(qp.q))) * np.tile([20, 20, 100, 3, 3], N * max_contacts)
     gaps = np.array([both(v) for v in vs])  # the same constant for every v
@@ -312,6 +312,8 @@ def test_constraints_are_chosen_by_name_in_files():
     assert from_table("robot.toml", MpcConfig, table) == CONFIG
     assert from_table("config.json", MpcConfig, json.loads(json.dumps(asdict(CONFIG)))) == CONFIG
     assert pickle.loads(pickle.dumps(CONFIG)) == CONFIG
+    former = from_table("robot.toml", MpcConfig, {"effort_about": "weight"})
+    assert former == MpcConfig(effort_reference="gravity")
     assert [str(one) for one in MpcConfig(line_friction=False).constraints] == names[:3]
     for wrong in ({"constraints": ["frictoin"]}, {"contact": "point"}, {"constraints": []}):
         with pytest.raises(InputError, match=next(iter(wrong))):
@@ -359,7 +361,7 @@ def test_standing_feet_share_the_weight():
 
 def test_effort_about_the_weight_stands_with_exactly_the_weight():
     state, horizon = standing()
-    config = MpcConfig(effort_about="weight")
+    config = MpcConfig(effort_reference="gravity")
     wrench, _ = solve(config, ROBOT, expert(), state, horizon, DT, 2)
     np.testing.assert_allclose(wrench.force, [[0.0, 0.0, WEIGHT / 2]] * 2, atol=1e-6)
     np.testing.assert_allclose(wrench.moment, 0.0, atol=1e-6)
@@ -369,7 +371,7 @@ def test_effort_about_the_weight_is_all_of_it_on_one_foot():
     state, horizon = standing()
     horizon = horizon._replace(contact=jnp.asarray(BOTH).at[:, 1].set(False))
     dear = expert()._replace(R=jax.tree.map(lambda r: 1e9 * r, expert().R))
-    wrench, _ = solve(MpcConfig(effort_about="weight"), ROBOT, dear, state, horizon, DT, 1)
+    wrench, _ = solve(MpcConfig(effort_reference="gravity"), ROBOT, dear, state, horizon, DT, 1)
     np.testing.assert_allclose(wrench.force, [[0.0, 0.0, WEIGHT], [0.0] * 3], atol=1e-3)
 
 
@@ -442,7 +444,7 @@ def test_u_is_packed_forces_first():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"horizon": 0}, {"step_ticks": 0}, {"effort_about": "something"}]
+    "wrong", [{"horizon": 0}, {"step_ticks": 0}, {"effort_reference": "something"}]
 )
 def test_impossible_problems_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):

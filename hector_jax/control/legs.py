@@ -8,7 +8,7 @@ land.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +46,8 @@ class LegParameters(NamedTuple):
 class LegConfig:
     """Swing path and joint gains, where no others are given."""
 
+    RENAMED: ClassVar = {"stance_weight": ("gravity_compensation", {})}
+
     height: float = 0.08  # [m] apex of the swing foot
     landing: float = -0.005  # [m] height aimed at
     kp: tuple[float, ...] = (
@@ -56,7 +58,7 @@ class LegConfig:
         20.0,
     )  # [N m/rad] yaw, roll, pitch, knee, ankle
     kd: tuple[float, ...] = (1.5, 1.5, 1.5, 1.5, 0.5)  # [N m s/rad]
-    stance_weight: bool = False  # add the leg's own weight to the stance torque
+    gravity_compensation: bool = False  # add the leg's own weight to the stance torque
 
     def __post_init__(self) -> None:
         check(self, height=NOT_NEGATIVE, kp=NOT_NEGATIVE, kd=NOT_NEGATIVE)
@@ -68,7 +70,7 @@ class LegConfig:
     def parameters(self) -> LegParameters:
         """The numbers, to be traced."""
         kp, kd = np.array(self.kp), np.array(self.kd)
-        return LegParameters(self.height, self.landing, kp, kd, float(self.stance_weight))
+        return LegParameters(self.height, self.landing, kp, kd, float(self.gravity_compensation))
 
 
 def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:

@@ -15,7 +15,7 @@ foot in the air has no M_z; and see `contact`.
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -57,21 +57,23 @@ class MpcParameters(NamedTuple):
 class MpcConfig:
     """What the MPC is compiled for, and its numbers where no others are given."""
 
+    RENAMED: ClassVar = {"effort_about": ("effort_reference", {"weight": "gravity"})}
+
     horizon: int = 10  # steps N
     step_ticks: int = 3  # ticks per step: dt = 0.03 s
     friction: float = 0.6  # mu; at most the floor's own, or the feet slip
     max_force: float = 500.0  # [N] per foot
     line_friction: bool = True  # False leaves LINE_FRICTION out of the constraints
-    effort_about: str = (
-        "zero"  # R prices u ("zero", the paper) or u less the weight's share ("weight")
+    effort_reference: str = (
+        "zero"  # R prices u (the paper), or u less "gravity", the weight's share
     )
     qp: QpConfig = QpConfig()
     contact: str = LINE_FOOT  # a ContactModel or its name
     constraints: tuple[str, ...] = CONSTRAINTS  # of Constraint or their names
 
     def __post_init__(self) -> None:
-        rules = {"friction": POSITIVE, "max_force": POSITIVE, "effort_about": ("zero", "weight")}
-        check(self, **rules, horizon=AT_LEAST_ONE, step_ticks=AT_LEAST_ONE)
+        rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
+        check(self, **rules, step_ticks=AT_LEAST_ONE, effort_reference=("zero", "gravity"))
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
             choose_part("MpcConfig.constraints", one, Constraint, CONSTRAINTS)
@@ -85,7 +87,7 @@ class MpcConfig:
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """The numbers, to be traced."""
-        effort_reference = float(self.effort_about == "weight")
+        effort_reference = float(self.effort_reference == "gravity")
         return MpcParameters(weights, self.friction, self.max_force, effort_reference)
 
     @property

@@ -201,7 +201,8 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
 
     Args:
         where: the file and the place in it, for the message.
-        kind: the dataclass, which checks itself; fields without a default have to be there.
+        kind: the dataclass, which checks itself; fields without a default have to be there. Its
+            `RENAMED`, where it has any, maps former names to names and words of today.
         table: read from the file.
 
     Raises:
@@ -211,6 +212,10 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
     if not isinstance(table, Mapping):
         raise InputError(f"{where} must be a table of {', '.join(known)}, got {short_repr(table)}")
     values = {}
+    for old, (new, words) in getattr(kind, "RENAMED", {}).items():
+        if old in table:
+            table = {new if name == old else name: value for name, value in table.items()}
+            table[new] = words.get(str(table[new]), table[new])
     for name, value in table.items():
         if name not in known:
             raise InputError(f"{where}: {unknown('field', name, known)}")

@@ -12,17 +12,8 @@ from hector_jax.qp.method import INTERIOR_POINT, JAXOPT, SOLVERS, QpConfig, Solv
 from hector_jax.qp.problem import QP, Solution, Status
 from hector_jax.qp.solver import check_solved, solve_qp
 
+# fmt: off
 __all__ = [
-    "INTERIOR_POINT",
-    "JAXOPT",
-    "QP",
-    "SAVED",
-    "SOLVERS",
-    "QpConfig",
-    "Solution",
-    "Solver",
-    "Status",
-    "block_diagonal",
-    "check_solved",
-    "solve_qp",
+    "INTERIOR_POINT", "JAXOPT", "QP", "SAVED", "SOLVERS", "QpConfig", "Solution", "Solver",
+    "Status", "block_diagonal", "check_solved", "solve_qp",
 ]

@@ -109,13 +109,7 @@ def _improve(fixed: _Fixed, limit: Array, state: _Try) -> _Try:
 
 
 def active_set(
-    tolerances: Tolerances,
-    qp: Normal,
-    start: Point,
-    *,
-    active: Array,
-    enabled: Array,
-    limit: Array,
+    tolerances: Tolerances, qp: Normal, start: Point, *, active: Array, enabled: Array, limit: Array
 ) -> tuple[Point, Array, Array]:
     """Solve with the active sides as equations, and correct the guess by signs until it stays.
 

@@ -102,9 +102,7 @@ class QpConfig:
         usual = BITS_64 if jnp.finfo(dtype).bits == 64 else BITS_32
         tolerance = self.tolerance or usual.residual
         return usual._replace(
-            residual=tolerance,
-            target=min(usual.target, tolerance),
-            cap=self.ratio_cap or usual.cap,
+            residual=tolerance, target=min(usual.target, tolerance), cap=self.ratio_cap or usual.cap
         )
 
 

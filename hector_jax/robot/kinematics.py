@@ -59,10 +59,7 @@ def foot_jacobians(
 
 
 def inverse_legs(
-    robot: Robot,
-    position: Float[Array, "2 3"],
-    yaw: Float[Array, "2"],
-    pitch: Float[Array, "2"],
+    robot: Robot, position: Float[Array, "2 3"], yaw: Float[Array, "2"], pitch: Float[Array, "2"]
 ) -> Float[Array, "10"]:
     """Joint angles [rad] that put the foot points at `position`; the inverse of `foot_poses`.
 
@@ -200,10 +197,7 @@ def _inverse_leg(
 
 
 def _any_chain(
-    axes: str,
-    origin: Float[Array, "5 3"],
-    foot_point: Float[Array, "3"],
-    joints: Float[Array, "5"],
+    axes: str, origin: Float[Array, "5 3"], foot_point: Float[Array, "3"], joints: Float[Array, "5"]
 ) -> _Chain:
     turns = {"x": rot_x, "y": rot_y, "z": rot_z}
     R, point = jnp.eye(3, dtype=joints.dtype), jnp.zeros(3, joints.dtype)

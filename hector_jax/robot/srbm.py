@@ -75,12 +75,7 @@ def step(
 
 
 def unexplained(
-    robot: Robot,
-    before: State,
-    after: State,
-    wrench: Wrench,
-    feet: Float[Array, "2 3"],
-    dt: float,
+    robot: Robot, before: State, after: State, wrench: Wrench, feet: Float[Array, "2 3"], dt: float
 ) -> Load:
     """The load that the motion from one state to the next owes to something beside the wrench.
 

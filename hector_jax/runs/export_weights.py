@@ -101,7 +101,7 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
     return "".join(
         [
             header,
-            _ATTENTION if mpc.effort_about == "weight" else "",
+            _ATTENTION if mpc.effort_reference == "gravity" else "",
             _block("Q", np.concatenate(weights.Q), _STATES),
             _block("Alpha", Alpha, _INPUTS),
         ]
