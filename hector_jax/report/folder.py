@@ -22,8 +22,9 @@ from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.report.report import VOID, change_text
 from hector_jax.robot.model import Robot
 from hector_jax.runs.metrics import BASELINES, Interval
-from hector_jax.tuning.difftune import Evaluation, Iteration
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.difftune import Iteration, status_of
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import Loss, with_alphas
 
 METRICS, RESULT = "metrics.jsonl", "result.json"
 _MOST_BYTES = 100_000_000
@@ -59,7 +60,7 @@ class Asked(NamedTuple):
     """What a run was asked for."""
 
     trajectory: str  # the first, where there are several
-    loss: LossConfig
+    loss: Loss
     data: Path  # folder of its net
     net: Path | None  # or the net itself
     variant: str  # of the net
@@ -79,7 +80,7 @@ def read_asked(folder: Path) -> Asked:
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return Asked(
             trajectory=str(flags["traj"] if isinstance(flags["traj"], str) else flags["traj"][0]),
-            loss=LossConfig(**loss),
+            loss=with_alphas(loss),
             data=Path(flags["data"]),
             net=Path(flags["net"]) if flags.get("net") else None,
             variant=str(flags.get("variant", "residual")),
@@ -142,18 +143,17 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
     tree = lambda values: jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(values)))  # noqa: E731
     weights = vector(row["weights"])
     return Iteration(
-        iteration=int(row["iteration"]),
+        iteration=np.array(row["iteration"]),
         weights=tree(weights),
         evaluation=Evaluation(
             loss=number(row["L"]),
-            parts=Losses(*(number(row[part]) for part in ("L_Eul", "L_pos", "L_ctrl"))),
+            terms={name: number(row[name]) for name in row if name.startswith("L_")},
             gradient=tree(vector(row["gradient_log"]) / weights),
             fallen=number(row["fallen"]),
             residual=number(row["residual"]),
         ),
-        accepted=bool(row["accepted"]),
-        reason=str(row["reason"]),
-        step=float(row["step"]),
+        status=np.array(status_of(row["reason"])),
+        step_scale=number(row["step"]),
     )
 
 

@@ -23,7 +23,6 @@ from hector_jax.core.inputs import plural
 from hector_jax.runs.metrics import (
     BASELINES,
     FEWEST,
-    PARTS,
     Comparison,
     Interval,
     Verdict,
@@ -31,8 +30,9 @@ from hector_jax.runs.metrics import (
     mean,
     rms,
 )
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning, aligned
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning
+from hector_jax.tuning.evaluate import aligned
+from hector_jax.tuning.loss import Loss
 
 WORLDS = {"standin": "hardware stand-in"}  # what worlds are called where it is not their name
 
@@ -52,7 +52,6 @@ _FIDELITY = (
 )
 
 _AXES = ("F_x", "F_y", "F_z", "M_x", "M_y", "M_z")
-UNITS = {"L": "", "L_Eul": "rad^2", "L_pos": "m^2", "L_ctrl": "N^2, (N m)^2"}
 VOID = "*"
 
 
@@ -69,7 +68,7 @@ class Report(NamedTuple):
     trajectory: str
     verdict: Verdict
     tunings: Mapping[str, Tuning]  # `without`, `with` and, refreshed, `with_refreshed`
-    norms: Mapping[str, Losses]  # of the parts' gradients in log-weights at nominal, by model
+    norms: Mapping[str, Mapping[str, float]]  # of the terms' gradients in log-weights, by model
     errors: Mapping[str, Mapping[str, Any]]  # held-out, of `raw`, `linear`, `net`: training.report
     pictures: Sequence[Picture]
     film: Picture | str  # or why there is none
@@ -89,7 +88,7 @@ def _scale(largest: float) -> int:
 def part_columns(verdict: Verdict) -> dict[str, tuple[int, Callable[[float], str]]]:
     """By part: the power of ten of its column and how its numbers are written."""
     columns = {}
-    for part in PARTS:
+    for part in verdict.parts:
         largest = max(mean(verdict, name, part).value for name in verdict.scores)
         power = _scale(largest)
         lead = math.floor(math.log10(largest / 10.0**power)) if largest > 0.0 else 0
@@ -128,8 +127,9 @@ def _baselines(verdict: Verdict) -> list[str]:
     return [name for name in BASELINES if name in verdict.scores and len(verdict.scores) > 1]
 
 
-def _formula(alpha: LossConfig) -> str:
-    return f"L = {_power(alpha.euler)} L_Eul + {_power(alpha.position)} L_pos + L_ctrl"
+def _formula(loss: Loss) -> str:
+    terms = [t.name if t.weight == 1.0 else f"{_power(t.weight)} {t.name}" for t in loss]
+    return "L = " + " + ".join(terms)
 
 
 def _power(x: float) -> str:
@@ -143,7 +143,7 @@ def legend(verdict: Verdict) -> list[str]:
         f"{plural(count, 'plant')} ({'seeds' if count > 1 else 'seed'} {seeds_text(verdict.seeds)})"
     )
     interval = " [95 % bootstrap interval]" if len(verdict.seeds) >= FEWEST else ""
-    lines = [f"{_formula(verdict.alpha)}; means over {plants}."]
+    lines = [f"{_formula(verdict.loss)}; means over {plants}."]
     if _baselines(verdict):
         lines.append(
             f"Change of L in %, median over plants of the paired ratio{interval}; below zero is "
@@ -189,15 +189,14 @@ def _terminal_table(verdict: Verdict, padding: int) -> Table:
     columns = part_columns(verdict)
     table = Table(box=box.SIMPLE_HEAD, padding=(0, padding, 0, 0), pad_edge=False, show_edge=False)
     table.add_column("set\n", no_wrap=True)
-    order = ("L_Eul", "L_pos", "L_ctrl", "L")
-    for part in order:
+    for part in verdict.parts:
         power = columns[part][0]
         table.add_column(part + (f"\nx1e{power}" if power else "\n"), justify="right", no_wrap=True)
     table.add_column("falls\n", justify="right", no_wrap=True)
     for baseline in _baselines(verdict):
         table.add_column(f"against {baseline}\n[%]", justify="right", no_wrap=True)
     for name in verdict.scores:
-        means = [columns[part][1](mean(verdict, name, part).value) for part in order]
+        means = [columns[part][1](mean(verdict, name, part).value) for part in verdict.parts]
         fell = Text(
             str(int(verdict.scores[name].fallen.sum())),
             style="red" if int(verdict.scores[name].fallen.sum()) else "",
@@ -236,11 +235,11 @@ def write_report(folder: Path, report: Report) -> Path:
         *(line.replace(VOID, "\\" + VOID) for line in legend(report.verdict)),
         parts_table(report.verdict),
         errors_of_tracking(report.verdict),
-        _switching(report.verdict),
+        *([_switching(report.verdict)] if "L_ctrl" in report.verdict.parts else []),
         "## Tuning",
         *(tuning_section(name, tuning) for name, tuning in report.tunings.items()),
-        "### Gradients of the three parts",
-        _norms(report.verdict.alpha, report.norms),
+        "### Gradients of the terms",
+        _norms(report.verdict.loss, report.norms),
         "## GRFM-Net on held-out walks",
         _net_errors(report.errors),
         *(_shift(count, shift) for count, shift in enumerate(report.shifts, 1)),
@@ -377,14 +376,14 @@ def _clause(comparison: Comparison, baseline: str) -> str:
 def verdict_table(verdict: Verdict) -> str:
     """Means, falls, changes and wins of all sets, in Markdown."""
     columns = part_columns(verdict)
-    head = ["set", "L_Eul", "L_pos", "L_ctrl", "L", "falls"]
+    head = ["set", *verdict.parts, "falls"]
     head = [h + (f" x1e{columns[h][0]}" if h in columns and columns[h][0] else "") for h in head]
     for baseline in _baselines(verdict):
         head += [f"against {baseline} [%]", "wins"]
     rows = []
     for name in verdict.scores:
         row = [f"**{name}**"]
-        for part in ("L_Eul", "L_pos", "L_ctrl"):
+        for part in verdict.parts[:-1]:
             row.append(columns[part][1](mean(verdict, name, part).value))
         row += [
             mean(verdict, name).text(columns["L"][1]),
@@ -413,9 +412,9 @@ def parts_table(verdict: Verdict) -> str:
         for baseline in BASELINES:
             comparison = _compared(verdict, name, baseline)
             if comparison is not None:
-                cells = [change_text(comparison.change[p]) for p in ("L_Eul", "L_pos", "L_ctrl")]
+                cells = [change_text(comparison.change[p]) for p in verdict.parts[:-1]]
                 rows.append([f"{name} against {baseline}", *cells])
-    head = ("change in % of", *(f"{p} [{UNITS[p]}]" for p in ("L_Eul", "L_pos", "L_ctrl")))
+    head = ("change in % of", *(f"{term.name} [{term.unit}]" for term in verdict.loss))
     return markdown_table(head, rows)
 
 
@@ -486,25 +485,25 @@ def _at_bounds(weights: Weights) -> str:
     return ", ".join(names) or "none"
 
 
-def _norms(alpha: LossConfig, norms: Mapping[str, Losses]) -> str:
-    rows = []
-    for name, norm in norms.items():
-        auto = aligned(alpha, norm)
-        rows.append(
-            [
-                name,
-                *(f"{float(x):.3g}" for x in norm),
-                f"{alpha.euler * float(norm.euler):.3g}",
-                f"{alpha.position * float(norm.position):.3g}",
-                f"{_power(auto.euler)}, {_power(auto.position)}",
-            ]
-        )
-    head = ("model", "L_Eul", "L_pos", "L_ctrl", "alpha_1 L_Eul", "alpha_2 L_pos", "auto")
+def _norms(loss: Loss, norms: Mapping[str, Mapping[str, float]]) -> str:
+    """Norms of the gradients, and the alphas that would align them with that of the last term."""
+    *others, last = (term.name for term in loss)
+    powers = lambda loss: ", ".join(_power(term.weight) for term in loss[:-1])  # noqa: E731
+    rows = [
+        [
+            name,
+            *(f"{norm[term.name]:.3g}" for term in loss),
+            *(f"{term.weight * norm[term.name]:.3g}" for term in loss[:-1]),
+            powers(aligned(loss, norm, last)),
+        ]
+        for name, norm in norms.items()
+    ]
+    weighted = [f"alpha_{i} {name}" for i, name in enumerate(others, 1)]
     return (
         "Norms of the gradients in log-weights at the nominal weights. The paper's footnote "
-        "chooses alpha so that the three have one order of magnitude; `auto` is what "
-        "`--alpha auto` takes for alpha_1, alpha_2. This run: "
-        f"{_power(alpha.euler)}, {_power(alpha.position)}.\n\n" + markdown_table(head, rows)
+        f"chooses alpha so that the {len(loss)} have one order of magnitude; `auto` is what "
+        f"`--alpha auto` takes for alpha_1 to alpha_{len(others)}. This run: {powers(loss)}.\n\n"
+        + markdown_table(("model", *others, last, *weighted, "auto"), rows)
     )
 
 

@@ -21,7 +21,6 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import read_json
 from hector_jax.report.report import (
     STAND_IN,
-    UNITS,
     VOID,
     Picture,
     change_text,
@@ -35,8 +34,9 @@ from hector_jax.report.report import (
     verdict_table,
 )
 from hector_jax.runs import metrics
-from hector_jax.runs.metrics import BASELINES, PARTS, Comparison, Interval, Verdict
+from hector_jax.runs.metrics import BASELINES, Comparison, Interval, Verdict
 from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.loss import PAPER_LOSS
 
 PAPER = {
     "straight": {
@@ -60,7 +60,8 @@ PAPER = {
 }
 """L_Eul, L_pos, L_ctrl and L by trajectory and set: the paper's table of losses in experiments."""
 
-_ORDER = ("L_Eul", "L_pos", "L_ctrl", "L")  # the paper's
+_UNITS = {term.name: term.unit for term in PAPER_LOSS} | {"L": ""}
+_ORDER = tuple(_UNITS)  # the paper's
 _RIVALS = ("without", "searched", "ceiling")  # that `with` is held against besides the baselines
 _TRAJECTORIES = {"straight": "Straight line", "c": "C curve", "s": "S curve"}
 
@@ -414,7 +415,7 @@ def _paper_control() -> str:
 
 
 def _paper_table() -> str:
-    head = ("", *(f"{part} [{UNITS[part]}]" if UNITS[part] else part for part in _ORDER))
+    head = ("", *(f"{part} [{_UNITS[part]}]" if _UNITS[part] else part for part in _ORDER))
     rows = [
         [f"{trajectory}: {name}", *(f"{x:.3g}".replace("e+0", "e") for x in losses)]
         for trajectory, sets in PAPER.items()
@@ -481,7 +482,7 @@ def _csv(found: Mapping[tuple[str, str], Line]) -> str:
     for (trajectory, name), line in found.items():
         paper = PAPER.get(trajectory, {}).get(name)
         for part in _ORDER:
-            row = [trajectory, name, part, UNITS[part], *line.means[part], line.falls, line.seeds]
+            row = [trajectory, name, part, _UNITS[part], *line.means[part], line.falls, line.seeds]
             for other in others:
                 one = line.against.get(other)
                 wins = "" if one is None or part != "L" else one.wins
@@ -508,7 +509,7 @@ def _result(table: Table, found: Mapping[tuple[str, str], Line]) -> dict[str, An
     for trajectory, verdict in table.verdicts.items():
         one = metrics.as_result(verdict)
         for name, score in verdict.scores.items():
-            by_seed = {part: score.losses[part].tolist() for part in PARTS}
+            by_seed = {part: score.losses[part].tolist() for part in verdict.parts}
             by_seed["fallen"] = score.fallen.astype(bool).tolist()
             one["sets"][name]["standin"]["by_seed"] = by_seed
         one["against"] = {

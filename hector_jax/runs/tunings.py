@@ -30,9 +30,10 @@ from hector_jax.runs.cache import cached, content_key
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.tuning import difftune, measured
-from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, Tuning
-from hector_jax.tuning.loss import Losses
+from hector_jax.tuning import difftune, evaluate, measured
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -68,14 +69,12 @@ def as_line(name: str, iteration: Iteration) -> str:
     vector = lambda tree: np.asarray(weights_to_vector(tree)).tolist()  # noqa: E731
     row = {
         "set": name,
-        "iteration": iteration.iteration,
-        "accepted": iteration.accepted,
+        "iteration": int(iteration.iteration),
+        "accepted": bool(iteration.accepted),
         "reason": iteration.reason,
-        "step": iteration.step,
+        "step": float(iteration.step_scale),
         "L": float(found.loss),
-        "L_Eul": float(found.parts.euler),
-        "L_pos": float(found.parts.position),
-        "L_ctrl": float(found.parts.control),
+        **{name: float(term) for name, term in found.terms.items()},
         "fallen": float(found.fallen),
         "residual": float(found.residual),
         "weights": dict(zip(WEIGHT_NAMES, vector(iteration.weights), strict=True)),
@@ -116,11 +115,11 @@ def _stored(tuned: Tuned) -> Any:
     return Tuned(tuned.tuning._replace(history=history), tuned.commit)
 
 
-def _stored_like(_: Any) -> Any:
+def _stored_like(loss: Loss, _: Any) -> Any:
     none, text = np.zeros(0), np.array("")
     rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), nominal())
-    seen = Evaluation(none, Losses(none, none, none), rows, none, none)
-    history: Any = Iteration(none, rows, seen, none, np.zeros(0, "U1"), none)  # pyright: ignore
+    seen = Evaluation(none, {term.name: none for term in loss}, rows, none, none)
+    history: Any = Iteration(none, rows, seen, none, none)
     return Tuned(Tuning(history, nominal(), nominal(), text), text)  # pyright: ignore
 
 
@@ -128,14 +127,7 @@ def _restored(stored: Any) -> Tuned:
     """What `_stored` was given."""
     tuning, rows = stored.tuning, stored.tuning.history
     history = [
-        Iteration(
-            int(rows.iteration[i]),
-            *jax.tree.map(lambda x, i=i: np.asarray(x[i]), (rows.weights, rows.evaluation)),
-            accepted=bool(rows.accepted[i]),
-            reason=str(rows.reason[i]),
-            step=float(rows.step[i]),
-        )
-        for i in range(len(rows.iteration))
+        jax.tree.map(lambda x, i=i: np.asarray(x[i]), rows) for i in range(len(rows.iteration))
     ]
     tuning = Tuning(history, tuning.ten, tuning.converged, str(tuning.stop))
     return Tuned(tuning, str(stored.commit))
@@ -265,7 +257,8 @@ def tune(
         for name, tuning in _tunings(pool, config, robot, start, asked, title, on_iteration):
             yield name, _stored(Tuned(tuning, commit))
 
-    stored = cached(paths, make, like=_stored_like, kind=_KIND, robot=robot)
+    like = partial(_stored_like, config.loss)
+    stored = cached(paths, make, like=like, kind=_KIND, robot=robot)
     tuned = {name: _restored(one) for name, one in stored.items()}
     if journal is not None:
         journal.write({name: one.tuning.history for name, one in tuned.items()})
@@ -334,7 +327,7 @@ def tune_measured(
                 weights,
                 lambda trial: list(pool.map(job, repeat(trial), plants)),
                 lambda iteration: tell(
-                    iteration.iteration,
+                    int(iteration.iteration),
                     config.iterations,
                     f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6",
                 ),
@@ -342,17 +335,20 @@ def tune_measured(
         yield "walks", _stored(Tuned(tuning, commit))
 
     paths = {"walks": folder / f"tuning-walks-{key}.npz"}
-    return _restored(cached(paths, make, like=_stored_like, kind=_KIND, robot=robot)["walks"])
+    like = partial(_stored_like, config.loss)
+    return _restored(cached(paths, make, like=like, kind=_KIND, robot=robot)["walks"])
 
 
-def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> Losses:
+def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     anchor = standing_anchor(robot)
     effect = network.effect_of(problem.params, config.rollout.walk.gait)
     each = [
-        difftune.gradient_norms(config, robot, nominal(robot), command, anchor, effect)
+        evaluate.gradient_norms(
+            config.rollout, robot, nominal(robot), command, anchor, effect, config.loss
+        )
         for command in problem.commands
     ]
-    return jax.tree.map(lambda *x: np.mean(x, axis=0), *jax.device_get(each))
+    return jax.tree.map(lambda *x: float(np.mean(x)), *each)
 
 
 def gradient_norms(
@@ -360,7 +356,7 @@ def gradient_norms(
     config: TuneConfig,
     robot: Robot,
     problems: Mapping[str, Problem],
-) -> dict[str, Losses]:
+) -> dict[str, dict[str, float]]:
     """Norms of the gradients of the loss's parts at nominal weights, means over the commands."""
     with bar("norms of the gradients") as tell:
         running = {
