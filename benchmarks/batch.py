@@ -75,8 +75,7 @@ def measure(
     anchor = standing_anchor(robot)
     effect = last_command if net is None else as_effect(load_net(net, robot)[0])
     starts = sample_weights(nominal(), 1.5, min(DRAWN, max(singles, many, 1)))
-    alpha = config.loss.as_arrays()
-    scenario = Scenario(command, anchor, np.asarray(0), alpha, np.asarray(1.0))
+    scenario = Scenario(command, anchor, np.asarray(0), config.loss, np.asarray(1.0))
 
     def start(i: int) -> Weights:
         return starts[i % len(starts)]
@@ -98,7 +97,9 @@ def measure(
 
     def of_batch(what: str, used: int, count: int, told: _Run) -> list[str]:
         found = told.found
-        left = np.where(found.stop == Stop.BAD_START, 1.0, found.loss / found.course.loss[:, 0])
+        left = np.where(
+            found.stop == Stop.BAD_START, 1.0, found.loss / found.history.evaluation.loss[:, 0]
+        )
         return row(what, used, count, told, left, np.mean(found.stop == Stop.BAD_START))
 
     devices, rows, checks = jax.devices(), [], []

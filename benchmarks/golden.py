@@ -52,7 +52,7 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
-from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
@@ -68,7 +68,7 @@ def _flat(tree: Any) -> np.ndarray:
 
 
 def _loss(walked: Trajectory) -> float:
-    return float(total(LossConfig(), losses(walked)))
+    return float(total(PAPER_LOSS, losses(PAPER_LOSS, walked)))
 
 
 def controllers() -> dict[str, WalkConfig]:
@@ -166,7 +166,9 @@ def rollouts() -> Arrays:
         for command in COMMANDS if model == "plain" else ("s",):
             known = named_command(command), standing_anchor(robot), effect
             seen = tune_step(config, robot, nominal(), *known)
-            found[f"{model}, {command}"] = _flat([seen.loss, seen.parts, seen.gradient])
+            found[f"{model}, {command}"] = _flat(
+                [seen.loss, [seen.terms[term.name] for term in config.loss], seen.gradient]
+            )
     short = TuneConfig(rollout=RolloutConfig(ticks=50))
     known = robot, nominal(), named_command("s"), standing_anchor(robot), last_command
     for name, walking in controllers().items():
@@ -177,7 +179,7 @@ def rollouts() -> Arrays:
     lead = replace(short, rollout=RolloutConfig(ticks=50, lead=20, block=40))
     found["lead"] = _flat(tune_step(lead, *known).gradient)
     walked, columns = jax.jit(sensitivity.propagate, static_argnums=0)(short.rollout, *known)
-    found["forward recursion"] = _flat(sensitivity.gradient(LossConfig(), walked, columns))
+    found["forward recursion"] = _flat(sensitivity.gradient(PAPER_LOSS, walked, columns))
     noise = State(*(np.full(3, 1e-3) for _ in range(4)))
     varied = no_variation()._replace(
         mass=np.asarray(1.1), friction=np.asarray(0.4), delay=np.asarray(0.004), noise=noise

@@ -21,7 +21,8 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.difftune import TuneConfig, evaluate
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.evaluate import evaluate
 
 DRAWN = 256  # different problems; larger batches repeat them
 

@@ -40,8 +40,8 @@ from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
 from hector_jax.tuning.batch import Problem, Scenario, Tunings, stack, tail_weights, tune_batch
-from hector_jax.tuning.difftune import Reason, Stop, TuneConfig, stopped
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.difftune import Stop, TuneConfig, stop_reason
+from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
 from hector_jax.tuning.rollout import Variation, no_variation
 
 HELD_BACK = Command(  # ahead, aside and into turns of another rate: no tuning walks it
@@ -135,9 +135,9 @@ def scenario(
     variation: Variation | None = None,
 ) -> Scenario:
     """A walk from standing, its tracking priced `tracking` times as in the paper."""
-    prices = LossConfig(tracking * LossConfig.euler, tracking * LossConfig.position)
+    loss = with_alphas({t.name: tracking * t.weight for t in PAPER_LOSS[:2]})
     anchor, which = standing_anchor(robot), np.asarray(effect)
-    return Scenario(command, anchor, which, prices.as_arrays(), np.asarray(scale), variation)
+    return Scenario(command, anchor, which, loss, np.asarray(scale), variation)
 
 
 def problem(start: Weights, scenarios: Sequence[Scenario], tail: float = 1.0) -> Problem:
@@ -158,17 +158,17 @@ def one_of(tree: Any, row: int) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[row], tree)
 
 
-def final_parts(found: Tunings) -> Losses:
-    """Parts of the loss on the model of each converged set."""
-    rows = np.arange(found.course.loss.shape[1])
+def final_terms(found: Tunings) -> Terms:
+    """Terms of the loss on the model of each converged set."""
+    rows = np.arange(found.history.evaluation.loss.shape[1])
     ran = rows <= np.asarray(found.iterations)[:, None]
-    last = np.max(np.where(ran & (found.course.reason == Reason.ACCEPTED), rows, 0), axis=1)
-    return jax.tree.map(lambda x: x[np.arange(len(last)), last], found.course.parts)
+    last = np.max(np.where(ran & found.history.accepted, rows, 0), axis=1)
+    return jax.tree.map(lambda x: x[np.arange(len(last)), last], found.history.evaluation.terms)
 
 
 def ended(flags: Flags, found: Tunings, row: int) -> str:
     """Why a tuning ended, and when."""
-    words = stopped(TuneConfig(iterations=flags.iterations), Stop(int(found.stop[row])))
+    words = stop_reason(TuneConfig(iterations=flags.iterations), Stop(int(found.stop[row])))
     return f"{words} (after {found.iterations[row]})"
 
 
@@ -225,7 +225,7 @@ def shared(flags: Shared) -> None:
     effects, commands = whole_net(flags, robot), {n: named_command(n) for n in names}
     asked = [problem(nominal(), [scenario(robot, c)]) for c in commands.values()]
     alone = tuned(flags, robot, effects, asked, "one set for each")
-    scales = alone.course.loss[:, 0]
+    scales = alone.history.evaluation.loss[:, 0]
     walks = [scenario(robot, c, scale=k) for c, k in zip(commands.values(), scales, strict=True)]
     tails = {"mean of all": 1.0, "worst of all": 0.0}
     asked = [problem(nominal(), walks, tail) for tail in tails.values()]
@@ -367,16 +367,14 @@ def front(flags: Front) -> None:
     judged_sets = {"nominal": nominal(), "expert": expert(), **sets}
     with workers(flags.processes) as pool:
         scores = judged(pool, robot, judged_sets, command, [hfs()], "on the hfs")
-    paper = LossConfig()
 
-    def tracking(euler: Any, position: Any) -> Any:
-        return paper.euler * euler + paper.position * position
+    def tracking(terms: Mapping[str, Any]) -> Any:
+        return sum(term.weight * terms[term.name] for term in PAPER_LOSS[:2])
 
-    parts = final_parts(found)
-    model = np.stack([tracking(parts.euler, parts.position), parts.control], axis=1)
+    terms = final_terms(found)
+    model = np.stack([tracking(terms), terms["L_ctrl"]], axis=1)
     there = {
-        n: (float(tracking(s.losses["L_Eul"], s.losses["L_pos"])[0]), float(s.losses["L_ctrl"][0]))
-        for n, s in scores.items()
+        n: (float(tracking(s.losses)[0]), float(s.losses["L_ctrl"][0])) for n, s in scores.items()
     }
     rows = []
     for name, (track, control) in there.items():
@@ -421,10 +419,10 @@ def starts(flags: Starts) -> None:
     if not first_host():
         return
     sound = np.asarray(found.stop) != Stop.BAD_START
-    first, last = found.course.loss[sound, 0], found.loss[sound]
-    accepted = found.course.reason == Reason.ACCEPTED
+    first, last = found.history.evaluation.loss[sound, 0], found.loss[sound]
+    accepted = found.history.accepted
     ran = np.arange(accepted.shape[1]) <= np.asarray(found.iterations)[:, None]
-    curves = np.where(accepted & ran, found.course.loss, np.nan)[sound]
+    curves = np.where(accepted & ran, found.history.evaluation.loss, np.nan)[sound]
     at = lambda x: [million(q) for q in np.quantile(x, (0, 0.25, 0.5, 0.75, 1))]  # noqa: E731
     rows = [["at the start", *at(first)], ["at the end", *at(last)]]
     best = np.flatnonzero(sound)[np.argsort(last)[:3]]

@@ -51,7 +51,7 @@ from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import Iteration, TuneConfig
-from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner
 
 ARMS = {
@@ -126,8 +126,8 @@ class Walked(NamedTuple):
 
 
 def _loss(walk: Trajectory) -> tuple[float, np.ndarray]:
-    parts = losses(walk)
-    return float(total(LossConfig(), parts)), np.array([float(p) for p in parts])
+    terms = losses(PAPER_LOSS, walk)
+    return float(total(PAPER_LOSS, terms)), np.array([float(terms[t.name]) for t in PAPER_LOSS])
 
 
 def _cut(walk: Trajectory, first: int, end: int) -> Trajectory:

@@ -21,12 +21,15 @@ from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import optimizers
 import plots
 import tyro
+from lockstep import BenchmarkResult, Round, benchmark, lowest, walks
+from optimizers import Bayes, CmaEs, Differences, Given, Optimizer, Random, Steps, adam, steps_to
 
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
@@ -43,18 +46,6 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import nets, searches
 from hector_jax.runs.cache import content_key, robot_hash
 from hector_jax.search.cmaes import Generation, SearchConfig
-from hector_jax.search.race import Raced, Turn, lowest, race, walks
-from hector_jax.search.rivals import (
-    Bayes,
-    CmaEs,
-    Differences,
-    Given,
-    Random,
-    Rival,
-    Steps,
-    adam,
-    steps_to,
-)
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -63,11 +54,12 @@ from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
-MARKS = (25, 50, 100, 200)  # walks after which the table tells the lowest loss
+MARKS = (25, 50, 100, 200)  # walks after which the table has the lowest loss
 ON_MODEL = ("without", "with", "adam")
 WITH_NET = ("with", "adam")
 NEAR = 3.0  # log-weights: a factor of 20 either way
-CODE = ("tuning.rivals", "grfm.network", "sim.walk")  # that decides the numbers
+CODE = ("search.cmaes", "tuning.difftune", "grfm.network", "sim.walk")  # that decides the numbers
+OPTIMIZERS = Path(optimizers.__file__).read_text()  # likewise
 RATE = 0.05  # of Adam, in log-weights: DiffTune's step in Q
 
 
@@ -91,13 +83,13 @@ class Flags:
                 raise InputError(f"--{name} must be at least {least}, got {getattr(self, name)}")
 
 
-class Course(NamedTuple):
-    """Weights that a method found on the model, one after the other, without those refused."""
+class ModelRun(NamedTuple):
+    """Weights that a method found on the model, one after the other, without those rejected."""
 
     steps: list[list[float]]  # in 18 log-weights
-    seconds: list[float]  # on the model, until each; what was refused is paid for too
+    seconds: list[float]  # on the model, until each; what was rejected is paid for too
     compiling: float  # [s], before
-    iterations: int  # of the model, refused ones too
+    iterations: int  # of the model, rejected ones too
     iteration: float  # [s] each
 
 
@@ -110,27 +102,46 @@ class Prices(NamedTuple):
     training: float  # of the net; zero where it was made before
 
 
-def _course_job(
+class Repeat(NamedTuple):
+    """One repeat of a method."""
+
+    rounds: list[Round]
+    lowest: np.ndarray  # loss after each walk, that of the start first
+    seconds: np.ndarray  # of one core after each of them
+
+
+class Results(NamedTuple):
+    """What the report is made of."""
+
+    engine: str
+    start: float  # loss
+    methods: dict[str, list[Repeat]]
+    model: dict[str, ModelRun]
+    prices: Prices
+    took: dict[str, float] | None  # [s] collection and training here; None where made before
+
+
+def _model_job(
     method: str, config: TuneConfig, robot: Robot, command: Command, params: Params | None
-) -> Course:
+) -> ModelRun:
     effect = effect_of(params, config.rollout.walk.gait)
     start, anchor, begin = nominal(), standing_anchor(robot), time.monotonic()
     first = difftune.tune_step(config, robot, start, command, anchor, effect)
     jax.block_until_ready(first)
     compiled = time.monotonic()
-    told: list[tuple[Iteration, float]] = []
-    note = lambda iteration: told.append((iteration, time.monotonic() - compiled))  # noqa: E731
+    rows: list[tuple[Iteration, float]] = []
+    note = lambda iteration: rows.append((iteration, time.monotonic() - compiled))  # noqa: E731
     if method == "adam":
         adam(config, RATE, robot, start, command, anchor, effect, note)
     else:
         difftune.tune(config, robot, start, command, anchor, effect, note)
-    kept = [(i.weights, seconds) for i, seconds in told[1:] if i.accepted]
-    return Course(
-        [steps_to(start, weights).tolist() for weights, _ in kept],
-        [seconds for _, seconds in kept],
+    accepted = [(i.weights, seconds) for i, seconds in rows[1:] if i.accepted]
+    return ModelRun(
+        [steps_to(start, weights).tolist() for weights, _ in accepted],
+        [seconds for _, seconds in accepted],
         compiled - begin,
-        len(told),
-        told[-1][1] / len(told),
+        len(rows),
+        rows[-1][1] / len(rows),
     )
 
 
@@ -145,9 +156,11 @@ def _price_job(config: TuneConfig, robot: Robot, command: Command) -> float:
     return (time.monotonic() - begin) / 3
 
 
-def _think_job(rival: Rival, start: Weights, past: Sequence[Generation]) -> tuple[Steps, float]:
+def _think_job(
+    optimizer: Optimizer, start: Weights, past: Sequence[Generation]
+) -> tuple[Steps, float]:
     begin = time.monotonic()
-    return rival.ask(start, past), time.monotonic() - begin
+    return optimizer.ask(start, past), time.monotonic() - begin
 
 
 def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[str, float] | None]:
@@ -176,35 +189,33 @@ def on_model(
     robot: Robot,
     command: Command,
     params: Params,
-) -> tuple[dict[str, Course], float]:
-    """Courses of the methods that follow the model, and the seconds of a walk; kept under OUT."""
+) -> tuple[dict[str, ModelRun], float]:
+    """Runs of the methods that follow the model, and the seconds of a walk; kept under OUT."""
     # seconds are kept too: they are of this code and so many at once
     made = flags.processes, environment().get("commit")
-    key = content_key(config, RATE, command, params, robot, repr(made), code=CODE)
+    key = content_key(config, RATE, command, params, robot, repr(made), OPTIMIZERS, code=CODE)
     path = flags.out / f"model-{key}.json"
     if not path.exists():
         with bar("tuning on the model, and the price of a walk") as tell:
             tell(0, len(ON_MODEL), "compiling")
             price = pool.submit(_price_job, config, robot, command).result()
+            nets = {name: params if name in WITH_NET else None for name in ON_MODEL}
             running = {
-                name: pool.submit(
-                    _course_job, name, config, robot, command, params if name in WITH_NET else None
-                )
-                for name in ON_MODEL
+                name: pool.submit(_model_job, name, config, robot, command, net)
+                for name, net in nets.items()
             }
-            told = {name: future.result()._asdict() for name, future in running.items()}
-        write_json(path, {"walk": price, "courses": told})
-    told = json.loads(path.read_text())
-    return {name: Course(**told["courses"][name]) for name in ON_MODEL}, told["walk"]
+            runs = {name: future.result()._asdict() for name, future in running.items()}
+        write_json(path, {"walk": price, "courses": runs})
+    data = json.loads(path.read_text())
+    return {name: ModelRun(**data["courses"][name]) for name in ON_MODEL}, data["walk"]
 
 
-def entrants(
-    flags: Flags, config: TuneConfig, courses: Mapping[str, Course]
-) -> dict[str, dict[str, Rival]]:
+def all_contestants(
+    flags: Flags, config: TuneConfig, model: Mapping[str, ModelRun]
+) -> dict[str, dict[str, Optimizer]]:
     """All who race, by method and repeat."""
     size, seeds = flags.batch, range(flags.repeats)
     budget = max(flags.rollouts // size, 1) * size
-    given = {n: Given(tuple(map(tuple, course.steps)), size) for n, course in courses.items()}
     drawn = {
         "cma-es": lambda seed: CmaEs(SearchConfig(budget, size, seed)),
         "bayes near": lambda seed: Bayes(seed, NEAR, most=size),
@@ -212,23 +223,23 @@ def entrants(
         "random": lambda seed: Random(seed, most=size),
     }
     return {
-        **{name: {name: rival} for name, rival in given.items()},
+        **{n: {n: Given(tuple(map(tuple, run.steps)), size)} for n, run in model.items()},
         "differences": {"differences": Differences(config)},
         **{name: {f"{name} {i}": make(i) for i in seeds} for name, make in drawn.items()},
     }
 
 
-def run(
+def race(
     pool: Executor,
     flags: Flags,
     config: TuneConfig,
     robot: Robot,
     command: Command,
     engine: Engine,
-    rivals: Mapping[str, Rival],
-) -> Raced:
-    """The race, taking up its record."""
-    size = sum(rival.most for rival in rivals.values())
+    contestants: Mapping[str, Optimizer],
+) -> BenchmarkResult:
+    """The race, taking up its journal."""
+    size = sum(one.most for one in contestants.values())
     about = {
         "trajectory": flags.traj,
         "engine": engine.name,
@@ -239,48 +250,51 @@ def run(
         "plant": tree_hash(hfs()),
         "command": tree_hash(command),
         "start": tree_hash(nominal()),
-        "settings": content_key(sorted(rivals.items()), code=CODE),
+        "settings": content_key(sorted(contestants.items()), OPTIMIZERS, code=CODE),
     }
 
     def think(
-        asked: Mapping[str, tuple[Rival, Weights, Sequence[Generation]]],
+        waiting: Mapping[str, tuple[Optimizer, Weights, Sequence[Generation]]],
     ) -> dict[str, tuple[Steps, float]]:
-        running = {name: pool.submit(_think_job, *known) for name, known in asked.items()}
+        running = {name: pool.submit(_think_job, *one) for name, one in waiting.items()}
         return {name: future.result() for name, future in running.items()}
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
         every = {flags.traj: [weights for each in sets.values() for weights in each]}
-        told = searches.losses_on_hfs(pool, config, robot, every, engine=engine, at_once=size)[
-            flags.traj
-        ]
+        found = searches.losses_on_hfs(pool, config, robot, every, engine=engine, at_once=size)
+        losses = found[flags.traj]
         ends = np.cumsum([len(each) for each in sets.values()])
-        return dict(zip(sets, np.split(told, ends[:-1]), strict=True))
+        return dict(zip(sets, np.split(losses, ends[:-1]), strict=True))
 
     with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as tell:
 
-        def on_round(raced: Raced) -> None:
-            done = sum(map(walks, raced.turns.values()))
-            best = {name: lowest(raced.start, turns)[-1] for name, turns in raced.turns.items()}
+        def on_round(result: BenchmarkResult) -> None:
+            done = sum(map(walks, result.rounds.values()))
+            best = {n: lowest(result.start, rounds)[-1] for n, rounds in result.rounds.items()}
             first = min(best, key=best.__getitem__)
             remark = f"first {first}, L {best[first] / 1e6:.3f}e6" if done else "compiling"
-            tell(done, flags.rollouts * len(rivals), remark)
+            tell(done, flags.rollouts * len(contestants), remark)
 
-        path = flags.out / "race.jsonl"
-        return race(rivals, nominal(), flags.rollouts, think, walk, path, about, on_round)
+        return benchmark(
+            contestants,
+            nominal(),
+            flags.rollouts,
+            think=think,
+            walk=walk,
+            path=flags.out / "race.jsonl",
+            about=about,
+            on_round=on_round,
+        )
 
 
-def paid(
-    name: str,
-    turns: Sequence[Turn],
-    courses: Mapping[str, Course],
-    prices: Prices,
+def seconds_spent(
+    name: str, rounds: Sequence[Round], model: Mapping[str, ModelRun], prices: Prices
 ) -> np.ndarray:
     """Seconds of one core after each walk, that of the start first."""
-    count = walks(turns)
-    if name in courses:
-        thought = np.diff([0.0, *courses[name].seconds[:count]])
+    if name in model:
+        thought = np.diff([0.0, *model[name].seconds[: walks(rounds)]])
     else:
-        each = [np.full(len(t.walked.losses), t.seconds / len(t.walked.losses)) for t in turns]
+        each = [np.full(len(r.walked.losses), r.seconds / len(r.walked.losses)) for r in rounds]
         thought = np.concatenate([np.zeros(0), *each])
     before = prices.collection + prices.training if name in WITH_NET else 0.0
     return before + np.concatenate([[0.0], np.cumsum(thought + prices.walk)])
@@ -299,130 +313,106 @@ def main() -> None:
     with workers(flags.processes) as pool:
         params, took = prepare(pool, flags, robot)
         params = jax.tree.map(np.asarray, params)
-        courses, walk = on_model(pool, flags, config, robot, command, params)
-        methods = entrants(flags, config, courses)
-        rivals = {name: rival for each in methods.values() for name, rival in each.items()}
-        raced = run(pool, flags, config, robot, command, engine, rivals)
+        model, walk = on_model(pool, flags, config, robot, command, params)
+        methods = all_contestants(flags, config, model)
+        every = {name: one for each in methods.values() for name, one in each.items()}
+        result = race(pool, flags, config, robot, command, engine, every)
     full = RolloutConfig().ticks / flags.ticks  # data are walked, and their tunings run, 4 s each
-    plain = courses["without"]
+    plain = model["without"]
     prices = Prices(
         walk,
-        {name: course.iteration for name, course in courses.items()},
+        {name: run.iteration for name, run in model.items()},
         full * (nets.CollectConfig.walks * walk + 3 * plain.iterations * plain.iteration),
         took["training"] if took else 0.0,
     )
-    groups = {
-        method: [
-            (raced.turns[name], paid(method, raced.turns[name], courses, prices)) for name in each
-        ]
-        for method, each in methods.items()
-    }
-    told = report(flags, engine.name, raced.start, groups, courses, prices, took)
-    say(f"the report is {told}")
+
+    def repeat(method: str, name: str) -> Repeat:
+        rounds = result.rounds[name]
+        spent = seconds_spent(method, rounds, model, prices)
+        return Repeat(rounds, lowest(result.start, rounds), spent)
+
+    repeats = {method: [repeat(method, name) for name in each] for method, each in methods.items()}
+    path = report(flags, Results(engine.name, result.start, repeats, model, prices, took))
+    say(f"the report is {path}")
 
 
-def report(
-    flags: Flags,
-    engine: str,
-    start: float,
-    groups: Mapping[str, Sequence[tuple[Sequence[Turn], np.ndarray]]],
-    courses: Mapping[str, Course],
-    prices: Prices,
-    took: Mapping[str, float] | None,
-) -> Path:
-    """Write the report with its pictures and its numbers as JSON; returns its path.
+def _millions(losses: Sequence[float]) -> str:
+    """Median of losses and, of several, their range [1e6]."""
+    middle = f"{statistics.median(losses) / 1e6:.3f}"
+    if len(losses) == 1:
+        return middle
+    return f"{middle} [{min(losses) / 1e6:.3f}, {max(losses) / 1e6:.3f}]"
 
-    Args:
-        flags: what was asked for.
-        engine: of the walks.
-        start: loss of the start.
-        groups: of each method's repeats, the turns and the seconds after each walk.
-        courses: on the model.
-        prices: in seconds of one core.
-        took: seconds of collection and training on this machine; None where made before.
-    """
-    best = {m: [lowest(start, turns) for turns, _ in each] for m, each in groups.items()}
+
+def as_numbers(flags: Flags, results: Results) -> dict[str, dict[str, Any]]:
+    """Numbers of the methods, for race.json."""
     marks = [mark for mark in MARKS if mark < flags.rollouts] + [flags.rollouts]
-
-    def cell(losses: Sequence[float]) -> str:
-        middle = f"{statistics.median(losses) / 1e6:.3f}"
-        if len(losses) == 1:
-            return middle
-        return f"{middle} [{min(losses) / 1e6:.3f}, {max(losses) / 1e6:.3f}]"
-
-    rows, told = [], {}
-    for method, each in groups.items():
-        after = {m: [float(x[min(m, len(x) - 1)]) for x in best[method]] for m in marks}
-        seconds = [float(spent[-1]) for _, spent in each]
-        last = [float(turns[-1].walked.losses[-1]) for turns, _ in each if turns]
-        own = cell(last) if method in courses and last else ""
-        count = [walks(turns) for turns, _ in each]
-        rows.append(
-            [
-                plots.METHODS[method],
-                str(len(each)),
-                *(cell(losses) for losses in after.values()),
-                own,
-                f"{statistics.median(count):g}",
-                f"{statistics.median(seconds):.0f}",
-            ]
-        )
-        told[method] = {
-            "best": {str(mark): losses for mark, losses in after.items()},
-            "walks": count,
-            "seconds": seconds,
-            "losses": [[x for t in turns for x in t.walked.losses.tolist()] for turns, _ in each],
-            "spent": [spent.tolist() for _, spent in each],
-            "last": last,
+    return {
+        method: {
+            "best": {
+                str(mark): [float(one.lowest[min(mark, len(one.lowest) - 1)]) for one in each]
+                for mark in marks
+            },
+            "walks": [walks(one.rounds) for one in each],
+            "seconds": [float(one.seconds[-1]) for one in each],
+            "losses": [[x for r in one.rounds for x in r.walked.losses.tolist()] for one in each],
+            "spent": [one.seconds.tolist() for one in each],
+            "last": [float(one.rounds[-1].walked.losses[-1]) for one in each if one.rounds],
         }
-    head = ["method", "repeats", *(f"after {m}" for m in marks), "its own last", "walks", "s"]
-    table = markdown_table(head, rows)
-    count = {m: [(np.arange(len(x), dtype=float), x) for x in losses] for m, losses in best.items()}
-    spent = {
-        m: [(seconds, x) for (_, seconds), x in zip(groups[m], losses, strict=True)]
-        for m, losses in best.items()
+        for method, each in results.methods.items()
     }
+
+
+def report(flags: Flags, results: Results) -> Path:
+    """Write the report with its pictures and its numbers as JSON; returns its path."""
+    numbers, about = as_numbers(flags, results), environment()
+    rows = [
+        [
+            plots.METHODS[method],
+            str(len(results.methods[method])),
+            *map(_millions, row["best"].values()),
+            _millions(row["last"]) if method in results.model and row["last"] else "",
+            f"{statistics.median(row['walks']):g}",
+            f"{statistics.median(row['seconds']):.0f}",
+        ]
+        for method, row in numbers.items()
+    ]
+    marks = next(iter(numbers.values()))["best"]
+    head = ["method", "repeats", *(f"after {m}" for m in marks), "its own last", "walks", "s"]
+    by_walks, by_seconds = (
+        {m: [(x(one), one.lowest) for one in each] for m, each in results.methods.items()}
+        for x in (lambda one: np.arange(len(one.lowest), dtype=float), lambda one: one.seconds)
+    )
+    out = flags.out
+    what = "walks on the high-fidelity simulator"
     captions = {
-        "rollouts.png": plots.race(
-            flags.out / "rollouts.png", count, "walks on the high-fidelity simulator"
-        ),
-        "seconds.png": plots.race(flags.out / "seconds.png", spent, "seconds of one core")
+        "rollouts.png": plots.race(out / "rollouts.png", by_walks, what),
+        "seconds.png": plots.race(out / "seconds.png", by_seconds, "seconds of one core")
         + " The methods with the net begin after its walks and its training.",
     }
-    about = environment()
-    write_json(
-        flags.out / "race.json",
-        {
-            "flags": {n: str(v) for n, v in asdict(flags).items()},
-            "engine": engine,
-            "environment": about,
-            "start": start,
-            "prices": prices._asdict(),
-            "took": took,
-            "courses": {n: c._asdict() for n, c in courses.items()},
-            "methods": told,
-        },
-    )
-    text = _words(flags, engine, start, table, courses, prices, took)
-    text.insert(1, made_at(about))
+    data = {
+        "flags": {n: str(v) for n, v in asdict(flags).items()},
+        "engine": results.engine,
+        "environment": about,
+        "start": results.start,
+        "prices": results.prices._asdict(),
+        "took": results.took,
+        "courses": {name: run._asdict() for name, run in results.model.items()},
+        "methods": numbers,
+    }
+    write_json(out / "race.json", data)
+    text = ["# The race", made_at(about), *_text(flags, results, markdown_table(head, rows))]
     text += [f"![{name}]({name})\n\n{caption}" for name, caption in captions.items()]
-    write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
-    return flags.out / "report.md"
+    write_file(out / "report.md", ("\n\n".join(text) + "\n").encode())
+    return out / "report.md"
 
 
-def _words(
-    flags: Flags,
-    engine: str,
-    start: float,
-    table: str,
-    courses: Mapping[str, Course],
-    prices: Prices,
-    took: Mapping[str, float] | None,
-) -> list[str]:
+def _text(flags: Flags, results: Results, table: str) -> list[str]:
+    prices, took, start = results.prices, results.took, results.start
     iterations = ", ".join(
-        f"{plots.METHODS[n]} {prices.iterations[n]:.2f} s ({c.iterations} of them; compiling took "
-        f"{c.compiling:.0f} s and is not counted)"
-        for n, c in courses.items()
+        f"{plots.METHODS[n]} {prices.iterations[n]:.2f} s ({run.iterations} of them; compiling "
+        f"took {run.compiling:.0f} s and is not counted)"
+        for n, run in results.model.items()
     )
     made = (
         f"On this machine, {flags.processes} processes, collection took {took['collection']:.0f} s "
@@ -431,9 +421,9 @@ def _words(
         else f"The net was taken from {flags.net}; **its training is not in the seconds**."
     )
     return [
-        "# The race",
-        f"Trajectory {flags.traj}, {flags.ticks} ticks, engine {engine}. Lowest L [1e6] on the "
-        f"high-fidelity simulator so far; all start from the nominal weights, {start / 1e6:.3f}, "
+        f"Trajectory {flags.traj}, {flags.ticks} ticks, engine {results.engine}. Lowest L [1e6] on "
+        f"the high-fidelity simulator so far; all start from the nominal weights, "
+        f"{start / 1e6:.3f}, "
         "and stay in one box. What is random: median over the repeats, and their range.",
         table,
         "## What is counted",

@@ -51,7 +51,7 @@ from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import named_world
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import PAPER_LOSS
 
 BASELINE = "nominal"
 
@@ -146,7 +146,7 @@ def main() -> None:
         for level, at_level in scenes.items()
         for name in sets
     }
-    config, loss = WalkConfig(), LossConfig()
+    config, loss = WalkConfig(), PAPER_LOSS
     with workers(flags.processes) as pool:
         walked = walk_groups(
             groups,

@@ -40,9 +40,9 @@ from hector_jax.control.weights import (
     DIRECTION_NAMES,
     Weights,
     expert,
-    moved,
     nominal,
     sample_weights,
+    scale_weights,
 )
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import bar, exit_code, say
@@ -60,8 +60,8 @@ from hector_jax.runs.tunings import Problem
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, refusal, tune_step
-from hector_jax.tuning.loss import LossConfig, loss_of
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, rejection_reason, tune_step
+from hector_jax.tuning.loss import PAPER_LOSS, loss_of
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 PUBLISHED = {"nominal": nominal, "expert": expert}
@@ -181,7 +181,7 @@ def tuned_sets(
 
 
 def _walked(walk: Trajectory) -> Walked:
-    loss = loss_of(LossConfig(), walk)
+    loss = loss_of(PAPER_LOSS, walk)
     return Walked(np.asarray(loss), walk.fallen.any(), walk.residual.max())
 
 
@@ -202,7 +202,7 @@ def walk_groups(
         kind="transfer",
         robot=robot,
         folder=folder,
-        settings=(config, LossConfig(), engine.name),
+        settings=(config, repr(PAPER_LOSS), engine.name),
         title=f" on the high-fidelity simulator, engine {engine.name}",
     )
     return walked, engine.name
@@ -212,7 +212,7 @@ def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
     """Walks whose losses make the gradients at a weight set: phases, directions, both sides."""
     steps = alignment.STEP * np.eye(len(DIRECTION_NAMES))
     return [
-        Job(moved(point.weights, side * step), point.command, hfs(), start_tick=phase)
+        Job(scale_weights(point.weights, side * step), point.command, hfs(), start_tick=phase)
         for phase in phases
         for step in steps
         for side in (1, -1)
@@ -238,7 +238,7 @@ def _model_job(
         anchor = standing_anchor(robot, tick)
         found = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
         row = alignment.as_directions(weights, found.gradient)
-        rows.append(np.where(refusal(config, found), np.nan, row))
+        rows.append(np.where(rejection_reason(config, found), np.nan, row))
     losses = [
         float(_model_loss(config, robot, weights, command, standing_anchor(robot, tick), effect))
         for weights, command, tick in others

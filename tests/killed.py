@@ -34,8 +34,8 @@ from hector_jax.runs import nets, tunings, verdicts
 from hector_jax.runs.journal import Journal
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
-from hector_jax.tuning.loss import Losses
+from hector_jax.tuning.difftune import TuneConfig, descend
+from hector_jax.tuning.evaluate import Evaluation
 
 ROBOT, S = load_robot(), named_command("s")
 WALKS = 30
@@ -55,7 +55,8 @@ def look(folder: Path, weights) -> Evaluation:
     time.sleep(0.01)
     loss = np.array(logs @ logs)
     none = np.array(0.0)
-    return Evaluation(loss, Losses(loss, loss, loss), gradient, none, none)
+    terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
+    return Evaluation(loss, terms, gradient, none, none)
 
 
 def tune_toys(folder: Path, pool, config, robot, start, problems, title, on_iteration):

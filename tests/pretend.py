@@ -1,13 +1,15 @@
 """Walks, scores and verdicts that no simulator made, for what is only drawn, judged or written."""
 
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.runs.metrics import Score, Verdict, stack_scores
-from hector_jax.tuning.difftune import Evaluation, Iteration
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.difftune import Iteration, StepStatus
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import PAPER_LOSS, total
 
 SETS = ("nominal", "expert", "without_ten", "with_ten", "without", "with")
 
@@ -115,21 +117,21 @@ def pretend_verdict(seeds=8, fallen=()):
             for i in range(seeds)
         ]
         scores[name] = stack_scores(rows)
-    return Verdict(np.arange(seeds), scores, LossConfig())
+    return Verdict(np.arange(seeds), scores, PAPER_LOSS)
 
 
 def pretend_history(iterations=30, pace=5.0, refused=()):
     """A tuning whose loss falls; refused iterations are not finite."""
     history = []
     for i in range(iterations + 1):
-        parts = Losses(
-            *(np.array(x) for x in (8 * np.exp(-i / pace) + 2, 6 * np.exp(-i / 9) + 1)),
-            control=np.array(5.5e5 + 2e4 * np.sqrt(i)),
-        )
-        loss = np.array(
-            np.nan if i in refused else 1e5 * parts.euler + 2e5 * parts.position + parts.control
-        )
-        found = Evaluation(loss, parts, nominal(), np.array(0.0), np.array(1e-12))
-        reason = "loss or gradient not finite" if i in refused else ""
-        history.append(Iteration(i, nominal(), found, not reason, reason, 1.0 if i else 0.0))
+        terms = {
+            "L_Eul": np.array(8 * np.exp(-i / pace) + 2),
+            "L_pos": np.array(6 * np.exp(-i / 9) + 1),
+            "L_ctrl": np.array(5.5e5 + 2e4 * np.sqrt(i)),
+        }
+        loss = np.array(np.nan if i in refused else float(total(PAPER_LOSS, terms)))
+        found = Evaluation(loss, terms, nominal(), np.array(0.0), np.array(1e-12))
+        status = StepStatus.NOT_FINITE if i in refused else StepStatus.ACCEPTED
+        row = i, nominal(), found, int(status), 1.0 if i else 0.0
+        history.append(Iteration(*jax.tree.map(np.asarray, row)))
     return history

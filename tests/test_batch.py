@@ -15,7 +15,7 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, sample_weights, vector_to_weights, weights_to_vector
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning import difftune
+from hector_jax.tuning import batch, difftune
 from hector_jax.tuning.batch import (
     PER_CALL,
     Problem,
@@ -25,8 +25,9 @@ from hector_jax.tuning.batch import (
     tail_weights,
     tune_batch,
 )
-from hector_jax.tuning.difftune import Evaluation, Reason, Stop, TuneConfig, tune
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.difftune import StepStatus, Stop, TuneConfig, tune
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, no_variation
 
 ROBOT = load_robot()
@@ -34,33 +35,34 @@ ANCHOR = standing_anchor(ROBOT)
 STARTS = [sample_weights(nominal(), factor, 1)[0] for factor in (1.05, 1.2, 1.5, 2.0, 3.0)]
 TOY = TuneConfig(iterations=40, patience=5)
 NOMINAL = np.asarray(weights_to_vector(nominal()))
-PAPER = LossConfig().as_arrays()
 
 
 def vector(weights):
     return np.asarray(weights_to_vector(weights))
 
 
-def toy(config, robot, weights, command, anchor, effect, alpha, variation=None):
+def toy(config, robot, weights, command, anchor, effect, loss, variation=None):
     """A bowl in log-weights about a point that the command moves; with a floor under it."""
     middle = np.log(NOMINAL) + 0.3 * jnp.asarray(command.yaw_rate)[0]
     away = jnp.log(weights_to_vector(weights)) - middle
-    scale = alpha.euler
+    scale = loss[0].weight
     gradient = vector_to_weights(2.0 * scale * away / weights_to_vector(weights))
     loss = scale * (1.0 + away @ away)
     falls = 1.0 * (weights_to_vector(weights)[0] > 1e3)
-    return Evaluation(loss, Losses(loss, loss, loss), gradient, falls, jnp.asarray(1e-12))
+    return Evaluation(
+        loss, dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss), gradient, falls, jnp.asarray(1e-12)
+    )
 
 
 @pytest.fixture
 def on_toy(monkeypatch):
-    monkeypatch.setattr(difftune, "evaluate", toy)
-    monkeypatch.setattr(difftune, "_evaluate", jax.jit(toy, static_argnums=0))
+    monkeypatch.setattr(batch, "evaluate", toy)
+    monkeypatch.setattr(difftune, "evaluate_jit", jax.jit(toy, static_argnums=0))
 
 
-def scenario(name="straight", alpha=PAPER, scale=1.0, effect=0, variation=None):
+def scenario(name="straight", loss=PAPER_LOSS, scale=1.0, effect=0, variation=None):
     scale, effect = np.asarray(scale), np.asarray(effect)
-    return Scenario(named_command(name), ANCHOR, effect, alpha, scale, variation)
+    return Scenario(named_command(name), ANCHOR, effect, loss, scale, variation)
 
 
 def problem(start, scenarios, tail=1.0):
@@ -76,13 +78,13 @@ def test_each_tuning_of_a_batch_is_that_of_a_single_one(on_toy):
         for part in ("ten", "converged"):
             ours = jax.tree.map(lambda x, i=i: x[i], getattr(found, part))
             np.testing.assert_allclose(vector(ours), vector(getattr(alone, part)), rtol=1e-9)
-        assert difftune.stopped(TOY, Stop(int(found.stop[i]))) == alone.stop
+        assert difftune.stop_reason(TOY, Stop(int(found.stop[i]))) == alone.stop
         assert found.iterations[i] == len(alone.history) - 1
         ran = slice(len(alone.history))
         losses = [i.evaluation.loss for i in alone.history]
-        np.testing.assert_allclose(found.course.loss[i, ran], losses, rtol=1e-9)
+        np.testing.assert_allclose(found.history.evaluation.loss[i, ran], losses, rtol=1e-9)
         np.testing.assert_array_equal(
-            found.course.reason[i, ran] == Reason.ACCEPTED, [i.accepted for i in alone.history]
+            found.history.status[i, ran] == StepStatus.ACCEPTED, [i.accepted for i in alone.history]
         )
     assert len(set(found.iterations)) > 1  # some ended and were frozen before others
     assert max(found.iterations) >= PER_CALL
@@ -100,18 +102,19 @@ def test_a_start_that_falls_keeps_itself_and_says_so(on_toy):
     asked = stack([problem(w, [scenario("c")]) for w in (STARTS[0], bad)])
     found = tune_batch(TOY, ROBOT, asked, last_command)
     assert found.stop[1] == Stop.BAD_START
-    assert found.course.reason[1, 0] == Reason.FELL
+    assert found.history.status[1, 0] == StepStatus.FELL
     np.testing.assert_array_equal(vector(found.converged)[1], vector(bad))
     assert found.stop[0] != Stop.BAD_START
 
 
 def test_a_batch_has_loss_weights_of_its_own_and_scales_its_losses(on_toy):
-    heavy = LossConfig(3e5, 0.0).as_arrays()
+    heavy = with_alphas({"L_Eul": 3e5, "L_pos": 0.0})
     asked = [
-        problem(STARTS[0], [scenario(alpha=a, scale=k)]) for a, k in ((PAPER, 1.0), (heavy, 2.0))
+        problem(STARTS[0], [scenario(loss=a, scale=k)])
+        for a, k in ((PAPER_LOSS, 1.0), (heavy, 2.0))
     ]
     found = tune_batch(TOY, ROBOT, stack(asked), last_command)
-    first = found.course.loss[:, 0]
+    first = found.history.evaluation.loss[:, 0]
     assert first[1] == pytest.approx(1.5 * first[0])
 
 
@@ -170,7 +173,7 @@ from hector_jax.core.runtime import setup_jax
 setup_jax()
 import test_batch as t
 if sys.argv[1] == "toy":
-    t.difftune.evaluate = t.toy
+    t.batch.evaluate = t.toy
 config, asked = t.shared_case(sys.argv[1])
 assert len(jax.devices()) == 2
 one, two = (
@@ -210,7 +213,7 @@ setup_jax()
 all_devices()
 import jax, numpy as np
 import test_batch as t
-t.difftune.evaluate = t.toy
+t.batch.evaluate = t.toy
 config, asked = t.shared_case("toy")
 assert jax.process_count() == 2 and len(jax.devices()) == 2 * len(jax.local_devices())
 found = t.tune_batch(config, t.ROBOT, asked, t.last_command)

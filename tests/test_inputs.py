@@ -36,7 +36,6 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs.nets import CollectConfig
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.loss import LossConfig
 from hector_jax.tuning.online import OnlineConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -83,7 +82,6 @@ CONFIGS = (
     MpcConfig,
     WalkConfig,
     RolloutConfig,
-    LossConfig,
     TuneConfig,
     SearchConfig,
     OnlineConfig,

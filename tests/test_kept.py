@@ -86,7 +86,7 @@ def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
         same(back._replace(history=[], stop=0), TUNING._replace(history=[], stop=0))
         for one, other in zip(back.history, TUNING.history, strict=True):
             assert one.iteration == other.iteration
-            assert one.step == other.step
+            assert one.step_scale == other.step_scale
             same((one.weights, one.evaluation), (other.weights, other.evaluation))
         assert [as_line("a", i) for i in back.history] == [as_line("a", i) for i in TUNING.history]
     assert tuned == ["without"]

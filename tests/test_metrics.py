@@ -8,7 +8,7 @@ from pretend import SETS, pretend_score, pretend_verdict, pretend_walk
 
 from hector_jax.core.files import as_json
 from hector_jax.runs import metrics
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 
 
 def mean_of(x):
@@ -18,12 +18,12 @@ def mean_of(x):
 
 def _judge(**losses):
     scores = {name: [pretend_score(x) for x in row] for name, row in losses.items()}
-    return metrics.make_verdict(LossConfig(), range(len(next(iter(losses.values())))), scores)
+    return metrics.make_verdict(PAPER_LOSS, range(len(next(iter(losses.values())))), scores)
 
 
 def test_the_total_is_the_weighted_sum_of_the_parts():
-    one = metrics.score(LossConfig(euler=2.0, position=3.0), pretend_walk())
-    euler, position, control = (one.losses[part] for part in metrics.UNITS)
+    one = metrics.score(with_alphas({"L_Eul": 2.0, "L_pos": 3.0}), pretend_walk())
+    euler, position, control = (one.losses[term.name] for term in PAPER_LOSS)
     assert one.L == pytest.approx(2 * euler + 3 * position + control, rel=1e-12)
     assert 0 < one.switching < control
 
@@ -34,13 +34,13 @@ def test_rms_errors_are_those_of_the_walk_per_axis():
     shifted = walk._replace(
         state=walk.reference._replace(position=walk.reference.position + offset)
     )
-    one = metrics.score(LossConfig(), shifted)
+    one = metrics.score(PAPER_LOSS, shifted)
     np.testing.assert_allclose(one.rms_position, offset, rtol=1e-12)
     np.testing.assert_allclose(one.rms_euler, 0.0)
 
 
 def test_a_fall_is_charged_and_told_and_its_missing_samples_stay_out_of_the_rms():
-    upright, fell = (metrics.score(LossConfig(), pretend_walk(fall_at=t)) for t in (None, 2.0))
+    upright, fell = (metrics.score(PAPER_LOSS, pretend_walk(fall_at=t)) for t in (None, 2.0))
     assert fell.fallen
     assert not upright.fallen
     assert fell.L > upright.L
@@ -105,7 +105,7 @@ def test_the_result_has_the_promised_keys_and_is_json():
     assert tuple(result["sets"]) == SETS
     for name, worlds in result["sets"].items():
         found = worlds["standin"]
-        for part in metrics.PARTS:
+        for part in ("L_Eul", "L_pos", "L_ctrl", "L"):
             assert found[part]["low"] <= found[part]["mean"] <= found[part]["high"]
         assert found["falls"] == 0
         assert found["seeds"] == list(range(8))
@@ -117,17 +117,15 @@ def test_the_result_has_the_promised_keys_and_is_json():
 def test_legs_that_touch_are_counted_up_to_a_fall():
     touching = np.arange(400) >= 150
     walk = pretend_walk(fall_at=2.0)._replace(legs_touch=touching)
-    one = metrics.score(LossConfig(), walk)
+    one = metrics.score(PAPER_LOSS, walk)
     assert one.legs_touch == pytest.approx(0.5)
-    verdict = metrics.make_verdict(LossConfig(), [0, 1], {"with": [one, one]})
+    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"with": [one, one]})
     assert metrics.as_result(verdict)["sets"]["with"]["standin"]["legs_touch"] == pytest.approx(1.0)
 
 
 def test_the_result_of_a_set_that_falls_at_once_is_still_json():
-    walk = metrics.score(LossConfig(), pretend_walk(fall_at=-1.0))
-    verdict = metrics.make_verdict(
-        LossConfig(), [0, 1], {"nominal": [walk] * 2, "with": [walk] * 2}
-    )
+    walk = metrics.score(PAPER_LOSS, pretend_walk(fall_at=-1.0))
+    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"nominal": [walk] * 2, "with": [walk] * 2})
     found = metrics.as_result(verdict)["sets"]["with"]["standin"]
     found = json.loads(as_json(found))
     assert found["falls"] == 2
@@ -138,12 +136,12 @@ def test_the_result_of_a_set_that_falls_at_once_is_still_json():
 def test_a_missing_walk_or_a_loss_that_is_not_a_number_is_named():
     one = pretend_score(1.0)
     with pytest.raises(ValueError, match="set 'with' has 1 walks for 2 seeds"):
-        metrics.make_verdict(LossConfig(), [0, 1], {"with": [one]})
+        metrics.make_verdict(PAPER_LOSS, [0, 1], {"with": [one]})
     with pytest.raises(ValueError, match=r"set 'with': the loss on seeds \[7\]"):
         metrics.make_verdict(
-            LossConfig(),
+            PAPER_LOSS,
             [3, 7],
             {"with": [one, one._replace(losses=one.losses | {"L": np.array(np.nan)})]},
         )
     with pytest.raises(ValueError, match="at least one seed"):
-        metrics.make_verdict(LossConfig(), [], {})
+        metrics.make_verdict(PAPER_LOSS, [], {})

@@ -16,8 +16,9 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 from hector_jax.tuning import online
-from hector_jax.tuning.difftune import Evaluation, TuneConfig
-from hector_jax.tuning.loss import Losses, losses, total
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.online import MeasuredState, OnlineConfig, follow, init_trace, retuner
 from hector_jax.tuning.rollout import init_carry, step_carry
 
@@ -72,7 +73,7 @@ def _loss(theta, carry):
     walk = samples._replace(period=samples.period[0], initial=carry.state)
     change = jax.tree.map(lambda new, old: new[0] - old[0], samples.command, carry.commands)
     change = sum(jnp.sum(x**2) for x in change)
-    return total(TUNE.loss, losses(walk)) + change
+    return total(TUNE.loss, losses(PAPER_LOSS, walk)) + change
 
 
 _losses = jax.jit(lambda thetas, carry: jax.lax.map(lambda theta: _loss(theta, carry), thetas))
@@ -117,7 +118,9 @@ def toy(gradient=None, **wrong):
 
     def found(config, robot, command, anchor, effect, trace, weights, tick, told_, measured):
         loss, fallen, residual = (np.asarray(told[k], float) for k in told)
-        return trace, Evaluation(loss, Losses(loss, loss, loss), gradient, fallen, residual)
+        return trace, Evaluation(
+            loss, dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss), gradient, fallen, residual
+        )
 
     return found
 
@@ -235,4 +238,4 @@ def test_the_model_commands_along_the_measured_states_what_the_walk_commanded():
         carry, _ = retune.step(carry, tick, *row)
     commands = stack([last for _, _, last in seen[1:42]])
     change = jax.tree.map(lambda w: jnp.sum(jnp.diff(w, axis=0) ** 2), commands)
-    assert float(told[0].evaluation.parts.control) == pytest.approx(float(sum(change)), rel=1e-6)
+    assert float(told[0].evaluation.terms["L_ctrl"]) == pytest.approx(float(sum(change)), rel=1e-6)

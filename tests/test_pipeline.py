@@ -31,8 +31,8 @@ from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import Evaluation, TuneConfig, Tuning
-from hector_jax.tuning.loss import Losses
+from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.rollout import RolloutConfig
 
 
@@ -230,7 +230,8 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
         logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
         gradient = vector_to_weights(jnp.asarray(2.0 * size * logs / vector))
         loss = np.array(size * (logs @ logs))
-        return Evaluation(loss, Losses(loss, loss, loss), gradient, np.array(0.0), np.array(0.0))
+        terms = dict.fromkeys(("L_Eul", "L_pos", "L_ctrl"), loss)
+        return Evaluation(loss, terms, gradient, np.array(0.0), np.array(0.0))
 
     monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
     told, config = SimpleQueue(), TuneConfig(iterations=12)

@@ -15,7 +15,7 @@ from hector_jax.report.fidelity import Drift
 from hector_jax.report.motion import COLOURS, motions
 from hector_jax.report.plots.style import looks_of
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import PAPER_LOSS
 
 FOUR = ("nominal", "expert", "without", "with")
 
@@ -155,7 +155,7 @@ def test_falls_stand_at_the_edge_of_changes_and_do_not_squeeze_the_axis(tmp_path
 
 def test_the_loss_by_iteration_shows_refused_steps_that_are_no_numbers(tmp_path, drawn):
     histories = {"without": pretend_history(12), "with": pretend_history(8, refused=(3, 5))}
-    plots.losses(tmp_path / "loss.png", LossConfig(), histories)
+    plots.losses(tmp_path / "loss.png", PAPER_LOSS, histories)
     whole = drawn[0].axes[0]
     kept = [0, 1, 2, 4, 6, 7, 8]
     expected = [histories["with"][i].evaluation.loss / 1e6 for i in kept]

@@ -14,8 +14,8 @@ from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import Report, write_report
 from hector_jax.runs.metrics import Verdict
-from hector_jax.tuning.difftune import Tuning
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.difftune import StepStatus, Tuning
+from hector_jax.tuning.loss import PAPER_LOSS
 
 
 def _printed(verdict, **options):
@@ -26,7 +26,7 @@ def _printed(verdict, **options):
 
 def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device)"):
     history = pretend_history(14, refused=(3, 12))
-    history[12] = history[12]._replace(reason="QP residual 2.0e-05 above 1e-06")
+    history[12] = history[12]._replace(status=np.array(StepStatus.UNSOLVED))
     tuning = Tuning(history, history[10].weights, bounds()[1], "the step became too small to gain")
     errors = {
         name: {"force": x, "moment": x / 200, "stance": [x] * 6, "swing": [x] * 5 + [0.0]}
@@ -36,7 +36,7 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         trajectory="straight",
         verdict=verdict or pretend_verdict(),
         tunings={"without": tuning, "with": tuning},
-        norms={"without": Losses(*np.array([12.0, 7.0, 8e5]))},
+        norms={"without": {"L_Eul": 12.0, "L_pos": 7.0, "L_ctrl": 8e5}},
         errors=errors,
         pictures=[Picture("loss.png", "Loss by iteration.")],
         film=film,
@@ -96,7 +96,7 @@ def test_legs_that_touch_are_told_where_they_do(tmp_path):
 
 def test_the_table_goes_without_baselines_that_were_not_walked():
     whole = pretend_verdict(2)
-    text = _printed(Verdict(whole.seeds, {"mine.json": whole.scores["with"]}, LossConfig()))
+    text = _printed(Verdict(whole.seeds, {"mine.json": whole.scores["with"]}, PAPER_LOSS))
     assert "against" not in text
     assert "Change of L" not in text
     both = _printed(whole._replace(scores={n: whole.scores[n] for n in ("nominal", "with")}))

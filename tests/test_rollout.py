@@ -9,9 +9,10 @@ from model import PLAIN, SHORT, small_effect
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning import difftune, sensitivity
+from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune_step
-from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.evaluate import evaluate_jit
+from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 LONG = RolloutConfig(ticks=400)
@@ -35,7 +36,7 @@ def test_named_weights_walk_every_trajectory(robot, anchor, name, weights):
     trajectory = walk(LONG, robot, weights(), named_command(name), anchor, PLAIN)
     assert not trajectory.fallen.any()
     assert trajectory.residual.max() < 1e-8
-    assert total(LossConfig(), losses(trajectory)) < 3e6
+    assert total(PAPER_LOSS, losses(PAPER_LOSS, trajectory)) < 3e6
 
 
 def test_a_foot_in_the_air_gets_no_wrench(robot, anchor):
@@ -60,9 +61,9 @@ def test_falling_is_seen_and_charged(robot, anchor):
     trajectory = walk(LONG, robot, weak, named_command("straight"), anchor, PLAIN)
     assert trajectory.fallen[-1]
     fallen = float(trajectory.fallen.sum())
-    assert losses(trajectory).position >= 10 * fallen * 0.5**2
-    assert losses(trajectory).euler >= 10 * fallen * 0.8**2
-    assert np.isfinite(total(LossConfig(), losses(trajectory)))
+    assert losses(PAPER_LOSS, trajectory)["L_pos"] >= 10 * fallen * 0.5**2
+    assert losses(PAPER_LOSS, trajectory)["L_Eul"] >= 10 * fallen * 0.8**2
+    assert np.isfinite(total(PAPER_LOSS, losses(PAPER_LOSS, trajectory)))
 
 
 def test_starting_half_a_cycle_later_mirrors_the_walk(robot):
@@ -124,7 +125,7 @@ def check_gradient(config, robot, weights, command, anchor, effect, bar):
     print(f"error against differences {errors}", end=" ")
     assert errors[-1] <= bar, errors
     trajectory, columns = propagate(config, robot, weights, command, anchor, effect)
-    _, forward = sensitivity.gradient(LossConfig(), trajectory, columns)
+    _, forward = sensitivity.gradient(PAPER_LOSS, trajectory, columns)
     forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
     print(f"forward against reverse {relative(forward, reverse):.1e}")
     assert relative(forward, reverse) <= 1e-8
@@ -194,7 +195,7 @@ def test_a_block_has_at_least_one_tick():
 def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
     config = TuneConfig(rollout=SHORT)
     tune_step(config, robot, nominal(), named_command("s"), anchor, PLAIN)
-    before = difftune._evaluate._cache_size()
-    other = TuneConfig(rollout=SHORT, loss=LossConfig(euler=1.0), beta_q=0.1, iterations=20)
+    before = evaluate_jit._cache_size()
+    other = TuneConfig(rollout=SHORT, loss=with_alphas({"L_Eul": 1.0}), beta_q=0.1, iterations=20)
     tune_step(other, robot, expert(), named_command("c"), anchor, PLAIN)
-    assert difftune._evaluate._cache_size() == before
+    assert evaluate_jit._cache_size() == before

@@ -10,8 +10,8 @@ from hector_jax.control.weights import (
     DIRECTION_NAMES,
     bounds,
     expert,
-    moved,
     nominal,
+    scale_weights,
     weights_to_vector,
 )
 from hector_jax.search.cmaes import SearchConfig, search
@@ -34,7 +34,7 @@ def unasked(sets):
 
 def run(folder, config=CONFIG, walk=bowl, start=None, names=("s",)):
     starts = dict.fromkeys(names, nominal() if start is None else start)
-    return search(config, starts, walk, folder, ABOUT)
+    return search(config, starts, walk, folder=folder, about=ABOUT)
 
 
 def same(one, other):
@@ -120,7 +120,7 @@ def test_searches_in_lock_step_are_those_that_go_alone(tmp_path):
 def test_what_is_asked_lies_in_the_box_and_treats_both_feet_alike(tmp_path):
     step = np.zeros(18)
     step[DIRECTION_NAMES.index("Q_x")] = np.log(1e4 / 50.0)  # at the upper edge
-    start = jax.tree.map(np.clip, moved(nominal(), step), *bounds())
+    start = jax.tree.map(np.clip, scale_weights(nominal(), step), *bounds())
     low, high = (np.asarray(weights_to_vector(w)) for w in bounds())
     seen = []
 
@@ -158,7 +158,7 @@ def test_a_record_of_another_search_is_refused(tmp_path):
     with pytest.raises(ValueError, match="its start is"):
         run(tmp_path, start=expert())
     with pytest.raises(ValueError, match="its world is bowl"):
-        search(CONFIG, {"s": nominal()}, bowl, tmp_path, {"world": "hfs"})
+        search(CONFIG, {"s": nominal()}, bowl, folder=tmp_path, about={"world": "hfs"})
     assert (tmp_path / "s.jsonl").read_bytes() == kept
 
 

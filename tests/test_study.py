@@ -18,7 +18,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.report.video import VideoUnavailable
 from hector_jax.runs import nets, searches, tunings, verdicts
 from hector_jax.runs.tunings import Tuned
-from hector_jax.search.cmaes import Found, Generation
+from hector_jax.search.cmaes import Generation, SearchResult
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import Tuning
 
@@ -35,7 +35,7 @@ def asked(monkeypatch):
     def search(pool, config, tune, robot, starts, *, engine, folder):
         told["search"] = config
         generation = Generation(np.zeros((10, 18)), np.full(10, 2e6))
-        one = Found(expert(), 2e6, 7, [generation] * 2, "2 generations")
+        one = SearchResult(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(starts, one)
 
     def side_by_side(pool, config, robot, start, problems, title, on_iteration):

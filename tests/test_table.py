@@ -15,7 +15,7 @@ from hector_jax.report.table import PAPER, Fall, Search, Table, summaries, write
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import BASELINES
 from hector_jax.tuning.difftune import Tuning
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import PAPER_LOSS
 
 
 def judged(seeds=4, fell=(), **levels):
@@ -25,7 +25,7 @@ def judged(seeds=4, fell=(), **levels):
         name: [pretend_score(level * w, (name, i) in fell) for i, w in enumerate(wobble)]
         for name, level in levels.items()
     }
-    return metrics.make_verdict(LossConfig(), range(seeds), scores)
+    return metrics.make_verdict(PAPER_LOSS, range(seeds), scores)
 
 
 def with_losses(score, **losses):

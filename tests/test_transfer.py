@@ -8,7 +8,13 @@ import pytest
 from alignment import BEYOND_SAG, SAG
 
 from hector_jax.control.weights import DIRECTION_NAMES as NAMES
-from hector_jax.control.weights import directions, moved, nominal, sample_weights, weights_to_vector
+from hector_jax.control.weights import (
+    directions,
+    nominal,
+    sample_weights,
+    scale_weights,
+    weights_to_vector,
+)
 from hector_jax.core.files import as_json
 
 RNG = np.random.default_rng(1)
@@ -24,7 +30,7 @@ def test_central_differences_are_the_gradient_in_the_directions():
     slope = RNG.normal(size=18)
 
     def loss(logs):
-        weights = moved(nominal(), logs)
+        weights = scale_weights(nominal(), logs)
         return slope @ directions() @ np.log(np.asarray(weights_to_vector(weights)))
 
     step = alignment.STEP * np.eye(18)

@@ -14,7 +14,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk, walk_many
 from hector_jax.sim.world import Push, build_world, hfs, ideal
-from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
 CONFIG, ROBOT = WalkConfig(), load_robot()
 
@@ -143,7 +143,7 @@ def test_expert_weights_walk_far_in_ideal(name):
     assert rms(walked.state.position - walked.reference.position).max() <= 0.06
     assert np.rad2deg(rms(walked.state.euler - walked.reference.euler)).max() <= 3.0
     four = jax.tree.map(lambda x: x[:4000] if np.ndim(x) and len(x) > 4000 else x, walked)
-    assert total(LossConfig(), losses(four)) <= 4e6
+    assert total(PAPER_LOSS, losses(PAPER_LOSS, four)) <= 4e6
 
 
 @pytest.mark.slow

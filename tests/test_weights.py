@@ -11,8 +11,8 @@ from hector_jax.control.weights import (
     bounds,
     directions,
     expert,
-    moved,
     nominal,
+    scale_weights,
     vector_to_weights,
     weights_to_vector,
 )
@@ -72,6 +72,6 @@ def test_the_feet_share_their_weights_in_every_direction():
     assert (steps.sum(axis=0) == 1).all()
     step = np.zeros(18)
     step[DIRECTION_NAMES.index("R_Fz")] = np.log(2.0)
-    weights = moved(nominal(), step)
+    weights = scale_weights(nominal(), step)
     np.testing.assert_allclose(weights.R.force[:, 2], 2.0 * nominal().R.force[:, 2])
     np.testing.assert_allclose(weights.R.force[:, :2], nominal().R.force[:, :2])

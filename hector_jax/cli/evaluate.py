@@ -24,7 +24,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, verdicts
 from hector_jax.runs.folder import RESULT, load_run
 from hector_jax.runs.metrics import Score, Verdict
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import PAPER_LOSS, Loss
 
 
 def evaluate(args: Evaluate) -> None:
@@ -55,9 +55,7 @@ def evaluate(args: Evaluate) -> None:
         print_table(named, f"{course.name}, {plural(count, 'plant')}", args.world)
 
 
-def verdict_of(
-    loss: LossConfig, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
-) -> Verdict:
+def verdict_of(loss: Loss, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]) -> Verdict:
     """`metrics.make_verdict`, saying where a QP of the walks was not solved."""
     verdict = metrics.make_verdict(loss, seeds, scores)
     for name, score in verdict.scores.items():
@@ -79,7 +77,7 @@ def walk(args: Walk) -> None:
     weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
     trajectory = arguments.walked(args, robot, course, weights)
-    score = metrics.score(LossConfig(), trajectory)
+    score = metrics.score(PAPER_LOSS, trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
     plans = np.asarray(trajectory.residual)[::samples]
@@ -94,12 +92,11 @@ def walk(args: Walk) -> None:
         # a walk that falls at once has no errors
         print(as_json({"seconds": upright, "fell": fell, **losses, **errors, **solved}))
     else:
-        units = metrics.UNITS.items()
-        parts = ", ".join(f"{part} {score.losses[part]:.4g} {unit}" for part, unit in units)
+        terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in PAPER_LOSS)
         end = "fell after" if fell else "ended after" if score.fallen else "walked"
         print(
             f"{course.name} in {args.world}, {printable(args.weights)} weights: {end} "
-            f"{upright:.2f} s; L {score.L / 1e6:.3f}e6 ({parts})"
+            f"{upright:.2f} s; L {score.L / 1e6:.3f}e6 ({terms})"
         )
         cm, degrees = 100 * score.rms_position, np.degrees(score.rms_euler)
         print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")

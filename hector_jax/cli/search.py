@@ -17,6 +17,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import searches
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim.engine import choose_engine
+from hector_jax.tuning.loss import alphas
 
 
 def search(args: Search) -> None:
@@ -62,7 +63,7 @@ def search(args: Search) -> None:
             "start": args.start,
             "engine": engine.name,
             "rollout": asdict(tune.rollout),
-            "loss": asdict(tune.loss),
+            "loss": alphas(tune.loss),
             "versions": versions(),
         }
         save_weights(out / f"{name}.json", one.weights)

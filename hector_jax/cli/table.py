@@ -45,7 +45,7 @@ from hector_jax.runs.metrics import BASELINES, Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.runs.verdicts import Judged
-from hector_jax.search.cmaes import Found, SearchConfig
+from hector_jax.search.cmaes import SearchConfig, SearchResult
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import Imperfections, hfs
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
@@ -221,7 +221,7 @@ def _make_table(
             pictures=_draw(out, robot, by_trajectory, judged),
             config={
                 "flags": parse.as_table(args),
-                "tune": asdict(plan.tune),
+                "tune": plan.tune.as_table(),
                 "search": asdict(plan.search),
             },
             environment=made_with,
@@ -233,11 +233,11 @@ def _make_table(
     return report, by_trajectory
 
 
-def _search(bench: _Bench) -> dict[str, Found]:
+def _search(bench: _Bench) -> dict[str, SearchResult]:
     """The derivative-free baseline of all trajectories, in lock-step."""
     plan, engine = bench.plan, choose_engine("auto")
     settings = replace(plan.search, budget=plan.search.population)  # a record serves any budget
-    model = engine.name, plan.tune.rollout, plan.tune.loss
+    model = engine.name, plan.tune.rollout, repr(plan.tune.loss)
     key = content_key(*model, settings, bench.robot, hfs(), nominal(), code=searches.SEARCH_CODE)
     return searches.search(
         bench.pool,
@@ -277,7 +277,7 @@ def _tune(bench: _Bench, name: str) -> dict[str, Tuned]:
 
 
 def _sets(
-    plan: _Plan, name: str, tuned: Mapping[str, Tuned], searched: Found
+    plan: _Plan, name: str, tuned: Mapping[str, Tuned], searched: SearchResult
 ) -> dict[str, Weights]:
     return {
         "nominal": nominal(),
@@ -327,9 +327,9 @@ def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:
     ]
 
 
-def _search_in_table(plan: _Plan, one: Found) -> Search:
-    walks = len(one.history) * plan.search.population
-    return Search(walks, one.walk, one.loss, one.stop)
+def _search_in_table(plan: _Plan, found: SearchResult) -> Search:
+    walks = len(found.history) * plan.search.population
+    return Search(walks, found.walk, found.loss, found.stop)
 
 
 def _draw(

@@ -1,6 +1,5 @@
 """`hector tune`: weights tuned with and without the net, judged and reported in a run folder."""
 
-import dataclasses
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -43,8 +42,8 @@ from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.runs.verdicts import Judged
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, aligned
-from hector_jax.tuning.loss import Losses
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.evaluate import aligned
 
 _FOLDERS = ("out", "run", "resume")  # flags that name the run folder
 
@@ -209,14 +208,14 @@ def _net(pool: Executor, args: Tune, robot: Robot) -> TrainedNet:
     return nets.ground(pool, robot, arguments.folder_of(args.data, args.robot, robot), args.variant)
 
 
-def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, Losses]]:
+def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, dict[str, float]]]:
     """The run with its loss weights, and the norms of the gradients by set."""
     problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
     norms = tunings.gradient_norms(pool, run.config, run.robot, problems)
     loss = run.config.loss
     if run.args.alpha == "auto":
         loss = aligned(loss, norms["with"])
-        say(f"loss weights alpha: {loss.euler:g} (Euler), {loss.position:g}")
+        say("loss weights: " + ", ".join(f"{t.name} {t.weight:g}" for t in loss))
     return run._replace(config=replace(run.config, loss=loss)), norms
 
 
@@ -229,7 +228,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
         for one in run.trajectories
     ]
     now = {
-        "tune": dataclasses.asdict(run.config),
+        "tune": run.config.as_table(),
         "net": tree_hash(run.net.params),
         "command": commands[0] if len(commands) == 1 else commands,
         "seconds": run.seconds,

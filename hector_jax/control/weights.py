@@ -102,12 +102,12 @@ def directions() -> Float[np.ndarray, "18 24"]:
     return np.concatenate([eye[:12], feet])
 
 
-def moved(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
+def scale_weights(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
     """Weights after a step in the 18 directions.
 
     >>> steps = np.zeros(18)
     >>> steps[DIRECTION_NAMES.index("Q_yaw")] = np.log(2.0)
-    >>> moved(nominal(), steps).Q.euler.round(6).tolist()
+    >>> scale_weights(nominal(), steps).Q.euler.round(6).tolist()
     [50.0, 50.0, 100.0]
     """
     vector = weights_to_vector(weights) * jnp.exp(logs @ directions())
@@ -117,4 +117,4 @@ def moved(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
 def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:
     """Draw weight sets log-uniformly within x/factor of some weights, always the same ones."""
     draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(DIRECTION_NAMES)))
-    return [moved(weights, np.log(factor) * row) for row in draws]
+    return [scale_weights(weights, np.log(factor) * row) for row in draws]

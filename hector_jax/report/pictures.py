@@ -18,7 +18,7 @@ from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
 from hector_jax.runs.folder import Histories
 from hector_jax.tuning.difftune import TuneConfig, Tuning
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import Loss
 
 
 def of_run(
@@ -93,7 +93,7 @@ def of_view(
     folder: Path,
     robot: Robot,
     histories: Histories,
-    loss: LossConfig,
+    loss: Loss,
     viewed: Mapping[str, ViewedWalk],
 ) -> None:
     """Draw what the page of `view` shows, as a film and pictures.

@@ -11,9 +11,10 @@ from hector_jax.control.weights import WEIGHT_NAMES, Weights, bounds, weights_to
 from hector_jax.core.files import write_file
 from hector_jax.report.fidelity import error_rows
 from hector_jax.report.report import Picture, markdown_table, power_text, render, summaries
-from hector_jax.runs.metrics import Term, Verdict, terms
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning, aligned
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.runs.metrics import Verdict
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning
+from hector_jax.tuning.evaluate import aligned
+from hector_jax.tuning.loss import Loss
 
 TUNED = {  # weight sets that the summary names
     "with": "through the net",
@@ -28,7 +29,9 @@ class Report(NamedTuple):
     trajectory: str
     verdict: Verdict
     tunings: Mapping[str, Tuning]  # `without`, `with` and, refreshed, `with_refreshed`
-    norms: Mapping[str, Losses]  # of the parts' gradients in log-weights at nominal, by model
+    norms: Mapping[
+        str, Mapping[str, float]
+    ]  # of the terms' gradients in log-weights at nominal, by model
     errors: Mapping[str, Mapping[str, Any]]  # held-out, of `raw`, `linear`, `net`: training.report
     pictures: Sequence[Picture]
     film: Picture | str  # or why there is none
@@ -55,7 +58,7 @@ def write_report(folder: Path, report: Report) -> Path:
         sets=summaries(report.verdict),
         sections=[tuning_section(name, tuning) for name, tuning in report.tunings.items()],
         alpha=_weights_text(report.verdict.loss),
-        norms_table=_norms_table(report.verdict.loss, report.verdict.alpha, report.norms),
+        norms_table=_norms_table(report.verdict.loss, report.norms),
         net_table=_net_table(report.errors),
     )
     path = folder / "report.md"
@@ -101,20 +104,20 @@ def _at_bounds(weights: Weights) -> str:
     return ", ".join(names) or "none"
 
 
-def _norms_table(loss: Sequence[Term], alpha: LossConfig, norms: Mapping[str, Losses]) -> str:
+def _norms_table(loss: Loss, norms: Mapping[str, Mapping[str, float]]) -> str:
     rows = []
     for name, norm in norms.items():
-        parts = [float(x) for x in norm]
+        parts = [norm[term.name] for term in loss]
         # the weight of the last part is 1
         products = [term.weight * x for term, x in zip(loss, parts, strict=True)][:-1]
         cells = (f"{x:.3g}" for x in (*parts, *products))
-        rows.append([name, *cells, _weights_text(terms(aligned(alpha, norm)))])
+        rows.append([name, *cells, _weights_text(aligned(loss, norm, loss[-1].name))])
     names = [term.name for term in loss]
     heads = [f"alpha_{k} {name}" for k, name in enumerate(names[:-1], 1)]
     return markdown_table(("model", *names, *heads, "auto"), rows)
 
 
-def _weights_text(loss: Sequence[Term]) -> str:
+def _weights_text(loss: Loss) -> str:
     return ", ".join(power_text(term.weight) for term in loss[:-1])
 
 

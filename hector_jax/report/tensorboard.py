@@ -47,7 +47,7 @@ def write_events(folder: Path, out: Path) -> list[Path]:
 def _scalars(line: dict) -> dict[str, float]:
     """Numbers of an iteration by tag; those that were not finite are left out."""
     rooms = {
-        "loss": ("L", "L_Eul", "L_pos", "L_ctrl"),
+        "loss": [name for name in line if name == "L" or name.startswith("L_")],
         "step": ("step", "accepted", "residual"),
     }
     found = {f"{room}/{name}": line.get(name) for room, names in rooms.items() for name in names}

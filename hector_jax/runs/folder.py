@@ -28,9 +28,9 @@ from hector_jax.core import inputs, settings
 from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.robot.model import Robot
-from hector_jax.runs.metrics import UNITS
-from hector_jax.tuning.difftune import Evaluation, Iteration
-from hector_jax.tuning.loss import LossConfig, Losses
+from hector_jax.tuning.difftune import Iteration, status_of
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import Loss, with_alphas
 
 CONFIG, METRICS, RESULT, VERSIONS = "config.json", "metrics.jsonl", "result.json", "versions.json"
 _MOST_BYTES = 100_000_000
@@ -52,7 +52,7 @@ class RunRequest(NamedTuple):
     """What a run was started with."""
 
     trajectory: str  # the first, where there are several
-    loss: LossConfig
+    loss: Loss
     data: Path  # folder of its net
     net: Path | None  # or the net itself
     variant: str  # of the net
@@ -84,7 +84,7 @@ def read_request(folder: Path) -> RunRequest:
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return RunRequest(
             trajectory=str(flags["traj"] if isinstance(flags["traj"], str) else flags["traj"][0]),
-            loss=LossConfig(**loss),
+            loss=with_alphas(loss),
             data=Path(flags["data"]),
             net=Path(flags["net"]) if flags.get("net") else None,
             variant=str(flags.get("variant", "residual")),
@@ -107,12 +107,12 @@ def as_line(name: str, iteration: Iteration) -> str:
 
     row = {
         "set": name,
-        "iteration": iteration.iteration,
-        "accepted": iteration.accepted,
+        "iteration": int(iteration.iteration),
+        "accepted": bool(iteration.accepted),
         "reason": iteration.reason,
-        "step": iteration.step,
+        "step": float(iteration.step_scale),
         "L": float(evaluation.loss),
-        **{part: float(loss) for part, loss in zip(UNITS, evaluation.parts, strict=True)},
+        **{name: float(term) for name, term in evaluation.terms.items()},
         "fallen": float(evaluation.fallen),
         "residual": float(evaluation.residual),
         "weights": named(iteration.weights),
@@ -181,18 +181,17 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
 
     weights = vector(row["weights"])
     return Iteration(
-        iteration=int(row["iteration"]),
+        iteration=np.array(row["iteration"]),
         weights=tree(weights),
         evaluation=Evaluation(
             loss=number(row["L"]),
-            parts=Losses(*(number(row[part]) for part in UNITS)),
+            terms={name: number(row[name]) for name in row if name.startswith("L_")},
             gradient=tree(vector(row["gradient_log"]) / weights),
             fallen=number(row["fallen"]),
             residual=number(row["residual"]),
         ),
-        accepted=bool(row["accepted"]),
-        reason=str(row["reason"]),
-        step=float(row["step"]),
+        status=np.array(status_of(row["reason"])),
+        step_scale=number(row["step"]),
     )
 
 

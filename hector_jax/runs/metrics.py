@@ -19,12 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.tuning.loss import LossConfig, losses, switch_loss, total
+from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, losses, switch_loss, total
 
 BASELINES = ("nominal", "expert")
-UNITS = {"L_Eul": "rad^2", "L_pos": "m^2", "L_ctrl": "N^2, (N m)^2"}
-"""Units of the parts of the loss, by their names, in the order of `Losses`."""
-PARTS = (*UNITS, "L")
 
 COVERAGE = 0.95  # of an interval
 RESAMPLES, FEWEST = 10_000, 4  # resamples of a bootstrap; samples that have an interval
@@ -75,29 +72,16 @@ class Comparison(NamedTuple):
     counts: bool  # neither falls more often than the other allows
 
 
-class Term(NamedTuple):
-    """A part of the loss."""
-
-    name: str
-    unit: str
-    weight: float
-
-
 class Verdict(NamedTuple):
     """All sets on the same seeds of one world."""
 
     seeds: Int[np.ndarray, " seeds"]
     scores: dict[str, Score]  # by set, stacked over seeds
-    alpha: LossConfig
-
-    @property
-    def loss(self) -> tuple[Term, ...]:
-        """The parts of the loss."""
-        return terms(self.alpha)
+    loss: Loss
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Names of the parts of the loss, and of their sum."""
+        """Names of the terms of the loss, and of their sum."""
         return (*(term.name for term in self.loss), "L")
 
 
@@ -109,26 +93,20 @@ class Summary(NamedTuple):
     against: dict[str, Comparison]  # by the other set
 
 
-def terms(alpha: LossConfig) -> tuple[Term, ...]:
-    """The parts of the loss with their units and weights, in the order of `Losses`."""
-    weights = map(float, alpha.as_arrays())
-    return tuple(map(Term, UNITS, UNITS.values(), weights))
-
-
-def score(config: LossConfig, walk: Trajectory) -> Score:
+def score(loss: Loss, walk: Trajectory) -> Score:
     """Compute losses, falls and tracking errors of one walk of any world.
 
     Args:
-        config: weights of the loss.
+        loss: terms and weights.
         walk: without batch axes.
 
     Source: Eq. 11.
     """
-    parts = losses(walk)
+    terms = losses(loss, walk)
     fallen = np.asarray(walk.fallen)
-    named = dict(zip(PARTS, (*parts, total(config, parts)), strict=True))
+    named = terms | {"L": total(loss, terms)}
     return Score(
-        losses={part: np.asarray(loss, float) for part, loss in named.items()},
+        losses={part: np.asarray(value, float) for part, value in named.items()},
         switching=np.asarray(switch_loss(walk), float),
         rms_euler=_rms(np.asarray(walk.state.euler) - walk.reference.euler, ~fallen),
         rms_position=_rms(np.asarray(walk.state.position) - walk.reference.position, ~fallen),
@@ -138,10 +116,11 @@ def score(config: LossConfig, walk: Trajectory) -> Score:
     )
 
 
-def score_like(*axes: int) -> Score:
+def score_like(*axes: int, loss: Loss = PAPER_LOSS) -> Score:
     """Return a score of zeros with some first axes, for `load_tree`."""
     one, three = np.zeros(axes), np.zeros((*axes, 3))
-    return Score(dict.fromkeys(PARTS, one), one, three, three, one.astype(bool), one, one)
+    parts = dict.fromkeys((*(term.name for term in loss), "L"), one)
+    return Score(parts, one, three, three, one.astype(bool), one, one)
 
 
 def stack_scores(scores: Sequence[Score]) -> Score:
@@ -155,12 +134,12 @@ def _rms(error: Float[np.ndarray, "T 3"], rows: Bool[np.ndarray, " T"]) -> Float
 
 
 def make_verdict(
-    config: LossConfig, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
+    loss: Loss, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]
 ) -> Verdict:
     """Put the walks of all sets together.
 
     Args:
-        config: the loss weights the scores were made with.
+        loss: that the scores were made with.
         seeds: the plants, in the order of the scores.
         scores: by set, one score per seed.
 
@@ -174,10 +153,10 @@ def make_verdict(
         if len(walks) != len(seeds):
             raise ValueError(f"set '{name}' has {len(walks)} walks for {len(seeds)} seeds")
         stacked[name] = stack_scores(walks)
-        wrong = [s for s, loss in zip(seeds, stacked[name].L, strict=True) if not np.isfinite(loss)]
+        wrong = [s for s, L in zip(seeds, stacked[name].L, strict=True) if not np.isfinite(L)]
         if wrong:
             raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")
-    return Verdict(np.asarray(seeds, int), stacked, config)
+    return Verdict(np.asarray(seeds, int), stacked, loss)
 
 
 def bootstrap(statistic: Callable[..., Any], *samples: Shaped[np.ndarray, "n ..."]) -> Interval:
@@ -257,7 +236,7 @@ def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
     the other parts under `.parts`.
     """
     return {
-        "alpha": {"euler": verdict.alpha.euler, "position": verdict.alpha.position},
+        "alpha": alphas(verdict.loss),
         "sets": {name: {world: _set_result(verdict, name)} for name in verdict.scores},
     }
 

@@ -6,7 +6,6 @@ settings) and what it came to; `again` does it once more and says whether the sa
 """
 
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,15 +26,14 @@ from hector_jax.grfm.network import Params, effect_of, layout, variant_of
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.tuning.difftune import (
-    Evaluation,
     Iteration,
-    Reason,
+    StepStatus,
     TuneConfig,
-    believed,
-    refusal,
+    rejection_reason,
+    step_status,
     tune_step,
 )
-from hector_jax.tuning.loss import Losses
+from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.rollout import rollout
 
 MOST = 3
@@ -91,9 +89,9 @@ def keep(
     Returns:
         Where it was written, if it was.
     """
-    code = Reason(int(believed(config, iteration.evaluation)))
+    code = StepStatus(int(step_status(config, iteration.evaluation)))
     kind = code.name.lower().replace("_", "-")
-    if code is Reason.ACCEPTED or len(list(folder.glob(f"{name}-*-{kind}.npz"))) >= MOST:
+    if code is StepStatus.ACCEPTED or len(list(folder.glob(f"{name}-*-{kind}.npz"))) >= MOST:
         return None
     path = folder / f"{name}-{iteration.iteration:03d}-{kind}.npz"
     anchor = standing_anchor(robot)
@@ -101,10 +99,10 @@ def keep(
     variant = None if net is None else variant_of(net)
     about = {
         "name": name,
-        "iteration": iteration.iteration,
+        "iteration": int(iteration.iteration),
         "reason": iteration.reason,
         "net": variant and {"variant": variant.name, "hidden": variant.widths(net)},
-        "config": asdict(config),
+        "config": config.as_table(),
         "description": to_table(robot.description),
         "environment": environment(),
     }
@@ -130,16 +128,18 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         description = from_table(f"{path}: description", Description, about.get("description", {}))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: settings that this version does not know: {error}") from error
+    config = TuneConfig.from_table(f"{path}: config", about.get("config"))
+    terms = {term.name: none for term in config.loss}
     like = Dump(
         load_robot()._replace(description=description),
         nominal(),
         Command(np.zeros(0), np.zeros((0, 2)), np.zeros(0)),
         Anchor(np.zeros(3), none, none),
         params,
-        Evaluation(none, Losses(none, none, none), nominal(), none, none),
+        Evaluation(none, terms, nominal(), none, none),
     )
     dump, _ = load_tree(path, like, kind=_KIND)
-    return dump, from_table(f"{path}: config", TuneConfig, about.get("config")), about
+    return dump, config, about
 
 
 _walk = jax.jit(rollout, static_argnums=0)
@@ -169,7 +169,7 @@ def again(path: Path) -> Replayed:
         name=about["name"],
         iteration=about["iteration"],
         recorded=_summary(about["reason"], dump.seen),
-        again=_summary(refusal(config, evaluation), evaluation),
+        again=_summary(rejection_reason(config, evaluation), evaluation),
         first=_first(config, walked),
         same=all(jax.tree.leaves(same)),
         changed={
@@ -184,9 +184,7 @@ def _summary(reason: str, evaluation: Evaluation) -> dict[str, Any]:
     gradient = np.max([np.max(np.abs(g)) for g in jax.tree.leaves(evaluation.gradient)])
     numbers = {
         "loss": evaluation.loss,
-        "L_Eul": evaluation.parts.euler,
-        "L_pos": evaluation.parts.position,
-        "L_ctrl": evaluation.parts.control,
+        **evaluation.terms,
         "gradient": gradient,  # its largest entry
         "fallen": evaluation.fallen,
         "residual": evaluation.residual,

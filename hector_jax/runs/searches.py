@@ -15,7 +15,7 @@ from hector_jax.core.tree_file import tree_hash
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.search import cmaes as searching
-from hector_jax.search.cmaes import Found, Generation, SearchConfig, best
+from hector_jax.search.cmaes import Generation, SearchConfig, SearchResult, best
 from hector_jax.sim.engine import Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
@@ -74,7 +74,7 @@ def search(
     engine: Engine,
     folder: Path,
     own: Mapping[str, Command] | None = None,
-) -> dict[str, Found]:
+) -> dict[str, SearchResult]:
     """CMA-ES on the high-fidelity simulator, taking up the records under `folder`.
 
     Args:
@@ -121,4 +121,6 @@ def search(
                 "lowest L: " + ", ".join(lowest) if done else "compiling",
             )
 
-        return searching.search(config, starts, walk, folder, about, on_generation)
+        return searching.search(
+            config, starts, walk, folder=folder, about=about, on_generation=on_generation
+        )

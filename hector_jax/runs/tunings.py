@@ -30,9 +30,10 @@ from hector_jax.runs.journal import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.tuning import difftune, measured
-from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, Tuning
-from hector_jax.tuning.loss import Losses
+from hector_jax.tuning import difftune, evaluate, measured
+from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -67,11 +68,11 @@ def _stored(tuned: Tuned) -> Any:
     return Tuned(tuned.tuning._replace(history=history), tuned.commit)
 
 
-def _stored_like(_: Any) -> Any:
+def _stored_like(loss: Loss, _: Any) -> Any:
     none, text = np.zeros(0), np.array("")
     rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), nominal())
-    seen = Evaluation(none, Losses(none, none, none), rows, none, none)
-    history: Any = Iteration(none, rows, seen, none, np.zeros(0, "U1"), none)  # pyright: ignore
+    seen = Evaluation(none, {term.name: none for term in loss}, rows, none, none)
+    history: Any = Iteration(none, rows, seen, none, none)
     return Tuned(Tuning(history, nominal(), nominal(), text), text)  # pyright: ignore
 
 
@@ -79,14 +80,7 @@ def _restored(stored: Any) -> Tuned:
     """What `_stored` was given."""
     tuning, rows = stored.tuning, stored.tuning.history
     history = [
-        Iteration(
-            int(rows.iteration[i]),
-            *jax.tree.map(lambda x, i=i: np.asarray(x[i]), (rows.weights, rows.evaluation)),
-            accepted=bool(rows.accepted[i]),
-            reason=str(rows.reason[i]),
-            step=float(rows.step[i]),
-        )
-        for i in range(len(rows.iteration))
+        jax.tree.map(lambda x, i=i: np.asarray(x[i]), rows) for i in range(len(rows.iteration))
     ]
     tuning = Tuning(history, tuning.ten, tuning.converged, str(tuning.stop))
     return Tuned(tuning, str(stored.commit))
@@ -226,7 +220,8 @@ def tune(
         for name, tuning in _tunings(pool, config, robot, start, asked, title, note):
             yield name, _stored(Tuned(tuning, commit))
 
-    stored = cached(paths, make, like=_stored_like, kind=_KIND, robot=robot)
+    like = partial(_stored_like, config.loss)
+    stored = cached(paths, make, like=like, kind=_KIND, robot=robot)
     tuned = {name: _restored(one) for name, one in stored.items()}
     if journal is not None:
         journal.write({name: one.tuning.history for name, one in tuned.items()})
@@ -295,7 +290,7 @@ def tune_measured(
                 weights,
                 lambda trial: list(pool.map(job, repeat(trial), plants)),
                 lambda iteration: tell(
-                    iteration.iteration,
+                    int(iteration.iteration),
                     config.iterations,
                     f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6",
                 ),
@@ -303,17 +298,20 @@ def tune_measured(
         yield "walks", _stored(Tuned(tuning, commit))
 
     paths = {"walks": folder / f"tuning-walks-{key}.npz"}
-    return _restored(cached(paths, make, like=_stored_like, kind=_KIND, robot=robot)["walks"])
+    like = partial(_stored_like, config.loss)
+    return _restored(cached(paths, make, like=like, kind=_KIND, robot=robot)["walks"])
 
 
-def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> Losses:
+def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     anchor = standing_anchor(robot)
     effect = network.effect_of(problem.params, config.rollout.walk.gait)
     each = [
-        difftune.gradient_norms(config, robot, nominal(robot), command, anchor, effect)
+        evaluate.gradient_norms(
+            config.rollout, robot, nominal(robot), command, anchor, effect, config.loss
+        )
         for command in problem.commands
     ]
-    return jax.tree.map(lambda *x: np.mean(x, axis=0), *jax.device_get(each))
+    return jax.tree.map(lambda *x: float(np.mean(x)), *each)
 
 
 def gradient_norms(
@@ -321,7 +319,7 @@ def gradient_norms(
     config: TuneConfig,
     robot: Robot,
     problems: Mapping[str, Problem],
-) -> dict[str, Losses]:
+) -> dict[str, dict[str, float]]:
     """Norms of the gradients of the loss's parts at nominal weights, means over the commands."""
     with bar("norms of the gradients") as tell:
         running = {

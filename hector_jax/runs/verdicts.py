@@ -27,7 +27,7 @@ from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 _CODE = ("sim.walk", "runs.metrics")  # modules that decide the numbers, for `content_key`
@@ -86,18 +86,18 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
-def _judged(config: LossConfig, walk: Trajectory, commit: str) -> JudgedWalk:
+def _judged(config: Loss, walk: Trajectory, commit: str) -> JudgedWalk:
     up = int(np.sum(~np.asarray(walk.fallen)))
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
     upright = np.asarray(up * float(walk.period))
     return JudgedWalk(metrics.score(config, walk), upright, last, commit)
 
 
-def _like(with_walk: bool) -> Any:
+def _like(loss: Loss, with_walk: bool) -> Any:
     """Layout of the artefact of one walk, with its trajectory or without."""
     walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like().trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
-    one: Any = JudgedWalk(metrics.score_like(), np.zeros(()), last, np.array(""))  # pyright: ignore
+    one: Any = JudgedWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
     return one, walk if with_walk else None
 
 
@@ -157,9 +157,9 @@ def judge(
     else:
         paths = {}
         for case, job in jobs.items():
-            key = content_key(walk_config, config.loss, robot, job, code=_CODE)
+            key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
             paths[case] = _path(folder, case, key, with_walk(case))
-        like = lambda case: _like(with_walk(case))  # noqa: E731
+        like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
         found = cached(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in found.items()}
     return Judged(

@@ -1,1 +1,1 @@
-"""Searches that only walk: CMA-ES and those it is compared with."""
+"""Search on walks, without derivatives: CMA-ES."""

@@ -14,6 +14,7 @@ would otherwise wait in every tick for the slowest problem on any device.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -28,8 +29,9 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Evaluation, Progress, Stop, TuneConfig
-from hector_jax.tuning.loss import Losses, LossWeights
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Stop, TuneConfig, TuneState
+from hector_jax.tuning.evaluate import Evaluation, evaluate
+from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.rollout import Variation
 
 AXIS = "problems"
@@ -42,8 +44,8 @@ class Scenario(NamedTuple):
     command: Command
     anchor: Anchor
     effect: Int[Array, "*batch"]  # which of the batch's phis
-    alpha: LossWeights
-    scale: Float[Array, "*batch"]  # the loss is divided by it
+    loss: Loss  # its weights with the same leading axes
+    scale: Float[Array, "*batch"]  # of the loss, which is divided by it
     variation: Variation | None = None
 
 
@@ -55,16 +57,6 @@ class Problem(NamedTuple):
     tail: Float[Array, "*batch"]  # share of the worst scenarios that count: 1 mean, 0 worst alone
 
 
-class Course(NamedTuple):
-    """What each iteration did, (problems, iterations + 1); not finite or zero after the end."""
-
-    weights: Weights
-    loss: Float[np.ndarray, "problems iterations"]
-    parts: Losses
-    reason: Int[np.ndarray, "problems iterations"]  # a `difftune.Reason`
-    share: Float[np.ndarray, "problems iterations"]  # of the full step; of the start 1
-
-
 class Tunings(NamedTuple):
     """A batch of tunings, problems first."""
 
@@ -73,7 +65,7 @@ class Tunings(NamedTuple):
     loss: Float[np.ndarray, " problems"]  # of the converged weights
     stop: Int[np.ndarray, " problems"]  # a `difftune.Stop`
     iterations: Int[np.ndarray, " problems"]  # rollouts behind each, the start not counted
-    course: Course
+    history: Iteration  # (problems, iterations + 1); zero after the end
 
 
 Tree = TypeVar("Tree")
@@ -128,27 +120,27 @@ def _evaluate(
 
     def walk(scenario: Scenario) -> Evaluation:
         which = 0 if single else scenario.effect
-        found = difftune.evaluate(
+        found = evaluate(
             config.rollout,
             robot,
             weights,
             scenario.command,
             scenario.anchor,
             jax.tree.map(lambda leaf: leaf[which], effects),
-            scenario.alpha,
+            scenario.loss,
             scenario.variation,
         )
-        loss, parts, gradient = jax.tree.map(
-            lambda x: x / scenario.scale, (found.loss, found.parts, found.gradient)
+        loss, terms, gradient = jax.tree.map(
+            lambda x: x / scenario.scale, (found.loss, found.terms, found.gradient)
         )
-        return found._replace(loss=loss, parts=parts, gradient=gradient)
+        return found._replace(loss=loss, terms=terms, gradient=gradient)
 
     found = _over(lanes, walk, problem.scenarios)
     by = tail_weights(found.loss, problem.tail)
-    loss, parts, gradient = jax.tree.map(
-        lambda x: jnp.tensordot(by, x, axes=1), (found.loss, found.parts, found.gradient)
+    loss, terms, gradient = jax.tree.map(
+        lambda x: jnp.tensordot(by, x, axes=1), (found.loss, found.terms, found.gradient)
     )
-    return Evaluation(loss, parts, gradient, jnp.max(found.fallen), jnp.max(found.residual))
+    return Evaluation(loss, terms, gradient, jnp.max(found.fallen), jnp.max(found.residual))
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -159,41 +151,39 @@ def _advance(
     robot: Robot,
     effects: jax.tree_util.Partial,
     problems: Problem,
-    progress: Progress,
-) -> tuple[Progress, Course]:
+    states: TuneState,
+) -> tuple[TuneState, Iteration]:
     """Up to PER_CALL iterations of each problem, and what they did."""
 
-    def tune(robot: Robot, effects: jax.tree_util.Partial, asked: tuple[Problem, Progress]):
-        problem, progress = asked
+    def tune(robot: Robot, effects: jax.tree_util.Partial, one: tuple[Problem, TuneState]):
+        problem, begin = one
 
-        def step(progress: Progress) -> tuple[Progress, Course]:
-            found = _evaluate(config, lanes, robot, effects, problem, progress.trial)
-            then, reason = difftune.update(config, progress, found)
-            return then, Course(progress.trial, found.loss, found.parts, reason, progress.share)
+        def step(state: TuneState) -> tuple[TuneState, Iteration]:
+            evaluation = _evaluate(config, lanes, robot, effects, problem, state.trial)
+            return difftune.update(config, state, evaluation)
 
-        def note(state):
-            progress, course, row = state
-            progress, told = step(progress)
-            course = jax.tree.map(lambda kept, x: kept.at[row].set(x), course, told)
-            return progress, course, row + 1
+        def record(carry: tuple) -> tuple:
+            state, history, row = carry
+            state, iteration = step(state)
+            history = jax.tree.map(lambda rows, x: rows.at[row].set(x), history, iteration)
+            return state, history, row + 1
 
-        shapes = jax.eval_shape(step, progress)[1]
+        shapes = jax.eval_shape(step, begin)[1]
         empty = jax.tree.map(lambda x: jnp.zeros((PER_CALL, *x.shape), x.dtype), shapes)
-        going = lambda state: (state[0].stop == Stop.GOING) & (state[2] < PER_CALL)  # noqa: E731
-        progress, course, _ = jax.lax.while_loop(going, note, (progress, empty, 0))
-        return progress, course
+        going = lambda carry: (carry[0].stop == Stop.GOING) & (carry[2] < PER_CALL)  # noqa: E731
+        return jax.lax.while_loop(going, record, (begin, empty, 0))[:2]
 
-    def share(robot, effects, problems, progress):
-        return _over(lanes, partial(tune, robot, effects), (problems, progress))
+    def on_device(robot, effects, problems, states):
+        return _over(lanes, partial(tune, robot, effects), (problems, states))
 
     whole, split = PartitionSpec(), PartitionSpec(AXIS)
     return jax.shard_map(
-        share,
+        on_device,
         mesh=mesh,
         in_specs=(whole, whole, split, split),
         out_specs=split,
         check_vma=False,
-    )(robot, effects, problems, progress)
+    )(robot, effects, problems, states)
 
 
 def _place(mesh: Mesh, tree: Any) -> Any:
@@ -222,7 +212,7 @@ def tune_batch(
     """Tune all problems of a batch.
 
     Args:
-        config: how; its loss weights are not read, those of the scenarios are.
+        config: how; its loss is not read, those of the scenarios are.
         robot: the body that the controllers believe in.
         problems: stacked, see `stack`; the same on every host.
         effects: phis stacked likewise, of which the scenarios name theirs by number.
@@ -239,33 +229,34 @@ def tune_batch(
     """
     devices = jax.devices() if devices is None else list(devices)
     lanes = lanes_of(devices[0].platform) if lanes is None else lanes
-    count = _checked(config, problems, effects)
+    count = _check_problems(config, problems, effects)
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
-    progress = jax.tree.map(np.asarray, jax.vmap(partial(difftune.init, config))(problems.start))
+    config = replace(config, loss=PAPER_LOSS)  # the scenarios' counts: no program for each
+    states = jax.tree.map(np.asarray, jax.vmap(partial(difftune.init, config))(problems.start))
     # what fills the last device up has ended before it begins
     rows = np.minimum(np.arange(math.ceil(count / len(devices)) * len(devices)), count - 1)
-    filled, progress = jax.tree.map(lambda x: x[rows], (problems, progress))
-    progress.stop[count:] = Stop.LIMIT
-    filled, progress = _place(mesh, filled), _place(mesh, progress)
+    filled, states = jax.tree.map(lambda x: x[rows], (problems, states))
+    states.stop[count:] = Stop.LIMIT
+    filled, states = _place(mesh, filled), _place(mesh, states)
 
-    courses, left = [], count
+    histories, left = [], count
     tell(0, count, "compiling")
     while left:
-        progress, course = _advance(config, lanes, mesh, robot, effects, filled, progress)
-        stop, loss = _fetch((progress.stop, progress.loss))
-        courses.append(_fetch(course))
+        states, history = _advance(config, lanes, mesh, robot, effects, filled, states)
+        stop, loss = _fetch((states.stop, states.loss))
+        histories.append(_fetch(history))
         left = int(np.sum(stop[:count] == Stop.GOING))
         tell(count - left, count, f"median L {np.median(loss[:count]):.4g}")
-    found = jax.tree.map(lambda x: x[:count], _fetch(progress))
-    course = jax.tree.map(
-        lambda *parts: np.concatenate(parts, axis=1)[:count, : config.iterations + 1], *courses
+    found = jax.tree.map(lambda x: x[:count], _fetch(states))
+    history = jax.tree.map(
+        lambda *parts: np.concatenate(parts, axis=1)[:count, : config.iterations + 1], *histories
     )
-    return Tunings(found.ten, found.best, found.loss, found.stop, found.count - 1, course)
+    return Tunings(found.ten, found.best, found.loss, found.stop, found.count - 1, history)
 
 
-def _checked(config: TuneConfig, problems: Problem, effects: jax.tree_util.Partial) -> int:
-    """Number of the problems."""
+def _check_problems(config: TuneConfig, problems: Problem, effects: jax.tree_util.Partial) -> int:
+    """Check the problems of a batch; returns their number."""
     scenarios, tail = problems.scenarios, np.asarray(problems.tail)
     if tail.ndim != 1 or not len(tail):
         raise ValueError(f"Problem.tail must be stacked, one per problem, got shape {tail.shape}")

@@ -3,7 +3,7 @@
 theta <- P_Theta(theta - beta theta g), with g the gradient in log-weights, divided by its largest
 magnitude inside Q and inside R: a weight moves by at most beta_Q or beta_R of itself, whatever the
 size of the loss. A step that ends in a fall, a bad solve or a number that is not finite is refused:
-the weights go back, the step is halved and the refusal is told.
+the weights go back, the step is halved and the rejection_reason is told.
 
 Two results come out of one run: the weights after the paper's `ten` iterations, each accepted
 unless it is refused, and the `converged` ones, for which steps that raise the loss are halved too
@@ -14,7 +14,7 @@ from Python, one iteration after the other; `batch` compiles them into its loop 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -25,12 +25,13 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import Weights, bounds, weights_to_vector
+from hector_jax.control.weights import Weights, bounds
 from hector_jax.core.inputs import InputError
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, from_table
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.loss import LossConfig, Losses, LossWeights, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
+from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
+from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, check_loss, with_alphas
+from hector_jax.tuning.rollout import RolloutConfig
 
 PAPER_ITERATIONS = 10
 
@@ -40,7 +41,7 @@ class TuneConfig:
     """How the weights are tuned."""
 
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
-    loss: LossConfig = LossConfig()
+    loss: tuple = PAPER_LOSS  # of `LossTerm`
     beta_q: float = 0.05  # largest relative step of a weight in Q
     beta_r: float = 0.08  # and in R
     update: str = "relative"  # or "literal": the paper's theta - beta dL/dtheta
@@ -63,22 +64,31 @@ class TuneConfig:
             smallest_step=POSITIVE,
             residual=POSITIVE,
         )
+        check_loss(self.loss)
+
+    def as_table(self) -> dict[str, Any]:
+        """The settings as JSON values; of the loss its weights."""
+        return asdict(replace(self, loss=PAPER_LOSS)) | {"loss": alphas(self.loss)}
+
+    @classmethod
+    def from_table(cls, where: str, table: Any, loss: Loss = PAPER_LOSS) -> "TuneConfig":
+        """Settings of JSON values, with the terms of a loss.
+
+        Raises:
+            InputError: one line with `where`, for settings that there are not.
+        """
+        if not isinstance(table, dict) or not isinstance(table.get("loss", {}), dict):
+            return from_table(where, cls, table)  # refuses it
+        rest = {name: value for name, value in table.items() if name != "loss"}
+        try:
+            weighted = with_alphas(table.get("loss", {}), loss)
+        except InputError as error:
+            raise InputError(f"{where}: loss: {error}") from None
+        return replace(from_table(where, cls, rest), loss=weighted)
 
 
-class Evaluation(NamedTuple):
-    """One rollout of a weight set on the model, with the gradient of its loss."""
-
-    loss: Float[Array, "*batch"]
-    parts: Losses
-    gradient: Weights  # dL/dtheta
-    fallen: Float[Array, "*batch"]  # share of the ticks after a fall
-    residual: Float[
-        Array, "*batch"
-    ]  # worst of the rollout; infinite where a minimiser is not unique
-
-
-class Reason(IntEnum):
-    """Why an iteration was refused."""
+class StepStatus(IntEnum):
+    """Whether an iteration was accepted, or why it was rejected."""
 
     ACCEPTED = 0
     NOT_FINITE = 1
@@ -97,11 +107,11 @@ class Stop(IntEnum):
     BAD_START = 4  # refused
 
 
-class Progress(NamedTuple):
+class TuneState(NamedTuple):
     """Where a tuning stands between two rollouts: the state of the rule."""
 
     trial: Weights  # to be evaluated next
-    share: Float[Array, "*batch"]  # of the full step that leads from `best` to `trial`
+    step_scale: Float[Array, "*batch"]  # of the full step that leads from `best` to `trial`
     count: Int[Array, "*batch"]  # iteration of the trial; the start is 0
     best: Weights  # the last that were accepted
     loss: Float[Array, "*batch"]  # theirs
@@ -112,14 +122,23 @@ class Progress(NamedTuple):
 
 
 class Iteration(NamedTuple):
-    """What one iteration did; a line of metrics.jsonl."""
+    """An iteration of a tuning; with leading axes, a history of them."""
 
-    iteration: int
+    iteration: Int[Array, "*batch"]  # its number; the start is 0
     weights: Weights
     evaluation: Evaluation
-    accepted: bool
-    reason: str  # why it was refused; empty when accepted
-    step: float  # share of the full step that led here
+    status: Int[Array, "*batch"]  # a `StepStatus`
+    step_scale: Float[Array, "*batch"]  # of the full step that led here; 0 at the start
+
+    @property
+    def accepted(self) -> Any:
+        """Whether the weights became the best so far."""
+        return self.status == StepStatus.ACCEPTED
+
+    @property
+    def reason(self) -> str:
+        """Why the weights of one iteration were rejected; empty when accepted."""
+        return _in_words(StepStatus(int(self.status)), self.evaluation)
 
 
 class Tuning(NamedTuple):
@@ -131,41 +150,6 @@ class Tuning(NamedTuple):
     stop: str  # why it ended
 
 
-def evaluate(
-    config: RolloutConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-    alpha: LossWeights,
-    variation: Variation | None = None,
-) -> Evaluation:
-    """Loss of a weight set on the model and its gradient, in one program.
-
-    Args:
-        config, robot, weights, command, anchor, effect, variation: see `rollout`.
-        alpha: weights of the parts of the loss.
-
-    Source: Eq. 9, 11.
-    """
-
-    def objective(weights: Weights) -> tuple[Array, tuple]:
-        trajectory = rollout(config, robot, weights, command, anchor, effect, variation)
-        parts = losses(trajectory)
-        seen = parts, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
-        return total(alpha, parts), seen
-
-    (loss, (parts, fallen, residual)), gradient = jax.value_and_grad(objective, has_aux=True)(
-        weights
-    )
-    return Evaluation(loss, parts, gradient, fallen, residual)
-
-
-_evaluate = jax.jit(evaluate, static_argnums=0)
-# once for a rollout: new weights, commands, nets and loss weights need no compilation
-
-
 def tune_step(
     config: TuneConfig,
     robot: Robot,
@@ -174,9 +158,8 @@ def tune_step(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> Evaluation:
-    """`evaluate` with the rollout and the loss weights of a tuning, compiled."""
-    alpha = config.loss.as_arrays()
-    return _evaluate(config.rollout, robot, weights, command, anchor, effect, alpha)
+    """`evaluate` with the rollout and the loss of a tuning, compiled."""
+    return evaluate_jit(config.rollout, robot, weights, command, anchor, effect, config.loss)
 
 
 def relative_step(beta_q: float, beta_r: float) -> optax.GradientTransformation:
@@ -213,29 +196,29 @@ def _mean_over_feet(tree: Weights) -> Weights:
 
 
 def step_weights(
-    config: TuneConfig, weights: Weights, gradient: Weights, share: float | Float[Array, ""]
+    config: TuneConfig, weights: Weights, gradient: Weights, step_scale: float | Float[Array, ""]
 ) -> Weights:
-    """Weights after `share` of a full step downhill, projected onto the box."""
+    """Weights after `step_scale` of a full step downhill, projected onto the box."""
     if config.tie_feet:
         gradient = _mean_over_feet(gradient)
     optimiser = _optimiser(config)
     updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
-    moved = optax.apply_updates(weights, jax.tree.map(lambda u: share * u, updates))
+    moved = optax.apply_updates(weights, jax.tree.map(lambda u: step_scale * u, updates))
     return optax.projections.projection_box(moved, *bounds())
 
 
-def believed(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
-    """Whether an evaluation is to be believed: the `Reason` why not."""
+def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
+    """`StepStatus` of an evaluation by itself, whatever the loss was before."""
     # squares, because a gradient near the largest number overflows where a step is made of it
     squares = [jnp.square(x) for x in (evaluation.loss, *jax.tree.leaves(evaluation.gradient))]
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in squares]))
     solved = jnp.asarray(evaluation.residual) <= config.residual
-    reason = jnp.where(solved, Reason.ACCEPTED, Reason.UNSOLVED)
-    reason = jnp.where(jnp.asarray(evaluation.fallen) > 0, Reason.FELL, reason)
-    return jnp.where(finite, reason, Reason.NOT_FINITE).astype(jnp.int32)
+    reason = jnp.where(solved, StepStatus.ACCEPTED, StepStatus.UNSOLVED)
+    reason = jnp.where(jnp.asarray(evaluation.fallen) > 0, StepStatus.FELL, reason)
+    return jnp.where(finite, reason, StepStatus.NOT_FINITE).astype(jnp.int32)
 
 
-def init(config: TuneConfig, weights: Weights, count: int = 0) -> Progress:
+def init(config: TuneConfig, weights: Weights, count: int = 0) -> TuneState:
     """A tuning before its first rollout, which is iteration `count`.
 
     With `tie_feet` both feet start from the geometric mean of their weights in R.
@@ -246,9 +229,9 @@ def init(config: TuneConfig, weights: Weights, count: int = 0) -> Progress:
         tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights)))
         # weights that are equal stay so to the last bit
         weights = jax.tree.map(lambda w, t: jnp.where(equal, w, t), weights, tied)
-    return Progress(
+    return TuneState(
         trial=weights,
-        share=jnp.asarray(1.0),
+        step_scale=jnp.asarray(1.0),
         count=jnp.asarray(count, jnp.int32),
         best=weights,
         loss=jnp.asarray(jnp.inf, float),  # typed as later ones, or `update` is compiled again
@@ -260,67 +243,77 @@ def init(config: TuneConfig, weights: Weights, count: int = 0) -> Progress:
 
 
 def update(
-    config: TuneConfig, progress: Progress, evaluation: Evaluation
-) -> tuple[Progress, Int[Array, ""]]:
-    """What follows from the rollout of the trial: the next trial, and why this one was refused.
+    config: TuneConfig, state: TuneState, evaluation: Evaluation
+) -> tuple[TuneState, Iteration]:
+    """Accept or reject the trial by its evaluation; returns the next state and the iteration.
 
     The first `PAPER_ITERATIONS` are accepted whatever the loss; later ones must lower it. A
-    refusal halves the step, an acceptance doubles it up to the full one. After the paper's
+    rejection halves the step, an acceptance doubles it up to the full one. After the paper's
     iterations the tuning stops where the step has become too small or `patience` accepted
     iterations gained less than `gain`.
     """
-    count, start = progress.count, jnp.isinf(progress.loss)  # nothing was accepted yet
+    count, start = state.count, jnp.isinf(state.loss)  # nothing was accepted yet
     late = count > PAPER_ITERATIONS
-    reason = believed(config, evaluation)
-    rose = late & ~(evaluation.loss < progress.loss)
-    reason = jnp.where((reason == Reason.ACCEPTED) & rose, Reason.ROSE, reason)
-    accepted = reason == Reason.ACCEPTED
+    status = step_status(config, evaluation)
+    rose = late & ~(evaluation.loss < state.loss)
+    status = jnp.where((status == StepStatus.ACCEPTED) & rose, StepStatus.ROSE, status)
+    accepted = status == StepStatus.ACCEPTED
 
-    def kept(new: Any, old: Any) -> Any:
+    def if_accepted(new: Any, old: Any) -> Any:
         return jax.tree.map(lambda x, y: jnp.where(accepted, x, y), new, old)
 
-    best = kept(progress.trial, progress.best)
-    gradient = kept(evaluation.gradient, progress.gradient)
-    recent = jnp.append(jnp.asarray(evaluation.loss), progress.recent[:-1])
-    recent = kept(recent, progress.recent)
-    share = jnp.where(accepted, jnp.minimum(1.0, 2.0 * progress.share), progress.share / 2.0)
+    best = if_accepted(state.trial, state.best)
+    gradient = if_accepted(evaluation.gradient, state.gradient)
+    recent = jnp.append(jnp.asarray(evaluation.loss), state.recent[:-1])
+    recent = if_accepted(recent, state.recent)
+    scale = jnp.where(accepted, jnp.minimum(1.0, 2.0 * state.step_scale), state.step_scale / 2.0)
 
     little = recent[0] > (1 - config.gain) * recent[-1]  # false before there are enough
     stop = jnp.where(count >= config.iterations, Stop.LIMIT, Stop.GOING)
     stop = jnp.where(late & little, Stop.NO_GAIN, stop)
-    stop = jnp.where(late & (share < config.smallest_step), Stop.SMALL_STEP, stop)
+    stop = jnp.where(late & (scale < config.smallest_step), Stop.SMALL_STEP, stop)
     stop = jnp.where(start & ~accepted, Stop.BAD_START, stop)
-    return Progress(
-        trial=step_weights(config, best, gradient, share),
-        share=share,
+    after = TuneState(
+        trial=step_weights(config, best, gradient, scale),
+        step_scale=scale,
         count=count + 1,
         best=best,
-        loss=kept(evaluation.loss, progress.loss),
+        loss=if_accepted(evaluation.loss, state.loss),
         gradient=gradient,
         recent=recent,
-        ten=jax.tree.map(lambda x, y: jnp.where(late, y, x), best, progress.ten),
+        ten=jax.tree.map(lambda x, y: jnp.where(late, y, x), best, state.ten),
         stop=stop.astype(jnp.int32),
-    ), reason.astype(jnp.int32)
+    )
+    led = jnp.where(start, 0.0, state.step_scale)
+    return after, Iteration(count, state.trial, evaluation, status.astype(jnp.int32), led)
 
 
-def _in_words(config: TuneConfig, reason: Reason, evaluation: Evaluation) -> str:
-    return {
-        Reason.ACCEPTED: "",
-        Reason.NOT_FINITE: "loss or gradient not finite",
-        Reason.FELL: "the robot fell",
-        Reason.UNSOLVED: (
-            f"QP residual {float(evaluation.residual):.1e} above {config.residual:.0e}"
-        ),
-        Reason.ROSE: "the loss rose",
-    }[reason]
+REASONS = {
+    StepStatus.NOT_FINITE: "loss or gradient not finite",
+    StepStatus.FELL: "the robot fell",
+    StepStatus.UNSOLVED: "QP residual",
+    StepStatus.ROSE: "the loss rose",
+}
+"""How the reasons of rejections begin."""
 
 
-def refusal(config: TuneConfig, evaluation: Evaluation) -> str:
-    """Why an evaluation is not to be believed; empty when it is."""
-    return _in_words(config, Reason(int(believed(config, evaluation))), evaluation)
+def _in_words(status: StepStatus, evaluation: Evaluation) -> str:
+    residual = f" {float(evaluation.residual):.1e} too large"
+    return REASONS.get(status, "") + (residual if status == StepStatus.UNSOLVED else "")
 
 
-def stopped(config: TuneConfig, stop: Stop) -> str:
+def status_of(reason: str) -> StepStatus:
+    """Status of an iteration whose reason is known, such as from a file."""
+    found = (status for status, text in REASONS.items() if reason.startswith(text))
+    return next(found, StepStatus.NOT_FINITE if reason else StepStatus.ACCEPTED)
+
+
+def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:
+    """Why an evaluation cannot be used; empty when it can."""
+    return _in_words(StepStatus(int(step_status(config, evaluation))), evaluation)
+
+
+def stop_reason(config: TuneConfig, stop: Stop) -> str:
     """Why a tuning ended, in words."""
     return {
         Stop.GOING: "not ended",
@@ -366,67 +359,35 @@ def tune(
 def descend(
     config: TuneConfig,
     weights: Weights,
-    look: Callable[[Weights], Evaluation],
+    evaluate: Callable[[Weights], Evaluation],
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
     first: int = 0,
 ) -> Tuning:
-    """The rule, driven from Python: whatever `look` finds of weights is stepped down.
+    """The rule, driven from Python: step down whatever loss `evaluate` finds.
 
     Args:
         config: how.
         weights: where to start.
-        look: loss and gradient of weights.
+        evaluate: loss and gradient of weights.
         on_iteration: called after each iteration.
         first: number of the first one; from the paper's ten on every step has to lower the loss.
 
     Raises:
-        InputError: the evaluation of the starting weights is not to be believed; `on_iteration` has
-            been told of it.
+        InputError: the starting weights were rejected; `on_iteration` was called before.
     """
     history: list[Iteration] = []
-    progress = init(config, weights, first)
-    while progress.stop == Stop.GOING:
+    state = init(config, weights, first)
+    while state.stop == Stop.GOING:
         # copies, because a view would keep the device's array for as long as the history
-        trial = jax.tree.map(np.array, progress.trial)
-        found = jax.tree.map(np.array, look(trial))
-        step = float(progress.share) if history else 0.0
-        progress, code = update(config, progress, found)
-        reason = _in_words(config, Reason(int(code)), found)
-        history.append(Iteration(first + len(history), trial, found, not reason, reason, step))
+        trial = jax.tree.map(np.array, state.trial)
+        state, iteration = update(config, state, jax.tree.map(np.array, evaluate(trial)))
+        history.append(jax.tree.map(np.array, iteration))
         on_iteration(history[-1])
-        if progress.stop == Stop.BAD_START:
-            raise InputError(f"the starting weights cannot be tuned from: {reason}")
-    stop = Stop(int(progress.stop))
-    words = stopped(config, stop)
-    if stop == Stop.SMALL_STEP and refusal(config, found):
-        words = f"{words}, the last refused: {reason}"
-    ten, converged = jax.tree.map(np.asarray, (progress.ten, progress.best))
+    stop, last = Stop(int(state.stop)), history[-1]
+    if stop == Stop.BAD_START:
+        raise InputError(f"the starting weights cannot be tuned from: {last.reason}")
+    words = stop_reason(config, stop)
+    if stop == Stop.SMALL_STEP and rejection_reason(config, last.evaluation):
+        words = f"{words}, the last refused: {last.reason}"
+    ten, converged = jax.tree.map(np.asarray, (state.ten, state.best))
     return Tuning(history, ten, converged, words)
-
-
-def gradient_norms(
-    config: TuneConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    anchor: Anchor,
-    effect: jax.tree_util.Partial,
-) -> Losses:
-    """Norms of the parts' gradients in log-weights, which the paper's footnote aligns."""
-
-    def norm(alpha: LossWeights) -> Float[Array, ""]:
-        found = _evaluate(config.rollout, robot, weights, command, anchor, effect, alpha)
-        logs = jax.tree.map(jnp.multiply, found.gradient, weights)
-        return jnp.linalg.norm(weights_to_vector(logs))
-
-    return Losses(*(norm(LossWeights(*alone)) for alone in np.eye(3)))
-
-
-def aligned(config: LossConfig, norms: Losses) -> LossConfig:
-    """Loss weights that bring the three gradients to the order of that of L_ctrl (footnote)."""
-    power = lambda ratio: float(10.0 ** np.round(np.log10(max(float(ratio), 1e-12))))  # noqa: E731
-    return replace(
-        config,
-        euler=power(norms.control / norms.euler),
-        position=power(norms.control / norms.position),
-    )

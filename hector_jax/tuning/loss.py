@@ -3,21 +3,26 @@
     L = alpha_1 sum |e - e_ref|^2 + alpha_2 sum |p - p_ref|^2 + sum |u_j - u_{j-1}|^2      over 1
     kHz samples
 
+A loss is a tuple of terms, each a function of a trajectory with a weight alpha; `PAPER_LOSS` has
+the three of the paper. A term of one's own goes into that tuple (docs/howto/loss.md): gradients,
+logs, tables and files go through the terms by name.
+
 A world that ticks slower weighs its tracking sums by the milliseconds a tick stands for; the
 smoothness counts the changes of the held command. A fall is a fall: every missing sample is charged
 the larger of the last error and a fixed one, and smoothness stops.
 """
 
-from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import add
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hector_jax.core.settings import NOT_NEGATIVE, check
+from hector_jax.core.inputs import InputError, did_you_mean, short_repr
+from hector_jax.core.settings import NOT_NEGATIVE
 from hector_jax.core.trajectory import Trajectory, Wrench
 
 SAMPLE = 1e-3  # [s] the rate at which the paper sums
@@ -25,40 +30,34 @@ FALL_POSITION = 0.5  # [m] least error charged after a fall
 FALL_EULER = 0.8  # [rad]
 
 
-class LossWeights(NamedTuple):
-    """Weights of the three parts as arrays, so that one program serves them all."""
+class LossTerm(NamedTuple):
+    """One term of the loss.
 
-    euler: Float[Array, "*batch"]  # alpha_1 [1/rad^2]
-    position: Float[Array, "*batch"]  # alpha_2 [1/m^2]
-    control: Float[Array, "*batch"]  # 1 in the paper
+    As a pytree it has one leaf, its weight: another weight needs no compilation, another function
+    does. In cache keys a function is known by its name.
+    """
 
+    name: str  # "L_Eul": in tables, logs and files; begins with L_
+    unit: str  # "rad^2"
+    weight: float  # alpha; an array in a batch
+    of: Callable[[Trajectory], Float[Array, ""]]  # the unweighted term of one walk
 
-@dataclass(frozen=True)
-class LossConfig:
-    """Weights of the parts."""
-
-    euler: float = 1e5  # alpha_1 [1/rad^2]
-    position: float = 2e5  # alpha_2 [1/m^2]
-
-    def __post_init__(self) -> None:
-        check(self, euler=NOT_NEGATIVE, position=NOT_NEGATIVE)
-
-    @property
-    def control(self) -> float:
-        """Weight of L_ctrl, by which the others are measured."""
-        return 1.0
-
-    def as_arrays(self) -> LossWeights:
-        """The weights as arguments of a compiled program."""
-        return LossWeights(*(np.asarray(getattr(self, name)) for name in LossWeights._fields))
+    def __repr__(self) -> str:
+        of = f"{self.of.__module__}.{self.of.__qualname__}"
+        return f"LossTerm({self.name!r}, {self.unit!r}, {self.weight!r}, {of})"
 
 
-class Losses(NamedTuple):
-    """Unweighted parts of the loss."""
+jax.tree_util.register_pytree_node(
+    LossTerm,
+    lambda term: ((term.weight,), (term.name, term.unit, term.of)),
+    lambda static, weight: LossTerm(*static[:2], *weight, static[2]),
+)
 
-    euler: Float[Array, "*batch"]  # L_Eul [rad^2]
-    position: Float[Array, "*batch"]  # L_pos [m^2]
-    control: Float[Array, "*batch"]  # L_ctrl [N^2 and (N m)^2]
+Loss = tuple[LossTerm, ...]
+"""What a walk costs: the sum of some terms, each times its weight."""
+
+Terms = dict[str, Float[Array, "*batch"]]
+"""A number for each term of a loss, by its name."""
 
 
 def _charged(
@@ -76,18 +75,37 @@ def _squared_changes(command: Wrench, fallen: Bool[Array, " T"]) -> Float[Array,
     return jnp.where(fallen[1:], 0.0, change)
 
 
-def losses(trajectory: Trajectory) -> Losses:
-    """Parts of the loss of one walk. Source: Eq. 11."""
-    trajectory = jax.tree.map(jnp.asarray, trajectory)  # MuJoCo's walks come as numpy
-    state, reference, fallen = trajectory.state, trajectory.reference, trajectory.fallen
-    euler = jnp.sum((state.euler - reference.euler) ** 2, axis=-1)
-    position = jnp.sum((state.position - reference.position) ** 2, axis=-1)
+def euler_loss(trajectory: Trajectory) -> Float[Array, ""]:
+    """Squared error of roll, pitch and yaw [rad^2], summed over 1 kHz samples."""
+    error = jnp.sum((trajectory.state.euler - trajectory.reference.euler) ** 2, axis=-1)
     samples = trajectory.period / SAMPLE
-    return Losses(
-        euler=samples * jnp.sum(_charged(euler, fallen, FALL_EULER)),
-        position=samples * jnp.sum(_charged(position, fallen, FALL_POSITION)),
-        control=jnp.sum(_squared_changes(trajectory.command, fallen)),
-    )
+    return samples * jnp.sum(_charged(error, trajectory.fallen, FALL_EULER))
+
+
+def position_loss(trajectory: Trajectory) -> Float[Array, ""]:
+    """Squared error of the centre of mass [m^2], summed over 1 kHz samples."""
+    error = jnp.sum((trajectory.state.position - trajectory.reference.position) ** 2, axis=-1)
+    samples = trajectory.period / SAMPLE
+    return samples * jnp.sum(_charged(error, trajectory.fallen, FALL_POSITION))
+
+
+def control_loss(trajectory: Trajectory) -> Float[Array, ""]:
+    """Squared changes of the commanded wrench [N^2 and (N m)^2], summed over a walk."""
+    return jnp.sum(_squared_changes(trajectory.command, trajectory.fallen))
+
+
+PAPER_LOSS: Loss = (
+    LossTerm("L_Eul", "rad^2", 1e5, euler_loss),
+    LossTerm("L_pos", "m^2", 2e5, position_loss),
+    LossTerm("L_ctrl", "N^2, (N m)^2", 1.0, control_loss),
+)
+"""The loss of the paper. Source: Eq. 11."""
+
+
+def losses(loss: Loss, trajectory: Trajectory) -> Terms:
+    """Unweighted terms of the loss of one walk. Source: Eq. 11."""
+    trajectory = jax.tree.map(jnp.asarray, trajectory)  # MuJoCo's walks come as numpy
+    return {term.name: term.of(trajectory) for term in loss}
 
 
 def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
@@ -97,20 +115,65 @@ def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
     return jnp.sum(jnp.where(switched, _squared_changes(trajectory.command, trajectory.fallen), 0))
 
 
-def total(weights: LossWeights | LossConfig, parts: Losses) -> Float[Array, "*batch"]:
-    """L of its parts. Source: Eq. 11.
+def total(loss: Loss, terms: Mapping[str, Any]) -> Float[Array, "*batch"]:
+    """L of its terms. Source: Eq. 11.
 
-    >>> total(LossConfig(), Losses(*map(jnp.asarray, (1.0, 2.0, 3e5)))).item()
+    >>> total(PAPER_LOSS, {"L_Eul": 1.0, "L_pos": 2.0, "L_ctrl": 3e5}).item()
     800000.0
     """
-    return (
-        weights.euler * parts.euler
-        + weights.position * parts.position
-        + weights.control * parts.control
-    )
+    return jnp.asarray(reduce(add, (term.weight * terms[term.name] for term in loss)))
 
 
-@partial(jax.jit, static_argnums=0)
-def loss_of(config: LossConfig, trajectory: Trajectory) -> Float[Array, ""]:
+@jax.jit
+def loss_of(loss: Loss, trajectory: Trajectory) -> Float[Array, ""]:
     """L of one walk. Source: Eq. 11."""
-    return total(config, losses(trajectory))
+    return total(loss, losses(loss, trajectory))
+
+
+def check_loss(loss: Loss) -> None:
+    """Check the terms of a loss.
+
+    Raises:
+        InputError: no term, two of one name, a name that does not begin with `L_`, or a weight that
+            is negative or not finite.
+    """
+    if not all(isinstance(term, LossTerm) for term in loss):
+        raise InputError(f"a loss must be a tuple of LossTerm, got {short_repr(loss)}")
+    names = [term.name for term in loss]
+    if not names or len(set(names)) < len(names) or not all(n.startswith("L_") for n in names):
+        raise InputError(f"a loss must have terms of unlike names L_..., got {short_repr(names)}")
+    for term in loss:
+        if not isinstance(term.weight, (int, float)) or term.weight not in NOT_NEGATIVE:
+            got = short_repr(term.weight)
+            raise InputError(f"weight of {term.name} must be a number of at least 0, got {got}")
+
+
+_KEYS = {"L_Eul": "euler", "L_pos": "position"}  # names of the weights in files
+
+
+def alphas(loss: Loss) -> dict[str, float]:
+    """Weights of a loss as JSON values, by the name that files have for them.
+
+    >>> alphas(PAPER_LOSS)
+    {'euler': 100000.0, 'position': 200000.0, 'L_ctrl': 1.0}
+    """
+    return {_KEYS.get(term.name, term.name): float(term.weight) for term in loss}
+
+
+def with_alphas(weights: Mapping[str, float], loss: Loss = PAPER_LOSS) -> Loss:
+    """A loss with other weights of some terms, each by the name of the term or its key in files.
+
+    Raises:
+        InputError: the loss has no such term, or a weight is negative or not finite.
+
+    >>> [term.weight for term in with_alphas({"L_Eul": 3.0, "position": 5.0})]
+    [3.0, 5.0, 1.0]
+    """
+    names = {key: term.name for term in loss for key in (term.name, _KEYS.get(term.name, ""))}
+    for key in weights:
+        if key not in names:
+            raise InputError(f"no term {key!r} in the loss{did_you_mean(key, names)}")
+    given = {names[key]: weight for key, weight in weights.items()}
+    found = tuple(t._replace(weight=given.get(t.name, t.weight)) for t in loss)
+    check_loss(found)
+    return found

@@ -21,14 +21,8 @@ from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.difftune import (
-    PAPER_ITERATIONS,
-    Evaluation,
-    Iteration,
-    TuneConfig,
-    Tuning,
-    descend,
-)
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend
+from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.online import MeasuredState, follow, init_trace
 
 

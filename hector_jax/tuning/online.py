@@ -33,9 +33,10 @@ from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.grfm.effect import HISTORY
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import sensitivity
-from hector_jax.tuning.difftune import Evaluation, Iteration, TuneConfig, refusal, step_weights
-from hector_jax.tuning.loss import losses
-from hector_jax.tuning.rollout import Carry
+from hector_jax.tuning.difftune import Iteration, TuneConfig, step_status, step_weights
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import Loss, losses
+from hector_jax.tuning.rollout import Carry, RolloutConfig
 from hector_jax.tuning.sensitivity import Sensitivities, Varied, no_tangents, step_sensitivities
 
 ESTIMATORS = ("carried", "cut", "model")
@@ -88,7 +89,8 @@ def _carry(anchor: Anchor, measured: MeasuredState, commands: Wrench) -> Carry:
 
 
 def window_gradient(
-    config: TuneConfig,
+    config: RolloutConfig,
+    loss: Loss,
     robot: Robot,
     command: Command,
     anchor: Anchor,
@@ -102,7 +104,8 @@ def window_gradient(
     """Loss of the ticks of a window and its gradient by the weights.
 
     Args:
-        config: controller and loss.
+        config: controller.
+        loss: terms and their weights.
         robot: nominal body.
         command, anchor: what was walked, from where.
         effect: phi, `Window -> Effect`; its Jacobian is used.
@@ -126,7 +129,7 @@ def window_gradient(
         if measured:
             carry = _carry(anchor, now, carry.commands)
         then, tangents, sample, columns = step_sensitivities(
-            config.rollout, robot, weights, command, effect, carry, tangents, tick
+            config, robot, weights, command, effect, carry, tangents, tick
         )
         if measured:
             fallen = has_fallen(after.state, *robot.description.limits)
@@ -140,14 +143,20 @@ def window_gradient(
         one, (start, trace.tangents), (ticks, weights, now, after)
     )
     walk, columns = _with_command_before(samples, columns, trace)
-    loss, gradient = sensitivity.gradient(config.loss, walk, columns)
+    value, gradient = sensitivity.gradient(loss, walk, columns)
     fallen, residual = jnp.mean(1.0 * samples.fallen), jnp.max(samples.residual)
-    found = Evaluation(loss, losses(walk), gradient, fallen, residual)
+    found = Evaluation(value, losses(loss, walk), gradient, fallen, residual)
     return Trace(last.commands, tangents), found
 
 
-follow = jax.jit(window_gradient, static_argnums=0, static_argnames="measured")
-"""`window_gradient`, compiled once per config."""
+_window_gradient = jax.jit(window_gradient, static_argnums=0, static_argnames="measured")
+
+
+def follow(
+    config: TuneConfig, robot: Robot, *walked: Any, measured: bool = True
+) -> tuple[Trace, Evaluation]:
+    """`window_gradient` with the rollout and the loss of a tuning, compiled."""
+    return _window_gradient(config.rollout, config.loss, robot, *walked, measured=measured)
 
 
 def _with_command_before(
@@ -229,9 +238,10 @@ def step_adaptation(
     if len(carry.used) == config.window:
         walked = carry.states, carry.used, tick - config.window
         trace, evaluation = _follow_window(config, robot, command, anchor, effect, trace, *walked)
-        reason = refusal(config.tune, evaluation)
-        iteration = Iteration(carry.count, carry.weights, evaluation, not reason, reason, carry.led)
-        if reason:
+        status = step_status(config.tune, evaluation)
+        row = carry.count, carry.weights, evaluation, status, carry.led
+        iteration = Iteration(*jax.tree.map(np.asarray, row))
+        if not iteration.accepted:
             scale, led, newest, sound = carry.scale / 2.0, 0.0, carry.sound, carry.sound
             trace = init_trace(anchor, state, last)
         else:

@@ -74,7 +74,7 @@ class Late(NamedTuple):
     """What acted in the last tick, world frame; of it a delayed effect has a share."""
 
     wrench: Wrench
-    legs: Load
+    swing_leg_load: Load
 
 
 class Carry(NamedTuple):
@@ -144,8 +144,42 @@ def _moved_by(
         velocity = state.velocity + jnp.cross(state.ang_velocity, arm)
         return state._replace(position=state.position + arm, velocity=velocity)
 
-    moved = srbm.step(body, seen_from(state, variation.com), wrench, feet, dt, mixed.legs)
+    moved = srbm.step(body, seen_from(state, variation.com), wrench, feet, dt, mixed.swing_leg_load)
     return seen_from(moved, -variation.com)
+
+
+def _respond(
+    effect: jax.tree_util.Partial,
+    state: State,
+    commands: Wrench,
+    contact: Bool[Array, "2"],
+    since_switch: Float[Array, ""],
+) -> Late:
+    """What acts on the body by phi, which sees and answers in the yaw frame."""
+    yaw = state.euler[2]
+    seen = Window(
+        commands=turn(commands, -yaw),
+        contact=contact,
+        since_switch=since_switch,
+        base=from_yaw_frame(state),
+    )
+    found = effect(seen)
+    return Late(turn(found.wrench, yaw), turn(found.legs, yaw))
+
+
+def _move(
+    robot: Robot,
+    carry: Carry,
+    acting: Late,
+    feet: Float[Array, "2 3"],
+    dt: float,
+    variation: Variation | None,
+) -> State:
+    """State at the end of a tick."""
+    if variation is None:
+        return srbm.step(robot, carry.state, acting.wrench, feet, dt, acting.swing_leg_load)
+    before, there = carry.late, carry.feet.position
+    return _moved_by(variation, robot, carry.state, acting, feet, before, there, dt)
 
 
 def step_carry(
@@ -158,7 +192,7 @@ def step_carry(
     tick: Int[Array, ""],
     variation: Variation | None = None,
 ) -> tuple[Carry, Trajectory]:
-    """One tick of the closed loop: plan, effect, motion.
+    """Walk one tick of the closed loop: plan, effect, motion.
 
     Returns the next carry and the tick's sample of the trajectory (its `initial` and `period` are
     filled in by `rollout`).
@@ -187,37 +221,17 @@ def step_carry(
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), decided.wrench, carry.commands
     )
-    yaw = state.euler[2]
-    window = Window(
-        commands=turn(commands, -yaw),
-        contact=decided.contact,
-        since_switch=gait.since_switch(ticks, tick),
-        base=from_yaw_frame(state),
-    )
-    found = effect(window)
-    returned, legs = turn(found.wrench, yaw), turn(found.legs, yaw)
     stands, touchdown = decided.contact, decided.touchdown
+    acting = _respond(effect, state, commands, stands, gait.since_switch(ticks, tick))
     if variation is not None:
         touchdown = touchdown._replace(position=touchdown.position - error.position)
-        returned = _within_friction(returned, variation.friction)
+        acting = acting._replace(wrench=_within_friction(acting.wrench, variation.friction))
     feet = Feet(
         jnp.where(stands[:, None], feet.position, touchdown.position),
         jnp.where(stands, feet.yaw, touchdown.yaw),
     )
-    if variation is None:
-        late, moved = None, srbm.step(robot, state, returned, feet.position, ticks.tick, legs)
-    else:
-        late = Late(returned, legs)
-        moved = _moved_by(
-            variation,
-            robot,
-            state,
-            late,
-            feet.position,
-            carry.late,
-            carry.feet.position,
-            ticks.tick,
-        )
+    moved = _move(robot, carry, acting, feet.position, ticks.tick, variation)
+    late = None if variation is None else acting
     fallen = carry.fallen | has_fallen(moved, *robot.description.limits)
     sample = Trajectory(
         period=jnp.asarray(ticks.tick),
@@ -225,7 +239,7 @@ def step_carry(
         state=moved,
         reference=reference_at(ticks.tick, command, anchor, tick + 1.0),
         command=decided.wrench,
-        effect=returned,
+        effect=acting.wrench,
         contact=stands,
         feet=feet.position,
         joints=jnp.asarray(robot.standing_joints),

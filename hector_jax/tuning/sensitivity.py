@@ -3,7 +3,7 @@
 The recursion needs no memory in T and no reverse mode; the 24 columns of the sensitivity are 24
 tangents of one tick, so that each QP is solved and factorised once. With a network in the loop the
 past commands are part of what is carried. Reverse mode gives the same numbers faster
-(`difftune.evaluate`); this is the check on it, and what online tuning steps along.
+(`evaluate.evaluate`); this is the check on it, and what online tuning steps along.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.loss import LossConfig, losses, total
+from hector_jax.tuning.loss import Loss, losses, total
 from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
@@ -119,12 +119,13 @@ def propagate(
 
 
 def gradient(
-    loss: LossConfig, trajectory: Trajectory, sensitivities: Sensitivities
+    loss: Loss, trajectory: Trajectory, sensitivities: Sensitivities
 ) -> tuple[Float[Array, ""], Weights]:
     """Loss and its gradient from the sensitivities. Source: Eq. 9."""
 
     def objective(state: State, command: Wrench) -> Float[Array, ""]:
-        return total(loss, losses(trajectory._replace(state=state, command=command)))
+        walk = trajectory._replace(state=state, command=command)
+        return total(loss, losses(loss, walk))
 
     value, pull = jax.value_and_grad(objective, argnums=(0, 1))(
         trajectory.state, trajectory.command

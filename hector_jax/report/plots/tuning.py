@@ -11,12 +11,12 @@ from hector_jax.report.plots import style
 from hector_jax.report.plots.style import SETS, drawing, log_axis, looks_of, named
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
-from hector_jax.tuning.loss import LossConfig
+from hector_jax.tuning.loss import Loss
 
 
 def losses(
     path: Path,
-    alpha: LossConfig,
+    loss: Loss,
     histories: Mapping[str, Sequence[Iteration]],
     *,
     ten: int = PAPER_ITERATIONS,
@@ -25,19 +25,18 @@ def losses(
 
     Args:
         path: file to write.
-        alpha: loss weights, by which the parts are multiplied.
+        loss: terms, which are multiplied by their weights.
         histories: of the tunings, by weight set: `without` and `with`.
         ten: the iteration to mark.
     """
-    parts = {
-        "$L$": lambda found: found.loss,
-        r"$\alpha_1 L_\mathrm{Eul}$": lambda found: alpha.euler * found.parts.euler,
-        r"$\alpha_2 L_\mathrm{pos}$": lambda found: alpha.position * found.parts.position,
-        r"$L_\mathrm{ctrl}$": lambda found: found.parts.control,
-    }
+    parts = {"$L$": lambda found: found.loss}
+    for i, term in enumerate(loss, 1):
+        alpha = "" if term.weight == 1.0 else rf"\alpha_{i} "
+        title = rf"${alpha}L_\mathrm{{{term.name.removeprefix('L_')}}}$"
+        parts[title] = lambda found, term=term: term.weight * found.terms[term.name]
     accepted = {n: np.array([i.accepted for i in history]) for n, history in histories.items()}
     cross = {"linestyle": "none", "marker": "x", "color": "black", "markersize": 4.5}
-    with drawing(path, 10.0, 2.7) as figure:
+    with drawing(path, 2.5 * len(parts), 2.7) as figure:
         panels = figure.subplots(1, len(parts))
         for panel, (title, part) in zip(panels, parts.items(), strict=True):
             panel.axvline(ten, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)

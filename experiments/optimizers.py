@@ -1,9 +1,9 @@
 """Ways to tune the weights with walks on a simulator, each asked in rounds what it walks next.
 
-A rival is a pure function of what was walked: the start alone, then a `Generation` for each of its
-rounds. So a race can be cut and taken up, rivals go in lock-step and think in other processes. All
-move in 18 log-weights inside the box, from one start. Those that follow the gradient of a model
-learn nothing from the walks: theirs is a `Given` course, which is only judged.
+An optimizer is a pure function of what was walked: the start alone, then a `Generation` for each of
+its rounds. So a benchmark can be cut and taken up, optimizers go in lock-step and think in other
+processes. All move in 18 log-weights inside the box, from one start. Those that follow the gradient
+of a model learn nothing from the walks: theirs is a `Given` list of weights, which is only judged.
 """
 
 import math
@@ -30,16 +30,16 @@ from hector_jax.control.weights import (
 )
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import Robot
-from hector_jax.search.cmaes import Generation, SearchConfig, next_generation, placed, room
-from hector_jax.tuning.difftune import Iteration, TuneConfig, refusal, step_weights, tune_step
+from hector_jax.search.cmaes import CmaSearch, Generation, SearchConfig, log_bounds, project
+from hector_jax.tuning.difftune import Iteration, TuneConfig, step_status, step_weights, tune_step
 
 DIM = len(DIRECTION_NAMES)
 Steps = Float[np.ndarray, "walks 18"]  # log-weights, less those of the start
 
 
 @runtime_checkable
-class Rival(Protocol):
-    """One who asks for walks."""
+class Optimizer(Protocol):
+    """Chooses what is walked next."""
 
     @property
     def most(self) -> int:
@@ -68,12 +68,12 @@ class Random:
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
         """The next draws, those outside the box moved to its edge."""
         draws = np.random.default_rng([self.seed, len(past)]).normal(size=(self.most, DIM))
-        return np.clip(self.spread * draws, *room(start).T)
+        return np.clip(self.spread * draws, *log_bounds(start).T)
 
 
 @dataclass(frozen=True)
 class CmaEs:
-    """The search of `tuning.search`."""
+    """The search of `search.cmaes`."""
 
     config: SearchConfig = SearchConfig()
 
@@ -84,7 +84,9 @@ class CmaEs:
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
         """Its next generation."""
-        return next_generation(self.config, start, past[1:])
+        search = CmaSearch(self.config, start)
+        search.replay(past[1:])
+        return np.zeros((0, DIM)) if search.stop else search.ask()
 
 
 @dataclass(frozen=True)
@@ -113,16 +115,16 @@ class Bayes:
             )
         from threadpoolctl import threadpool_limits
 
-        box = np.clip(room(start), -self.reach, self.reach)
+        box = np.clip(log_bounds(start), -self.reach, self.reach)
         if len(past) == 1:
             first = Random(self.seed, self.spread, self.most).ask(start, past)
             return np.clip(first, *box.T)
         rng = np.random.default_rng([self.seed, len(past)])
         with threadpool_limits(1), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # lengths at their bounds
-            return self._chosen(rng, box, past)
+            return self._choose(rng, box, past)
 
-    def _chosen(
+    def _choose(
         self, rng: np.random.Generator, box: np.ndarray, past: Sequence[Generation]
     ) -> Steps:
         from sklearn.gaussian_process import GaussianProcessRegressor
@@ -131,7 +133,7 @@ class Bayes:
         steps = np.concatenate([generation.steps for generation in past])
         losses = np.concatenate([generation.losses for generation in past])
         losses = np.where(np.isfinite(losses), losses, losses[np.isfinite(losses)].max())
-        told = np.log(losses)
+        logs = np.log(losses)
         matern = Matern(np.full(DIM, 3.0), length_scale_bounds=(0.3, 100.0), nu=2.5)
         kernel = ConstantKernel(1.0, (1e-2, 1e2)) * matern + WhiteKernel(1e-2, (1e-6, 1.0))
         fitted = GaussianProcessRegressor(
@@ -139,15 +141,15 @@ class Bayes:
             normalize_y=True,
             n_restarts_optimizer=1,
             random_state=int(rng.integers(2**31)),
-        ).fit(steps, told)
+        ).fit(steps, logs)
         process = GaussianProcessRegressor(fitted.kernel_, optimizer=None, normalize_y=True)
         for _ in range(self.most):
-            process.fit(steps, told)
-            near = steps[np.argsort(told)[:5]]
+            process.fit(steps, logs)
+            near = steps[np.argsort(logs)[:5]]
             spot = _most_promising(
-                rng, box, near, lambda x: process.predict(x, return_std=True), told.min()
+                rng, box, near, lambda x: process.predict(x, return_std=True), logs.min()
             )
-            steps, told = np.vstack([steps, spot]), np.append(told, told.min())
+            steps, logs = np.vstack([steps, spot]), np.append(logs, logs.min())
         return steps[-self.most :]
 
 
@@ -191,7 +193,7 @@ class Differences:
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
         """The 18 neighbours of where it is, or the next step."""
-        box = room(start)
+        box = log_bounds(start)
         at, loss = past[0].steps[0], past[0].losses[0]
         share, gradient, offsets = 1.0, None, self._offsets(box, at)
         for generation in past[1:]:
@@ -207,15 +209,15 @@ class Differences:
             return np.asarray(at + np.diag(offsets))
         if share < self.tune.smallest_step:
             return np.zeros((0, DIM))
-        return self._stepped(start, at, gradient, share)[None]
+        return self._step_from(start, at, gradient, share)[None]
 
     def _offsets(self, box: np.ndarray, at: np.ndarray) -> Float[np.ndarray, "18"]:
         return np.where(at + self.step > box[:, 1], -self.step, self.step)
 
-    def _stepped(
+    def _step_from(
         self, start: Weights, at: np.ndarray, gradient: np.ndarray, share: float
     ) -> Float[np.ndarray, "18"]:
-        weights = placed(start, at)
+        weights = project(start, at)
         flat = (gradient @ directions()) / np.asarray(weights_to_vector(weights))
         tree = jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(flat)))
         return steps_to(start, step_weights(self.tune, weights, tree, share))
@@ -256,14 +258,14 @@ def adam(
     Raises:
         InputError: the starting weights fall or cannot be solved on the model.
     """
-    optimiser, box = optax.adam(1.0), room(weights)
+    optimiser, box = optax.adam(1.0), log_bounds(weights)
     history: list[Iteration] = []
 
     def look(steps: np.ndarray, share: float) -> Iteration:
-        at = placed(weights, steps)
+        at = project(weights, steps)
         found = jax.tree.map(np.asarray, tune_step(config, robot, at, command, anchor, effect))
-        reason = refusal(config, found)
-        iteration = Iteration(len(history), at, found, not reason, reason, share)
+        row = len(history), at, found, step_status(config, found), share
+        iteration = Iteration(*jax.tree.map(np.asarray, row))
         history.append(iteration)
         on_iteration(iteration)
         return iteration

@@ -1,0 +1,91 @@
+"""Loss of a weight set on the model and its gradient, by reverse mode (Eq. 9, 11)."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hector_jax.control.reference import Anchor, Command
+from hector_jax.control.weights import Weights, weights_to_vector
+from hector_jax.robot.model import Robot
+from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
+from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
+
+
+class Evaluation(NamedTuple):
+    """One rollout of a weight set on the model, with the gradient of its loss."""
+
+    loss: Float[Array, "*batch"]
+    terms: Terms  # without their weights
+    gradient: Weights  # dL/dtheta
+    fallen: Float[Array, "*batch"]  # share of the ticks after a fall
+    residual: Float[Array, "*batch"]  # largest of the rollout; infinite where a QP is not unique
+
+
+def evaluate(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+    loss: Loss,
+    variation: Variation | None = None,
+) -> Evaluation:
+    """Compute the loss of a weight set on the model and its gradient, in one program.
+
+    Args:
+        config, robot, weights, command, anchor, effect, variation: see `rollout`.
+        loss: terms and their weights.
+
+    Source: Eq. 9, 11.
+    """
+
+    def objective(weights: Weights) -> tuple[Array, tuple]:
+        trajectory = rollout(config, robot, weights, command, anchor, effect, variation)
+        terms = losses(loss, trajectory)
+        seen = terms, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+        return total(loss, terms), seen
+
+    (value, (terms, fallen, residual)), gradient = jax.value_and_grad(objective, has_aux=True)(
+        weights
+    )
+    return Evaluation(value, terms, gradient, fallen, residual)
+
+
+evaluate_jit = jax.jit(evaluate, static_argnums=0)
+"""`evaluate`, compiled once per rollout and set of terms: new weights, commands, nets and alphas
+need no compilation."""
+
+
+def gradient_norms(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    anchor: Anchor,
+    effect: jax.tree_util.Partial,
+    loss: Loss,
+) -> dict[str, float]:
+    """Norms of the gradients of the terms in log-weights, each without its alpha."""
+
+    def norm(name: str) -> float:
+        alone = tuple(term._replace(weight=float(term.name == name)) for term in loss)
+        found = evaluate_jit(config, robot, weights, command, anchor, effect, alone)
+        logs = jax.tree.map(jnp.multiply, found.gradient, weights)
+        return float(jnp.linalg.norm(weights_to_vector(logs)))
+
+    return {term.name: norm(term.name) for term in loss}
+
+
+def aligned(loss: Loss, norms: dict[str, float], to: str = "L_ctrl") -> Loss:
+    """Loss whose terms have gradients of the order of that of one of them (footnote of Eq. 11)."""
+    one = {term.name: term.weight for term in loss}[to]
+
+    def power(ratio: float) -> float:
+        return float(10.0 ** np.round(np.log10(max(ratio, 1e-12))))
+
+    ratios = {name: norms[to] / norm for name, norm in norms.items() if name != to}
+    return with_alphas({name: one * power(ratio) for name, ratio in ratios.items()}, loss)
