@@ -14,7 +14,7 @@ from pretend import pretend_history
 
 from hector_jax.cli import main as cli
 from hector_jax.control.controller import WalkConfig, walk_config
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.reference import named_command
 from hector_jax.control.trajectories import limits
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
@@ -233,8 +233,8 @@ def test_a_dump_knows_the_robot_without_its_files(tmp_path):
     robot = load_robot(copied(tmp_path))
     one = pretend_history(1)[0]
     fell = one._replace(evaluation=one.evaluation._replace(fallen=np.array(1.0)), reason="fell")
-    known = robot, named_command("straight"), standing_anchor(robot), None
-    path = replay.keep(tmp_path / "dumps", "without", TuneConfig(), *known, fell)
+    what = {"config": TuneConfig(), "robot": robot, "command": named_command("straight")}
+    path = replay.keep(tmp_path / "dumps", "without", fell, **what, net=None)
     for file in tmp_path.glob("*r*.*"):
         file.unlink()
     found, _, _ = replay.load(path)

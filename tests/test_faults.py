@@ -23,6 +23,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import replay, tunings
+from hector_jax.runs.journal import Journal
 from hector_jax.runs.tunings import Problem
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import Evaluation, TuneConfig, descend
@@ -124,7 +125,7 @@ def tune(folder, command, params, config=CONFIG, robot=ROBOT):
             {"with": Problem(command, params)},
             Path(kept),
             title="tuning",
-            journal=tunings.Journal(Path(kept) / "metrics.jsonl"),
+            journal=Journal(Path(kept) / "metrics.jsonl"),
             dumps=folder,
         )
         lines = (Path(kept) / "metrics.jsonl").read_text().splitlines()

@@ -37,6 +37,7 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import read_json
+from hector_jax.runs.journal import Journal
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
@@ -244,7 +245,7 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     options: dict[str, Any] = {
         "start": run.start,
         "commit": run.commit,
-        "journal": tunings.Journal(run.folder / "metrics.jsonl"),
+        "journal": Journal(run.folder / "metrics.jsonl"),
         "dumps": run.folder / "dumps",
     }
     step = partial(tunings.tune, pool, run.config, run.robot, folder=run.kept, **options)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from hector_jax.control.reference import Anchor, Command
+from hector_jax.control.reference import Anchor, Command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
@@ -70,12 +70,12 @@ class Replayed(NamedTuple):
 def keep(
     folder: Path,
     name: str,
+    iteration: Iteration,
+    *,
     config: TuneConfig,
     robot: Robot,
     command: Command,
-    anchor: Anchor,
-    params: Params | None,
-    iteration: Iteration,
+    net: Params | None,
 ) -> Path | None:
     """Write a dump of an iteration whose evaluation is not to be believed.
 
@@ -85,8 +85,8 @@ def keep(
     Args:
         folder: of the dumps.
         name: of the tuning.
-        config, robot, command, anchor, params: what it tunes.
         iteration: any of it; of those to be believed nothing is kept.
+        config, robot, command, net: what it tunes, from standing.
 
     Returns:
         Where it was written, if it was.
@@ -96,17 +96,14 @@ def keep(
     if code is Reason.ACCEPTED or len(list(folder.glob(f"{name}-*-{kind}.npz"))) >= MOST:
         return None
     path = folder / f"{name}-{iteration.iteration:03d}-{kind}.npz"
-    dump = Dump(robot, iteration.weights, command, anchor, params, iteration.evaluation)
+    anchor = standing_anchor(robot)
+    dump = Dump(robot, iteration.weights, command, anchor, net, iteration.evaluation)
+    variant = None if net is None else variant_of(net)
     about = {
         "name": name,
         "iteration": iteration.iteration,
         "reason": iteration.reason,
-        "net": None
-        if params is None
-        else {
-            "variant": variant_of(params).name,
-            "hidden": variant_of(params).widths(params),
-        },
+        "net": variant and {"variant": variant.name, "hidden": variant.widths(net)},
         "config": asdict(config),
         "description": to_table(robot.description),
         "environment": environment(),

@@ -19,7 +19,6 @@ from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
-from hector_jax.core.files import append_file, write_file
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
@@ -27,7 +26,7 @@ from hector_jax.grfm.network import Params
 from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
 from hector_jax.runs.cache import cached, content_key
-from hector_jax.runs.folder import as_line
+from hector_jax.runs.journal import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
@@ -60,32 +59,6 @@ class Tuned(NamedTuple):
 
     tuning: Tuning
     commit: str  # at which it was made; empty where that is not known
-
-
-class Journal:
-    """metrics.jsonl, a line for each iteration: as they come; in order when tunings are over."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._histories: dict[str, Sequence[Iteration]] = {}
-
-    def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
-        """Write the file anew, with these tunings after or instead of those written before.
-
-        Raises:
-            WriteError: where the file cannot be written; the old one stays.
-        """
-        self._histories.update(histories)
-        lines = (as_line(name, i) for name, history in self._histories.items() for i in history)
-        write_file(self.path, "".join(lines).encode())
-
-    def add(self, name: str, iteration: Iteration) -> None:
-        """Write one line more.
-
-        Raises:
-            WriteError: where the file cannot be written.
-        """
-        append_file(self.path, as_line(name, iteration).encode())
 
 
 def _stored(tuned: Tuned) -> Any:
@@ -186,6 +159,23 @@ def _tunings(
                 yield running.pop(future), future.result()
 
 
+def _note(
+    config: TuneConfig,
+    robot: Robot,
+    problems: Mapping[str, Problem],
+    journal: Journal | None,
+    dumps: Path | None,
+    name: str,
+    iteration: Iteration,
+) -> None:
+    """Write what a tuning did to the journal, and to a dump where it was refused."""
+    if journal is not None:
+        journal.add(name, iteration)
+    command, params, others = problems[name]
+    if dumps is not None and not others:
+        replay.keep(dumps, name, iteration, config=config, robot=robot, command=command, net=params)
+
+
 def tune(
     pool: Executor,
     config: TuneConfig,
@@ -227,20 +217,13 @@ def tune(
         key = content_key(config, robot, start, *problem, code=TUNING_CODE)
         paths[name] = folder / f"tuning-{name}-{key}.npz"
 
-    def on_iteration(name: str, iteration: Iteration) -> None:
-        if journal is not None:
-            journal.add(name, iteration)
-        command, params, others = problems[name]
-        if dumps is not None and not others:
-            anchor = standing_anchor(robot)
-            replay.keep(dumps, name, config, robot, command, anchor, params, iteration)
-
     def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         if journal is not None:
             there = {name: _restored(one).tuning.history for name, one in found.items()}
             journal.write({name: there.get(name, ()) for name in problems})  # in their order
         asked = {name: problems[name] for name in missing}
-        for name, tuning in _tunings(pool, config, robot, start, asked, title, on_iteration):
+        note = partial(_note, config, robot, problems, journal, dumps)
+        for name, tuning in _tunings(pool, config, robot, start, asked, title, note):
             yield name, _stored(Tuned(tuning, commit))
 
     stored = cached(paths, make, like=_stored_like, kind=_KIND, robot=robot)
