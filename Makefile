@@ -26,7 +26,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
-tune: $(STAMP) ## tune a trajectory and judge it: make tune TRAJ=straight|c|s|all
+tune: $(STAMP) ## tune a trajectory and judge it: make tune TRAJ=straight|c|s|all, TRAJ="c s"
 	@$(BIN)/hector tune --traj $(TRAJ)
 
 table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a look
