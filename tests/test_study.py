@@ -226,7 +226,7 @@ def test_several_trajectories_are_one_run(tmp_path, monkeypatch):
 )
 def test_what_one_set_cannot_be_tuned_for_is_one_line(tmp_path, monkeypatch, changes, message):
     monkeypatch.chdir(tmp_path)
-    Path("short.toml").write_text("[[segment]]\nseconds = 2.0\nahead = 0.2\n")
+    Path("short.toml").write_text('name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n')
     with pytest.raises(InputError, match=message):
         tune.tune(flags.Tune(**changes))
     assert [path.name for path in tmp_path.iterdir()] == ["short.toml"]
