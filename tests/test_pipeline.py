@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from queue import SimpleQueue
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from pretend import pretend_history
@@ -227,7 +228,7 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
         vector = np.asarray(weights_to_vector(weights))
         (size,) = command.duration
         logs = np.log(vector) - (1.0 if size > 1.0 else -1.0)
-        gradient = vector_to_weights(2.0 * size * logs / vector)
+        gradient = vector_to_weights(jnp.asarray(2.0 * size * logs / vector))
         loss = np.array(size * (logs @ logs))
         return Evaluation(loss, Losses(loss, loss, loss), gradient, np.array(0.0), np.array(0.0))
 

@@ -151,8 +151,8 @@ def walked(monkeypatch):
     """What would have been walked, and for how long."""
     walks = []
 
-    def pretend(config, robot, weights, command, plant, seconds, seed):
-        walks.append((command, seconds))
+    def pretend(config, robot, job):
+        walks.append((job.command, job.seconds))
         raise InputError("walked")
 
     monkeypatch.setattr(arguments, "walk", pretend)

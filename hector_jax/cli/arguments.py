@@ -47,8 +47,8 @@ def short_names(texts: Sequence[str]) -> dict[str, str]:
     for text, own in parts.items():
         others = [part for other, part in parts.items() if other != text]
         tails = (own[-k:] for k in range(1, len(own) + 1))
-        found = (tail for tail in tails if not any(o[-len(tail) :] == tail for o in others))
-        names[text] = "/".join(next(found, (text,)))
+        unique = (tail for tail in tails if not any(o[-len(tail) :] == tail for o in others))
+        names[text] = "/".join(next(unique, (text,)))
     return names
 
 
@@ -95,41 +95,46 @@ def course(text: str, robot: Robot) -> NamedCommand:
     Raises:
         InputError: there is no such trajectory, or its file is wrong.
     """
-    found = trajectories.command_of(text)
-    if found.seconds and (told := beyond(limits(robot, walk_config(robot).gait), found.command)):
-        say(f"warning: {text}: {told}")
-    return found
+    trajectory = trajectories.command_of(text)
+    if trajectory.seconds and (
+        excess := beyond(limits(robot, walk_config(robot).gait), trajectory.command)
+    ):
+        say(f"warning: {text}: {excess}")
+    return trajectory
 
 
-def seconds(given: float, wanted: NamedCommand) -> float:
+def seconds(flag: float, trajectory: NamedCommand) -> float:
     """Length of a walk [s]: what the trajectory's file says, else what the flag does.
 
     Raises:
         InputError: both say one.
     """
-    if wanted.seconds is None:
-        return given
-    if given != Walk.seconds:
+    if trajectory.seconds is None:
+        return flag
+    if flag != Walk.seconds:
         raise InputError(
-            f"--seconds is for built-in trajectories: {wanted.name} lasts {wanted.seconds:g} s, "
-            f"as its file says, got {given:g}"
+            f"--seconds is for built-in trajectories: {trajectory.name} lasts "
+            f"{trajectory.seconds:g} s, "
+            f"as its file says, got {flag:g}"
         )
-    return wanted.seconds
+    return trajectory.seconds
 
 
-def lasting(config: TuneConfig, wanted: NamedCommand) -> TuneConfig:
+def lasting(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
     """The tuning with rollouts as long as the trajectory, where its file says how long."""
-    if wanted.seconds is None:
+    if trajectory.seconds is None:
         return config
-    ticks = round(wanted.seconds / config.rollout.walk.gait.tick)
+    ticks = round(trajectory.seconds / config.rollout.walk.gait.tick)
     return replace(config, rollout=replace(config.rollout, ticks=ticks))
 
 
-def walked(args: Walk | View, robot: Robot, wanted: NamedCommand, weights: Weights) -> Trajectory:
+def walked(
+    args: Walk | View, robot: Robot, trajectory: NamedCommand, weights: Weights
+) -> Trajectory:
     """One walk in the world of the flags."""
-    lasts = seconds(args.seconds, wanted)
+    lasts = seconds(args.seconds, trajectory)
     if args.world == "srbm":
-        return verdicts.walk_rigid_body(robot, weights, wanted.command, lasts)
+        return verdicts.walk_rigid_body(robot, weights, trajectory.command, lasts)
     plant = plants(args.world, range(args.seed, args.seed + 1))[0]
-    job = Job(weights, wanted.command, plant, lasts, args.seed)
+    job = Job(weights, trajectory.command, plant, lasts, args.seed)
     return walk(walk_config(robot), robot, job)

@@ -44,11 +44,11 @@ def train(args: Train) -> None:
     robot = load_robot(args.robot)
     data = arguments.default_of(args.data, Train.data, args.robot, robot)
     path = args.out or nets.net_path(data.parent, args.variant)
-    found = nets.train(config, robot, data, path)
+    net = nets.train(config, robot, data, path)
     if args.json:
-        print(as_json({"net": str(path), "errors": found.errors}))
+        print(as_json({"net": str(path), "errors": net.errors}))
     else:
-        _print_errors(found.errors)
+        _print_errors(net.errors)
     say(f"the net is in {path}")
 
 
@@ -73,7 +73,7 @@ def grfm(args: Grfm) -> None:
     effects["paper"] = as_effect(paper.params)
     effects["residual"] = as_effect(net.params)
     effects["gated"] = as_effect(net.params.linear)
-    found, drifts = {}, {}
+    result, drifts = {}, {}
     with bar("predicting the ground forces of the walks") as tell:
         for done, (world, walks) in enumerate(worlds.items()):
             tell(3 * done, 3 * len(worlds), f"{world}: errors")
@@ -88,17 +88,17 @@ def grfm(args: Grfm) -> None:
             calm = ~np.any(walks.job.push.force, axis=(1, 2))
             quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
             drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
-            found[world] = fidelity.as_result(errors, phases, drifts[world])
+            result[world] = fidelity.as_result(errors, phases, drifts[world])
     curves = fidelity.curves(robot, worlds["hfs"].trajectory, effects)
     trainings = {"training": net.course, "training_paper": paper.course}
     tick = config.rollout.walk.gait.tick
     drawn = pictures.of_nets(args.out, tick, curves, drifts, trainings)
-    told = fidelity.write_report(args.out, found, drawn)
+    report = fidelity.write_report(args.out, result, drawn)
     if args.json:
-        print(as_json({"report": str(told), "worlds": found}))
+        print(as_json({"report": str(report), "worlds": result}))
     else:
-        _print_errors(found["hfs"]["errors"])
-    say(f"the report is {told}")
+        _print_errors(result["hfs"]["errors"])
+    say(f"the report is {report}")
 
 
 def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -> Walks:

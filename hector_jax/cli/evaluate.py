@@ -30,8 +30,8 @@ from hector_jax.tuning.loss import LossConfig
 def evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
     robot = load_robot(args.robot)
-    wanted = arguments.course(args.traj, robot)
-    seconds = arguments.seconds(args.seconds, wanted)
+    course = arguments.course(args.traj, robot)
+    seconds = arguments.seconds(args.seconds, course)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
@@ -41,7 +41,7 @@ def evaluate(args: Evaluate) -> None:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         config = arguments.tune_config(robot)
         judged = verdicts.judge(
-            pool, config, robot, sets, wanted.command, plants, seeds, title=title, seconds=seconds
+            pool, config, robot, sets, course.command, plants, seeds, title=title, seconds=seconds
         )
     verdict = verdict_of(config.loss, seeds, judged.scores)
     result = metrics.as_result(verdict, args.world)
@@ -52,7 +52,7 @@ def evaluate(args: Evaluate) -> None:
     else:
         names = arguments.short_names(args.weights)
         named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
-        print_table(named, f"{wanted.name}, {plural(count, 'plant')}", args.world)
+        print_table(named, f"{course.name}, {plural(count, 'plant')}", args.world)
 
 
 def verdict_of(
@@ -76,44 +76,44 @@ def walk(args: Walk) -> None:
     if args.video is not None:
         check_film(args.video)
     robot = load_robot(args.robot)
-    weights, wanted = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
+    weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = arguments.walked(args, robot, wanted, weights)
-    found = metrics.score(LossConfig(), trajectory)
+    trajectory = arguments.walked(args, robot, course, weights)
+    score = metrics.score(LossConfig(), trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
     plans = np.asarray(trajectory.residual)[::samples]
     unsolved = int(np.sum(~(plans <= SOLVED)))
-    fell = bool(found.fallen) and not unsolved  # without a plan it is no fall of these weights
+    fell = bool(score.fallen) and not unsolved  # without a plan it is no fall of these weights
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
     if args.json:
-        losses = {part: float(loss) for part, loss in found.losses.items()}
-        errors = {name: getattr(found, name).tolist() for name in ("rms_position", "rms_euler")}
-        solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(found.residual)}
+        losses = {part: float(loss) for part, loss in score.losses.items()}
+        errors = {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
+        solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
         # a walk that falls at once has no errors
         print(as_json({"seconds": upright, "fell": fell, **losses, **errors, **solved}))
     else:
         units = metrics.UNITS.items()
-        parts = ", ".join(f"{part} {found.losses[part]:.4g} {unit}" for part, unit in units)
-        end = "fell after" if fell else "ended after" if found.fallen else "walked"
+        parts = ", ".join(f"{part} {score.losses[part]:.4g} {unit}" for part, unit in units)
+        end = "fell after" if fell else "ended after" if score.fallen else "walked"
         print(
-            f"{wanted.name} in {args.world}, {printable(args.weights)} weights: {end} "
-            f"{upright:.2f} s; L {found.L / 1e6:.3f}e6 ({parts})"
+            f"{course.name} in {args.world}, {printable(args.weights)} weights: {end} "
+            f"{upright:.2f} s; L {score.L / 1e6:.3f}e6 ({parts})"
         )
-        cm, degrees = 100 * found.rms_position, np.degrees(found.rms_euler)
+        cm, degrees = 100 * score.rms_position, np.degrees(score.rms_euler)
         print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
         print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
-            f"{float(found.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
+            f"{float(score.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
         )
     if args.video is not None:
         beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
         say(f"walking with {beside} weights for the other half of the film")
         walks = {
-            beside: arguments.walked(args, robot, wanted, other(robot)),
+            beside: arguments.walked(args, robot, course, other(robot)),
             Path(args.weights).stem: trajectory,
         }
         pictures.film(args.video, robot, walks)
@@ -125,10 +125,10 @@ def compare(args: Compare) -> None:
     for folder in args.runs:
         if finished and folder not in finished:
             say(f"{folder} is left out: it is not a finished run")
-    told = compare_runs([load_run(folder) for folder in finished or args.runs])
+    comparison = compare_runs([load_run(folder) for folder in finished or args.runs])
     if args.out is not None:
-        write_json(args.out, told)
+        write_json(args.out, comparison)
     if args.json:
-        print(as_json(told))
+        print(as_json(comparison))
     else:
-        print_comparison(told)
+        print_comparison(comparison)

@@ -20,24 +20,24 @@ def export_controller(args: Export) -> None:
     path, config = export.find_weights(args.run, args.set)
     begun = read_request(args.run) if is_run else None
     robot = arguments.robot_of(args.run, begun) if begun else load_robot(args.robot)
-    wanted = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
+    course = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
     weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
     say("exporting the controller and comparing it with the live one on a walk")
     controller = config or walk_config(robot)
     with locked(folder):
         card = export.export(
-            controller, robot, weights, wanted.command, folder, name=name, seconds=args.seconds
+            controller, robot, weights, course.command, folder, name=name, seconds=args.seconds
         )
     if args.json:
         print(as_json(card))
         return
-    found = card["check"]
+    check = card["check"]
     differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
-    print(f"largest difference from the live controller: {differences.format(**found)}")
+    print(f"largest difference from the live controller: {differences.format(**check)}")
     for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
         times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
-        print(f"a call {text} [ms]: {times.format(**found[what])}")
+        print(f"a call {text} [ms]: {times.format(**check[what])}")
     say(f"the export is in {folder}")
 
 
@@ -48,11 +48,11 @@ def examine(args: Doctor) -> None:
         Broken: something does not.
     """
     say("testing this machine: two short walks and a film")
-    told, faults = doctor.examine()
+    facts, faults = doctor.examine()
     if args.json:
-        print(as_json({**told, "faults": faults}))
+        print(as_json({**facts, "faults": faults}))
     else:
-        for name, text in told.items():
+        for name, text in facts.items():
             print(f"{name:12s} {text}")
     if faults:
         raise Broken("; ".join(faults))

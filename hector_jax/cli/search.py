@@ -23,16 +23,16 @@ def search(args: Search) -> None:
     """Search for weights on the simulator, without gradients."""
     robot = load_robot(args.robot)
     texts = COMMANDS if args.traj == "all" else (args.traj,)
-    wanted = [arguments.course(text, robot) for text in texts]
-    own = {one.name: one.command for one in wanted}
+    courses = [arguments.course(text, robot) for text in texts]
+    own = {one.name: one.command for one in courses}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = choose_engine(args.engine)
-    tune = arguments.lasting(arguments.tune_config(robot), wanted[0])
+    tune = arguments.lasting(arguments.tune_config(robot), courses[0])
     start = arguments.weights(args.start, robot)
     out = arguments.default_of(args.out, Search.out, args.robot, robot)
     make_folder(out)
     with workers(args.processes) as pool:
-        found = searches.search(
+        results = searches.search(
             pool,
             config,
             tune,
@@ -43,13 +43,13 @@ def search(args: Search) -> None:
             own=own,
         )
         say("walking with the start, expert and best weights")
-        sets = {name: [start, expert(robot), found[name].weights] for name in own}
+        sets = {name: [start, expert(robot), results[name].weights] for name in own}
         at_once = config.population * len(own)
         compared = searches.losses_on_hfs(
             pool, tune, robot, sets, engine=engine, at_once=at_once, own=own
         )
     cards = {}
-    for name, one in found.items():
+    for name, one in results.items():
         at_start, at_expert, again = compared[name].tolist()
         losses = {"start": at_start, "best": one.loss, "best_again": again, "expert": at_expert}
         cards[name] = {

@@ -71,7 +71,7 @@ _SNAPSHOTS = VideoConfig(height=360)
 
 @dataclass(frozen=True)
 class _Plan:
-    """What the flags ask for, found sound."""
+    """What the flags ask for, checked."""
 
     commands: Mapping[str, Command]
     seeds: range
@@ -119,20 +119,20 @@ def _sets_from_files(args: flags.Table) -> dict[str, dict[str, Weights]]:
         if name in (*SETS, CEILING, *folders):
             raise InputError(f"--extra {text}: there is a set '{name}' already")
         folders[name] = Path(folder)
-    found = {}
+    sets = {}
     for trajectory in args.trajectories:
         ceiling = args.ceiling / f"{trajectory}.json"
         paths = {CEILING: ceiling} if ceiling.exists() else {}
         paths |= {name: folder / f"{trajectory}.json" for name, folder in folders.items()}
-        found[trajectory] = {name: load_weights(path) for name, path in paths.items()}
-    return found
+        sets[trajectory] = {name: load_weights(path) for name, path in paths.items()}
+    return sets
 
 
 def _long_search(card: Path) -> Search:
     """What the card beside the ceiling's weights tells of its search."""
-    told = read_json(card, "the card of a search")
+    content = read_json(card, "the card of a search")
     try:
-        return Search(told["walks"], told["best_at"], told["L"]["best"], told["stop"])
+        return Search(content["walks"], content["best_at"], content["L"]["best"], content["stop"])
     except (KeyError, TypeError) as error:
         raise InputError(f"{card}: not the card of a search: {error!r}") from None
 
@@ -150,12 +150,12 @@ class _Bench(NamedTuple):
 
 def table(args: flags.Table) -> None:
     """Make the table of all sets on all trajectories."""
-    report, found = make_table(args, partial(arguments.plants, "standin"))
+    report, by_trajectory = make_table(args, partial(arguments.plants, "standin"))
     if args.json:
-        results = {name: metrics.as_result(verdict) for name, verdict in found.items()}
+        results = {name: metrics.as_result(verdict) for name, verdict in by_trajectory.items()}
         print(as_json({"report": str(report), "trajectories": results}))
     else:
-        for name, verdict in found.items():
+        for name, verdict in by_trajectory.items():
             print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
     say(f"the report is {report}")
 
@@ -207,16 +207,16 @@ def _make_table(
             name: _judge(bench, name, judges, _sets(plan, name, one, searched[name]))
             for name, one in tuned.items()
         }
-    by_trajectory = {name: _verdict(plan, found) for name, found in judged.items()}
+    by_trajectory = {name: _verdict(plan, one) for name, one in judged.items()}
     commits = {one.commit for each in tuned.values() for one in each.values()}
-    commits |= {w.commit for found in judged.values() for ws in found.walks.values() for w in ws}
+    commits |= {w.commit for one in judged.values() for ws in one.walks.values() for w in ws}
     report = write_table(
         out,
         Table(
             by_trajectory,
             falls=[fall for name, one in judged.items() for fall in _falls(plan, name, one)],
             tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tuned.items()},
-            searches={name: _search_in_table(plan, found) for name, found in searched.items()},
+            searches={name: _search_in_table(plan, one) for name, one in searched.items()},
             ceilings=plan.ceilings,
             pictures=_draw(out, robot, by_trajectory, judged),
             config={
@@ -327,9 +327,9 @@ def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:
     ]
 
 
-def _search_in_table(plan: _Plan, found: Found) -> Search:
-    walks = len(found.history) * plan.search.population
-    return Search(walks, found.walk, found.loss, found.stop)
+def _search_in_table(plan: _Plan, one: Found) -> Search:
+    walks = len(one.history) * plan.search.population
+    return Search(walks, one.walk, one.loss, one.stop)
 
 
 def _draw(
@@ -347,12 +347,12 @@ def _draw(
     }
     caption = plots.changes(out / "pictures" / "changes.png", verdicts, paper)
     pictures = [Picture("pictures/changes.png", caption)]
-    for name, found in judged.items():
+    for name, one in judged.items():
         # the last one's footprints are drawn
-        walks = {key: walk for key, walk in found.first.items() if key != "with"}
-        walks["with"] = found.first["with"]
+        walks = {key: walk for key, walk in one.first.items() if key != "with"}
+        walks["with"] = one.first["with"]
         with tempfile.TemporaryDirectory() as folder:
-            strip = _snapshots(Path(folder), robot, found.first)
+            strip = _snapshots(Path(folder), robot, one.first)
             file = f"pictures/{name}.png"
             pictures.append(Picture(file, f"{name}: {plots.collective(out / file, walks, strip)}"))
     return pictures

@@ -51,9 +51,9 @@ _FOLDERS = ("out", "run", "resume")  # flags that name the run folder
 
 def tune(args: Tune) -> None:
     """Tune one weight set for all trajectories, or one for each, anew or where a run was left."""
-    given = [f"--{name} {getattr(args, name)}" for name in _FOLDERS if getattr(args, name)]
-    if len(given) > 1:
-        raise InputError(f"{' and '.join(given)}: only one can be given")
+    named = [f"--{name} {getattr(args, name)}" for name in _FOLDERS if getattr(args, name)]
+    if len(named) > 1:
+        raise InputError(f"{' and '.join(named)}: only one can be given")
     if args.video:
         check_film(Path("film.mp4"))
     base, robot = args.resume or args.out or args.run, load_robot(args.robot)
@@ -98,21 +98,21 @@ def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
         InputError: there is no such trajectory, they last differently, or --refresh cannot take
             them.
     """
-    found = tuple(arguments.course(text, robot) for text in args.traj)
-    first = found[0]
-    if len({one.seconds or Walk.seconds for one in found}) > 1:
-        lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in found)
+    courses = tuple(arguments.course(text, robot) for text in args.traj)
+    first = courses[0]
+    if len({one.seconds or Walk.seconds for one in courses}) > 1:
+        lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in courses)
         raise InputError(f"--traj expects trajectories of one length, got {lasts}; add --each")
     if args.refresh and args.net:
         raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
-    if args.refresh and len(found) > 1:
-        raise InputError(f"--refresh takes one trajectory, got {len(found)}; add --each")
+    if args.refresh and len(courses) > 1:
+        raise InputError(f"--refresh takes one trajectory, got {len(courses)}; add --each")
     if args.refresh and len(first.command.duration) > PIECES:
         raise InputError(
             f"--refresh takes trajectories of at most {PIECES} segments, {first.name} has "
             f"{len(first.command.duration)}"
         )
-    return found
+    return courses
 
 
 class _Run(NamedTuple):
@@ -319,22 +319,22 @@ def _result(
         seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
         return verdict_of(run.config.loss, seeds, scores)
 
-    def content(names: Sequence[str], found: Verdict) -> dict[str, Any]:
-        result = metrics.as_result(found)
+    def content(names: Sequence[str], one: Verdict) -> dict[str, Any]:
+        result = metrics.as_result(one)
         for name, there in metrics.as_result(verdict(names, 1), "hfs")["sets"].items():
             result["sets"][name] |= there
         return result
 
     names = list(judged)
-    found = {run.name: verdict(names, 0)}
-    result = content(names, found[run.name])
+    by_name = {run.name: verdict(names, 0)}
+    result = content(names, by_name[run.name])
     if len(names) > 1:
-        found |= {name: verdict([name], 0) for name in names}
-        result["trajectories"] = {name: content([name], found[name]) for name in names}
+        by_name |= {name: verdict([name], 0) for name in names}
+        result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.shifts:
         result["refresh"] = tuned.shifts
     write_json(run.folder / "result.json", result)
-    return result, found
+    return result, by_name
 
 
 def _draw(run: _Run, tuned: _Tuned, judged: Judged, on_hfs: Judged) -> list[Picture]:
@@ -355,5 +355,5 @@ def _film(run: _Run, judged: Judged) -> Picture | str:
     pair = {name: judged.first[name] for name in ("nominal", "with")}
     film = run.folder / "film.mp4"
     caption = "Nominal and tuned weights on the first stand-in plant."
-    told = pictures.film(film, run.robot, pair, run.folder / "film.png")
-    return told or Picture(film.name, caption)
+    reason = pictures.film(film, run.robot, pair, run.folder / "film.png")
+    return reason or Picture(film.name, caption)

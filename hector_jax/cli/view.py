@@ -34,7 +34,7 @@ def view_run(args: View) -> None:
         check_film(folder / "film.mp4")
     begun = read_request(args.run)
     robot = arguments.robot_of(args.run, begun)
-    wanted = arguments.course(begun.trajectory, robot)
+    course = arguments.course(begun.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
             raise InputError(f"--out must not be the folder of the run, got {folder}")
@@ -49,10 +49,10 @@ def view_run(args: View) -> None:
         place = WORLDS.get(args.world, args.world)
         story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
-        for when, (name, (weights, told)) in zip(("before", "after"), sets.items(), strict=True):
-            walked = arguments.walked(args, robot, wanted, weights)
+        for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
+            walked = arguments.walked(args, robot, course, weights)
             loss = metrics.score(begun.loss, walked).L / 1e6
-            story.append(f"{when}: {told}, L {loss:.3f}e6 in this walk")
+            story.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
             say(f"  {story[-1]}")
             walked = at_interval(walked, walk_config(robot).gait.tick)
             stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
@@ -62,8 +62,8 @@ def view_run(args: View) -> None:
 
     def motions() -> tuple[dict[str, Motion], str]:
         story = walk()
-        found = (motion(robot, *one) for one in shown.values())
-        return dict(zip(plots.titles(shown), found, strict=True)), story
+        moving = (motion(robot, *one) for one in shown.values())
+        return dict(zip(plots.titles(shown), moving, strict=True)), story
 
     if folder is not None:
         walk()
@@ -89,10 +89,10 @@ def replay_dump(args: Replay) -> None:
     Raises:
         Broken: it does not come out the same.
     """
-    found = replay.again(args.dump)
-    print(as_json(found._asdict(), indent=2) if args.json else replay.in_words(found))
-    if not found.same:
-        raise Broken(f"{args.dump}: {replay.verdict(found)}")
+    replayed = replay.again(args.dump)
+    print(as_json(replayed._asdict(), indent=2) if args.json else replay.in_words(replayed))
+    if not replayed.same:
+        raise Broken(f"{args.dump}: {replay.verdict(replayed)}")
 
 
 def tensorboard(args: Tensorboard) -> None:

@@ -248,8 +248,8 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
         errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: its card does not tell its training: {error!r}") from None
-    made = {"settings": settings, "made_of": made_of}
-    return TrainedNet(params, linear, errors, course, config, (), held_out), made
+    followed_from = {"settings": settings, "made_of": made_of}
+    return TrainedNet(params, linear, errors, course, config, (), held_out), followed_from
 
 
 def training_settings(config: TrainConfig) -> dict[str, Any]:

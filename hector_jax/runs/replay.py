@@ -161,15 +161,15 @@ def again(path: Path) -> Replayed:
     effect = effect_of(dump.params, config.rollout.walk.gait)
     problem = dump.robot, dump.weights, dump.command, dump.anchor, effect
     with _on_cpu():
-        found = jax.device_get(tune_step(config, *problem))
+        evaluation = jax.device_get(tune_step(config, *problem))
         walked = jax.device_get(_walk(config.rollout, *problem))
-    same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, found)
+    same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, evaluation)
     then, now = about["environment"], environment()
     return Replayed(
         name=about["name"],
         iteration=about["iteration"],
         recorded=_summary(about["reason"], dump.seen),
-        again=_summary(refusal(config, found), found),
+        again=_summary(refusal(config, evaluation), evaluation),
         first=_first(config, walked),
         same=all(jax.tree.leaves(same)),
         changed={
@@ -204,24 +204,26 @@ def _first(config: TuneConfig, walked: Trajectory) -> dict[str, int | None]:
     return {name: int(np.argmax(at)) if at.any() else None for name, at in wrong.items()}
 
 
-def in_words(found: Replayed) -> str:
+def in_words(replayed: Replayed) -> str:
     """A table of what was recorded and what came out, and the verdict."""
     labels = {"gradient": "largest gradient", "fallen": "share fallen", "residual": "QP residual"}
     cell = lambda x: x if isinstance(x, str) else f"{x:.17g}"  # noqa: E731
-    lines = [f"{found.name}, iteration {found.iteration}", f"{'':18s}{'recorded':32s}again"]
-    for name, value in found.recorded.items():
-        lines.append(f"{labels.get(name, name):18s}{cell(value):32s}{cell(found.again[name])}")
-    for name, tick in found.first.items():
+    lines = [f"{replayed.name}, iteration {replayed.iteration}", f"{'':18s}{'recorded':32s}again"]
+    for name, value in replayed.recorded.items():
+        lines.append(f"{labels.get(name, name):18s}{cell(value):32s}{cell(replayed.again[name])}")
+    for name, tick in replayed.first.items():
         lines.append(f"{f'first {name}':18s}{'':32s}{'never' if tick is None else f'tick {tick}'}")
-    return "\n".join([*lines, verdict(found)])
+    return "\n".join([*lines, verdict(replayed)])
 
 
-def verdict(found: Replayed) -> str:
+def verdict(replayed: Replayed) -> str:
     """Whether it is the same, and which versions or machines are not."""
-    if found.same:
+    if replayed.same:
         return "the same to the last bit"
-    then, now = found.recorded["reason"], found.again["reason"]
+    then, now = replayed.recorded["reason"], replayed.again["reason"]
     what = "the same reason, other numbers" if then == now else f"now {now or 'not refused'}"
-    changed = [f"{name} {old or '-'} -> {new or '-'}" for name, (old, new) in found.changed.items()]
+    changed = [
+        f"{name} {old or '-'} -> {new or '-'}" for name, (old, new) in replayed.changed.items()
+    ]
     made = f"changed since: {', '.join(changed)}" if changed else "same versions, same machine"
     return f"not reproduced: {what}; {made}"
