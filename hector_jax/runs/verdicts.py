@@ -101,6 +101,11 @@ def _like(with_walk: bool) -> Any:
     return one, walk if with_walk else None
 
 
+def _path(folder: Path, case: Case, key: str, with_walk: bool) -> Path:
+    name, seed = case
+    return folder / f"{'walk' if with_walk else 'score'}-{name}-{seed}-{key}.npz"
+
+
 def judge(
     pool: Executor,
     config: TuneConfig,
@@ -119,16 +124,12 @@ def judge(
 
     Args:
         pool: worker processes.
-        config: controller and loss.
-        robot: nominal body.
+        config, robot: controller and loss, nominal body.
         sets: weights by name.
-        command: what to walk.
-        plants: of the seeds.
-        seeds: of the plants and of the estimators.
+        command, seconds: what to walk, and how long.
+        plants, seeds: the plants, and the seeds of their estimators.
         title: for the person who waits.
-        seconds: of each walk.
-        folder: of the scores, a file per walk; a walk that is there is not walked again. None:
-            nothing is kept.
+        folder: of the scores, where walks that are there are not walked again; None: keep none.
         commit: to note with what is walked now.
 
     Raises:
@@ -156,9 +157,8 @@ def judge(
     else:
         paths = {}
         for case, job in jobs.items():
-            what = "walk" if with_walk(case) else "score"
             key = content_key(walk_config, config.loss, robot, job, code=_CODE)
-            paths[case] = folder / f"{what}-{case[0]}-{case[1]}-{key}.npz"
+            paths[case] = _path(folder, case, key, with_walk(case))
         like = lambda case: _like(with_walk(case))  # noqa: E731
         found = cached(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in found.items()}
