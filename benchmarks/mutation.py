@@ -119,7 +119,7 @@ def _faults(part: str, file: str, source: str) -> Iterator[Fault]:
         elif isinstance(node, ast.BoolOp):
             yield from between(node.values[0], node.values[1], WORDS)
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Invert | ast.Not):
-            yield fault(first(node), first(node.operand), "")
+            yield fault(first(node), first(node) + (4 if isinstance(node.op, ast.Not) else 1), "")
         elif isinstance(node, ast.Constant) and (after := _numbers(node)):
             yield fault(first(node), last(node), after)
         elif isinstance(node, ast.Attribute) and node.attr in NAMES:

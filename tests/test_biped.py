@@ -32,7 +32,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.mjx_model import batched_model, find_places
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
-from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.difftune import StepStatus, TuneConfig
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 
@@ -232,7 +232,8 @@ def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tm
 def test_a_dump_knows_the_robot_without_its_files(tmp_path):
     robot = load_robot(copied(tmp_path))
     one = pretend_history(1)[0]
-    fell = one._replace(evaluation=one.evaluation._replace(fallen=np.array(1.0)), reason="fell")
+    evaluation = one.evaluation._replace(fallen=np.array(1.0))
+    fell = one._replace(evaluation=evaluation, status=np.array(StepStatus.FELL))
     what = {"config": TuneConfig(), "robot": robot, "command": named_command("straight")}
     path = replay.keep(tmp_path / "dumps", "without", fell, **what, net=None)
     for file in tmp_path.glob("*r*.*"):

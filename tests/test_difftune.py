@@ -307,7 +307,8 @@ def test_the_loss_is_that_of_its_parts():
 def test_aligned_loss_weights_are_powers_of_ten_that_level_the_gradients():
     config = aligned(PAPER_LOSS, {"L_Eul": 0.3, "L_pos": 4e-3, "L_ctrl": 2e4})
     assert config == with_alphas({"L_Eul": 1e5, "L_pos": 1e7})
-    for gradient, alpha in ((0.3, config.euler), (4e-3, config.position)):
+    for gradient, term in zip((0.3, 4e-3), config, strict=False):
+        alpha = term.weight
         assert 10**-0.5 <= alpha * gradient / 2e4 <= 10**0.5
 
 

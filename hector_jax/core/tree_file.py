@@ -97,9 +97,7 @@ def load_tree(
         InputError: one line naming the file, for one that is missing, cut, changed, of another
             kind, format, layout or robot.
     """
-    arrays, card = _read(path)
-    if card["kind"] != kind:
-        raise InputError(f"{path}: holds {short_repr(card['kind'])[1:-1]}, expected {kind}")
+    arrays, card = _read(path, kind)
     if robot is not None and card["robot"] != (expected := tree_hash(robot, ROBOT_DIGITS)):
         raise InputError(
             f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
@@ -122,16 +120,16 @@ def load_tree(
     return jax.tree.unflatten(jax.tree.structure(like), leaves), card
 
 
-def read_card(path: Path) -> dict[str, Any]:
-    """The card of a file that `save_tree` wrote, once the file as a whole is found sound.
+def read_card(path: Path, kind: str | None = None) -> dict[str, Any]:
+    """The card of a file that `save_tree` wrote, of a kind, once the whole file is found sound.
 
     Raises:
         InputError: one line naming the file, as `load_tree`.
     """
-    return _read(path)[1]
+    return _read(path, kind)[1]
 
 
-def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _read(path: Path, kind: str | None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     data = _read_bytes(Path(path))
     content, digest = data[:-_SHA256], data[-_SHA256:]
     if hashlib.sha256(content).hexdigest().encode() != digest:
@@ -146,6 +144,8 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except Exception as error:  # whoever made the archive chose what goes wrong
         raise InputError(f"{path}: no card or no plain arrays inside: {one_line(error)}") from error
     _check_card(path, card)
+    if kind is not None and card["kind"] != kind:
+        raise InputError(f"{path}: holds {short_repr(card['kind'])[1:-1]}, expected {kind}")
     return arrays, card
 
 

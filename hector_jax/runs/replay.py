@@ -121,7 +121,7 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
     Raises:
         InputError: one line naming the file that is damaged, no dump or of another version.
     """
-    about = read_card(path)["about"]
+    about = read_card(path, _KIND)["about"]
     net, none = about.get("net"), np.zeros(())
     try:
         params = None if net is None else layout(net["variant"], tuple(net["hidden"]))

@@ -146,7 +146,7 @@ def _tunings(
             ended = wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done
             while not heard.empty():  # also all that those told which have ended
                 name, iteration = heard.get()
-                done += iteration.iteration > 0
+                done += int(iteration.iteration > 0)
                 tell(done, total, f"{name}: L {float(iteration.evaluation.loss) / 1e6:.3f}e6")
                 on_iteration(name, iteration)
             for future in ended:
