@@ -1,1 +1,37 @@
-"""Gradient tuning of a walking biped's model predictive controller in JAX."""
+"""Gradient tuning of a walking robot's model predictive controller in JAX (DiffTune, GRFM-Net).
+
+The names below are the public surface; each package has its own. They are imported when they are
+first used, so that `import hector_jax` costs nothing.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_MODULES = {
+    "core.inputs": ("InputError",),
+    "core.runtime": ("setup_jax",),
+    "core.trajectory": ("State", "Trajectory", "Wrench"),
+    "robot.model": ("Robot", "load_robot"),
+    "qp": ("QP", "QpConfig", "solve_qp"),
+    "control": ("Weights", "expert", "nominal", "named_command", "standing_anchor"),
+    "control.controller": ("WalkConfig", "walk_config"),
+    "sim.loop": ("Job",),
+    "sim.walk": ("walk",),
+    "sim.world": ("hfs", "ideal"),
+    "grfm.network": ("as_effect", "load_net"),
+    "tuning.loss": ("PAPER_LOSS", "LossTerm"),
+    "tuning.rollout": ("RolloutConfig", "rollout"),
+    "tuning.difftune": ("TuneConfig", "tune"),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,9 +1,13 @@
 """The house: who imports whom, and which outside package enters through which door."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+
+import hector_jax
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
@@ -121,3 +125,11 @@ def test_scripts_use_nothing_private_of_the_package():
             if node.attr not in ("_asdict", "_fields", "_make", "_replace")
         ]
     assert not wrong
+
+
+def test_every_public_name_is_there_and_importing_the_package_imports_nothing_else():
+    words = [sys.executable, "-c", "import sys, hector_jax; print('jax' in sys.modules)"]
+    assert subprocess.run(words, capture_output=True, text=True).stdout == "False\n"
+    assert len(hector_jax.__all__) == len({id(getattr(hector_jax, n)) for n in hector_jax.__all__})
+    with pytest.raises(AttributeError, match="no attribute 'tuna'"):
+        hector_jax.tuna  # noqa: B018

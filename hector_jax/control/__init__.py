@@ -4,26 +4,75 @@
 plans the wrench under the `contact` constraints, `legs` turn it into torques, and `controller`
 calls them in turn. `parameters` has their numbers in one tree and which of them are tuned.
 """
-# ruff: noqa: I001
-# fmt: off
 
-from hector_jax.control.contact import LINE_FOOT, Contact, ContactModel, InputConstraint
-from hector_jax.control.contact import Rows, StateConstraint, Step
+from hector_jax.control.contact import (
+    LINE_FOOT,
+    Contact,
+    ContactModel,
+    InputConstraint,
+    Rows,
+    StateConstraint,
+    Step,
+)
+from hector_jax.control.controller import (
+    Memory,
+    Plan,
+    Retune,
+    WalkConfig,
+    actuate,
+    init_memory,
+    plan,
+    step_plan,
+    walk_config,
+)
 from hector_jax.control.legs import Measurement
-from hector_jax.control.controller import Memory, Plan, Retune, WalkConfig
-from hector_jax.control.controller import actuate, init_memory, plan, step_plan, walk_config
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import THETA, Parameters, Tunable, tunables
-from hector_jax.control.reference import Anchor, Command, named_command, reference_at
-from hector_jax.control.reference import standing_anchor
+from hector_jax.control.reference import (
+    Anchor,
+    Command,
+    named_command,
+    reference_at,
+    standing_anchor,
+)
 from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, expert, nominal
 
 __all__ = [
-    "LINE_FOOT", "THETA", "Anchor", "Command", "Contact", "ContactModel", "Horizon",
-    "InputConstraint", "Measurement", "Memory", "MpcConfig", "MpcProblem", "NamedCommand",
-    "Parameters", "Plan", "Retune", "Rows", "StateConstraint", "Step", "Tunable", "WalkConfig",
-    "Weights", "actuate", "build_qp", "command_of", "expert", "init_memory", "named_command",
-    "nominal", "plan", "reference_at", "solve_mpc", "standing_anchor", "step_plan", "tunables",
+    "LINE_FOOT",
+    "THETA",
+    "Anchor",
+    "Command",
+    "Contact",
+    "ContactModel",
+    "Horizon",
+    "InputConstraint",
+    "Measurement",
+    "Memory",
+    "MpcConfig",
+    "MpcProblem",
+    "NamedCommand",
+    "Parameters",
+    "Plan",
+    "Retune",
+    "Rows",
+    "StateConstraint",
+    "Step",
+    "Tunable",
+    "WalkConfig",
+    "Weights",
+    "actuate",
+    "build_qp",
+    "command_of",
+    "expert",
+    "init_memory",
+    "named_command",
+    "nominal",
+    "plan",
+    "reference_at",
+    "solve_mpc",
+    "standing_anchor",
+    "step_plan",
+    "tunables",
     "walk_config",
 ]
