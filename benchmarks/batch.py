@@ -24,10 +24,11 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal, sample_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax
+from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.batch import Problem, Scenario, lanes_of, stack, tune_batch
+from hector_jax.tuning.batch import Problem, Scenario, lanes_of, tune_batch
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Stop, TuneConfig, tune
 from hector_jax.tuning.rollout import RolloutConfig
 

@@ -33,7 +33,7 @@ def one(ticks: int, batch: int, repeats: int) -> dict[str, float]:
     from hector_jax.core.runtime import setup_jax
     from hector_jax.grfm.effect import last_command
     from hector_jax.robot.model import load_robot
-    from hector_jax.tuning.difftune import TuneConfig, evaluate
+    from hector_jax.tuning.difftune import TuneConfig, tune_step
     from hector_jax.tuning.rollout import RolloutConfig
 
     setup_jax()
@@ -42,7 +42,7 @@ def one(ticks: int, batch: int, repeats: int) -> dict[str, float]:
     anchor, weights = standing_anchor(robot), nominal()
 
     def run(weights):
-        return evaluate(config, robot, weights, command, anchor, last_command)
+        return tune_step(config, robot, weights, command, anchor, last_command)
 
     if batch > 1:
         rng = np.random.default_rng(0)

@@ -27,22 +27,24 @@ from queue import SimpleQueue
 PARTS = {
     "control": (
         "control/footstep control/gait control/legs control/mpc control/reference"
-        " control/trajectories control/controller control/weights",
+        " control/trajectories control/controller control/weights control/contact"
+        " control/parameters",
         "gait footstep legs reference trajectories weights config mpc controller rollout export",
     ),
     "qp": (
         "qp/problem qp/active_set qp/interior_point qp/certificates qp/method qp/derivative"
-        " qp/gpu_kernel",
+        " qp/gpu_kernel qp/linear qp/solver",
         "qp gpu_kernel mpc",
     ),
     "tuning": (
         "tuning/batch tuning/difftune tuning/loss tuning/measured tuning/online tuning/rollout"
-        " tuning/sensitivity search/cmaes",
+        " tuning/sensitivity tuning/evaluate search/cmaes",
         "loss config rollout difftune faults measured online search batch",
     ),
     "sim": (
-        "sim/actuators sim/changes sim/parallel sim/sensing sim/walk sim/world",
-        "changes sensing world walk variation parallel fidelity",
+        "sim/actuators sim/changes sim/loop sim/mjx_model sim/parallel sim/sensing sim/walk"
+        " sim/world",
+        "changes sensing world walk engine variation parallel fidelity",
     ),
 }
 COMPARISONS = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}

@@ -57,8 +57,6 @@ PACKAGES = {  # in this order: title and purpose of each page of the reference
 PUBLIC = {  # of packages without `__all__`, in whichever of their modules they are defined
     "core": "State Wrench Load Trajectory InputError setup_jax",
     "robot": "Robot load_robot Description foot_poses foot_jacobians inverse_legs linearise",
-    "control": """Weights nominal expert Command Anchor named_command standing_anchor reference_at
-        GaitConfig FootstepConfig LegConfig MpcConfig Horizon solve_mpc WalkConfig Plan plan""",
     "sim": "Imperfections ideal hfs hfs_varied standin Job walk Engine choose_engine",
     "grfm": "Window Effect Phi as_effect load_net save_net load_walks TrainConfig train",
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning

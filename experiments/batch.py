@@ -31,6 +31,7 @@ from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
+from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net, member_effects
 from hector_jax.report.report import markdown_table
@@ -39,7 +40,7 @@ from hector_jax.runs import metrics, verdicts
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
-from hector_jax.tuning.batch import Problem, Scenario, Tunings, stack, tail_weights, tune_batch
+from hector_jax.tuning.batch import Problem, Scenario, Tunings, tail_weights, tune_batch
 from hector_jax.tuning.difftune import Stop, TuneConfig, stop_reason
 from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
 from hector_jax.tuning.rollout import Variation, no_variation

@@ -58,7 +58,8 @@ MARKS = (25, 50, 100, 200)  # walks after which the table has the lowest loss
 ON_MODEL = ("without", "with", "adam")
 WITH_NET = ("with", "adam")
 NEAR = 3.0  # log-weights: a factor of 20 either way
-CODE = ("search.cmaes", "tuning.difftune", "grfm.network", "sim.walk")  # that decides the numbers
+# modules that decide the numbers
+CODE = ("search.cmaes", "tuning.difftune", "grfm.network", "sim.walk", "sim.parallel")
 OPTIMIZERS = Path(optimizers.__file__).read_text()  # likewise
 RATE = 0.05  # of Adam, in log-weights: DiffTune's step in Q
 

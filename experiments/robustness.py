@@ -156,7 +156,7 @@ def main() -> None:
             kind="robustness",
             robot=robot,
             folder=flags.out / "scores",
-            settings=(config, loss),
+            settings=(config, repr(loss)),
         )
     scores = {
         (level, name): metrics.stack_scores([walked[group(level, name, seed)] for seed in seeds])

@@ -1,6 +1,7 @@
 """The house: who imports whom, and which outside package enters through which door."""
 
 import ast
+import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import hector_jax
+from hector_jax.runs import nets, searches
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
@@ -133,3 +135,26 @@ def test_every_public_name_is_there_and_importing_the_package_imports_nothing_el
     assert len(hector_jax.__all__) == len({id(getattr(hector_jax, n)) for n in hector_jax.__all__})
     with pytest.raises(AttributeError, match="no attribute 'tuna'"):
         hector_jax.tuna  # noqa: B018
+
+
+def test_what_scripts_import_inside_functions_is_there_too():
+    missing = []
+    for folder in ("benchmarks", "experiments", "examples", "hector_jax"):
+        for path in (ROOT.parent / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                    "hector_jax"
+                ):
+                    module = importlib.import_module(node.module)
+                    missing += [
+                        f"{path.name}: {node.module}.{alias.name}"
+                        for alias in node.names
+                        if not hasattr(module, alias.name)
+                        and not importlib.util.find_spec(f"{node.module}.{alias.name}")
+                    ]
+    assert missing == []
+
+
+@pytest.mark.parametrize("code", [nets.COLLECTION_CODE, searches.SEARCH_CODE])
+def test_what_both_engines_compute_is_in_the_key_of_their_walks(code):
+    assert {"sim.walk", "sim.parallel"} <= set(code)

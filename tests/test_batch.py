@@ -13,18 +13,11 @@ import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, sample_weights, vector_to_weights, weights_to_vector
+from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning import batch, difftune
-from hector_jax.tuning.batch import (
-    PER_CALL,
-    Problem,
-    Scenario,
-    lanes_of,
-    stack,
-    tail_weights,
-    tune_batch,
-)
+from hector_jax.tuning.batch import PER_CALL, Problem, Scenario, lanes_of, tail_weights, tune_batch
 from hector_jax.tuning.difftune import StepStatus, Stop, TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas

@@ -25,7 +25,9 @@ from hector_jax.control.controller import (
     step_plan,
     walk_config,
 )
-from hector_jax.control.legs import Measurement
+from hector_jax.control.footstep import FootstepConfig
+from hector_jax.control.gait import GaitConfig
+from hector_jax.control.legs import LegConfig, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import THETA, Parameters, Tunable, tunables
 from hector_jax.control.reference import (
@@ -39,6 +41,9 @@ from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, expert, nominal
 
 __all__ = [
+    "FootstepConfig",
+    "GaitConfig",
+    "LegConfig",
     "LINE_FOOT",
     "THETA",
     "Anchor",

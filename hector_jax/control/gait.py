@@ -89,11 +89,6 @@ def touchdowns(
     return count(later) - count(tick)
 
 
-def cycle_phase(config: GaitConfig, tick: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Phase of the gait cycle, 0 to 1."""
-    return (jnp.maximum(tick, config.first_tick) % config.cycle) / config.cycle
-
-
 def since_switch(config: GaitConfig, tick: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Time [s] since the last planned touchdown or lift-off."""
     clock = _feet_ticks(config, tick) % config.cycle

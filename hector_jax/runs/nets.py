@@ -37,7 +37,7 @@ from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
 
 # modules that decide the numbers, for `code_hash`
 TRAINING_CODE = ("grfm.training",)
-COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.parallel")
+COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.walk", "sim.parallel")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
 # modules that decide the numbers, for `content_key`
-SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.parallel")
+SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.walk", "sim.parallel")
 
 
 def _command(name: str, own: Mapping[str, Command] | None) -> Command:
@@ -88,7 +88,7 @@ def search(
         own: commands of trajectories that are not built in, by their name.
 
     Raises:
-        InputError: see `named_command` and `tuning.search.search`.
+        InputError: see `named_command` and `search.cmaes.search`.
         InputError: the folder cannot be written; told before
             anything is walked.
     """

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,14 +66,6 @@ class Tunings(NamedTuple):
     stop: Int[np.ndarray, " problems"]  # a `difftune.Stop`
     iterations: Int[np.ndarray, " problems"]  # rollouts behind each, the start not counted
     history: Iteration  # (problems, iterations + 1); zero after the end
-
-
-Tree = TypeVar("Tree")
-
-
-def stack(trees: Sequence[Tree]) -> Tree:
-    """Scenarios of a problem, problems of a batch, or phis of one kind, on a new leading axis."""
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *trees)
 
 
 def tail_weights(losses: Float[Array, " n"], tail: Float[Array, ""]) -> Float[Array, " n"]:

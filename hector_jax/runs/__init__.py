@@ -1,0 +1,1 @@
+"""What a run computes, stores and reads again."""
