@@ -327,9 +327,9 @@ def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:
     ]
 
 
-def _search_in_table(plan: _Plan, found: SearchResult) -> Search:
-    walks = len(found.history) * plan.search.population
-    return Search(walks, found.walk, found.loss, found.stop)
+def _search_in_table(plan: _Plan, result: SearchResult) -> Search:
+    walks = len(result.history) * plan.search.population
+    return Search(walks, result.walk, result.loss, result.stop)
 
 
 def _draw(

@@ -245,8 +245,8 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
         at = Step(read, reference, contact, lever)
         parts = [rows(constraint, at, turn) for constraint in config.on("states")]
         C, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
-        known = C @ jnp.concatenate(free)
-        return Rows(C @ states, lower - known, upper - known)
+        constant = C @ jnp.concatenate(free)
+        return Rows(C @ states, lower - constant, upper - constant)
 
     flat = states.reshape(*states.shape[:2], -1)
     horizon = problem.horizon

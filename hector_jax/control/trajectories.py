@@ -85,10 +85,10 @@ def load_command(path: Path) -> NamedCommand:
         InputError: one line naming the file and the field that is unknown, missing or out of range.
     """
     path = Path(path)
-    told = from_table(str(path), _File, read_toml(path, "a trajectory", _MOST_BYTES))
+    file = from_table(str(path), _File, read_toml(path, "a trajectory", _MOST_BYTES))
     segments = [
         from_table(f"{path}: segment {number}", Segment, one)
-        for number, one in enumerate(told.segment, 1)
+        for number, one in enumerate(file.segment, 1)
     ]
     seconds = sum(one.seconds for one in segments)
     if seconds > _MOST_SECONDS:
@@ -100,7 +100,7 @@ def load_command(path: Path) -> NamedCommand:
         velocity=np.array([(one.v_x, one.v_y) for one in segments]),
         yaw_rate=np.array([one.yaw_rate for one in segments]),
     )
-    return NamedCommand(told.name, command, round(seconds / _GRID) * _GRID)
+    return NamedCommand(file.name, command, round(seconds / _GRID) * _GRID)
 
 
 def command_of(text: str) -> NamedCommand:
@@ -165,12 +165,12 @@ def beyond(limits: Limits, command: Command) -> str | None:
     A change from one segment to the next counts like a start from standing.
     """
     ahead, aside = np.asarray(command.velocity).T
-    asked = {
+    limits_by_name = {
         "v_x": (ahead, -limits.back, limits.ahead, "m/s"),
         "v_y": (aside, -limits.aside, limits.aside, "m/s"),
         "yaw_rate": (np.asarray(command.yaw_rate), -limits.turn, limits.turn, "rad/s"),
     }
-    for name, (values, low, high, unit) in asked.items():
+    for name, (values, low, high, unit) in limits_by_name.items():
         changes = np.diff(values, prepend=0.0)
         for number, (value, change) in enumerate(zip(values, changes, strict=True), 1):
             for what, size in ((name, value), (f"the change of {name}", change)):

@@ -92,7 +92,7 @@ def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.n
     if array.shape != shape:
         raise InputError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
     for index, value in np.ndenumerate(array):
-        if told := validation_error(value, float, WEIGHTS):
+        if fault := validation_error(value, float, WEIGHTS):
             place = "".join(f"[{i}]" for i in index)
-            raise InputError(f"{path}: {name}{place} {told}")
+            raise InputError(f"{path}: {name}{place} {fault}")
     return array.astype(float)

@@ -44,25 +44,25 @@ def versions() -> dict[str, str]:
 
 @cache  # every file's card asks for them
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
-            found[package] = version(package)
+            installed[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 def environment() -> dict[str, str]:
     """What the numbers were made with: versions, platform, device and, if known, the commit."""
-    found = versions() | {
+    details = versions() | {
         "platform": f"{platform.system()} {platform.machine()}",
         "cores": str(os.cpu_count()),
         "device": jax.default_backend(),
         "precision": str(jnp.asarray(0.0).dtype),
     }
     commit = _commit(_ROOT.parent)
-    return found | ({"commit": commit} if commit else {})
+    return details | ({"commit": commit} if commit else {})
 
 
 def _commit(folder: Path) -> str:
@@ -118,15 +118,15 @@ def _source(module: str) -> Path:
 
 def _imported(tree: ast.Module) -> list[str]:
     """Modules of this package that a module imports, relative to it."""
-    package, found = f"{_ROOT.name}.", []
+    package, modules = f"{_ROOT.name}.", []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(package):
             module = f"{node.module}."[len(package) :]
             names = [f"{module}{alias.name}" for alias in node.names]
-            found += [name for name in names if _source(name).exists()] + [module[:-1]] * bool(
+            modules += [name for name in names if _source(name).exists()] + [module[:-1]] * bool(
                 module
             )
-    return found
+    return modules
 
 
 def _is_text(node: ast.AST) -> bool:

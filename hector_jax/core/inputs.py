@@ -27,8 +27,8 @@ def unknown(what: str, name: Any, names: Iterable[str]) -> str:
     "unknown set 'wiht'; did you mean 'with'?; known: with, without"
     """
     names = list(names)
-    known = ", ".join(names) or "none"
-    return f"unknown {what} {short_repr(name)}{did_you_mean(name, names)}; known: {known}"
+    choices = ", ".join(names) or "none"
+    return f"unknown {what} {short_repr(name)}{did_you_mean(name, names)}; known: {choices}"
 
 
 def short_repr(value: Any) -> str:

@@ -41,7 +41,7 @@ class Part(str):
 P = TypeVar("P", bound=Part)
 
 
-def choose_part(what: str, chosen: str, kind: type[P], known: Iterable[P]) -> P:
+def choose_part(what: str, chosen: str, kind: type[P], parts: Iterable[P]) -> P:
     """The part itself, or the known one of that name.
 
     Raises:
@@ -49,7 +49,7 @@ def choose_part(what: str, chosen: str, kind: type[P], known: Iterable[P]) -> P:
     """
     if isinstance(chosen, kind):
         return chosen
-    by_name = {str(part): part for part in known}
+    by_name = {str(part): part for part in parts}
     if isinstance(chosen, Part):
         raise InputError(f"{what} must be a {kind.__name__}, got {chosen!r}")
     return by_name[choose(what, chosen, by_name)]

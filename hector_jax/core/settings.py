@@ -208,18 +208,20 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
     Raises:
         InputError: one line naming `where` and the field that is unknown, missing or wrong.
     """
-    known = {field.name: field for field in fields(kind)}  # pyright: ignore[reportArgumentType]
+    by_name = {field.name: field for field in fields(kind)}  # pyright: ignore[reportArgumentType]
     if not isinstance(table, Mapping):
-        raise InputError(f"{where} must be a table of {', '.join(known)}, got {short_repr(table)}")
+        raise InputError(
+            f"{where} must be a table of {', '.join(by_name)}, got {short_repr(table)}"
+        )
     values = {}
     for old, (new, words) in getattr(kind, "RENAMED", {}).items():
         if old in table:
             table = {new if name == old else name: value for name, value in table.items()}
             table[new] = words.get(str(table[new]), table[new])
     for name, value in table.items():
-        if name not in known:
-            raise InputError(f"{where}: {unknown('field', name, known)}")
-        type_ = known[name].type
+        if name not in by_name:
+            raise InputError(f"{where}: {unknown('field', name, by_name)}")
+        type_ = by_name[name].type
         types = [x for x in (type_, *get_args(type_)) if isinstance(x, type)]
         inner = next(filter(is_dataclass, types), None)
         if inner and value is not None:
@@ -229,9 +231,9 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
             values[name] = convert(value, type_)
         except InputError as error:
             raise InputError(f"{where}: {name} {error}") from None
-    for name, field in known.items():
+    for name, field in by_name.items():
         if name not in table and field.default is field.default_factory is MISSING:
-            raise InputError(f"{where}: missing field {name!r}; known: {', '.join(known)}")
+            raise InputError(f"{where}: missing field {name!r}; known: {', '.join(by_name)}")
     try:
         return kind(**values)
     except InputError as error:

@@ -105,8 +105,8 @@ def load_tree(
     wanted = _named_leaves(like)
     if arrays.keys() != wanted.keys():
         odd = sorted(arrays.keys() ^ wanted.keys())
-        told = one_line(", ".join(odd))
-        raise InputError(f"{path}: another layout of {kind}; fields that differ: {told}")
+        differences = one_line(", ".join(odd))
+        raise InputError(f"{path}: another layout of {kind}; fields that differ: {differences}")
     for name, leaf in wanted.items():
         is_text = np.asarray(leaf).dtype.kind == "U"
         if (dtype := arrays[name].dtype).kind not in ("U" if is_text else "biuf"):
@@ -160,8 +160,8 @@ def _check_card(path: Path, card: Any) -> None:
     for name, kind in kinds.items():
         if name not in card:
             raise InputError(f"{path}: card.{name} is missing")
-        if told := validation_error(card[name], kind):
-            raise InputError(f"{path}: card.{name} {told}")
+        if fault := validation_error(card[name], kind):
+            raise InputError(f"{path}: card.{name} {fault}")
 
 
 def _read_bytes(path: Path) -> bytes:

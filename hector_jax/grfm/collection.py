@@ -95,10 +95,10 @@ def collect(
         save_tree(paths[i], walks[i], kind="walks", robot=robot, about=facts)
         done += 1
         progress(done, len(jobs))
-    found = [walk for walk in walks if walk is not None]
-    if len(found) < len(jobs):
-        raise ValueError(f"{folder}: {len(jobs)} walks asked for, {len(found)} came")
-    falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in found)
+    complete = [walk for walk in walks if walk is not None]
+    if len(complete) < len(jobs):
+        raise ValueError(f"{folder}: {len(jobs)} walks asked for, {len(complete)} came")
+    falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in complete)
     card = {"walks": len(jobs), "falls": falls, "shards": [path.name for path in paths], **facts}
     write_file(Path(folder) / "card.json", (json.dumps(card, indent=2) + "\n").encode())
 

@@ -86,13 +86,13 @@ def guess(
         from jax.experimental.pallas import triton
 
         options["compiler_params"] = triton.CompilerParams(num_warps=4, num_stages=1)
-    found = pl.pallas_call(
+    outputs = pl.pallas_call(
         partial(_kernel, n, _softness(dtype)),
         out_shape=Guess(**out),
         interpret=interpret,
         **options,
     )(*tiles)
-    return Guess(found.x[:n], found.y[:m], found.side[:m], found.settled)
+    return Guess(outputs.x[:n], outputs.y[:m], outputs.side[:m], outputs.settled)
 
 
 class _Problem(NamedTuple):

@@ -176,8 +176,8 @@ class Normal(NamedTuple):
         primal = jnp.max(self.violation(x) / self.row_sizes(x), initial=0.0)
         dual = largest(price + self.q + pull) / self.slope_size(point)
         gap = jnp.abs(jnp.sum(terms)) / (_SMALL * self.reach + largest(terms))
-        found = jnp.stack([primal, dual, gap])
-        return jnp.where(jnp.isfinite(jnp.sum(found)), found, jnp.inf)
+        residuals = jnp.stack([primal, dual, gap])
+        return jnp.where(jnp.isfinite(jnp.sum(residuals)), residuals, jnp.inf)
 
 
 def _scales(tolerances: Tolerances, qp: QP) -> tuple[Array, Array, Array]:

@@ -50,7 +50,7 @@ def _scalars(line: dict) -> dict[str, float]:
         "loss": [name for name in line if name == "L" or name.startswith("L_")],
         "step": ("step", "accepted", "residual"),
     }
-    found = {f"{room}/{name}": line.get(name) for room, names in rooms.items() for name in names}
+    scalars = {f"{room}/{name}": line.get(name) for room, names in rooms.items() for name in names}
     for room in ("weights", "gradient_log"):
-        found |= {f"{room}/{name}": value for name, value in line.get(room, {}).items()}
-    return {tag: float(value) for tag, value in found.items() if value is not None}
+        scalars |= {f"{room}/{name}": value for name, value in line.get(room, {}).items()}
+    return {tag: float(value) for tag, value in scalars.items() if value is not None}

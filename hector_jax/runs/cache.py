@@ -90,9 +90,9 @@ def cached(
             key: load_artefact(path, like(key), kind=kind, robot=robot)
             for key, path in paths.items()
         }
-        found = {key: tree for key, tree in loaded.items() if tree is not None}
-        missing = [key for key in paths if key not in found]
-        for key, tree in make(missing, dict(found)) if missing else ():
+        trees = {key: tree for key, tree in loaded.items() if tree is not None}
+        missing = [key for key in paths if key not in trees]
+        for key, tree in make(missing, dict(trees)) if missing else ():
             save_tree(paths[key], tree, kind=kind, robot=robot, about=about)
-            found[key] = tree
-    return {key: found[key] for key in paths}
+            trees[key] = tree
+    return {key: trees[key] for key in paths}

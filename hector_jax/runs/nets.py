@@ -155,10 +155,10 @@ def samples(robot: Robot, *folders: Path) -> Samples:
 
 def _samples(robot: Robot, folder: Path) -> Samples:
     walks = collection.load_walks(folder, robot)
-    found, dropped = dataset.make_dataset(
+    data, dropped = dataset.make_dataset(
         robot, walks.trajectory, walks.job.start_tick, push=walks.job.push
     )
-    rest, held_out = dataset.split_by_walk(found)
+    rest, held_out = dataset.split_by_walk(data)
     return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
 
 
@@ -280,10 +280,10 @@ def ground(pool: Executor, robot: Robot, data: Path, variant: str | None = None)
     with locked(data):  # a second process that begins now waits, and finds the net
         if not path.exists():
             return _train(config, robot, (walks,), path)
-    found, about = load_net(path, robot, config.variant)
+    trained, about = load_net(path, robot, config.variant)
     check_settings(path, about["settings"], training_settings(config))
     check_settings(path, about["made_of"], made_of)
-    return found._replace(folders=(walks,))
+    return trained._replace(folders=(walks,))
 
 
 def refresh(

@@ -211,13 +211,13 @@ def tune(
         key = content_key(config, robot, start, *problem, code=TUNING_CODE)
         paths[name] = folder / f"tuning-{name}-{key}.npz"
 
-    def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    def make(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         if journal is not None:
-            there = {name: _restored(one).tuning.history for name, one in found.items()}
+            there = {name: _restored(one).tuning.history for name, one in stored.items()}
             journal.write({name: there.get(name, ()) for name in problems})  # in their order
-        asked = {name: problems[name] for name in missing}
+        wanted = {name: problems[name] for name in missing}
         note = partial(_note, config, robot, problems, journal, dumps)
-        for name, tuning in _tunings(pool, config, robot, start, asked, title, note):
+        for name, tuning in _tunings(pool, config, robot, start, wanted, title, note):
             yield name, _stored(Tuned(tuning, commit))
 
     like = partial(_stored_like, config.loss)
@@ -282,7 +282,7 @@ def tune_measured(
     key = content_key(config, robot, weights, command, params, *plants, code=code)
     job = partial(_measured_job, config, robot, command, params)
 
-    def make(missing: list[str], found: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    def make(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         with bar(title) as tell:
             tell(0, config.iterations, "compiling")
             tuning = measured.tune_measured(

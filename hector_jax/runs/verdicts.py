@@ -63,8 +63,8 @@ def walk_jobs(
     """The walks of jobs, in order, as they come."""
     with bar(title) as tell:
         tell(0, len(jobs), "compiling")
-        for done, found in enumerate(MUJOCO_C.walk(pool, config.rollout.walk, robot, jobs), 1):
-            yield found
+        for done, walk in enumerate(MUJOCO_C.walk(pool, config.rollout.walk, robot, jobs), 1):
+            yield walk
             tell(done, len(jobs), "")
 
 
@@ -145,24 +145,24 @@ def judge(
     def with_walk(case: Case) -> bool:
         return folder is not None and case[1] == seeds[0]
 
-    def make(missing: list[Case], found: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
-        there = f"; {len(found)} of {plural(len(jobs), 'walk')} are there" if found else ""
+    def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
+        there = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
         walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
         for case, walk in zip(missing, walks, strict=True):
-            kept = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
-            yield case, (_judged(config.loss, walk, commit), kept)
+            samples = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
+            yield case, (_judged(config.loss, walk, commit), samples)
 
     if folder is None:
-        found = dict(make(list(jobs), {}))
+        results = dict(make(list(jobs), {}))
     else:
         paths = {}
         for case, job in jobs.items():
             key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
             paths[case] = _path(folder, case, key, with_walk(case))
         like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
-        found = cached(paths, make, like=like, kind="walk", robot=robot)
-    walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in found.items()}
+        results = cached(paths, make, like=like, kind="walk", robot=robot)
+    walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
     return Judged(
         {name: [walks[name, seed] for seed in seeds] for name in sets},
-        {name: found[name, seeds[0]][1] for name in sets if with_walk((name, seeds[0]))},
+        {name: results[name, seeds[0]][1] for name in sets if with_walk((name, seeds[0]))},
     )

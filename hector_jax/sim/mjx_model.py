@@ -107,15 +107,15 @@ def find_places(world: World) -> Places:
 
 def mjx_contacts(data: mjx.Data) -> Contacts:
     """Contacts of the last MJX step; slots whose bodies are apart have geoms -1."""
-    found = data._impl.contact
-    rows = np.maximum(found.efc_address, 0)[:, None] + np.arange(4)
+    contact = data._impl.contact
+    rows = np.maximum(contact.efc_address, 0)[:, None] + np.arange(4)
     edges = data._impl.efc_force[np.minimum(rows, data._impl.efc_force.shape[0] - 1)]
     return Contacts(
-        geoms=jnp.where((found.dist < found.includemargin)[:, None], found.geom, -1),
-        position=found.pos,
-        frame=found.frame,
+        geoms=jnp.where((contact.dist < contact.includemargin)[:, None], contact.geom, -1),
+        position=contact.pos,
+        frame=contact.frame,
         pyramid=edges,
-        friction=found.friction[:, :2],
+        friction=contact.friction[:, :2],
     )
 
 

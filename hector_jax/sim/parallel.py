@@ -164,10 +164,10 @@ def _sample(
     carry, _ = jax.lax.scan(partial(_millisecond, program, walk), carry, when)
     time = when[0][-1] + (when[1][-1] + 1) / program.substeps
     after = _read(program, walk, carry.physics)
-    known = walk.robot, walk.job.command, carry.anchor, time, carry.yaw, after
+    truth = walk.robot, walk.job.command, carry.anchor, time, carry.yaw, after
     effect = jax.tree.map(lambda w: w / program.period, carry.effect)
     touches = Touches(carry.fallen, carry.legs)
-    now = loop.sample(program.config, *known, effect=effect, touches=touches)
+    now = loop.sample(program.config, *truth, effect=effect, touches=touches)
     carry = carry._replace(last=where(carry.fallen, carry.last, now))
     return carry, carry.last._replace(fallen=carry.fallen)
 
@@ -176,9 +176,9 @@ def _plan(
     program: _Program, walk: _Walk, tick: Int[Array, ""], carry: _Carry, *, max_contacts: int
 ) -> tuple[Memory, Plan]:
     job, reading = walk.job, _read(program, walk, carry.physics)
-    asked = carry.anchor, tick, carry.memory, carry.yaw, reading, walk.error
+    inputs = carry.anchor, tick, carry.memory, carry.yaw, reading, walk.error
     return loop.plan_tick(
-        program.config, walk.robot, job.weights, job.command, *asked, max_contacts=max_contacts
+        program.config, walk.robot, job.weights, job.command, *inputs, max_contacts=max_contacts
     )
 
 
@@ -209,13 +209,13 @@ def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     reading = _read(program, walk, physics)
     anchor = standing_anchor(robot)._replace(tick=job.start_tick)
     memory = init_memory(robot, loop.measure(robot, reading, yaw, walk.error))
-    asked = anchor, tick, memory, yaw, reading, walk.error
+    inputs = anchor, tick, memory, yaw, reading, walk.error
     shapes = jax.eval_shape(
-        lambda: loop.plan_tick(config, robot, job.weights, job.command, *asked, max_contacts=2)[1]
+        lambda: loop.plan_tick(config, robot, job.weights, job.command, *inputs, max_contacts=2)[1]
     )
-    known = robot, job.command, anchor, 1.0 * tick, yaw, reading
+    truth = robot, job.command, anchor, 1.0 * tick, yaw, reading
     touches = Touches(never, never)
-    now = loop.sample(config, *known, effect=zero_wrench(), touches=touches)
+    now = loop.sample(config, *truth, effect=zero_wrench(), touches=touches)
     return _Carry(
         memory=memory,
         plan=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),

@@ -136,13 +136,13 @@ def read_contacts(world: World, data: mujoco.MjData, out: Contacts, row: int) ->
     if count > CONTACTS:  # nobody walks with so many: told as the floor touched by no foot
         out.geoms[row] = world.floor
     elif count:
-        found = data.contact
-        edges = found.efc_address[:, None] + np.arange(4)
-        included = found.efc_address[:, None] >= 0
-        out.geoms[row, :count] = found.geom
-        out.position[row, :count] = found.pos
-        out.frame[row, :count] = found.frame.reshape(-1, 3, 3)
-        out.friction[row, :count] = found.friction[:, :2]
+        contact = data.contact
+        edges = contact.efc_address[:, None] + np.arange(4)
+        included = contact.efc_address[:, None] >= 0
+        out.geoms[row, :count] = contact.geom
+        out.position[row, :count] = contact.pos
+        out.frame[row, :count] = contact.frame.reshape(-1, 3, 3)
+        out.friction[row, :count] = contact.friction[:, :2]
         out.pyramid[row, :count] = included * data.efc_force.take(edges, mode="clip")
 
 
@@ -163,9 +163,9 @@ def measure(
 ) -> tuple[Measurement, Float[Array, ""]]:
     """What the controller is told, the truth plus `error`; and the true yaw, for the next call."""
     state = base_state(robot, reading, yaw_before)
-    told = State(*(value + error[3 * i : 3 * i + 3] for i, value in enumerate(state)))
+    estimate = State(*(value + error[3 * i : 3 * i + 3] for i, value in enumerate(state)))
     joints = reading.joints + error[12:]
-    return Measurement(told, joints, reading.joint_rates), state.euler[2]
+    return Measurement(estimate, joints, reading.joint_rates), state.euler[2]
 
 
 def draw_errors(

@@ -51,8 +51,8 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     def samples(robot, command, anchor, tick, yaw, readings, contacts, place) -> Sample:
         def one(time: Array, before: Array, after: Array, contacts: Contacts) -> Sample:
             effect, touches = loop.contact_wrench(robot, before, contacts, *place)
-            known = robot, command, anchor, time, yaw, after
-            return loop.sample(config, *known, effect=effect, touches=touches)
+            truth = robot, command, anchor, time, yaw, after
+            return loop.sample(config, *truth, effect=effect, touches=touches)
 
         times = tick + (1 + jnp.arange(count)) / count
         return jax.vmap(one)(times, readings[:-1], readings[1:], contacts)
@@ -166,14 +166,14 @@ def _walk_ticks(
             anchor = jax.device_put(anchor_at(robot, last, start))
         done = (tick - begin) * count
         error, yaw_before, now = errors[done:], yaw, np.array(tick, np.int32)
-        told = yaw, plant.readings[0], error[0]
+        inputs = yaw, plant.readings[0], error[0]
         if retune is not None and plan is not None and tick >= start:
-            measurement = programs.measure(body, told[1], yaw, error[0])
+            measurement = programs.measure(body, inputs[1], yaw, error[0])
             carry, weights = retune.step(carry, tick, anchor, measurement, plan.wrench)
             weights = jax.device_put(weights)
         max_contacts = contacts_needed(config, tick)
         memory, plan = programs.plan(
-            body, weights, command, anchor, now, memory, *told, max_contacts=max_contacts
+            body, weights, command, anchor, now, memory, *inputs, max_contacts=max_contacts
         )
         for i in range(count):
             held = imperfections, memory, plan, motors, yaw, numbers[i]

@@ -112,7 +112,7 @@ def _evaluate(
 
     def walk(scenario: Scenario) -> Evaluation:
         which = 0 if single else scenario.effect
-        found = evaluate(
+        evaluation = evaluate(
             config.rollout,
             robot,
             weights,
@@ -123,16 +123,16 @@ def _evaluate(
             scenario.variation,
         )
         loss, terms, gradient = jax.tree.map(
-            lambda x: x / scenario.scale, (found.loss, found.terms, found.gradient)
+            lambda x: x / scenario.scale, (evaluation.loss, evaluation.terms, evaluation.gradient)
         )
-        return found._replace(loss=loss, terms=terms, gradient=gradient)
+        return evaluation._replace(loss=loss, terms=terms, gradient=gradient)
 
-    found = _over(lanes, walk, problem.scenarios)
-    by = tail_weights(found.loss, problem.tail)
+    each = _over(lanes, walk, problem.scenarios)
+    by = tail_weights(each.loss, problem.tail)
     loss, terms, gradient = jax.tree.map(
-        lambda x: jnp.tensordot(by, x, axes=1), (found.loss, found.terms, found.gradient)
+        lambda x: jnp.tensordot(by, x, axes=1), (each.loss, each.terms, each.gradient)
     )
-    return Evaluation(loss, terms, gradient, jnp.max(found.fallen), jnp.max(found.residual))
+    return Evaluation(loss, terms, gradient, jnp.max(each.fallen), jnp.max(each.residual))
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -240,11 +240,11 @@ def tune_batch(
         histories.append(_fetch(history))
         left = int(np.sum(stop[:count] == Stop.GOING))
         tell(count - left, count, f"median L {np.median(loss[:count]):.4g}")
-    found = jax.tree.map(lambda x: x[:count], _fetch(states))
+    final = jax.tree.map(lambda x: x[:count], _fetch(states))
     history = jax.tree.map(
         lambda *parts: np.concatenate(parts, axis=1)[:count, : config.iterations + 1], *histories
     )
-    return Tunings(found.ten, found.best, found.loss, found.stop, found.count - 1, history)
+    return Tunings(final.ten, final.best, final.loss, final.stop, final.count - 1, history)
 
 
 def _check_problems(config: TuneConfig, problems: Problem, effects: jax.tree_util.Partial) -> int:
@@ -255,9 +255,9 @@ def _check_problems(config: TuneConfig, problems: Problem, effects: jax.tree_uti
     if not ((tail >= 0) & (tail <= 1)).all():
         raise ValueError(f"Problem.tail must be from 0 to 1, got {tail.min()} to {tail.max()}")
     phis = min((len(leaf) for leaf in jax.tree.leaves(effects)), default=1)
-    asked = np.asarray(scenarios.effect)
-    if asked.min() < 0 or asked.max() >= phis:
-        raise ValueError(f"Scenario.effect must be below {phis}, got {asked.min()}..{asked.max()}")
+    index = np.asarray(scenarios.effect)
+    if index.min() < 0 or index.max() >= phis:
+        raise ValueError(f"Scenario.effect must be below {phis}, got {index.min()}..{index.max()}")
     if not (np.asarray(scenarios.scale) > 0).all():
         raise ValueError("Scenario.scale must be positive")
     if scenarios.variation is not None:

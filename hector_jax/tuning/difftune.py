@@ -303,9 +303,9 @@ def _in_words(status: StepStatus, evaluation: Evaluation) -> str:
 
 
 def status_of(reason: str) -> StepStatus:
-    """Status of an iteration whose reason is known, such as from a file."""
-    found = (status for status, text in REASONS.items() if reason.startswith(text))
-    return next(found, StepStatus.NOT_FINITE if reason else StepStatus.ACCEPTED)
+    """Status of an iteration of which only the reason is there, such as from a file."""
+    statuses = (status for status, text in REASONS.items() if reason.startswith(text))
+    return next(statuses, StepStatus.NOT_FINITE if reason else StepStatus.ACCEPTED)
 
 
 def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:

@@ -73,8 +73,8 @@ def gradient_norms(
 
     def norm(name: str) -> float:
         alone = tuple(term._replace(weight=float(term.name == name)) for term in loss)
-        found = evaluate_jit(config, robot, weights, command, anchor, effect, alone)
-        logs = jax.tree.map(jnp.multiply, found.gradient, weights)
+        evaluation = evaluate_jit(config, robot, weights, command, anchor, effect, alone)
+        logs = jax.tree.map(jnp.multiply, evaluation.gradient, weights)
         return float(jnp.linalg.norm(weights_to_vector(logs)))
 
     return {term.name: norm(term.name) for term in loss}

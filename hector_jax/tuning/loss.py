@@ -174,6 +174,6 @@ def with_alphas(weights: Mapping[str, float], loss: Loss = PAPER_LOSS) -> Loss:
         if key not in names:
             raise InputError(f"no term {key!r} in the loss{did_you_mean(key, names)}")
     given = {names[key]: weight for key, weight in weights.items()}
-    found = tuple(t._replace(weight=given.get(t.name, t.weight)) for t in loss)
-    check_loss(found)
-    return found
+    weighted = tuple(t._replace(weight=given.get(t.name, t.weight)) for t in loss)
+    check_loss(weighted)
+    return weighted

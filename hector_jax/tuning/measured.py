@@ -73,16 +73,16 @@ def evaluate_walk(
     trace = init_trace(anchor, jax.tree.map(lambda x: x[0], states), first)
     used = jax.tree.map(lambda w: np.broadcast_to(w, (ticks - 1, *np.shape(w))), weights)
     tick = np.asarray(start_tick + 1, np.int32)
-    _, found = follow(config, robot, command, anchor, effect, trace, used, tick, states)
-    fallen = jnp.maximum(found.fallen, jnp.mean(1.0 * jnp.asarray(walk.fallen)))
-    worst = jnp.maximum(found.residual, jnp.max(jnp.asarray(walk.residual)))
-    return jax.tree.map(np.asarray, found._replace(fallen=fallen, residual=worst))
+    _, evaluation = follow(config, robot, command, anchor, effect, trace, used, tick, states)
+    fallen = jnp.maximum(evaluation.fallen, jnp.mean(1.0 * jnp.asarray(walk.fallen)))
+    worst = jnp.maximum(evaluation.residual, jnp.max(jnp.asarray(walk.residual)))
+    return jax.tree.map(np.asarray, evaluation._replace(fallen=fallen, residual=worst))
 
 
 def tune_measured(
     config: TuneConfig,
     weights: Weights,
-    look: Callable[[Weights], Sequence[Evaluation]],
+    evaluate: Callable[[Weights], Sequence[Evaluation]],
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
 ) -> Tuning:
     """Tune on measured walks, from weights that have been tuned on the model.
@@ -93,7 +93,7 @@ def tune_measured(
     Args:
         config: how; these iterations count from the paper's ten on.
         weights: where to start.
-        look: walks with weights on each plant and differentiates, see `evaluate_walk`.
+        evaluate: walks with weights on each plant and differentiates, see `evaluate_walk`.
         on_iteration: called after each iteration.
 
     Raises:
@@ -101,8 +101,8 @@ def tune_measured(
     """
 
     def mean(weights: Weights) -> Evaluation:
-        found = look(weights)
-        both = jax.tree.map(lambda *x: np.mean(x, axis=0), *found)
-        return both._replace(residual=np.max([one.residual for one in found]))
+        evaluations = evaluate(weights)
+        both = jax.tree.map(lambda *x: np.mean(x, axis=0), *evaluations)
+        return both._replace(residual=np.max([one.residual for one in evaluations]))
 
     return descend(config, weights, mean, on_iteration, PAPER_ITERATIONS)

@@ -145,8 +145,8 @@ def window_gradient(
     walk, columns = _with_command_before(samples, columns, trace)
     value, gradient = sensitivity.gradient(loss, walk, columns)
     fallen, residual = jnp.mean(1.0 * samples.fallen), jnp.max(samples.residual)
-    found = Evaluation(value, losses(loss, walk), gradient, fallen, residual)
-    return Trace(last.commands, tangents), found
+    evaluation = Evaluation(value, losses(loss, walk), gradient, fallen, residual)
+    return Trace(last.commands, tangents), evaluation
 
 
 _window_gradient = jax.jit(window_gradient, static_argnums=0, static_argnames="measured")
@@ -269,7 +269,7 @@ def _follow_window(
     stack = lambda rows: jax.tree.map(lambda *x: np.stack(x), *rows)  # noqa: E731
     if config.estimator != "carried":
         trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
-    found = follow(
+    result = follow(
         config.tune,
         robot,
         command,
@@ -281,7 +281,7 @@ def _follow_window(
         stack(states),
         measured=config.estimator != "model",
     )
-    return jax.tree.map(np.asarray, found)
+    return jax.tree.map(np.asarray, result)
 
 
 def retuner(

@@ -163,8 +163,8 @@ def _respond(
         since_switch=since_switch,
         base=from_yaw_frame(state),
     )
-    found = effect(seen)
-    return Late(turn(found.wrench, yaw), turn(found.legs, yaw))
+    answer = effect(seen)
+    return Late(turn(answer.wrench, yaw), turn(answer.legs, yaw))
 
 
 def _move(

@@ -76,12 +76,12 @@ class Look(NamedTuple):
         return {"linestyle": "none", "color": self.color, "marker": self.marker}
 
 
-def looks_of(names: Iterable[str], known: Mapping[str, Any] = SETS) -> dict[str, Look]:
+def looks_of(names: Iterable[str], table: Mapping[str, Any] = SETS) -> dict[str, Look]:
     """How each weight set (or curve, of `CURVES`) is drawn; others take spare looks in turn."""
     looks, spare = {}, cycle(_SPARE)
     for name in names:
-        if name in known:
-            looks[name] = Look(known[name], _MARKER.get(name, "^"))
+        if name in table:
+            looks[name] = Look(table[name], _MARKER.get(name, "^"))
         else:
             color, marker = next(spare)
             looks[name] = Look({"color": color, **_SPARE_STYLE}, marker)

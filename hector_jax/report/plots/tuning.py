@@ -29,11 +29,11 @@ def losses(
         histories: of the tunings, by weight set: `without` and `with`.
         ten: the iteration to mark.
     """
-    parts = {"$L$": lambda found: found.loss}
+    parts = {"$L$": lambda evaluation: evaluation.loss}
     for i, term in enumerate(loss, 1):
         alpha = "" if term.weight == 1.0 else rf"\alpha_{i} "
         title = rf"${alpha}L_\mathrm{{{term.name.removeprefix('L_')}}}$"
-        parts[title] = lambda found, term=term: term.weight * found.terms[term.name]
+        parts[title] = lambda evaluation, term=term: term.weight * evaluation.terms[term.name]
     accepted = {n: np.array([i.accepted for i in history]) for n, history in histories.items()}
     cross = {"linestyle": "none", "marker": "x", "color": "black", "markersize": 4.5}
     with drawing(path, 2.5 * len(parts), 2.7) as figure:
