@@ -27,7 +27,8 @@ from hector_jax.grfm.collection import load_walks, walked_with
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
-from hector_jax.robot.model import MODEL_PATH, load_robot
+from hector_jax.robot.description import MODEL_PATH
+from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, searches, tunings, verdicts
 from hector_jax.runs.nets import CollectConfig
 from hector_jax.tuning.difftune import TuneConfig

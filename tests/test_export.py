@@ -18,6 +18,7 @@ from oracles import exact_solution
 from scipy.spatial.transform import Rotation
 
 from hector_jax.cli.main import main
+from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
@@ -249,6 +250,10 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_reference="gravity"))
     assert "ATTENTION" in weights_cpp(nominal(), about_weight, ROBOT, name="nominal")
+    assert "friction at toe and heel: True" in text
+    mpc = MpcConfig(constraints=tuple(c for c in MpcConfig().constraints if c != LINE_FRICTION))
+    without = weights_cpp(nominal(), WalkConfig(mpc=mpc), ROBOT, name="nominal")
+    assert "friction at toe and heel: False" in without
     code = [line for line in text.splitlines() if not line.startswith("//")]
     assert code[0] == "double Q[12] = {"
     assert max(map(len, text.splitlines())) <= 100

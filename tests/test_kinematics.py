@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hector_jax.core.geometry import rotation_from_euler
+from hector_jax.robot.description import Description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs, leg_gravity
-from hector_jax.robot.model import FOOT_POINTS, load_model, load_robot
+from hector_jax.robot.model import load_model, load_robot
 
 foot_poses_jit = jax.jit(foot_poses)
 foot_jacobians_jit = jax.jit(foot_jacobians)
@@ -54,7 +55,7 @@ def test_foot_poses_are_those_of_mujoco(model, robot, random_joints):
     for joints in random_joints:
         data = pose(model, joints)
         feet = foot_poses_jit(robot, joints)
-        for side, foot in enumerate(FOOT_POINTS):
+        for side, foot in enumerate(Description.foot_points):
             site = data.site(foot)
             np.testing.assert_allclose(feet.position[side], site.xpos, rtol=0, atol=1e-12)
             np.testing.assert_allclose(
@@ -66,7 +67,7 @@ def test_foot_jacobians_are_those_of_mujoco(model, robot, random_joints):
     for joints in random_joints:
         data = pose(model, joints)
         J_v, J_w = foot_jacobians_jit(robot, joints)
-        for side, foot in enumerate(FOOT_POINTS):
+        for side, foot in enumerate(Description.foot_points):
             full_v, full_w = np.zeros((3, 16)), np.zeros((3, 16))
             mujoco.mj_jacSite(model, data, full_v, full_w, model.site(foot).id)
             own = slice(6 + 5 * side, 11 + 5 * side)
@@ -214,7 +215,7 @@ def foot_wrenches(model, data):
         side = ("left_foot", "right_foot").index(names[1])
         world = contact.frame.reshape(3, 3).T @ local[:3]
         force[side] += world
-        moment[side] += np.cross(contact.pos - data.site(FOOT_POINTS[side]).xpos, world)
+        moment[side] += np.cross(contact.pos - data.site(Description.foot_points[side]).xpos, world)
     return force, moment
 
 

@@ -20,8 +20,9 @@ from hector_jax.control.legs import (
 )
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench, zero_wrench
+from hector_jax.robot.description import Description
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
-from hector_jax.robot.model import FOOT_POINTS, STANDING, load_model, load_robot
+from hector_jax.robot.model import load_model, load_robot
 
 CONFIG = LegConfig()
 ROBOT = load_robot()
@@ -97,15 +98,15 @@ def statics(share):
     """MuJoCo's joint torques of the standing pose when the left foot carries `share` of it."""
     model = load_model()
     data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key(STANDING).id)
+    mujoco.mj_resetDataKeyframe(model, data, model.key(Description.standing).id)
     mujoco.mj_forward(model, data)
-    feet = np.array([data.site(name).xpos for name in FOOT_POINTS])
+    feet = np.array([data.site(name).xpos for name in Description.foot_points])
     com = data.subtree_com[1]
     force = WEIGHT * np.array([[0.0, 0.0, share], [0.0, 0.0, 1.0 - share]])
     # moments that bring the centre of pressure under the centre of mass
     moment = np.cross(com - feet, force)
     need = data.qfrc_bias.copy()
-    for foot, name in enumerate(FOOT_POINTS):
+    for foot, name in enumerate(Description.foot_points):
         J_v, J_w = np.zeros((3, model.nv)), np.zeros((3, model.nv))
         mujoco.mj_jacSite(model, data, J_v, J_w, model.site(name).id)
         need -= J_v.T @ force[foot] + J_w.T @ moment[foot]

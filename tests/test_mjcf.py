@@ -4,8 +4,9 @@ import struct
 
 import pytest
 
+from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.mjcf import read_mjcf
-from hector_jax.robot.model import MODEL_PATH, load_model
+from hector_jax.robot.model import load_model
 
 TEXT = MODEL_PATH.read_text()
 HEAD = '<mujoco model="hector">'

@@ -11,7 +11,8 @@ from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.grfm.dataset import at_interval
-from hector_jax.robot.model import MODEL_PATH, load_robot
+from hector_jax.robot.description import MODEL_PATH
+from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.changes import Change
 from hector_jax.sim.loop import Job

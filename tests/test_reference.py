@@ -3,7 +3,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.reference import COMMANDS, UNSEEN, Anchor, named_command, reference_at
+from hector_jax.control.reference import (
+    COMMANDS,
+    UNSEEN,
+    Anchor,
+    Command,
+    named_command,
+    reference_at,
+)
 
 ANCHOR = Anchor(jnp.array([0.3, -0.2, 0.42]), jnp.array(0.7), jnp.array(10))
 
@@ -19,11 +26,18 @@ def test_before_the_start_it_stands_at_the_anchor():
     assert not np.asarray(state.velocity).any()
 
 
-@pytest.mark.parametrize("name", COMMANDS + UNSEEN)
-def test_the_path_is_the_integral_of_its_velocity(name):
-    times = np.arange(0, 9.0, 1e-3)
-    state = path(named_command(name), times)
-    middle = path(named_command(name), times[:-1] + 5e-4)
+TURNS = Command(np.full(2, 2.0), np.array([[0.5, 0.0], [0.2, 0.0]]), np.full(2, np.pi / 2))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [*map(named_command, COMMANDS + UNSEEN), TURNS, TURNS._replace(yaw_rate=np.full(2, np.pi))],
+    ids=[*COMMANDS, *UNSEEN, "a turn a lap", "two turns a lap"],
+)
+def test_the_path_is_the_integral_of_its_velocity(command):
+    times = np.arange(0, 13.0, 1e-3)
+    state = path(command, times)
+    middle = path(command, times[:-1] + 5e-4)
     np.testing.assert_allclose(
         np.diff(state.position, axis=0), 1e-3 * np.asarray(middle.velocity), atol=2e-8
     )

@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hector_jax.robot.model import FOOT_POINTS, JOINT_NAMES, MODEL_PATH, load_model, load_robot
+from hector_jax.robot.description import MODEL_PATH, Description
+from hector_jax.robot.model import load_model, load_robot
 
 TEXT = MODEL_PATH.read_text()
 
@@ -55,14 +56,14 @@ def test_joint_limits_are_those_of_the_facts_sheet(robot):
 
 
 def test_actuators_and_joints_come_left_leg_then_right(model):
-    assert [model.actuator(i).name for i in range(model.nu)] == list(JOINT_NAMES)
+    assert [model.actuator(i).name for i in range(model.nu)] == list(Description.joints)
     assert list(model.actuator_trnid[:, 0]) == list(range(1, 11))
 
 
 def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor(model, robot):
     data = standing(model)
     assert robot.trunk_height == pytest.approx(0.548, abs=1e-3)
-    for foot, side in zip(FOOT_POINTS, (1, -1), strict=True):
+    for foot, side in zip(Description.foot_points, (1, -1), strict=True):
         np.testing.assert_allclose(
             data.site(foot).xpos, [-0.0135, side * 0.0942, 0.0], rtol=0, atol=1e-6
         )
@@ -247,6 +248,16 @@ def drop_line(text, *marks):
             lambda t: t.replace('axis="0 1 0" range="-2.38', 'axis="0 -1 0" range="-2.38'),
             ["axis of joint 'left_knee'", "expected [0. 1. 0.]"],
             id="knee axis reversed",
+        ),
+        pytest.param(
+            lambda t: t.replace('range="-2.38 -0.10"', 'range="-2.38 0"'),
+            ["range of joint 'left_knee'", "lower < upper < 0"],
+            id="knee that stretches",
+        ),
+        pytest.param(
+            lambda t: t.replace('range="-2.38 -0.10"', 'range="0.10 2.38"'),
+            ["range of joint 'left_knee'", "bends backwards only"],
+            id="knee that bends forwards",
         ),
         pytest.param(
             lambda t: t.replace('name="standing"', 'name="stand"'),

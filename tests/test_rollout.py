@@ -52,6 +52,21 @@ def test_commands_respect_friction_force_and_line_foot(robot, anchor):
     assert (np.abs(force[:, :2]) <= 0.5 * force[:, 2:] + 1e-4).all()
     assert (force[:, 2] >= -1e-6).all()
     assert (force[:, 2] <= 500).all()
+    assert (np.abs(force[:, :2]).sum(axis=1) <= 0.6 * force[:, 2] + 1e-4).all()  # MuJoCo's diamond
+
+
+def test_a_line_foot_is_pressed_between_heel_and_toe_and_has_no_moment_about_its_length(
+    robot, anchor
+):
+    trajectory = walk(LONG, robot, nominal(), named_command("straight"), anchor, PLAIN)
+    stands = np.asarray(trajectory.contact)
+    force = np.asarray(trajectory.command.force)[stands]
+    moment = np.asarray(trajectory.command.moment)[stands]
+    ratio = moment[:, 1] / force[:, 2]  # the feet point ahead to within a degree
+    assert (-robot.toe - 1e-4 <= ratio).all()
+    assert (ratio <= robot.heel + 1e-4).all()
+    assert ratio.max() > 0.99 * robot.heel  # a bound that is reached
+    assert np.abs(moment[:, 0]).max() <= 0.02 * np.abs(moment[:, 1]).max()
 
 
 def test_falling_is_seen_and_charged(robot, anchor):

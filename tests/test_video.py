@@ -16,7 +16,8 @@ from hector_jax.core.trajectory import State
 from hector_jax.report import render, video
 from hector_jax.report.motion import motion, motions, poses
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film, write_strip
-from hector_jax.robot.model import MODEL_PATH, load_robot
+from hector_jax.robot.description import MODEL_PATH
+from hector_jax.robot.model import load_robot
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,8 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report.motion import motions
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
-from hector_jax.robot.model import MODEL_PATH, Robot, load_robot
+from hector_jax.robot.description import MODEL_PATH
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.verdicts import walk_rigid_body
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk

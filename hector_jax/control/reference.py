@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Real
 
-from hector_jax.core.inputs import InputError, did_you_mean, short_repr
+from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot
 
@@ -79,10 +79,7 @@ def named_command(name: str) -> Command:
         InputError: the name is none of them.
     """
     if name not in _PIECES:
-        raise InputError(
-            f"unknown trajectory {short_repr(name)}{did_you_mean(name, _PIECES)}; "
-            f"known: {', '.join(_PIECES)}"
-        )
+        raise InputError(unknown("trajectory", name, _PIECES))
     seconds, velocity, rates = _PIECES[name]
     return Command(np.full(2, seconds), np.array(velocity), np.array(rates))
 
@@ -98,9 +95,8 @@ def _displacement(command: Command, time: Float[Array, ""]) -> tuple[Array, Arra
     spent = jnp.clip(time - start, 0.0, command.duration)
     turned = command.yaw_rate * spent
     heading = jnp.cumsum(turned) - turned
-    chord = (
-        jnp.sinc(turned / (2 * jnp.pi)) * spent
-    )  # of an arc of unit speed; np.sinc is sin(pi x)/(pi x)
+    # of an arc of unit speed; np.sinc is sin(pi x)/(pi x)
+    chord = jnp.sinc(turned / (2 * jnp.pi)) * spent
     arcs = _turn(heading + turned / 2, command.velocity * chord[:, None])
     return arcs.sum(axis=0), turned.sum()
 
@@ -130,7 +126,9 @@ def reference_at(
     # a/2)/sin(a/2).
     half = lap_turn / 2
     flat = jnp.abs(jnp.sin(half)) < 1e-9
-    ratio = jnp.where(flat, rounds, jnp.sin(rounds * half) / jnp.where(flat, 1.0, jnp.sin(half)))
+    # where a lap turns by whole turns, sin(n a/2)/sin(a/2) tends to n cos((n-1) a/2)
+    whole = rounds * jnp.cos((rounds - 1.0) * half)
+    ratio = jnp.where(flat, whole, jnp.sin(rounds * half) / jnp.where(flat, 1.0, jnp.sin(half)))
     laps = _turn((rounds - 1.0) * half, lap * ratio)
     step, turned = _displacement(command, inside)
     heading = anchor.yaw + rounds * lap_turn

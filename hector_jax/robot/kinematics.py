@@ -190,7 +190,7 @@ def _inverse_leg(
     # triangle of thigh and shin
     thigh, shin = -origin[3, 2], -origin[4, 2]
     cos_knee = (x**2 + z**2 - thigh**2 - shin**2) / (2 * thigh * shin)
-    # load_model's limits keep both ends off +-1, where arccos has no derivative
+    # compile_model has checked that the limits keep both ends off +-1, where arccos has no slope
     knee = -jnp.arccos(jnp.clip(cos_knee, jnp.cos(knee_lower), jnp.cos(knee_upper)))
     hip = jnp.arctan2(-x, -z) - jnp.arctan2(shin * jnp.sin(knee), thigh + shin * jnp.cos(knee))
     return jnp.stack([yaw, roll, hip, knee, pitch - hip - knee])

@@ -28,10 +28,6 @@ from hector_jax.robot.description import (
 )
 from hector_jax.robot.mjcf import read_mjcf, refusal
 
-# HECTOR's
-MODEL_PATH, STANDING = Description.model, Description.standing
-JOINT_NAMES, FOOT_POINTS = Description.joints, Description.foot_points
-
 _AXES = dict(zip("xyz", np.eye(3), strict=True))
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
 
@@ -200,6 +196,11 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
         closed = description.axes == HECTOR_AXES and which >= 3
         right = not closed or (at[0] == 0.0 and at[2] < 0.0)
         _expect(path, right, f"body of {this} is at {at}, expected x = 0 and z < 0")
+        # a stretched leg has no derivative there, and the closed form bends the knee backwards only
+        low, high = joint.range
+        right = not closed or which != 3 or -np.pi < low < high < 0.0
+        text = f"range of {this} is {joint.range}, expected -pi < lower < upper < 0"
+        _expect(path, right, f"{text}: it bends backwards only")
 
 
 def _check_motors(description: Description, model: mujoco.MjModel) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.control.weights_file import WEIGHTS, weights_tree
@@ -95,7 +96,7 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
         limit=mpc.friction * mpc.max_force,
         toe=float(robot.toe),
         heel=float(robot.heel),
-        line=mpc.line_friction,
+        line=LINE_FRICTION in mpc.constraints,
     )
     Alpha = pack_wrench(Wrench(*map(jnp.asarray, weights.R)))
     return "".join(

@@ -22,6 +22,7 @@ from hector_jax.control.reference import Anchor, Command, anchor_at, standing_an
 from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
 from hector_jax.core.tree import stack, where
+from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import loop, mjx_model, sensing
 from hector_jax.sim.actuators import Motors, init_actuators
@@ -250,7 +251,7 @@ def _walk_one(
     initial = jax.tree.map(lambda x: x[lead - 1], samples.state)
     own = partial(jax.lax.dynamic_slice_in_dim, start_index=lead, slice_size=program.ticks * each)
     plans, samples = jax.tree.map(own, (plans, samples))
-    return loop.as_trajectory(jnp.asarray(1e-3 * program.period), initial, plans, samples)
+    return loop.as_trajectory(jnp.asarray(TIME_STEP * program.period), initial, plans, samples)
 
 
 @partial(jax.jit, static_argnames="program")

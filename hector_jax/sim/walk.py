@@ -159,9 +159,10 @@ def _walk_ticks(
     anchor = jax.device_put(standing_anchor(robot, start))
     memory, motors, yaw = programs.begin(body, plant.readings[0]), init_actuators(), jnp.zeros(())
     carry = None if retune is None else retune.init
-    plan, samples = None, None
+    plan = samples = None
     for tick in range(begin, start + ticks):
-        if tick == start and samples is not None:
+        if tick == start:
+            assert samples is not None  # `walk_ticks` refuses a walk that begins at t = 0
             last = jax.tree.map(lambda x: x[-1], samples.state)
             anchor = jax.device_put(anchor_at(robot, last, start))
         done = (tick - begin) * count
