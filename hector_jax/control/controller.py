@@ -15,7 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax.control import gait, legs
-from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters, touchdown_points
+from hector_jax.control.footstep import (
+    Feet,
+    FootstepConfig,
+    FootstepParameters,
+    feet_where,
+    touchdown_points,
+)
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
@@ -27,6 +33,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import check, from_table
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 
 
@@ -199,8 +206,8 @@ def plan(
     problem = MpcProblem(robot, parameters.mpc, state, horizon)
     wrench, solution = solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
     residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
-    residual, stands = jnp.maximum(residual, solution.gap), gait.contact(config.gait, tick)
-    since = gait.swing_ticks(config.gait, tick)
+    residual = jnp.maximum(residual, solution.gap)
+    stands, since = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
     return Plan(wrench, stands, touchdown, since, residual, solution.status)
 
 
@@ -233,7 +240,7 @@ def step_plan(
 ) -> tuple[Memory, Plan]:
     """`plan` from what is measured; remembers where the standing feet are. Once a tick."""
     feet = measured_feet(robot, measurement)
-    decided = plan(
+    planned = plan(
         config,
         robot,
         parameters,
@@ -244,12 +251,7 @@ def step_plan(
         feet=feet,
         max_contacts=max_contacts,
     )
-    stands = decided.contact
-    liftoff = Feet(
-        jnp.where(stands[:, None], feet.position, memory.liftoff.position),
-        jnp.where(stands, feet.yaw, memory.liftoff.yaw),
-    )
-    return Memory(liftoff), decided
+    return Memory(feet_where(planned.contact, feet, memory.liftoff)), planned
 
 
 def actuate(
@@ -278,7 +280,7 @@ def actuate(
         measurement.state,
         start=memory.liftoff,
         end=plan.touchdown,
-        elapsed=plan.swing_ticks * config.gait.tick + 1e-3 * substep,
+        elapsed=plan.swing_ticks * config.gait.tick + TIME_STEP * substep,
         swing=config.gait.tick * config.gait.swing,
     )
     return legs.joint_torques(

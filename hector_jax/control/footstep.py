@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.settings import NOT_NEGATIVE, check
@@ -22,6 +22,12 @@ class Feet(NamedTuple):
 
     position: Float[Array, "*batch 2 3"]  # [m]
     yaw: Float[Array, "*batch 2"]  # [rad]
+
+
+def feet_where(stands: Bool[Array, "2"], yes: Feet, no: Feet) -> Feet:
+    """`yes` for the feet that stand, `no` for the others."""
+    position = jnp.where(stands[:, None], yes.position, no.position)
+    return Feet(position, jnp.where(stands, yes.yaw, no.yaw))
 
 
 class FootstepParameters(NamedTuple):

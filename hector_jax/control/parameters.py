@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from hector_jax.control.footstep import FootstepParameters
 from hector_jax.control.legs import LegParameters
 from hector_jax.control.mpc import MpcParameters
-from hector_jax.core.inputs import InputError, did_you_mean, short_repr
+from hector_jax.core.inputs import InputError, unknown
 
 
 class Parameters(NamedTuple):
@@ -78,10 +78,7 @@ def tunables(names: Sequence[str]) -> tuple[Tunable, ...]:
     """
     for name in names:
         if name not in BY_NAME:
-            raise InputError(
-                f"unknown tunable {short_repr(name)}{did_you_mean(name, BY_NAME)}; "
-                f"known: {', '.join(BY_NAME)}"
-            )
+            raise InputError(unknown("tunable", name, BY_NAME))
         if BY_NAME[name].path.startswith("legs."):
             raise InputError(
                 f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "

@@ -14,11 +14,11 @@ from jax import lax
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array
 
+from hector_jax.core.tree import where
 from hector_jax.qp import gpu_kernel
 from hector_jax.qp.linear import (
     block_diagonal,
     cholesky,
-    choose,
     matvec,
     multiplier,
     plus_gram,
@@ -95,11 +95,11 @@ def _improve(fixed: _Fixed, limit: Array, state: _Try) -> _Try:
     changed = worst_sides(qp, wrong, state.active, by)
     point = Point(x, _signed(fixed, z))
     better = jnp.max(residuals) < jnp.max(state.residuals)
-    best, residuals = choose(better, (point, residuals), (state.best, state.residuals))
+    best, residuals = where(better, (point, residuals), (state.best, state.residuals))
     # a factorisation that fails is tried again with a larger rho
     fine = jnp.isfinite(jnp.sum(x) + jnp.sum(z))
-    point = choose(fine, Point(x, z), state.point)
-    active = choose(fine, state.active ^ changed, state.active)
+    point = where(fine, Point(x, z), state.point)
+    active = where(fine, state.active ^ changed, state.active)
     rho = jnp.where(fine, state.rho, 100.0 * state.rho)
     iterations = state.iterations + 1
     # a flat P makes more passes worth their while though the guess stays
@@ -171,7 +171,7 @@ def first_guess(qp: Normal, unconstrained: Point) -> tuple[Point, Array]:
         x, y, side, settled = gpu_kernel.guess(qp.P, qp.q, block_diagonal(qp.A), lower, upper)
         z = jnp.maximum(jnp.asarray(SIGN, y.dtype) * y, 0.0)
         usable = (settled > 0) & jnp.isfinite(jnp.sum(x) + jnp.sum(y))
-        return choose(usable, (Point(x, z), jnp.stack([side > 0, side < 0])), violated(qp))
+        return where(usable, (Point(x, z), jnp.stack([side > 0, side < 0])), violated(qp))
 
     fits = qp.A.ndim == 3 and gpu_kernel.fits(len(qp.q), len(qp.row))
     if jax.default_backend() == "gpu" and fits:

@@ -14,8 +14,9 @@ from jax import lax
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array
 
+from hector_jax.core.tree import where
 from hector_jax.qp.certificates import certificates, rays
-from hector_jax.qp.linear import cholesky, choose, largest, matvec, multiplier, plus_gram, rmatvec
+from hector_jax.qp.linear import cholesky, largest, matvec, multiplier, plus_gram, rmatvec
 from hector_jax.qp.problem import SIGN, Approach, Normal, Point, Tolerances
 
 
@@ -111,7 +112,7 @@ def _advance(fixed: _Fixed, limit: int, state: _Loop) -> _Loop:
     new = (Point(x + step * dx, z + step * dz), slack + step * dslack)
     # a factorisation that fails is tried again further from singular
     fine = jnp.isfinite(jnp.sum(new[0].x) + jnp.sum(new[0].z) + jnp.sum(new[1]))
-    point, slack = choose(fine, new, (state.point, state.slack))
+    point, slack = where(fine, new, (state.point, state.slack))
     factors = jnp.where(fine, 0.1, jnp.array([10.0, 100.0], dtype))
     proximal = jnp.maximum(factors * state.proximal, least)
     done = jnp.max(qp.residuals(point)) <= tolerances.target
@@ -169,7 +170,7 @@ def approach(
         first = best.iterations == 0
         better = first | (jnp.max(residuals) < jnp.max(best.residuals))
         before = best.point, best.slack, best.residuals
-        point, slack, residuals = choose(better, (point, size * slack, residuals), before)
+        point, slack, residuals = where(better, (point, size * slack, residuals), before)
         sizes = jnp.stack([largest(point.x), jnp.maximum(largest(qp.P @ point.x), largest(qp.q))])
         far = first & (jnp.max(residuals) > tolerances.target)
         again = far & ~jnp.any(certified) & jnp.all(sizes > 0.0)

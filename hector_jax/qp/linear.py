@@ -2,7 +2,6 @@
 
 from typing import TypeVar
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -52,8 +51,3 @@ def largest(v: Array) -> Array:
 def multiplier(z: Array) -> Array:
     """Vector y (m,) of the multipliers of the sides (2, m)."""
     return z[0] - z[1]
-
-
-def choose(first: Array, a: T, b: T) -> T:
-    """`a` where `first` holds, else `b`, leaf by leaf."""
-    return jax.tree.map(lambda v, w: jnp.where(first, v, w), a, b)

@@ -31,11 +31,12 @@ from jaxtyping import Array
 
 from hector_jax.core.part import Part, choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
+from hector_jax.core.tree import where
 from hector_jax.qp.active_set import active_set, first_guess
 from hector_jax.qp.certificates import is_held, only_if, without_rows
 from hector_jax.qp.interior_point import approach
 from hector_jax.qp.jaxopt_solver import box_osqp
-from hector_jax.qp.linear import choose, largest, multiplier
+from hector_jax.qp.linear import largest, multiplier
 from hector_jax.qp.problem import (
     BITS_32,
     BITS_64,
@@ -137,7 +138,7 @@ def _solve_rounds(
         near = solver.approach(tolerances, qp, approaches, max_iterations=config.max_iterations)
         # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
         pushes = near.point.z * qp.reach > near.slack * largest(near.point.z)
-        begin, active = choose(state.approached, (near.point, pushes), (start, guess))
+        begin, active = where(state.approached, (near.point, pushes), (start, guess))
         limit = jnp.where(state.approached, config.max_iterations, config.active_set_tries)
         hopeful = state.going & ~jnp.any(near.certified)
         exact, exact_residuals, tries = active_set(
@@ -146,7 +147,7 @@ def _solve_rounds(
         point, residuals = state.point, state.residuals
         for other, its in ((near.point, near.residuals), (exact, exact_residuals)):
             better = jnp.max(its) < jnp.max(residuals)
-            point, residuals = choose(better, (other, its), (point, residuals))
+            point, residuals = where(better, (other, its), (point, residuals))
         steps = state.iterations + near.iterations + tries
         going = ~state.approached & (jnp.max(residuals) > tolerances.target)
         return _Best(point, residuals, near.certified, steps, jnp.ones((), bool), going)
@@ -165,7 +166,7 @@ def _solve_rounds(
 def _or_trivial(valid: Array, qp: QP) -> QP:
     """The QP, or a trivial one in its place, so that nothing that follows meets a NaN."""
     trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
-    return choose(valid, qp, trivial)
+    return where(valid, qp, trivial)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -16,6 +16,7 @@ from Python, one iteration after the other; `batch` compiles them into its loop 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +29,7 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, bounds
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, from_table
+from hector_jax.core.tree import where
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, check_loss, with_alphas
@@ -259,9 +261,7 @@ def update(
     status = jnp.where((status == StepStatus.ACCEPTED) & rose, StepStatus.ROSE, status)
     accepted = status == StepStatus.ACCEPTED
 
-    def if_accepted(new: Any, old: Any) -> Any:
-        return jax.tree.map(lambda x, y: jnp.where(accepted, x, y), new, old)
-
+    if_accepted = partial(where, accepted)
     best = if_accepted(state.trial, state.best)
     gradient = if_accepted(evaluation.gradient, state.gradient)
     recent = jnp.append(jnp.asarray(evaluation.loss), state.recent[:-1])

@@ -30,6 +30,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import NOT_NEGATIVE, SHARE, Range, check
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import HISTORY
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import sensitivity
@@ -266,7 +267,6 @@ def _follow_window(
     begin: int,
 ) -> tuple[Trace, Evaluation]:
     """`window_gradient` of the window from tick `begin`, as numbers of NumPy."""
-    stack = lambda rows: jax.tree.map(lambda *x: np.stack(x), *rows)  # noqa: E731
     if config.estimator != "carried":
         trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
     result = follow(

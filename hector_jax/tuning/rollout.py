@@ -19,14 +19,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax import qp
 from hector_jax.control import gait
-from hector_jax.control.controller import WalkConfig, contacts_needed, plan
-from hector_jax.control.footstep import Feet
+from hector_jax.control.controller import Plan, WalkConfig, contacts_needed, plan
+from hector_jax.control.footstep import Feet, feet_where
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, Range, check
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench, has_fallen
+from hector_jax.core.tree import where
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import srbm
 from hector_jax.robot.kinematics import foot_poses
@@ -182,6 +183,63 @@ def _move(
     return _moved_by(variation, robot, carry.state, acting, feet, before, there, dt)
 
 
+class _Belief(NamedTuple):
+    """What the controller sees of a carry."""
+
+    state: State
+    feet: Feet
+    error: State | None  # of `state`; None without a variation
+
+
+def _believe(carry: Carry, tick: Int[Array, ""], variation: Variation | None) -> _Belief:
+    if variation is None:
+        return _Belief(carry.state, carry.feet, None)
+    error = _estimate_error(variation, carry.state, tick)
+    # the legs know where the feet are from the body, not from the world
+    feet = carry.feet._replace(position=carry.feet.position + error.position)
+    return _Belief(jax.tree.map(jnp.add, carry.state, error), feet, error)
+
+
+def _on_real_ground(
+    carry: Carry, acting: Late, planned: Plan, belief: _Belief, variation: Variation | None
+) -> tuple[Late, Feet]:
+    """What acts on the body within the ground's friction, and where the feet really are."""
+    touchdown = planned.touchdown
+    if variation is not None and belief.error is not None:
+        touchdown = touchdown._replace(position=touchdown.position - belief.error.position)
+        acting = acting._replace(wrench=_within_friction(acting.wrench, variation.friction))
+    return acting, feet_where(planned.contact, carry.feet, touchdown)
+
+
+def _sample(
+    config: RolloutConfig,
+    robot: Robot,
+    before: Carry,
+    after: Carry,
+    acting: Late,
+    planned: Plan,
+    reference: State,
+) -> Trajectory:
+    """The sample of a tick."""
+    return Trajectory(
+        period=jnp.asarray(config.walk.gait.tick),
+        initial=before.state,
+        state=after.state,
+        reference=reference,
+        command=planned.wrench,
+        effect=acting.wrench,
+        contact=planned.contact,
+        feet=after.feet.position,
+        joints=jnp.asarray(robot.standing_joints),
+        fallen=after.fallen,
+        legs_touch=jnp.zeros_like(after.fallen),  # a rigid body has none
+        # A plan whose QP has no unique minimiser can be walked, so `plan` and the simulators keep
+        # its residual. It has no derivative, for which alone a rollout is walked: whoever tunes
+        # looks at the residual and refuses.
+        residual=jnp.where(planned.status == qp.Status.NOT_UNIQUE, jnp.inf, planned.residual),
+    )
+
+
 def step_carry(
     config: RolloutConfig,
     robot: Robot,
@@ -198,59 +256,31 @@ def step_carry(
     filled in by `rollout`).
     """
     walk, ticks = config.walk, config.walk.gait
-    state, feet = carry.state, carry.feet
-    here = anchor_at(robot, state, carry.anchor.tick)
-    anchor = jax.tree.map(lambda x, y: jnp.where(tick == here.tick, x, y), here, carry.anchor)
-    seen, standing = state, feet
-    if variation is not None:
-        error = _estimate_error(variation, state, tick)
-        seen = jax.tree.map(jnp.add, state, error)
-        # the legs know where the feet are from the body, not from the world
-        standing = feet._replace(position=feet.position + error.position)
-    decided = plan(
+    here = anchor_at(robot, carry.state, carry.anchor.tick)
+    anchor = where(tick == here.tick, here, carry.anchor)
+    belief = _believe(carry, tick, variation)
+    planned = plan(
         walk,
         robot,
         walk.parameters(weights),
         command=command,
         anchor=anchor,
         tick=tick,
-        state=seen,
-        feet=standing,
+        state=belief.state,
+        feet=belief.feet,
         max_contacts=contacts_needed(walk, 0),
     )
     commands = jax.tree.map(
-        lambda new, old: jnp.concatenate([new[None], old[:-1]]), decided.wrench, carry.commands
+        lambda new, old: jnp.concatenate([new[None], old[:-1]]), planned.wrench, carry.commands
     )
-    stands, touchdown = decided.contact, decided.touchdown
-    acting = _respond(effect, state, commands, stands, gait.since_switch(ticks, tick))
-    if variation is not None:
-        touchdown = touchdown._replace(position=touchdown.position - error.position)
-        acting = acting._replace(wrench=_within_friction(acting.wrench, variation.friction))
-    feet = Feet(
-        jnp.where(stands[:, None], feet.position, touchdown.position),
-        jnp.where(stands, feet.yaw, touchdown.yaw),
-    )
+    since = gait.since_switch(ticks, tick)
+    acting = _respond(effect, carry.state, commands, planned.contact, since)
+    acting, feet = _on_real_ground(carry, acting, planned, belief, variation)
     moved = _move(robot, carry, acting, feet.position, ticks.tick, variation)
-    late = None if variation is None else acting
     fallen = carry.fallen | has_fallen(moved, *robot.description.limits)
-    sample = Trajectory(
-        period=jnp.asarray(ticks.tick),
-        initial=state,
-        state=moved,
-        reference=reference_at(ticks.tick, command, anchor, tick + 1.0),
-        command=decided.wrench,
-        effect=acting.wrench,
-        contact=stands,
-        feet=feet.position,
-        joints=jnp.asarray(robot.standing_joints),
-        fallen=fallen,
-        legs_touch=jnp.zeros_like(fallen),  # a rigid body has none
-        # A plan whose QP has no unique minimiser can be walked, so `plan` and the simulators keep
-        # its residual. It has no derivative, for which alone a rollout is walked: whoever tunes
-        # looks at the residual and refuses.
-        residual=jnp.where(decided.status == qp.Status.NOT_UNIQUE, jnp.inf, decided.residual),
-    )
-    return Carry(moved, feet, commands, anchor, fallen, late), sample
+    after = Carry(moved, feet, commands, anchor, fallen, None if variation is None else acting)
+    reference = reference_at(ticks.tick, command, anchor, tick + 1.0)
+    return after, _sample(config, robot, carry, after, acting, planned, reference)
 
 
 def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
