@@ -179,7 +179,7 @@ def rollouts() -> Arrays:
     lead = replace(short, rollout=RolloutConfig(ticks=50, lead=20, block=40))
     found["lead"] = _flat(tune_step(lead, *known).gradient)
     walked, columns = jax.jit(sensitivity.propagate, static_argnums=0)(short.rollout, *known)
-    found["forward recursion"] = _flat(sensitivity.gradient(PAPER_LOSS, walked, columns))
+    found["forward recursion"] = _flat(sensitivity.gradient(PAPER_LOSS, walked, columns, known[1]))
     noise = State(*(np.full(3, 1e-3) for _ in range(4)))
     varied = no_variation()._replace(
         mass=np.asarray(1.1), friction=np.asarray(0.4), delay=np.asarray(0.004), noise=noise

@@ -20,7 +20,7 @@ from hector_jax.control.controller import (
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import Measurement, stance_torques, trunk_position
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.parameters import BY_NAME, FEEDBACK, THETA, tunables
+from hector_jax.control.parameters import FEEDBACK, TUNABLES, Q, check_tunables
 from hector_jax.control.reference import Anchor, named_command
 from hector_jax.control.weights import expert
 from hector_jax.core.geometry import rot_z
@@ -178,19 +178,32 @@ def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing(
         name: bool(
             sum(jnp.abs(d).max() for d in slope(parameters, one.write(still, np.ones(())))) > 1e-9
         )
-        for name, one in BY_NAME.items()
+        for name, one in TUNABLES.items()
         if not name.startswith("k")
     }
     unfelt = {"gravity_compensation", "foot_height"}
     assert felt == {name: name not in unfelt for name in felt}
     slope(FEEDBACK.write(parameters, np.array(0.3)), still)
     assert len(compiled) == 1
-    assert THETA[0].read(parameters) is parameters.mpc.weights.Q
+    assert Q.read(parameters) is parameters.mpc.weights.Q
     for name in ("foot_height", "kp"):
         with pytest.raises(InputError, match=f"{name} cannot be tuned by gradients"):
-            tunables([name])
+            check_tunables([name])
     with pytest.raises(InputError, match="did you mean 'turn_lead'"):
-        tunables(["turn_laed"])
+        check_tunables(["turn_laed"])
+
+
+def test_the_numbers_beside_the_weights_are_those_of_the_weights_or_of_the_config():
+    same = CONFIG.parameters(CONFIG.with_others(expert(), TUNABLES))
+    jax.tree.map(np.testing.assert_array_equal, CONFIG.parameters(expert()), same)
+    mine = CONFIG.with_others(expert()._replace(others={"turn_lead": 0.9}), ["turn_lead", "kp"])
+    assert mine.others["turn_lead"] == 0.9
+    assert mine.others["kp"].tolist() == list(CONFIG.legs.kp)
+    parameters = CONFIG.parameters(mine._replace(others={**mine.others, "foot_height": 0.1}))
+    assert (parameters.footstep.turn, parameters.legs.height) == (0.9, 0.1)
+    jax.tree.map(np.testing.assert_array_equal, parameters.mpc.weights, expert())
+    for name, one in TUNABLES.items():
+        assert np.shape(one.read(CONFIG.parameters(expert()))) == one.shape, name
 
 
 def test_before_the_gait_both_feet_share_the_weight():

@@ -1,5 +1,7 @@
 """DiffTune: how far it steps, what it refuses, when it stops; on a toy and on the rigid body."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,8 +10,10 @@ import pytest
 from model import CONFIG as SHORT
 from model import PLAIN
 
+from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import bounds, expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
@@ -288,7 +292,7 @@ def test_gradient_norms_are_those_of_the_parts():
 
     def gradient(euler, position):
         _, found = sensitivity.gradient(
-            with_alphas({"L_Eul": euler, "L_pos": position}), trajectory, columns
+            with_alphas({"L_Eul": euler, "L_pos": position}), trajectory, columns, nominal()
         )
         return vector(found) * vector(nominal())
 
@@ -325,3 +329,66 @@ def test_ten_iterations_from_nominal_go_down_inside_the_box(name, least):
     for iteration in found.history:
         assert iteration.accepted
         assert ((lower <= vector(iteration.weights)) & (vector(iteration.weights) <= upper)).all()
+
+
+# Numbers of the controller beside Q and R
+
+OTHERS = ("footstep_feedback", "friction", "turn_lead")
+
+
+def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays():
+    config = TuneConfig(others=("turn_lead", "footstep_feedback"))
+    start = init(config, nominal()._replace(others={"friction": 0.4})).trial
+    assert {name: float(x) for name, x in start.others.items()} == {
+        "footstep_feedback": 0.12,
+        "friction": 0.4,
+        "turn_lead": 0.5,
+    }
+    slopes = {"footstep_feedback": jnp.array(4.0), "friction": 1e9, "turn_lead": jnp.array(-2.0)}
+    gradient = random_tree(1)._replace(others=jax.tree.map(jnp.asarray, slopes))
+    moved = step_weights(config, start, gradient, 0.5)
+    without = step_weights(TuneConfig(), nominal(), random_tree(1), 0.5)
+    np.testing.assert_array_equal(vector(moved), vector(without))
+    # slope times width of the box is 2 and -4: the second takes the whole step
+    assert float(moved.others["turn_lead"]) == pytest.approx(0.5 + 0.5 * 0.02 * 2.0)
+    assert float(moved.others["footstep_feedback"]) == pytest.approx(0.12 - 0.5 * 0.02 * 0.25)
+    assert moved.others["friction"] == 0.4
+    far = step_weights(config, start, gradient, 100.0)
+    assert far.others["turn_lead"] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "fault"),
+    [
+        ({"others": ("turn_laed",)}, "did you mean 'turn_lead'"),
+        ({"others": ("foot_height",)}, "foot_height cannot be tuned by gradients"),
+        ({"others": ("friction",), "update": "literal"}, "others expects update relative"),
+    ],
+)
+def test_what_cannot_be_tuned_is_named(wrong, fault):
+    with pytest.raises(InputError, match=fault):
+        TuneConfig(**wrong)
+
+
+def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursion():
+    start = init(replace(SHORT, others=OTHERS), nominal()).trial
+    found = tune_step(SHORT, ROBOT, start, STRAIGHT, ANCHOR, PLAIN)
+
+    def loss(name, shift):
+        others = {**start.others, name: start.others[name] + shift}
+        moved = start._replace(others=others)
+        return float(tune_step(SHORT, ROBOT, moved, STRAIGHT, ANCHOR, PLAIN).loss)
+
+    for name in OTHERS:
+        expected = (loss(name, 1e-6) - loss(name, -1e-6)) / 2e-6
+        assert float(found.gradient.others[name]) == pytest.approx(expected, rel=1e-5, abs=1e-3)
+    trajectory, columns = propagate(SHORT.rollout, ROBOT, start, STRAIGHT, ANCHOR, PLAIN)
+    _, forward = sensitivity.gradient(SHORT.loss, trajectory, columns, start)
+    np.testing.assert_allclose(vector(forward), vector(found.gradient), rtol=1e-8)
+    for name in OTHERS:
+        np.testing.assert_allclose(
+            forward.others[name], found.gradient.others[name], rtol=1e-8, atol=1e-9
+        )
+    result = tune(replace(SHORT, others=OTHERS), ROBOT, nominal(), STRAIGHT, ANCHOR, PLAIN)
+    assert result.history[-1].evaluation.loss < found.loss
+    assert set(result.converged.others) == set(OTHERS)

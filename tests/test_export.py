@@ -57,7 +57,8 @@ def random_weights(seed):
 
 def test_weights_meet_their_schema_and_are_read_back(tmp_path):
     jsonschema.Draft202012Validator.check_schema(weights_schema())
-    weights = random_weights(0)
+    others = {"turn_lead": np.array(0.3), "kd": np.ones(5)}
+    weights = random_weights(0)._replace(others=others)
     save_weights(tmp_path / "weights.json", weights, SCHEMA)
     tree = json.loads((tmp_path / "weights.json").read_text())
     assert tree["$schema"] == SCHEMA
@@ -75,6 +76,8 @@ def test_weights_meet_their_schema_and_are_read_back(tmp_path):
         lambda tree: tree["R"].update(force=[1.0, 1.0, 1.0]),
         lambda tree: tree["Q"].update(euler=[1.0, 0.0, 1.0]),
         lambda tree: tree["Q"].update(euler=[1.0, "1", 1.0]),
+        lambda tree: tree.update(others={"turn_lead": 3.0}),
+        lambda tree: tree.update(others={"kd": 1.0}),
     ],
 )
 def test_what_the_loader_refuses_the_schema_refuses_too(tmp_path, wrong):

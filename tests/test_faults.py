@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from hector_jax.cli.main import main
+from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import bounds, nominal, weights_to_vector
+from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.core import tree_file
 from hector_jax.core.runtime import workers
 from hector_jax.report.run import tuning_section

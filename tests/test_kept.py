@@ -9,8 +9,9 @@ import pytest
 from pretend import pretend_history, pretend_walk
 from test_experiments import script
 
+from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command
-from hector_jax.control.weights import bounds, expert, nominal
+from hector_jax.control.weights import expert, nominal
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import journal, metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key

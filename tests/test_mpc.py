@@ -21,9 +21,9 @@ from hector_jax.control.contact import (
     StateConstraint,
 )
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
+from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
     Weights,
-    bounds,
     expert,
     nominal,
     vector_to_weights,

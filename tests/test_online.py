@@ -7,8 +7,9 @@ import pytest
 
 from hector_jax.control.controller import Retune, WalkConfig
 from hector_jax.control.legs import Measurement
+from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import bounds, nominal, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State, zero_wrench
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
@@ -58,7 +59,7 @@ def gradient(carries, trace, first, last, **how):
 
 
 def begun(carry):
-    trace = init_trace(ANCHOR, MeasuredState(carry.state, carry.feet), zero_wrench())
+    trace = init_trace(ANCHOR, MeasuredState(carry.state, carry.feet), zero_wrench(), nominal())
     return trace._replace(commands=carry.commands)
 
 

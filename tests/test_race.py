@@ -8,7 +8,8 @@ import pytest
 from lockstep import benchmark, lowest, walks
 from optimizers import Bayes, CmaEs, Differences, Given, Random, steps_to
 
-from hector_jax.control.weights import bounds, nominal, weights_to_vector
+from hector_jax.control.parameters import bounds
+from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.search.cmaes import Generation, SearchConfig, log_bounds, project
 from hector_jax.tuning.difftune import TuneConfig
 

@@ -8,7 +8,7 @@ import pytest
 from pretend import SETS, pretend_history, pretend_verdict
 from rich.console import Console
 
-from hector_jax.control.weights import bounds
+from hector_jax.control.parameters import bounds
 from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table

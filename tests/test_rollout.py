@@ -140,7 +140,7 @@ def check_gradient(config, robot, weights, command, anchor, effect, bar):
     print(f"error against differences {errors}", end=" ")
     assert errors[-1] <= bar, errors
     trajectory, columns = propagate(config, robot, weights, command, anchor, effect)
-    _, forward = sensitivity.gradient(PAPER_LOSS, trajectory, columns)
+    _, forward = sensitivity.gradient(PAPER_LOSS, trajectory, columns, weights)
     forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
     print(f"forward against reverse {relative(forward, reverse):.1e}")
     assert relative(forward, reverse) <= 1e-8

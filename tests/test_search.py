@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
     DIRECTION_NAMES,
-    bounds,
     expert,
     nominal,
     scale_weights,

@@ -219,7 +219,8 @@ def test_json_has_null_for_what_is_no_number(tmp_path):
 
 def test_weights_come_back_as_they_were_written(tmp_path):
     path = tmp_path / "weights.json"
-    for weights in (nominal(), expert()):
+    others = {"friction": np.array(0.3), "kp": np.arange(1.0, 6.0)}
+    for weights in (nominal(), expert(), nominal()._replace(others=others)):
         save_weights(path, weights)
         again = load_weights(path)
         assert jax.tree.structure(again) == jax.tree.structure(weights)
@@ -258,6 +259,14 @@ def _edit(change):
         (lambda t: t["R"].update(force=[[1, 1, 1], [1]]), "R.force must be 2 x 3 numbers, got"),
         (lambda t: t["R"].update(moment=None), "R.moment must be 2 x 3 numbers, got null"),
         (lambda t: t.update(Q=[1, 2]), "Q must be an object"),
+        (lambda t: t.update(others=[1, 2]), r"others must be an object, got \[1, 2\]"),
+        (lambda t: t.update(others={"frition": 1}), "unknown tunable 'frition'; did you mean 'fri"),
+        (
+            lambda t: t.update(others={"friction": 2}),
+            "others.friction must be a number from 0.1",
+        ),
+        (lambda t: t.update(others={"friction": [1]}), "others.friction must be a number, got"),
+        (lambda t: t.update(others={"kp": [9, 9, 9]}), "others.kp must be 5 numbers, got"),
     ],
 )
 def test_bad_weights_are_one_line_with_file_and_entry(tmp_path, change, message):

@@ -29,6 +29,19 @@ def rms(error):
     return np.sqrt(np.mean(np.asarray(error) ** 2, axis=0))
 
 
+def test_the_numbers_of_the_weights_are_those_of_plan_and_legs(short):
+    def walked(**others):
+        weights = CONFIG.with_others(expert()._replace(others=others), ["kp"])
+        return walk(CONFIG, ROBOT, Job(weights, named_command("straight"), ideal(), seconds=0.2))
+
+    for leaf, other in zip(jax.tree.leaves(walked()), jax.tree.leaves(short), strict=True):
+        np.testing.assert_array_equal(leaf, other[: len(leaf)] if np.ndim(leaf) else other)
+    higher = walked(foot_height=0.12).feet - short.feet[:200]
+    assert 0.02 < higher[..., 2].max() < 0.05
+    wider = walked(footstep_width=0.1).feet - short.feet[:200]
+    assert np.abs(wider[..., 1]).max() > 0.005
+
+
 def test_a_walk_has_a_sample_each_millisecond(short):
     assert short.period == 0.001
     assert all(

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
     DIRECTION_NAMES,
     WEIGHT_NAMES,
-    bounds,
     directions,
     expert,
     nominal,

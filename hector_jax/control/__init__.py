@@ -29,7 +29,7 @@ from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
-from hector_jax.control.parameters import THETA, Parameters, Tunable, tunables
+from hector_jax.control.parameters import TUNABLES, Parameters, Tunable
 from hector_jax.control.reference import (
     Anchor,
     Command,
@@ -45,7 +45,7 @@ __all__ = [
     "GaitConfig",
     "LegConfig",
     "LINE_FOOT",
-    "THETA",
+    "TUNABLES",
     "Anchor",
     "Command",
     "Contact",
@@ -78,6 +78,5 @@ __all__ = [
     "solve_mpc",
     "standing_anchor",
     "step_plan",
-    "tunables",
     "walk_config",
 ]

@@ -5,13 +5,14 @@ along; the MuJoCo worlds call `step_plan` and `actuate` with what they measure. 
 the nominal robot only, never the plant's own numbers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax.control import gait, legs
@@ -25,7 +26,7 @@ from hector_jax.control.footstep import (
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
-from hector_jax.control.parameters import Parameters
+from hector_jax.control.parameters import TUNABLES, Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
@@ -55,10 +56,19 @@ class WalkConfig:
             )
 
     def parameters(self, weights: Weights) -> Parameters:
-        """The controller's numbers, to be traced: these weights, else those of this config."""
-        return Parameters(
-            self.mpc.parameters(weights), self.footstep.parameters, self.legs.parameters
-        )
+        """The controller's numbers, to be traced: those of the weights, else of this config."""
+        mpc = self.mpc.parameters(weights._replace(others={}))
+        parameters = Parameters(mpc, self.footstep.parameters, self.legs.parameters)
+        for name, value in weights.others.items():
+            parameters = TUNABLES[name].write(parameters, value)
+        return parameters
+
+    def with_others(self, weights: Weights, names: Iterable[str]) -> Weights:
+        """The weights with `others` of these names, from this config where they have none."""
+        parameters = self.parameters(weights)
+        missing = [name for name in names if name not in weights.others]
+        more = {name: np.asarray(TUNABLES[name].read(parameters), float) for name in missing}
+        return weights._replace(others={**weights.others, **more})
 
     @property
     def mpc_step(self) -> float:

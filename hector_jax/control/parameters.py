@@ -12,13 +12,17 @@ program stays in `WalkConfig`, whose numbers are the defaults:
 0.2
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple
+
+import jax
+import numpy as np
 
 from hector_jax.control.footstep import FootstepParameters
 from hector_jax.control.legs import LegParameters
 from hector_jax.control.mpc import MpcParameters
+from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.inputs import InputError, unknown
 
 
@@ -36,6 +40,7 @@ class Tunable(NamedTuple):
     path: str  # "mpc.weights.Q"
     lower: float
     upper: float
+    shape: tuple[int, ...] = ()  # in `Weights.others`
 
     def read(self, parameters: Parameters) -> Any:
         """The part: a number or a tree of them."""
@@ -52,11 +57,9 @@ class Tunable(NamedTuple):
         return within(parameters, self.path.split("."))
 
 
-THETA = (Tunable("mpc.weights.Q", 1e-2, 1e4), Tunable("mpc.weights.R", 1e-7, 1.0))
-"""What is tuned by default: the 24 weights."""
-
+Q, R = Tunable("mpc.weights.Q", 1e-2, 1e4), Tunable("mpc.weights.R", 1e-7, 1.0)
 FEEDBACK = Tunable("footstep.feedback", 0.0, 0.5)
-BY_NAME = {
+TUNABLES = {
     "footstep_feedback": FEEDBACK,
     "footstep_width": Tunable("footstep.width", 0.0, 0.2),
     "turn_lead": Tunable("footstep.turn", 0.0, 2.0),
@@ -64,24 +67,42 @@ BY_NAME = {
     "friction": Tunable("mpc.friction", 0.1, 1.0),
     "gravity_compensation": Tunable("legs.gravity_compensation", 0.0, 1.0),
     "foot_height": Tunable("legs.height", 0.02, 0.2),
-    "kp": Tunable("legs.kp", 1.0, 300.0),
-    "kd": Tunable("legs.kd", 0.05, 10.0),
+    "kp": Tunable("legs.kp", 1.0, 300.0, (5,)),
+    "kd": Tunable("legs.kd", 0.05, 10.0, (5,)),
 }
-"""Others that can be asked for by name."""
+"""What can be tuned beside Q and R, by the names that `Weights.others` has for them."""
 
 
-def tunables(names: Sequence[str]) -> tuple[Tunable, ...]:
-    """Those of these names, for a tuner that follows the gradient of the rigid-body model.
+def check_tunables(names: Sequence[str]) -> None:
+    """Check what a tuner that follows the gradient of the rigid-body model is to tune.
 
     Raises:
         InputError: a name is unknown, or the model does not feel it: its gradient is zero.
     """
     for name in names:
-        if name not in BY_NAME:
-            raise InputError(unknown("tunable", name, BY_NAME))
-        if BY_NAME[name].path.startswith("legs."):
+        if name not in TUNABLES:
+            raise InputError(unknown("tunable", name, TUNABLES))
+        if TUNABLES[name].path.startswith("legs."):
             raise InputError(
                 f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
                 "gradient is zero; a search on walks can"
             )
-    return tuple(BY_NAME[name] for name in names)
+
+
+def bounds(others: Iterable[str] = ()) -> tuple[Weights, Weights]:
+    """Box Theta of feasible weights, lower and upper, with that of `others`.
+
+    >>> lower, upper = bounds(["turn_lead"])
+    >>> lower.Q.euler.tolist(), upper.others
+    ([0.01, 0.01, 0.01], {'turn_lead': 2.0})
+    """
+    like, others = nominal(), tuple(others)
+
+    def side(name: str) -> Weights:
+        return Weights(
+            jax.tree.map(lambda w: np.full_like(w, getattr(Q, name)), like.Q),
+            jax.tree.map(lambda w: np.full_like(w, getattr(R, name)), like.R),
+            {one: getattr(TUNABLES[one], name) for one in others},
+        )
+
+    return side("lower"), side("upper")

@@ -1,11 +1,12 @@
-"""theta: the 24 diagonal weights of the MPC, their box, and the sets with a name.
+"""theta: the 24 diagonal weights of the MPC and what is tuned beside them; the sets with a name.
 
 The diagonal of Q has the shape of a state and that of R the shape of a wrench (Eq. 3); the three
 gravity weights of the paper's 15-state cost are zero and not tuned. Trees of this shape also carry
 bounds, step sizes and gradients.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +18,11 @@ from hector_jax.robot.model import Robot
 
 
 class Weights(NamedTuple):
-    """Diagonals of the stage cost |x - x_ref|^2_Q + |u|^2_R."""
+    """Diagonals of the stage cost |x - x_ref|^2_Q + |u|^2_R, and numbers tuned beside them."""
 
     Q: State  # of the error of each state
     R: Wrench  # of the input of each foot
+    others: Mapping[str, Any] = {}  # by the names of `parameters.TUNABLES`; else the config's
 
 
 WEIGHT_NAMES = tuple(
@@ -70,18 +72,8 @@ def expert(robot: Robot | None = None) -> Weights:
     )
 
 
-def bounds() -> tuple[Weights, Weights]:
-    """Box Theta of feasible weights, lower and upper: Q in 0.01..1e4, R in 1e-7..1."""
-    like = nominal()
-    fill = lambda q, r: Weights(  # noqa: E731
-        jax.tree.map(lambda w: np.full_like(w, q), like.Q),
-        jax.tree.map(lambda w: np.full_like(w, r), like.R),
-    )
-    return fill(1e-2, 1e-7), fill(1e4, 1.0)
-
-
 def weights_to_vector(weights: Weights) -> Float[Array, "*batch 24"]:
-    """The 24 weights in the order of WEIGHT_NAMES; for gradients and other such trees too."""
+    """Q and R in the order of WEIGHT_NAMES; for gradients and other such trees too."""
     flat = [*weights.Q, *(w.reshape(*w.shape[:-2], 6) for w in weights.R)]
     return jnp.concatenate([jnp.asarray(w) for w in flat], axis=-1)
 
@@ -103,7 +95,7 @@ def directions() -> Float[np.ndarray, "18 24"]:
 
 
 def scale_weights(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
-    """Weights after a step in the 18 directions.
+    """Weights after a step in the 18 directions; `others` stay.
 
     >>> steps = np.zeros(18)
     >>> steps[DIRECTION_NAMES.index("Q_yaw")] = np.log(2.0)
@@ -111,7 +103,8 @@ def scale_weights(weights: Weights, logs: Float[np.ndarray, "18"]) -> Weights:
     [50.0, 50.0, 100.0]
     """
     vector = weights_to_vector(weights) * jnp.exp(logs @ directions())
-    return jax.tree.map(np.asarray, vector_to_weights(vector))
+    moved = vector_to_weights(vector)._replace(others=weights.others)
+    return jax.tree.map(np.asarray, moved)
 
 
 def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:

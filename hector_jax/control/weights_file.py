@@ -1,11 +1,13 @@
 """Weights to JSON and back."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.weights import Weights
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, unknown
@@ -17,10 +19,15 @@ _MOST_WEIGHTS = 1_000_000  # bytes
 
 
 def weights_tree(weights: Weights) -> dict[str, Any]:
-    """Weights as JSON values, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`."""
+    """Weights as JSON values, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`.
+
+    `"others": {"footstep_feedback": 0.12, ...}` follows where there are any.
+    """
+    parts = {"Q": weights.Q._asdict(), "R": weights.R._asdict(), "others": weights.others}
     return {
-        part: {name: np.asarray(value).tolist() for name, value in tree._asdict().items()}
-        for part, tree in weights._asdict().items()
+        part: {name: np.asarray(value).tolist() for name, value in tree.items()}
+        for part, tree in parts.items()
+        if tree
     }
 
 
@@ -35,7 +42,9 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
 
 
 def load_weights(path: Path) -> Weights:
-    """Read weights that `save_weights` or a person wrote; in `WEIGHTS`, not held to the box.
+    """Read weights that `save_weights` or a person wrote.
+
+    Q and R are in `WEIGHTS`, not held to the box; others are.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, unknown, of the wrong
@@ -49,15 +58,28 @@ def load_weights(path: Path) -> Weights:
         "Q": dict.fromkeys(State._fields, (3,)),
         "R": dict.fromkeys(Wrench._fields, (2, 3)),
     }
+    others = tree.pop("others", {}) if isinstance(tree, dict) else {}
     _check_keys(path, tree, shapes.keys(), "")
     values = {}
     for part, entries in shapes.items():
         _check_keys(path, tree[part], entries.keys(), f"{part}.")
         values[part] = {
-            name: _positive(path, f"{part}.{name}", tree[part][name], shape)
+            name: _numbers(path, f"{part}.{name}", tree[part][name], shape, WEIGHTS)
             for name, shape in entries.items()
         }
-    return Weights(Q=State(**values["Q"]), R=Wrench(**values["R"]))
+    return Weights(State(**values["Q"]), Wrench(**values["R"]), _others(path, others))
+
+
+def _others(path: Path, others: Any) -> dict[str, np.ndarray]:
+    if not isinstance(others, Mapping):
+        raise InputError(f"{path}: others must be an object, got {json.dumps(others)[:60]}")
+    values = {}
+    for name, value in others.items():
+        if name not in TUNABLES:
+            raise InputError(f"{path}: others: {unknown('tunable', name, TUNABLES)}")
+        _, lower, upper, shape = TUNABLES[name]
+        values[name] = _numbers(path, f"others.{name}", value, shape, Range(lower, upper))
+    return values
 
 
 def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -83,16 +105,16 @@ def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
             raise InputError(f'{path}: missing weight "{prefix}{name}"; {expected}')
 
 
-def _positive(path: Path, name: str, entry: Any, shape: tuple[int, ...]) -> np.ndarray:
-    wanted = " x ".join(str(s) for s in shape)
+def _numbers(path: Path, name: str, entry: Any, shape: tuple[int, ...], range: Range) -> np.ndarray:
+    wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
     try:
         array = np.array(entry, object)
     except ValueError:  # rows of different lengths
         array = np.array(None)
     if array.shape != shape:
-        raise InputError(f"{path}: {name} must be {wanted} numbers, got {json.dumps(entry)[:60]}")
+        raise InputError(f"{path}: {name} must be {wanted}, got {json.dumps(entry)[:60]}")
     for index, value in np.ndenumerate(array):
-        if fault := validation_error(value, float, WEIGHTS):
+        if fault := validation_error(value, float, range):
             place = "".join(f"[{i}]" for i in index)
             raise InputError(f"{path}: {name}{place} {fault}")
     return array.astype(float)

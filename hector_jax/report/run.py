@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hector_jax.control.weights import WEIGHT_NAMES, Weights, bounds, weights_to_vector
+from hector_jax.control.parameters import bounds
+from hector_jax.control.weights import WEIGHT_NAMES, Weights, weights_to_vector
 from hector_jax.core.files import write_file
 from hector_jax.report.fidelity import error_rows
 from hector_jax.report.report import Picture, markdown_table, power_text, render, summaries

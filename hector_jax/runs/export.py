@@ -150,7 +150,8 @@ def controller(
         both = (tick < moves) | config.gait.double_support
         branch = jnp.where(substep > 0, 0, jnp.where(both, 2, 1))
         memory, plan = lax.switch(branch, [lambda: (memory, plan), planned(1), planned(2)])
-        legs, now = config.legs.parameters, {"substep": substep, "measurement": measurement}
+        legs = config.parameters(weights).legs
+        now = {"substep": substep, "measurement": measurement}
         out = {
             "force": plan.wrench.force,
             "moment": plan.wrench.moment,

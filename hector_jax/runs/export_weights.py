@@ -7,8 +7,10 @@ import numpy as np
 
 from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.control.weights_file import WEIGHTS, weights_tree
+from hector_jax.core.settings import Range
 from hector_jax.core.trajectory import Wrench, pack_wrench
 from hector_jax.robot.model import Robot
 
@@ -29,7 +31,14 @@ _INPUTS = ("force, foot 0 (left)", "force, foot 1 (right)", "moment, foot 0", "m
 def weights_schema() -> dict[str, Any]:
     """JSON schema (draft 2020-12) of a weights file."""
     schema = _schema(weights_tree(nominal()))
-    schema["properties"]["$schema"] = {"type": "string"}
+    others = {
+        name: _schema(np.zeros(one.shape).tolist(), Range(one.lower, one.upper))
+        for name, one in TUNABLES.items()
+    }
+    schema["properties"] |= {
+        "$schema": {"type": "string"},
+        "others": {"type": "object", "properties": others, "additionalProperties": False},
+    }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Weights of the walking MPC: diagonals of |x - x_ref|^2_Q + |u|^2_R",
@@ -37,8 +46,8 @@ def weights_schema() -> dict[str, Any]:
     }
 
 
-def _schema(example: Any) -> dict[str, Any]:
-    """Schema of values that are nested as the example is."""
+def _schema(example: Any, range: Range = WEIGHTS) -> dict[str, Any]:
+    """Schema of values in a range that are nested as the example is."""
     if isinstance(example, dict):
         properties = {
             name: {"description": _DESCRIPTIONS[name], **_schema(value)}
@@ -50,11 +59,11 @@ def _schema(example: Any) -> dict[str, Any]:
         count = len(example)
         return {
             "type": "array",
-            "items": _schema(example[0]),
+            "items": _schema(example[0], range),
             "minItems": count,
             "maxItems": count,
         }
-    return {"type": "number", "minimum": WEIGHTS.low, "maximum": WEIGHTS.high}
+    return {"type": "number", "minimum": range.low, "maximum": range.high}
 
 
 _HEADER = """\

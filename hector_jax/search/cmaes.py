@@ -23,10 +23,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
     DIRECTION_NAMES,
     Weights,
-    bounds,
     directions,
     scale_weights,
     weights_to_vector,

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
-from hector_jax.control.legs import Measurement
+from hector_jax.control.legs import LegParameters, Measurement
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError
@@ -102,6 +102,7 @@ def plan_tick(
 def motor_torques(
     config: WalkConfig,
     robot: Robot,
+    legs: LegParameters,
     imperfections: Imperfections,
     memory: Memory,
     plan: Plan,
@@ -114,7 +115,7 @@ def motor_torques(
     """Motors, true yaw [rad] and the torque at the joints [N m] over the next millisecond.
 
     Args:
-        config, robot: the controller.
+        config, robot, legs: the controller.
         imperfections: of the plant's motors.
         memory, plan: of the controller.
         motors: of the millisecond before.
@@ -124,7 +125,7 @@ def motor_torques(
         error: of the state estimate now.
     """
     measurement, yaw = sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)
-    legs, now = config.legs.parameters, {"substep": substep, "measurement": measurement}
+    now = {"substep": substep, "measurement": measurement}
     torque = actuate(config, robot, legs, plan=plan, memory=memory, **now)
     motors, applied = step_actuators(robot, imperfections, motors, torque)
     return motors, yaw, applied

@@ -137,9 +137,10 @@ def _millisecond(
     tick, substep = when
     robot, job, places = walk.robot, walk.job, program.places
     before = _read(program, walk, carry.physics)
+    legs = program.config.parameters(job.weights).legs
     held = carry.memory, carry.plan, carry.motors, carry.yaw
     motors, yaw, torque = loop.motor_torques(
-        program.config, robot, job.plant, *held, substep, before, walk.error
+        program.config, robot, legs, job.plant, *held, substep, before, walk.error
     )
     force = push_force(job.push, (tick - job.start_tick) * program.substeps + substep)
     physics, data = _step_physics(program, walk, carry.physics, torque=torque, force=force)
@@ -325,8 +326,9 @@ def walk_batch(
     model, varied = mjx_model.batched_model(worlds, single)
     qpos = jnp.asarray(standing_qpos(worlds[0], robot.standing_joints, float(robot.trunk_height)))
     starts = np.array([job.start_tick for job in jobs], np.int32)
+    others = {name for job in jobs for name in job.weights.others}
     batch = WalkBatch(
-        weights=stack([job.weights for job in jobs]),
+        weights=stack([config.with_others(job.weights, others) for job in jobs]),
         command=stack([job.command for job in jobs]),
         plant=stack([job.imperfections for job in jobs]),
         push=stack([job.push for job in jobs]),

@@ -157,6 +157,7 @@ def _walk_ticks(
         job.imperfections.estimator, job.seed, steps - ticks * count, ticks * count
     )
     anchor = jax.device_put(standing_anchor(robot, start))
+    legs = jax.device_put(config.parameters(weights).legs)
     memory, motors, yaw = programs.begin(body, plant.readings[0]), init_actuators(), jnp.zeros(())
     carry = None if retune is None else retune.init
     plan = samples = None
@@ -178,7 +179,7 @@ def _walk_ticks(
         )
         for i in range(count):
             held = imperfections, memory, plan, motors, yaw, numbers[i]
-            motors, yaw, torque = programs.torques(body, *held, plant.readings[i], error[i])
+            motors, yaw, torque = programs.torques(body, legs, *held, plant.readings[i], error[i])
             plant.step(done + i, i, torque)
             if on_sample is not None:
                 on_sample(plant.world, plant.data)

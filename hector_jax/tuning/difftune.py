@@ -2,8 +2,9 @@
 
 theta <- P_Theta(theta - beta theta g), with g the gradient in log-weights, divided by its largest
 magnitude inside Q and inside R: a weight moves by at most beta_Q or beta_R of itself, whatever the
-size of the loss. A step that ends in a fall, a bad solve or a number that is not finite is refused:
-the weights go back, the step is halved and the rejection_reason is told.
+size of the loss. Other numbers of the controller (`TuneConfig.others`), which may be zero, move by
+at most beta_others of the width of their box. A step that ends in a fall, a bad solve or a number
+that is not finite is rejected: the weights go back and the step is halved.
 
 Two results come out of one run: the weights after the paper's `ten` iterations, each accepted
 unless it is refused, and the `converged` ones, for which steps that raise the loss are halved too
@@ -25,10 +26,12 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
+from hector_jax.control.parameters import TUNABLES, bounds, check_tunables
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import Weights, bounds
+from hector_jax.control.weights import Weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, from_table
+from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import where
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
@@ -46,6 +49,8 @@ class TuneConfig:
     loss: tuple = PAPER_LOSS  # of `LossTerm`
     beta_q: float = 0.05  # largest relative step of a weight in Q
     beta_r: float = 0.08  # and in R
+    others: tuple[str, ...] = ()  # of `parameters.TUNABLES`, tuned beside Q and R
+    beta_others: float = 0.02  # largest step of one, as a share of its box
     update: str = "relative"  # or "literal": the paper's theta - beta dL/dtheta
     tie_feet: bool = True  # one R for both feet, as the robot is its own mirror image
     iterations: int = 100  # at most
@@ -59,6 +64,7 @@ class TuneConfig:
             self,
             beta_q=POSITIVE,
             beta_r=POSITIVE,
+            beta_others=POSITIVE,
             update=("relative", "literal"),
             iterations=AT_LEAST_ONE,
             patience=AT_LEAST_ONE,
@@ -67,6 +73,9 @@ class TuneConfig:
             residual=POSITIVE,
         )
         check_loss(self.loss)
+        check_tunables(self.others)
+        if self.others and self.update != "relative":
+            raise InputError("TuneConfig.others expects update relative, got literal")
 
     def as_table(self) -> dict[str, Any]:
         """The settings as JSON values; of the loss its weights."""
@@ -164,37 +173,41 @@ def tune_step(
     return evaluate_jit(config.rollout, robot, weights, command, anchor, effect, config.loss)
 
 
-def relative_step(beta_q: float, beta_r: float) -> optax.GradientTransformation:
-    """Downhill in log-weights, the largest relative step being beta inside Q and inside R."""
+def relative_step(
+    beta_q: float, beta_r: float, beta_others: float = 0.0
+) -> optax.GradientTransformation:
+    """Downhill in log-weights, the largest relative step being beta inside Q and inside R.
 
-    def scaled(tree: Any, weights: Any, beta: float) -> Any:
-        logs = jax.tree.map(lambda g, w: g * w, tree, weights)
-        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(g)) for g in jax.tree.leaves(logs)]))
-        size = beta / jnp.where(largest > 0.0, largest, 1.0)
-        return jax.tree.map(lambda g, w: -size * g * w, logs, weights)
+    Other numbers step by at most `beta_others` of the width of their box.
+    """
+
+    def scaled(tree: Any, sizes: Any, beta: float) -> Any:
+        if not jax.tree.leaves(tree):
+            return tree
+        products = jax.tree.map(jnp.multiply, tree, sizes)
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(x)) for x in jax.tree.leaves(products)]))
+        by = beta / jnp.where(largest > 0.0, largest, 1.0)
+        return jax.tree.map(lambda x, size: -by * x * size, products, sizes)
 
     def update(gradient: Weights, state: optax.OptState, weights: Weights | None = None):
         if weights is None:
             raise ValueError("relative_step needs the weights: pass params to update")
-        return Weights(
-            scaled(gradient.Q, weights.Q, beta_q), scaled(gradient.R, weights.R, beta_r)
-        ), state
+        widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in weights.others}
+        sizes = weights._replace(others=widths)
+        return Weights(*map(scaled, gradient, sizes, (beta_q, beta_r, beta_others))), state
 
     return optax.GradientTransformation(lambda weights: optax.EmptyState(), update)
 
 
 def _optimiser(config: TuneConfig) -> optax.GradientTransformation:
     if config.update == "relative":
-        return relative_step(config.beta_q, config.beta_r)
-    return optax.multi_transform(
-        {"Q": optax.sgd(config.beta_q), "R": optax.sgd(config.beta_r)},
-        Weights("Q", "R"),  # pyright: ignore
-    )
+        return relative_step(config.beta_q, config.beta_r, config.beta_others)
+    rules = {"Q": optax.sgd(config.beta_q), "R": optax.sgd(config.beta_r), "": optax.set_to_zero()}
+    return optax.multi_transform(rules, Weights("Q", "R", ""))  # pyright: ignore
 
 
-def _mean_over_feet(tree: Weights) -> Weights:
-    both = lambda x: jnp.broadcast_to(x.mean(axis=0), x.shape)  # noqa: E731
-    return Weights(tree.Q, jax.tree.map(both, tree.R))
+def _mean_over_feet(R: Wrench) -> Wrench:
+    return jax.tree.map(lambda x: jnp.broadcast_to(x.mean(axis=0), x.shape), R)
 
 
 def step_weights(
@@ -202,11 +215,14 @@ def step_weights(
 ) -> Weights:
     """Weights after `step_scale` of a full step downhill, projected onto the box."""
     if config.tie_feet:
-        gradient = _mean_over_feet(gradient)
+        gradient = gradient._replace(R=_mean_over_feet(gradient.R))
+    zero = jax.tree.map(jnp.zeros_like, gradient.others)
+    tuned = {name: gradient.others[name] for name in config.others}
+    gradient = gradient._replace(others={**zero, **tuned})
     optimiser = _optimiser(config)
     updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
     moved = optax.apply_updates(weights, jax.tree.map(lambda u: step_scale * u, updates))
-    return optax.projections.projection_box(moved, *bounds())
+    return optax.projections.projection_box(moved, *bounds(weights.others))
 
 
 def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
@@ -225,12 +241,13 @@ def init(config: TuneConfig, weights: Weights, count: int = 0) -> TuneState:
 
     With `tie_feet` both feet start from the geometric mean of their weights in R.
     """
+    weights = config.rollout.walk.with_others(weights, config.others)
     weights = jax.tree.map(jnp.asarray, weights)
     if config.tie_feet:
         equal = jnp.all(jnp.stack([jnp.array_equal(*w) for w in weights.R]))
-        tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights)))
+        tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights.R)))
         # weights that are equal stay so to the last bit
-        weights = jax.tree.map(lambda w, t: jnp.where(equal, w, t), weights, tied)
+        weights = weights._replace(R=where(equal, weights.R, tied))
     return TuneState(
         trial=weights,
         step_scale=jnp.asarray(1.0),

@@ -70,7 +70,7 @@ def evaluate_walk(
     states = _measured_states(robot, jax.tree.map(lambda x: x[ends], walk.state), walk.joints[ends])
     first = Wrench(*(w[0] for w in walk.command))
     anchor = anchor_at(robot, walk.initial, start_tick)
-    trace = init_trace(anchor, jax.tree.map(lambda x: x[0], states), first)
+    trace = init_trace(anchor, jax.tree.map(lambda x: x[0], states), first, weights)
     used = jax.tree.map(lambda w: np.broadcast_to(w, (ticks - 1, *np.shape(w))), weights)
     tick = np.asarray(start_tick + 1, np.int32)
     _, evaluation = follow(config, robot, command, anchor, effect, trace, used, tick, states)

@@ -73,16 +73,17 @@ class Trace(NamedTuple):
     tangents: Varied  # of the carry at its end
 
 
-def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench) -> Trace:
+def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench, weights: Weights) -> Trace:
     """No weight has a part in what was measured so far.
 
     Args:
         anchor: of the reference.
         measured: now.
         last: wrench commanded over the last tick, taken for those before it too.
+        weights: whose numbers are counted.
     """
     commands = jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), last)
-    return Trace(commands, no_tangents(_carry(anchor, measured, commands)))
+    return Trace(commands, no_tangents(_carry(anchor, measured, commands), weights))
 
 
 def _carry(anchor: Anchor, measured: MeasuredState, commands: Wrench) -> Carry:
@@ -144,7 +145,8 @@ def window_gradient(
         one, (start, trace.tangents), (ticks, weights, now, after)
     )
     walk, columns = _with_command_before(samples, columns, trace)
-    value, gradient = sensitivity.gradient(loss, walk, columns)
+    first = jax.tree.map(lambda x: x[0], weights)
+    value, gradient = sensitivity.gradient(loss, walk, columns, first)
     fallen, residual = jnp.mean(1.0 * samples.fallen), jnp.max(samples.residual)
     evaluation = Evaluation(value, losses(loss, walk), gradient, fallen, residual)
     return Trace(last.commands, tangents), evaluation
@@ -234,7 +236,7 @@ def step_adaptation(
     state = MeasuredState(measurement.state, _feet(robot, measurement))
     states = (*carry.states, jax.tree.map(np.asarray, state))
     carry, iteration = carry._replace(states=states), None
-    trace = init_trace(anchor, state, last) if carry.trace is None else carry.trace
+    trace = carry.trace or init_trace(anchor, state, last, carry.weights)
     carry = carry._replace(trace=trace)
     if len(carry.used) == config.window:
         walked = carry.states, carry.used, tick - config.window
@@ -244,7 +246,7 @@ def step_adaptation(
         iteration = Iteration(*jax.tree.map(np.asarray, row))
         if not iteration.accepted:
             scale, led, newest, sound = carry.scale / 2.0, 0.0, carry.sound, carry.sound
-            trace = init_trace(anchor, state, last)
+            trace = init_trace(anchor, state, last, carry.weights)
         else:
             scale, led, sound = min(1.0, 2.0 * carry.scale), config.step * carry.scale, carry.newest
             newest = step_weights(config.tune, sound, evaluation.gradient, led)
@@ -306,4 +308,5 @@ def retuner(
             on_step(iteration)
         return carry, carry.weights
 
-    return Retune(init_adaptation(weights), step)
+    start = config.tune.rollout.walk.with_others(weights, config.tune.others)
+    return Retune(init_adaptation(start), step)

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import WEIGHT_NAMES, Weights, vector_to_weights, weights_to_vector
+from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
@@ -29,10 +30,10 @@ from hector_jax.tuning.rollout import (
 
 
 class Sensitivities(NamedTuple):
-    """Derivatives of a rollout by the 24 weights, which are the first axis."""
+    """Derivatives of a rollout by the n numbers of theta, which are the first axis."""
 
-    state: State  # (24, T, 3) each: dx_j+1 / dtheta
-    command: Wrench  # (24, T, 2, 3) each: du_j / dtheta
+    state: State  # (n, T, 3) each: dx_j+1 / dtheta
+    command: Wrench  # (n, T, 2, 3) each: du_j / dtheta
 
 
 class Varied(NamedTuple):
@@ -50,9 +51,10 @@ def varied(carry: Carry) -> Varied:
     return Varied(carry.state, carry.feet, carry.commands, carry.anchor.position, carry.anchor.yaw)
 
 
-def no_tangents(carry: Carry) -> Varied:
+def no_tangents(carry: Carry, weights: Weights) -> Varied:
     """Tangents of a start in which no weight has a part: dx_0 / dtheta = 0."""
-    return jax.tree.map(lambda x: jnp.zeros((len(WEIGHT_NAMES), *x.shape), x.dtype), varied(carry))
+    count = ravel_pytree(weights)[0].size
+    return jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), varied(carry))
 
 
 def step_sensitivities(
@@ -65,28 +67,26 @@ def step_sensitivities(
     tangents: Varied,
     tick: Int[Array, ""],
 ) -> tuple[Carry, Varied, Trajectory, Sensitivities]:
-    """One tick of the closed loop with its tangents, all 24 at once.
+    """One tick of the closed loop with its tangents, all n at once.
 
     Args:
         config, robot, weights, command, effect, carry, tick: as for `step_carry`.
         tangents: of the carry, the weights being their first axis.
 
     Returns:
-        The next carry and its tangents, the tick's sample, and the sample's sensitivities (24, 3).
+        The next carry and its tangents, the tick's sample, and the sample's sensitivities (n, 3).
 
     Source: Eq. 10.
     """
-    theta = weights_to_vector(weights)
+    theta, as_weights = ravel_pytree(weights)
 
-    def move(parts: Varied, theta: Float[Array, "24"]) -> tuple:
+    def move(parts: Varied, theta: Float[Array, " n"]) -> tuple:
         place = Anchor(parts.position, parts.yaw, carry.anchor.tick)
         now = Carry(parts.state, parts.feet, parts.commands, place, carry.fallen)
-        then, sample = step_carry(
-            config, robot, vector_to_weights(theta), command, effect, now, tick
-        )
+        then, sample = step_carry(config, robot, as_weights(theta), command, effect, now, tick)
         return (varied(then), sample.state, sample.command), (then, sample)
 
-    def along(tangent: Varied, direction: Float[Array, "24"]) -> tuple:
+    def along(tangent: Varied, direction: Float[Array, " n"]) -> tuple:
         return jax.jvp(move, (varied(carry), theta), (tangent, direction), has_aux=True)
 
     _, (later, state, wrench), (then, sample) = jax.vmap(along, out_axes=(None, 0, None))(
@@ -113,15 +113,15 @@ def propagate(
 
     carry = init_carry(robot, anchor)
     ticks = walked_ticks(config, anchor)
-    _, (samples, sensitivities) = jax.lax.scan(tick, (carry, no_tangents(carry)), ticks)
+    _, (samples, sensitivities) = jax.lax.scan(tick, (carry, no_tangents(carry, weights)), ticks)
     later = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), sensitivities)
     return from_start(config, samples), later
 
 
 def gradient(
-    loss: Loss, trajectory: Trajectory, sensitivities: Sensitivities
+    loss: Loss, trajectory: Trajectory, sensitivities: Sensitivities, weights: Weights
 ) -> tuple[Float[Array, ""], Weights]:
-    """Loss and its gradient from the sensitivities. Source: Eq. 9."""
+    """Loss and its gradient from the sensitivities by `weights`. Source: Eq. 9."""
 
     def objective(state: State, command: Wrench) -> Float[Array, ""]:
         walk = trajectory._replace(state=state, command=command)
@@ -131,4 +131,4 @@ def gradient(
         trajectory.state, trajectory.command
     )
     terms = jax.tree.map(lambda g, s: jnp.tensordot(s, g, axes=g.ndim), pull, tuple(sensitivities))
-    return value, vector_to_weights(sum(jax.tree.leaves(terms)))
+    return value, ravel_pytree(weights)[1](sum(jax.tree.leaves(terms)))
