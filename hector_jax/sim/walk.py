@@ -229,7 +229,11 @@ def walk_many(
     """
     host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
     sent = [
-        Job(host(weights), host(command), host(plant), *rest)
-        for weights, command, plant, *rest in jobs
+        job._replace(
+            weights=host(job.weights),
+            command=host(job.command),
+            imperfections=host(job.imperfections),
+        )
+        for job in jobs
     ]
     yield from pool.map(walk, repeat(config), repeat(host(robot)), sent)

@@ -244,7 +244,7 @@ def tune_batch(
     history = jax.tree.map(
         lambda *parts: np.concatenate(parts, axis=1)[:count, : config.iterations + 1], *histories
     )
-    return Tunings(final.ten, final.best, final.loss, final.stop, final.count - 1, history)
+    return Tunings(final.ten, final.best, final.loss, final.stop, final.iteration - 1, history)
 
 
 def _check_problems(config: TuneConfig, problems: Problem, effects: jax.tree_util.Partial) -> int:

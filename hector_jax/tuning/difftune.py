@@ -123,7 +123,7 @@ class TuneState(NamedTuple):
 
     trial: Weights  # to be evaluated next
     step_scale: Float[Array, "*batch"]  # of the full step that leads from `best` to `trial`
-    count: Int[Array, "*batch"]  # iteration of the trial; the start is 0
+    iteration: Int[Array, "*batch"]  # of the trial; the start is 0
     best: Weights  # the last that were accepted
     loss: Float[Array, "*batch"]  # theirs
     gradient: Weights  # theirs
@@ -236,8 +236,8 @@ def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
     return jnp.where(finite, reason, StepStatus.NOT_FINITE).astype(jnp.int32)
 
 
-def init(config: TuneConfig, weights: Weights, count: int = 0) -> TuneState:
-    """A tuning before its first rollout, which is iteration `count`.
+def init(config: TuneConfig, weights: Weights, first: int = 0) -> TuneState:
+    """A tuning before its first rollout, which is iteration `first`.
 
     With `tie_feet` both feet start from the geometric mean of their weights in R.
     """
@@ -251,7 +251,7 @@ def init(config: TuneConfig, weights: Weights, count: int = 0) -> TuneState:
     return TuneState(
         trial=weights,
         step_scale=jnp.asarray(1.0),
-        count=jnp.asarray(count, jnp.int32),
+        iteration=jnp.asarray(first, jnp.int32),
         best=weights,
         loss=jnp.asarray(jnp.inf, float),  # typed as later ones, or `update` is compiled again
         gradient=jax.tree.map(jnp.zeros_like, weights),
@@ -271,8 +271,8 @@ def update(
     iterations the tuning stops where the step has become too small or `patience` accepted
     iterations gained less than `gain`.
     """
-    count, start = state.count, jnp.isinf(state.loss)  # nothing was accepted yet
-    late = count > PAPER_ITERATIONS
+    iteration, start = state.iteration, jnp.isinf(state.loss)  # nothing was accepted yet
+    late = iteration > PAPER_ITERATIONS
     status = step_status(config, evaluation)
     rose = late & ~(evaluation.loss < state.loss)
     status = jnp.where((status == StepStatus.ACCEPTED) & rose, StepStatus.ROSE, status)
@@ -286,14 +286,14 @@ def update(
     scale = jnp.where(accepted, jnp.minimum(1.0, 2.0 * state.step_scale), state.step_scale / 2.0)
 
     little = recent[0] > (1 - config.gain) * recent[-1]  # false before there are enough
-    stop = jnp.where(count >= config.iterations, Stop.LIMIT, Stop.GOING)
+    stop = jnp.where(iteration >= config.iterations, Stop.LIMIT, Stop.GOING)
     stop = jnp.where(late & little, Stop.NO_GAIN, stop)
     stop = jnp.where(late & (scale < config.smallest_step), Stop.SMALL_STEP, stop)
     stop = jnp.where(start & ~accepted, Stop.BAD_START, stop)
     after = TuneState(
         trial=step_weights(config, best, gradient, scale),
         step_scale=scale,
-        count=count + 1,
+        iteration=iteration + 1,
         best=best,
         loss=if_accepted(evaluation.loss, state.loss),
         gradient=gradient,
@@ -302,7 +302,7 @@ def update(
         stop=stop.astype(jnp.int32),
     )
     led = jnp.where(start, 0.0, state.step_scale)
-    return after, Iteration(count, state.trial, evaluation, status.astype(jnp.int32), led)
+    return after, Iteration(iteration, state.trial, evaluation, status.astype(jnp.int32), led)
 
 
 REASONS = {

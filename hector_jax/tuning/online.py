@@ -192,7 +192,7 @@ class Adaptation(NamedTuple):
     sound: Weights  # of the last window that was not refused
     scale: float  # of the next step, 1 for a full one
     led: float  # scale of the step that led to `newest`
-    count: int  # windows so far
+    windows: int  # so far
     due: int  # gait tick
     trace: Trace | None  # of the windows so far; None before the first
     states: tuple[MeasuredState, ...]  # measured since the window began
@@ -242,7 +242,7 @@ def step_adaptation(
         walked = carry.states, carry.used, tick - config.window
         trace, evaluation = _follow_window(config, robot, command, anchor, effect, trace, *walked)
         status = step_status(config.tune, evaluation)
-        row = carry.count, carry.weights, evaluation, status, carry.led
+        row = carry.windows, carry.weights, evaluation, status, carry.led
         iteration = Iteration(*jax.tree.map(np.asarray, row))
         if not iteration.accepted:
             scale, led, newest, sound = carry.scale / 2.0, 0.0, carry.sound, carry.sound
@@ -251,8 +251,10 @@ def step_adaptation(
             scale, led, sound = min(1.0, 2.0 * carry.scale), config.step * carry.scale, carry.newest
             newest = step_weights(config.tune, sound, evaluation.gradient, led)
         due, states = tick + config.late, carry.states[-1:]
-        count = carry.count + 1
-        carry = Adaptation(carry.weights, newest, sound, scale, led, count, due, trace, states, ())
+        windows = carry.windows + 1
+        carry = Adaptation(
+            carry.weights, newest, sound, scale, led, windows, due, trace, states, ()
+        )
     weights = carry.newest if tick >= carry.due else carry.weights
     return carry._replace(weights=weights, used=(*carry.used, weights)), iteration
 

@@ -26,9 +26,9 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, Range, check
-from hector_jax.core.trajectory import Load, State, Trajectory, Wrench, has_fallen
+from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.core.tree import where
-from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
+from hector_jax.grfm.effect import HISTORY, Effect, Window, from_yaw_frame, ground_effect, turn
 from hector_jax.robot import srbm
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot
@@ -71,13 +71,6 @@ def no_variation() -> Variation:
     return Variation(one, one, none, grips, zero, State(none, none, none, none), np.asarray(0))
 
 
-class Late(NamedTuple):
-    """What acted in the last tick, world frame; of it a delayed effect has a share."""
-
-    wrench: Wrench
-    swing_leg_load: Load
-
-
 class Carry(NamedTuple):
     """What one tick hands to the next."""
 
@@ -86,7 +79,7 @@ class Carry(NamedTuple):
     commands: Wrench  # (HISTORY, 2, 3) each, world frame, newest first
     anchor: Anchor  # taken anew at t = 0
     fallen: Bool[Array, ""]
-    late: Late | None = None  # where there is a variation
+    before: Effect | None = None  # of the last tick, world frame; where there is a variation
 
 
 def init_carry(robot: Robot, anchor: Anchor) -> Carry:
@@ -125,13 +118,13 @@ def _moved_by(
     variation: Variation,
     robot: Robot,
     state: State,
-    now: Late,
+    now: Effect,
     feet: Float[Array, "2 3"],
-    before: Late,
+    before: Effect,
     feet_before: Float[Array, "2 3"],
     dt: float,
 ) -> State:
-    """`srbm.step` of the body as it is; what is late acts where the feet were."""
+    """`srbm.step` of the body as it is; what is delayed acts where the feet were."""
     share = variation.delay / dt
     mixed = jax.tree.map(lambda new, old: (1.0 - share) * new + share * old, now, before)
     lever = share * jnp.cross(feet_before - feet, before.wrench.force)
@@ -145,7 +138,7 @@ def _moved_by(
         velocity = state.velocity + jnp.cross(state.ang_velocity, arm)
         return state._replace(position=state.position + arm, velocity=velocity)
 
-    moved = srbm.step(body, seen_from(state, variation.com), wrench, feet, dt, mixed.swing_leg_load)
+    moved = srbm.step(body, seen_from(state, variation.com), wrench, feet, dt, mixed.legs)
     return seen_from(moved, -variation.com)
 
 
@@ -155,7 +148,7 @@ def _respond(
     commands: Wrench,
     contact: Bool[Array, "2"],
     since_switch: Float[Array, ""],
-) -> Late:
+) -> Effect:
     """What acts on the body by phi, which sees and answers in the yaw frame."""
     yaw = state.euler[2]
     seen = Window(
@@ -165,21 +158,21 @@ def _respond(
         base=from_yaw_frame(state),
     )
     answer = effect(seen)
-    return Late(turn(answer.wrench, yaw), turn(answer.legs, yaw))
+    return Effect(turn(answer.wrench, yaw), turn(answer.legs, yaw))
 
 
 def _move(
     robot: Robot,
     carry: Carry,
-    acting: Late,
+    acting: Effect,
     feet: Float[Array, "2 3"],
     dt: float,
     variation: Variation | None,
 ) -> State:
     """State at the end of a tick."""
-    if variation is None:
-        return srbm.step(robot, carry.state, acting.wrench, feet, dt, acting.swing_leg_load)
-    before, there = carry.late, carry.feet.position
+    before, there = carry.before, carry.feet.position
+    if variation is None or before is None:
+        return srbm.step(robot, carry.state, acting.wrench, feet, dt, acting.legs)
     return _moved_by(variation, robot, carry.state, acting, feet, before, there, dt)
 
 
@@ -201,8 +194,8 @@ def _believe(carry: Carry, tick: Int[Array, ""], variation: Variation | None) ->
 
 
 def _on_real_ground(
-    carry: Carry, acting: Late, planned: Plan, belief: _Belief, variation: Variation | None
-) -> tuple[Late, Feet]:
+    carry: Carry, acting: Effect, planned: Plan, belief: _Belief, variation: Variation | None
+) -> tuple[Effect, Feet]:
     """What acts on the body within the ground's friction, and where the feet really are."""
     touchdown = planned.touchdown
     if variation is not None and belief.error is not None:
@@ -216,7 +209,7 @@ def _sample(
     robot: Robot,
     before: Carry,
     after: Carry,
-    acting: Late,
+    acting: Effect,
     planned: Plan,
     reference: State,
 ) -> Trajectory:
@@ -332,7 +325,7 @@ def rollout(
     start, ticks = init_carry(robot, anchor), walked_ticks(config, anchor)
     if variation is not None:
         standing = jax.tree.map(lambda w: w[0], start.commands)
-        start = start._replace(late=Late(standing, Load(jnp.zeros(3), jnp.zeros(3))))
+        start = start._replace(before=ground_effect(standing))
     blocks = -(-len(ticks) // config.block)
     if blocks == 1:
         _, samples = walk(start, ticks)
