@@ -63,7 +63,7 @@ format: $(STAMP) ## format the code
 docs: $(STAMP) ## the site, into docs/_build; a warning is an error
 	@$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build
 
-lock: $(STAMP) ## resolve pyproject.toml anew into requirements.lock
+lock: $(STAMP) ## resolve pyproject.toml into requirements.lock
 	@$(BIN)/python -m pip install --quiet uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --no-header \
 		--no-emit-index-url pyproject.toml -o requirements.lock
