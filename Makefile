@@ -1,9 +1,9 @@
-# Each target does its own set-up: .venv is built once from requirements.lock, by stamp.
+# Each target sets up first: .venv is built once from requirements.lock; a stamp file marks it.
 TRAJ ?= straight
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# The first interpreter here that is Python 3.11 to 3.13 and can make environments.
+# The first interpreter that is Python 3.11 to 3.13 and can make environments.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	>/dev/null 2>&1 && echo $$p && break; done)
@@ -19,33 +19,33 @@ help: ## this list
 setup: $(STAMP) ## build .venv from the lock
 
 $(STAMP): requirements.lock pyproject.toml
-	@test -n "$(PYTHON)" || { echo "hector_jax needs Python 3.11 to 3.13; none found" >&2; exit 2; }
+	@test -n "$(PYTHON)" || { echo "hector_jax needs Python 3.11 to 3.13; there is none" >&2; exit 2; }
 	@echo "setting up $(VENV) with $$($(PYTHON) --version) (once, one to two minutes)"
 	@$(PYTHON) -m venv --clear $(VENV)
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -r requirements.lock
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
-tune: $(STAMP) ## tune a trajectory and judge it: make tune TRAJ=straight|c|s|all, TRAJ="c s"
+tune: $(STAMP) ## tune a trajectory and evaluate it: make tune TRAJ=straight|c|s|all, TRAJ="c s"
 	@$(BIN)/hector tune --traj $(TRAJ)
 
-table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a look
+table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a trial
 	@$(BIN)/hector table $(if $(QUICK),--quick)
 
-grfm: $(STAMP) ## how well the nets tell what the ground returns: runs/grfm/report.md
+grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm
 
-ceiling: $(STAMP) ## search of 2000 walks for each trajectory, taken up where it was cut; for a GPU
+ceiling: $(STAMP) ## search of 2000 walks for each trajectory; continues if interrupted; for a GPU
 	@$(BIN)/hector search --traj all --budget 2000 --population 40 --record runs/ceiling \
 		--out docs/results/ceiling
 
-test: $(STAMP) ## the fast suite
+test: $(STAMP) ## the fast tests
 	@$(BIN)/pytest -q -n 2 --dist loadfile
 
 quick: $(STAMP) ## the fast tests of controller, QP and tuner
 	@$(BIN)/pytest -q -n 2 --dist loadfile $(QUICK_TESTS)
 
-test-all: $(STAMP) ## the fast suite and the slow stories
+test-all: $(STAMP) ## the fast and the slow tests
 	@$(BIN)/pytest -q -n 2 --dist loadfile -m "slow or not slow"
 
 bench: $(STAMP) ## benchmarks on this machine; peers come with pip install -e ".[bench]"
@@ -56,14 +56,14 @@ check: $(STAMP) ## format, lint and types
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/pyright
 
-format: $(STAMP) ## put the code in the house's format
+format: $(STAMP) ## format the code
 	@$(BIN)/ruff format --quiet .
 	@$(BIN)/ruff check --quiet --fix .
 
 docs: $(STAMP) ## the site, into docs/_build; a warning is an error
 	@$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build
 
-lock: $(STAMP) ## resolve pyproject.toml anew into requirements.lock
+lock: $(STAMP) ## resolve pyproject.toml into requirements.lock
 	@$(BIN)/python -m pip install --quiet uv
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --no-header \
 		--no-emit-index-url pyproject.toml -o requirements.lock

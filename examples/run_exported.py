@@ -4,8 +4,8 @@ It needs jax, numpy and flatbuffers:
 
     python run_exported.py FOLDER
 
-FOLDER is the one that `hector export` wrote. The recorded walk in it is gone through as on the
-robot, a call every millisecond; what comes out must be what the live controller said.
+FOLDER is the one that `hector export` wrote. It contains a recorded walk. This program calls the
+controller with each millisecond of it, as on the robot, and compares with the recorded answers.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ def load(folder: Path, card: dict):
     name = "controller-cpu.jaxexport"
     blob = (folder / name).read_bytes()
     if hashlib.sha256(blob).hexdigest() != card["sha256"][name]:
-        sys.exit(f"{folder / name} is not the file that controller.json tells of")
+        sys.exit(f"{folder / name} does not have the sha256 that controller.json names")
     exported = export.deserialize(bytearray(blob))
     arguments, _ = jax.tree.unflatten(exported.in_tree, exported.in_avals)
     control = jax.jit(exported.call).lower(*arguments).compile()
@@ -33,7 +33,7 @@ def load(folder: Path, card: dict):
 
 
 def main(folder: Path) -> None:
-    """Go through the recorded walk, compare and time."""
+    """Call the controller along the recorded walk, compare and time."""
     if not (folder / "controller.json").exists():
         sys.exit(f"{folder}: no controller.json; expected the folder that `hector export` wrote")
     card = json.loads((folder / "controller.json").read_text())
@@ -63,7 +63,7 @@ def main(folder: Path) -> None:
     print(f"{len(spent)} calls, p50 {p50:.2f} ms, p99 {p99:.2f} ms")
     print(f"largest difference {worst_force:.1e} N, {worst_torque:.1e} N m at the joints")
     if not max(worst_force, worst_torque) <= 1e-6:
-        sys.exit("this is not what the live controller said")
+        sys.exit("the answers differ from the recorded ones by more than 1e-6")
 
 
 if __name__ == "__main__":

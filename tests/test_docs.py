@@ -3,6 +3,7 @@
 import ast
 import doctest
 import importlib
+import json
 import pkgutil
 import re
 import shlex
@@ -17,6 +18,7 @@ import pytest
 
 import hector_jax
 from hector_jax.cli import flags, parse
+from hector_jax.control.reference import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -150,6 +152,39 @@ def test_tests_that_pages_name_are_there():
     assert len(named) > 40
     for file, name in sorted(named):  # `test_a_name...` stands for the tests that begin so
         assert f"\ndef {name}" in (ROOT / "tests" / file).read_text(), f"{file}::{name}"
+
+
+def changes(seeds):
+    """Change of L in % by trajectory, set and baseline, of a table of the results."""
+    table = json.loads((DOCS / "results" / seeds / "table.json").read_text())["trajectories"]
+    return {
+        (name, which): one["standin"]["change"]
+        for name, trajectory in table.items()
+        for which, one in trajectory["sets"].items()
+    }
+
+
+def rows(path):
+    """Cells of a page's table, by the weight set that its row begins with."""
+    lines = re.findall(r"^\| `(\w+)`.*? \| (-.*) \|$", path.read_text(), re.MULTILINE)
+    return {name: cells.split(" | ") for name, cells in lines}
+
+
+def test_the_table_of_the_readme_is_that_of_the_results():
+    shown, expected = rows(ROOT / "README.md"), changes("seeds-1000")
+    for which in ("without", "with", "shared_mean", "ceiling"):
+        each = [expected[name, which][base] for name in COMMANDS for base in ("nominal", "expert")]
+        texts = [f"{one['median']:.0f} [{one['low']:.0f}, {one['high']:.0f}]" for one in each]
+        assert shown[which] == texts, which
+
+
+def test_the_table_of_the_results_page_is_that_of_its_files():
+    shown, files = rows(DOCS / "results.md"), (changes("."), changes("seeds-1000"))
+    for which in ("with", "with_walks", "shared_mean", "ceiling"):
+        for name, text in zip(COMMANDS, shown[which], strict=False):
+            each = [one[name, which] for one in files]
+            pairs = [f"{x['nominal']['median']:.0f} / {x['expert']['median']:.0f}" for x in each]
+            assert text == f"{pairs[0]} ({pairs[1]})", (which, name)
 
 
 def test_pages_have_titles_of_their_own():
