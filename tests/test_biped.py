@@ -65,7 +65,13 @@ def reordered(axes, folder):
                 assert was in text
                 text = text.replace(was, f'name="{side}_{joint}" class="{kinds[axis]}"')
         start, end = text.index(" 1 0 0 0 ") + 9, text.index('"/>\n  </keyframe>')
-        return text[:start] + " ".join(map(str, by_axis * 2)) + text[end:]
+        text = text[:start] + " ".join(map(str, by_axis * 2)) + text[end:]
+        compiled = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(compiled)
+        mujoco.mj_resetDataKeyframe(compiled, data, 0)
+        mujoco.mj_forward(compiled, data)
+        above = data.geom("left_tip").xpos[2] - compiled.geom("left_tip").size[0]
+        return text.replace("0 0 0.755410", f"0 0 {0.755410 - above}")
 
     return copied(
         folder, model, lambda text: text.replace("[joints]", f'[joints]\naxes = "{axes}"')

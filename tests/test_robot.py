@@ -260,6 +260,26 @@ def drop_line(text, *marks):
             id="knee that bends forwards",
         ),
         pytest.param(
+            lambda t: t.replace('cone="pyramidal"', 'cone="elliptic"'),
+            ["option cone is elliptic, expected pyramidal"],
+            id="elliptic cone",
+        ),
+        pytest.param(
+            lambda t: t.replace('conaffinity="1" condim="3"', 'conaffinity="1" condim="6"'),
+            ["condim of geom 'left_toe' is 6, expected 3"],
+            id="condim of a foot",
+        ),
+        pytest.param(
+            lambda t: t.replace('<geom friction="0.1 ', '<geom friction="0.9 '),
+            ["has friction 0.9", "the floor of a plant decides both"],
+            id="friction that hides the floor's",
+        ),
+        pytest.param(
+            lambda t: t.replace('solmix="0"', 'solmix="1"'),
+            ["solmix 1.0", "the floor of a plant decides both"],
+            id="stiffness that hides the floor's",
+        ),
+        pytest.param(
             lambda t: t.replace('name="standing"', 'name="stand"'),
             ["no keyframe 'standing'", "stand"],
             id="renamed keyframe",
