@@ -30,7 +30,7 @@ tune: $(STAMP) ## tune a trajectory and judge it: make tune TRAJ=straight|c|s|al
 	@$(BIN)/hector tune --traj $(TRAJ)
 
 table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a look
-	@$(BIN)/hector table $(if $(QUICK),--quick)
+	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
 
 grfm: $(STAMP) ## how well the nets tell what the ground returns: runs/grfm/report.md
 	@$(BIN)/hector grfm
