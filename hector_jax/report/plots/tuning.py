@@ -12,20 +12,13 @@ from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
 from hector_jax.tuning.loss import Loss
 
 
-def losses(
-    path: Path,
-    loss: Loss,
-    histories: Mapping[str, Sequence[Iteration]],
-    *,
-    ten: int = PAPER_ITERATIONS,
-) -> str:
+def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]]) -> str:
     """Draw the loss on the model by iteration, whole and by part.
 
     Args:
         path: file to write.
         loss: terms, which are multiplied by their weights.
         histories: of the tunings, by weight set: `without` and `with`.
-        ten: the iteration to mark.
     """
     parts = {"$L$": lambda evaluation: evaluation.loss}
     for i, term in enumerate(loss, 1):
@@ -37,7 +30,9 @@ def losses(
     with drawing(path, 2.5 * len(parts), 2.7) as figure:
         panels = figure.subplots(1, len(parts))
         for panel, (title, part) in zip(panels, parts.items(), strict=True):
-            panel.axvline(ten, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            panel.axvline(
+                PAPER_ITERATIONS, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0
+            )
             for name, look in looks_of(histories).items():
                 values = np.array([float(part(i.evaluation)) for i in histories[name]]) / 1e6
                 good, bad = np.flatnonzero(accepted[name]), np.flatnonzero(~accepted[name])
@@ -53,7 +48,8 @@ def losses(
         if not all(flags.all() for flags in accepted.values()):
             panels[0].plot([], [], **cross, label="refused step")
     return (
-        f"Loss on the model by iteration, whole and by part; the line is iteration {ten}, "
+        "Loss on the model by iteration, whole and by part; the line is iteration "
+        f"{PAPER_ITERATIONS}, "
         "a cross is a refused step; every tenth accepted one has a marker."
     )
 
