@@ -109,6 +109,11 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
     assert knowing == experiments | {"benchmarks.golden"}
 
 
+def test_the_package_imports_no_script():
+    scripts = {path.stem for path in (ROOT.parent / "experiments").glob("*.py")} | {"experiments"}
+    assert not [(name, target) for name, target in IMPORTS if target.split(".")[0] in scripts]
+
+
 def test_scripts_use_nothing_private_of_the_package():
     wrong = []
     for path in sorted((ROOT.parent / "experiments").glob("*.py")):

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 import table
+import table_steps
 from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
@@ -402,6 +403,7 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     monkeypatch.setattr(verdicts, "walk_jobs", None)
     monkeypatch.setattr(tunings, "_tune_job", None)
     monkeypatch.setattr(searches, "losses_on_hfs", None)
+    monkeypatch.setattr(table_steps, "tune_measured", None)
     capsys.readouterr()
     assert call_table(monkeypatch, *flags) == 0
     assert (tmp_path / "runs/table/table.csv").read_bytes() == first

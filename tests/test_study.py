@@ -19,11 +19,12 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.report.video import VideoUnavailable
+from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, searches, tunings, verdicts
 from hector_jax.runs.tunings import Tuned
 from hector_jax.search.cmaes import Generation, SearchResult
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 
 def plants(seeds):
@@ -157,6 +158,23 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
 def test_wrong_flags_are_told_before_anything_is_computed(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words):
         study.make_table(table(tmp_path, **changes), plants)
+
+
+def test_a_tuning_along_walks_is_stored_for_its_plants_and_steps(tmp_path, monkeypatch):
+    made = []
+
+    def tune_measured(config, start, evaluate, on_iteration):
+        made.append(config.iterations)
+        return Tuning(pretend_history(3), nominal(), expert(), "done")
+
+    monkeypatch.setattr(table_steps, "tune_measured", tune_measured)
+    bench = table_steps.Bench(None, TuneConfig(), load_robot(), None, tmp_path, "abc")
+    for steps, count in ((2, 3), (2, 3), (5, 3), (2, 4)):
+        tuned = table_steps.tune_along_walks(bench, "s", nominal(), steps, count)
+        assert tuned.commit == "abc"
+        assert len(tuned.tuning.history) == 4
+    assert made == [12, 15, 12]
+    assert len(list((tmp_path / "s").glob("tuning-walks-*.npz"))) == 3
 
 
 @pytest.mark.parametrize("field", [x for x in fields(Flags) if type(x.default) is int])
