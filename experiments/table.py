@@ -42,13 +42,13 @@ from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig
 
 PROGRAM = "python experiments/table.py"
-TUNED = ("without", "with")
+DIFFTUNE = ("without", "with")  # tuned on the model
 SETS = (
     "nominal",
     "expert",
     "searched",
-    *(f"{name}_ten" for name in TUNED),
-    *TUNED,
+    *(f"{name}_ten" for name in DIFFTUNE),
+    *DIFFTUNE,
     "with_walks",
 )
 CEILING = "ceiling"
@@ -185,32 +185,32 @@ def _make_table(
     with workers(flags.processes) as pool:
         params = nets.ground(pool, robot, flags.data).params
         bench = Bench(pool, config, robot, params, folder, about.get("commit", ""))
-        results = steps.search(bench, budget, flags.trajectories)
-        tuned = {
+        searches = steps.search(bench, budget, flags.trajectories)
+        tunings = {
             name: steps.tune(bench, name, flags.steps, flags.step_plants)
             for name in flags.trajectories
         }
         # nothing that tunes or searches runs once the plants of the verdict are known
-        drawn, judged = plants(flags.plants), {}
+        standins, walks = plants(flags.plants), {}
         for name, extra in files.sets.items():
-            sets = _rows(tuned[name], results[name], extra)
-            judged[name] = steps.judge(bench, name, sets, drawn, flags.plants)
+            sets = _rows(tunings[name], searches[name], extra)
+            walks[name] = steps.judge(bench, name, sets, standins, flags.plants)
     by_trajectory = {
-        name: verdict_of(config.loss, flags.plants, one.scores) for name, one in judged.items()
+        name: verdict_of(config.loss, flags.plants, one.scores) for name, one in walks.items()
     }
-    commits = {one.commit for each in tuned.values() for one in each.values()}
-    commits |= {w.commit for one in judged.values() for walks in one.walks.values() for w in walks}
+    commits = {one.commit for each in tunings.values() for one in each.values()}
+    commits |= {w.commit for one in walks.values() for each in one.walks.values() for w in each}
     settings = {"flags": as_table(flags), "tune": config.as_table(), "search": asdict(budget)}
     content = Table(
         by_trajectory,
-        falls=[fall for name, one in judged.items() for fall in _falls(name, one, flags.plants)],
-        tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tuned.items()},
+        falls=[fall for name, one in walks.items() for fall in _falls(name, one, flags.plants)],
+        tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tunings.items()},
         searches={
             name: Search(len(one.history) * budget.population, one.walk, one.loss, one.stop)
-            for name, one in results.items()
+            for name, one in searches.items()
         },
         ceilings=files.ceilings,
-        pictures=draw(out, robot, by_trajectory, {n: one.first for n, one in judged.items()}),
+        pictures=draw(out, robot, by_trajectory, {n: one.first for n, one in walks.items()}),
         config=settings,
         environment=about,
         commits=sorted(commits),
@@ -221,20 +221,20 @@ def _make_table(
 
 
 def _rows(
-    tuned: Mapping[str, Tuned], result: SearchResult, extra: Mapping[str, Weights]
+    tunings: Mapping[str, Tuned], search: SearchResult, extra: Mapping[str, Weights]
 ) -> dict[str, Weights]:
     """All weight sets of a trajectory, in the order of the table."""
     return {
         "nominal": nominal(),
         "expert": expert(),
-        "searched": result.weights,
-        **{f"{name}_ten": tuned[name].tuning.ten for name in TUNED},
-        **{name: one.tuning.converged for name, one in tuned.items()},
+        "searched": search.weights,
+        **{f"{name}_ten": tunings[name].tuning.ten for name in DIFFTUNE},
+        **{name: one.tuning.converged for name, one in tunings.items()},
         **extra,
     }
 
 
-def _falls(trajectory: str, judged: Judged, seeds: Sequence[int]) -> list[Fall]:
+def _falls(trajectory: str, walks: Judged, seeds: Sequence[int]) -> list[Fall]:
     return [
         Fall(
             trajectory,
@@ -244,8 +244,8 @@ def _falls(trajectory: str, judged: Judged, seeds: Sequence[int]) -> list[Fall]:
             float(walk.last.position[2]),
             *(float(angle) for angle in walk.last.euler[:2]),
         )
-        for name, walks in judged.walks.items()
-        for seed, walk in zip(seeds, walks, strict=True)
+        for name, each in walks.walks.items()
+        for seed, walk in zip(seeds, each, strict=True)
         if walk.score.fallen
     ]
 

@@ -71,14 +71,14 @@ def tune(bench: Bench, name: str, steps: int, plants: int) -> dict[str, Tuned]:
     command, folder = named_command(name), folder / name
     problems = {"without": Problem(command, None), "with": Problem(command, params)}
     title = f"tuning {name} without and with GRFM-Net"
-    tuned = tunings.tune(pool, config, robot, problems, folder, title=title, commit=commit)
+    results = tunings.tune(pool, config, robot, problems, folder, title=title, commit=commit)
     if steps:
-        start = tuned["with"].tuning.converged
+        start = results["with"].tuning.converged
         try:
-            tuned["with_walks"] = tune_along_walks(bench, name, start, steps, plants)
+            results["with_walks"] = tune_along_walks(bench, name, start, steps, plants)
         except InputError as error:  # a walk with the tuned weights falls
             say(f"{name}: no row with_walks: {error}")
-    return tuned
+    return results
 
 
 def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants: int) -> Tuned:
@@ -97,9 +97,9 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
     """
     config = TuneConfig(iterations=PAPER_ITERATIONS + steps)
     problem = Problem(named_command(name), bench.params)
-    drawn = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
+    simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
     known = config, bench.robot, start, problem.command, problem.params
-    key = content_key(*known, *drawn, code=WALKS_CODE)
+    key = content_key(*known, *simulators, code=WALKS_CODE)
     job = partial(_walk_job, config, bench.robot, problem)
 
     def make(missing: list[str], _: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
@@ -108,7 +108,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
             tuning = tune_measured(
                 config,
                 start,
-                lambda trial: list(bench.pool.map(job, repeat(trial), drawn)),
+                lambda trial: list(bench.pool.map(job, repeat(trial), simulators)),
                 lambda one: tell(
                     int(one.iteration),
                     config.iterations,
