@@ -23,7 +23,7 @@ from hector_jax.core.trajectory import State, has_fallen
 from hector_jax.grfm.collection import load_walks
 from hector_jax.robot.description import Description, read_description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs
-from hector_jax.robot.model import describe, load_model, load_robot
+from hector_jax.robot.model import compile_model, describe, load_robot
 from hector_jax.runs import folder as runs
 from hector_jax.runs import nets, replay
 from hector_jax.runs.export import find_weights
@@ -256,7 +256,7 @@ def test_a_dump_knows_the_robot_without_its_files(tmp_path):
 def test_legs_of_any_order_reach_random_poses_of_mujoco(tmp_path, axes):
     """By the closed form (zxyyy) or the damped Newton iteration, to 1e-6 m."""
     path = reordered(axes, tmp_path)
-    robot, model = load_robot(path), load_model(path)
+    robot, model = load_robot(path), compile_model(describe(path))
     data, names = mujoco.MjData(model), robot.description.foot_points
 
     def posed(joints):

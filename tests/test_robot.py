@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from hector_jax.robot.description import MODEL_PATH, Description
-from hector_jax.robot.model import load_model, load_robot
+from hector_jax.robot.model import compile_model, describe, load_robot
 
 TEXT = MODEL_PATH.read_text()
 
 
 @pytest.fixture(scope="module")
 def model():
-    return load_model()
+    return compile_model(describe())
 
 
 @pytest.fixture(scope="module")

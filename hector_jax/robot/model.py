@@ -123,11 +123,6 @@ def load_robot(path: Path | None = None) -> Robot:
     )
 
 
-def load_model(path: Path | None = None) -> mujoco.MjModel:
-    """The compiled and checked model of a file, see `describe` and `compile_model`."""
-    return compile_model(describe(path))
-
-
 @quiet_mujoco()
 def compile_model(description: Description) -> mujoco.MjModel:
     """The compiled and checked model of a description.

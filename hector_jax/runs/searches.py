@@ -22,9 +22,6 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
-# modules that decide the numbers, for `content_key`
-SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.walk", "sim.parallel")
-
 
 def _command(name: str, own: Mapping[str, Command] | None) -> Command:
     return own[name] if own and name in own else named_command(name)
