@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.runs.folder import read_metrics
 
@@ -21,8 +22,7 @@ def write_events(folder: Path, out: Path) -> list[Path]:
         The folders, one for each tuned set.
 
     Raises:
-        InputError: no run, or tensorboardX is not installed.
-        InputError: a folder cannot be written.
+        InputError: no run, tensorboardX is not installed, or a folder cannot be written.
     """
     try:
         from tensorboardX import SummaryWriter
@@ -33,7 +33,7 @@ def write_events(folder: Path, out: Path) -> list[Path]:
     lines = read_metrics(folder)
     folders = {name: out / name for name in dict.fromkeys(line["set"] for line in lines)}
     for name, place in folders.items():
-        place.mkdir(parents=True, exist_ok=True)
+        make_folder(place)
         for old in place.glob("events.out.tfevents.*"):
             old.unlink()
         with SummaryWriter(str(place)) as writer:
@@ -47,10 +47,14 @@ def write_events(folder: Path, out: Path) -> list[Path]:
 def _scalars(line: dict) -> dict[str, float]:
     """Numbers of an iteration by tag; those that were not finite are left out."""
     rooms = {
-        "loss": [name for name in line if name == "L" or name.startswith("L_")],
-        "step": ("step", "accepted", "residual"),
+        "loss": {name: line[name] for name in line if name == "L" or name.startswith("L_")},
+        "step": {name: line.get(name) for name in ("step", "accepted", "residual")},
+        "weights": line["weights"],
+        "gradient_log": line["gradient_log"],
     }
-    scalars = {f"{room}/{name}": line.get(name) for room, names in rooms.items() for name in names}
-    for room in ("weights", "gradient_log"):
-        scalars |= {f"{room}/{name}": value for name, value in line.get(room, {}).items()}
-    return {tag: float(value) for tag, value in scalars.items() if value is not None}
+    return {
+        f"{room}/{name}": float(value)
+        for room, values in rooms.items()
+        for name, value in values.items()
+        if value is not None
+    }
