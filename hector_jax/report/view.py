@@ -26,8 +26,6 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import COLOURS, INK, Motion
 from hector_jax.runs.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
 
-HOST, PORT = "127.0.0.1", 8080
-
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics
 _APART = 0.8  # [m] between the two walks
@@ -99,8 +97,8 @@ def serve(
     folder: Path,
     on_open: Callable[[str], None],
     *,
-    host: str = HOST,
-    port: int = PORT,
+    host: str,
+    port: int,
 ) -> None:
     """Show two walks and the tuning of a run until interrupted.
 
@@ -110,7 +108,7 @@ def serve(
         model: of the body that walks.
         folder: of the run, whose metrics are read again as they grow.
         on_open: called with the page's address once it can be opened.
-        host: address to listen on; the default lets no other machine in.
+        host: address to listen on.
         port: where it is taken, a free one is used instead.
 
     Raises:
