@@ -6,8 +6,7 @@ compared with where the robot was. The row `measured` moves it by the measured w
 that is left there is not due to the ground, but to a rigid body standing for a robot with legs.
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,9 +24,10 @@ from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.grfm.dataset import Dataset, make_dataset
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.grfm.training import predict
-from hector_jax.report.report import WORLDS, Picture, markdown_table, render
+from hector_jax.report.report import WORLDS, Picture, render
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
+from hector_jax.runs.folder import RESULT
 
 PHASES = {  # time [s] since the switch of stance
     "first 30 ms": (0.0, 0.03),
@@ -37,9 +37,8 @@ PHASES = {  # time [s] since the switch of stance
 HORIZONS = (0.2, 0.4)  # [s]
 FIRST, APART = 5, 35  # ticks: of the first prediction in a walk, and from one to the next
 
-_AXES = {"F_x": "N^2", "F_y": "N^2", "F_z": "N^2"}
-_AXES |= {"M_x": "(N m)^2", "M_y": "(N m)^2", "M_z": "(N m)^2"}
-_CONTACTS = ("stance", "swing")
+_UNITS = {"force": "N^2", "moment": "(N m)^2"}
+_AXES = {f"{kind[0].upper()}_{axis}": kind for kind in _UNITS for axis in "xyz"}
 
 
 class Drift(NamedTuple):
@@ -233,68 +232,28 @@ def write_report(
     Returns:
         report.md.
     """
-    sections = {
-        WORLDS.get(name, name): {
-            "errors": _error_table(world["errors"]),
-            "phases": _phase_table(world["phases"]),
-            "open_loop": _drift_table(world["open_loop"]),
-        }
-        for name, world in worlds.items()
-    }
-    path = folder / "report.md"
-    write_file(path, render("fidelity.md.j2", worlds=sections, pictures=pictures).encode())
-    write_json(folder / "result.json", worlds)
-    return path
+    values = {"worlds": worlds, "pictures": pictures, "WORLDS": WORLDS, "PHASES": PHASES}
+    text = render("fidelity.md.j2", **values, error_rows=error_rows)
+    write_file(folder / "report.md", text.encode())
+    write_json(folder / RESULT, worlds)
+    return folder / "report.md"
 
 
-def error_rows(errors: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
+def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
     """Mean square errors, labelled: of force and moment, then by contact and axis.
 
     Args:
         errors: of several phis, as `training.report` has them.
     """
-    rows = [
-        (f"{kind}, all [{unit}]", [one[kind] for one in errors])
-        for kind, unit in (("force", "N^2"), ("moment", "(N m)^2"))
+    errors = list(errors)
+    return [
+        *(
+            (f"{kind}, all [{unit}]", [one[kind] for one in errors])
+            for kind, unit in _UNITS.items()
+        ),
+        *(
+            (f"{axis}, {contact} [{_UNITS[kind]}]", [one[contact][i] for one in errors])
+            for contact in ("stance", "swing")
+            for i, (axis, kind) in enumerate(_AXES.items())
+        ),
     ]
-    return rows + [
-        (f"{axis}, {contact} [{unit}]", [one[contact][i] for one in errors])
-        for contact in _CONTACTS
-        for i, (axis, unit) in enumerate(_AXES.items())
-    ]
-
-
-def _number(x: float, form: str = ".3g") -> str:
-    """A number of a table; a dash where nothing was there to measure."""
-    return format(x, form) if math.isfinite(x) else "-"
-
-
-def _error_table(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    rows = [[label, *map(_number, values)] for label, values in error_rows([*errors.values()])]
-    return markdown_table(("mean square error", *errors), rows)
-
-
-def _phase_table(phases: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> str:
-    rows = [
-        [
-            f"{phase}, {contact}, {part} [{unit}]",
-            *(_number(float(np.mean(one[phase][contact][axes]))) for one in phases.values()),
-        ]
-        for phase in PHASES
-        for contact in _CONTACTS
-        for part, unit, axes in (("F", "N^2", slice(3)), ("M", "(N m)^2", slice(3, 6)))
-    ]
-    return markdown_table(("mean over the axes", *phases), rows)
-
-
-def _drift_table(drifts: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    units = (("position", "cm", 100.0), ("euler", "deg", 180.0 / np.pi))
-    rows = [
-        [
-            f"{part} after {horizon} [{unit}]",
-            *(_number(scale * one[horizon][part], ".2f") for one in drifts.values()),
-        ]
-        for horizon in next(iter(drifts.values()))
-        for part, unit, scale in units
-    ]
-    return markdown_table(("", *drifts), rows)
