@@ -1,17 +1,18 @@
 """What the experiments share: walks that are kept in groups, and how a report is written."""
 
+import shlex
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
-import numpy as np
 
-from hector_jax.core.console import bar, made_at
+from hector_jax.core.console import bar
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import cached, content_key
 from hector_jax.sim.loop import Job
@@ -47,6 +48,17 @@ def write_report(
     write_json(path.parent / json_name, {"environment": about, **numbers})
     write_file(path, ("\n\n".join(text) + "\n").encode())
     return path
+
+
+def made_at(environment: Mapping[str, str]) -> str:
+    """Line of a report that tells where it comes from: the commit, and the script with its flags.
+
+    Args:
+        environment: see `core.environment`; without a commit outside of a checkout.
+    """
+    script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
+    command = shlex.join(["python", script, *sys.argv[1:]])
+    return f"Made at {environment.get('commit', 'an unknown commit')} by `{command}`."
 
 
 def walk_groups(
@@ -91,7 +103,7 @@ def walk_groups(
                     rows.append(score(next(walks)))
                     done += 1
                     tell(done, len(jobs), name)
-                yield name, jax.tree.map(lambda *x: np.stack(x), *rows)
+                yield name, stack(rows)
 
     about = {"settings": [repr(part) for part in settings]}
     return cached(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)

@@ -7,10 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from lib import made_at
 
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import save_weights
-from hector_jax.core.console import exit_code, made_at
+from hector_jax.core.console import exit_code
 from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError
 
