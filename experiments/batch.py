@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net, member_effects
@@ -58,8 +59,11 @@ class Flags:
     """What all sub-commands ask."""
 
     net: Path | None = None  # GRFM-Net to tune through; none: the plain rigid body
-    iterations: int = 100  # at most
-    processes: int = 2  # that walk in MuJoCo, one core each
+    iterations: Annotated[int, AT_LEAST_ONE] = 100  # at most
+    processes: Annotated[int, AT_LEAST_ONE] = 2  # that walk in MuJoCo, one core each
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -76,9 +80,9 @@ class Robust(Flags):
 
     out: Path = Path("runs/batch/robust")  # folder of the report
     traj: str = "straight"
-    variations: int = 16
+    variations: Annotated[int, AT_LEAST_ONE] = 16
     noise: bool = False  # the controller sees the state with white noise
-    plants: int = 20  # drawn around the hfs, to judge by
+    plants: Annotated[int, AT_LEAST_ONE] = 20  # drawn around the hfs, to judge by
 
 
 @dataclass(frozen=True)
@@ -87,8 +91,8 @@ class Front(Flags):
 
     out: Path = Path("runs/batch/front")  # folder of the report
     traj: str = "straight"
-    points: int = 9
-    decades: float = 2.0  # to either side of the paper's weights
+    points: Annotated[int, Range(2)] = 9
+    decades: Annotated[float, POSITIVE] = 2.0  # to either side of the paper's weights
 
 
 @dataclass(frozen=True)
@@ -97,8 +101,8 @@ class Starts(Flags):
 
     out: Path = Path("runs/batch/starts")  # folder of the report
     traj: str = "straight"
-    starts: int = 32
-    factor: float = 3.0  # within which of nominal
+    starts: Annotated[int, AT_LEAST_ONE] = 32
+    factor: Annotated[float, Range(1.0, above=True)] = 3.0  # within which of nominal
 
 
 @dataclass(frozen=True)
@@ -107,18 +111,36 @@ class Verdict:
 
     out: Path  # folder of the report
     traj: str = "straight"
-    seeds: int = 8
-    first_seed: int = 0
-    processes: int = 2  # one core each
+    seeds: Annotated[int, AT_LEAST_ONE] = 8
+    first_seed: Annotated[int, SEED] = 0
+    processes: Annotated[int, AT_LEAST_ONE] = 2  # one core each
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 def tuned(
-    flags: Flags, robot: Robot, effects: Any, problems: Sequence[Problem], title: str
+    flags: Flags,
+    robot: Robot,
+    effects: Any,
+    problems: Sequence[Problem],
+    title: str,
+    nominal_rows: slice = slice(None),
 ) -> Tunings:
-    """Tune problems as one batch."""
+    """Tune problems as one batch; those of `nominal_rows` start at the nominal weights.
+
+    Raises:
+        InputError: the nominal weights are refused, so there is nothing to compare with.
+    """
+    config = TuneConfig(iterations=flags.iterations)
     with bar(f"{title}: {len(problems)} tunings on {len(jax.devices())} devices") as tell:
-        config = TuneConfig(iterations=flags.iterations)
-        return tune_batch(config, robot, stack(problems), effects, tell=tell)
+        tunings = tune_batch(config, robot, stack(problems), effects, tell=tell)
+    if np.any(np.asarray(tunings.stop)[nominal_rows] == Stop.BAD_START):
+        raise InputError(
+            f"{title}: the nominal weights are refused at their first walk: a fall, a plan that is "
+            "not solved, or numbers that are not finite; expected weights that walk on the model"
+        )
+    return tunings
 
 
 def whole_net(flags: Flags, robot: Robot) -> jax.tree_util.Partial:
@@ -416,7 +438,7 @@ def starts(flags: Starts) -> None:
     robot, command = load_robot(), named_command(flags.traj)
     begin = [nominal(), *sample_weights(nominal(), flags.factor, flags.starts - 1)]
     asked = [problem(w, [scenario(robot, command)]) for w in begin]
-    found = tuned(flags, robot, whole_net(flags, robot), asked, "starts")
+    found = tuned(flags, robot, whole_net(flags, robot), asked, "starts", slice(1))
     if not first_host():
         return
     sound = np.asarray(found.stop) != Stop.BAD_START
@@ -439,8 +461,7 @@ def starts(flags: Starts) -> None:
         f"x/{flags.factor:g} of it; {int((~sound).sum())} are refused at their "
         "first walk: a fall, a plan that is not solved, or numbers that are not finite.",
         markdown_table(["L on the model", "least", "25 %", "median", "75 %", "most"], rows),
-        f"From nominal: {million(last[0] if sound[0] else np.nan)}, "
-        f"{int(np.sum(last < last[0]))} of the others end lower.",
+        f"From nominal: {million(last[0])}, {int(np.sum(last < last[0]))} of the others end lower.",
         markdown_table(
             ["set", "L on the hfs", "fell"],
             [[n, million(s.L[0]), "yes" if s.fallen.any() else "no"] for n, s in scores.items()],
