@@ -22,7 +22,7 @@ from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import alignment
 import jax
@@ -30,7 +30,7 @@ import lib
 import numpy as np
 import plots
 import tyro
-from lib import write_report
+from lib import check_names, write_report
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.legs import LegConfig
@@ -81,22 +81,15 @@ class Flags:
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
     lead: int = 40  # ticks in place before t = 0 on the model, beside none
     ranks: int = 64  # weight sets about nominal for each rank correlation; 0 leaves them out
-    effort_about: str = "zero"  # or weight: see MpcConfig
+    effort_about: Literal["zero", "weight"] = "zero"  # see MpcConfig
     stance_weight: bool = False  # see LegConfig
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:
         if not self.sets:
             raise InputError(f"Flags.sets must name one at least of {', '.join(SETS)}, got none")
-        for name in self.sets:
-            if name not in SETS:
-                raise InputError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
-        for name in self.tuned:
-            if name not in self.trajectories:
-                raise InputError(
-                    f"Flags.tuned must be of the trajectories {', '.join(self.trajectories)}, "
-                    f"got {name!r}"
-                )
+        check_names("sets", self.sets, SETS)
+        check_names("tuned", self.tuned, self.trajectories)
 
 
 class Walked(NamedTuple):
@@ -250,9 +243,7 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
     """Evaluate gradients and losses on the model and on the hfs."""
     robot = jax.tree.map(np.asarray, load_robot())
     walk = WalkConfig(
-        mpc=MpcConfig(
-            effort_reference="gravity" if flags.effort_about == "weight" else flags.effort_about
-        ),
+        mpc=MpcConfig(effort_reference="gravity" if flags.effort_about == "weight" else "zero"),
         legs=LegConfig(gravity_compensation=flags.stance_weight),
     )
     configs = {
