@@ -2,15 +2,14 @@
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
-
 
 from hector_jax.core.console import bar
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_file, write_json
-from hector_jax.core.inputs import plural
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
@@ -48,6 +47,17 @@ def write_report(
     write_json(path.parent / json_name, {"environment": about, **numbers})
     write_file(path, ("\n\n".join(text) + "\n").encode())
     return path
+
+
+def check_names(flag: str, names: Iterable[str], choices: Collection[str]) -> None:
+    """Check that all names given to a flag are among those there are.
+
+    Raises:
+        InputError: one line naming the flag, the name and the choices.
+    """
+    for name in names:
+        if name not in choices:
+            raise InputError(f"Flags.{flag} must be of {', '.join(choices)}, got {name!r}")
 
 
 def made_at(environment: Mapping[str, str]) -> str:

@@ -117,11 +117,15 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
     return "Loss on the model by iteration from each start, and the losses at the end in order."
 
 
-_ARMS = {
-    "fixed": ("weights stay", SETS["nominal"]),
-    "until": ("tuned until the change", SETS["without"]),
-    "carried": ("tuned all the way", SETS["with"]),
+ARMS = {  # what happens to the weights along a walk
+    "fixed": "weights stay",
+    "until": "tuned until the change",
+    "carried": "tuned all the way",
+    "cut": "sensitivities begun anew in each window",
+    "model": "the model's own walk from each window's first state",
+    "plain": "no net: the plain rigid body",
 }
+ARM_LINES = {"fixed": SETS["nominal"], "until": SETS["without"], "carried": SETS["with"]}
 
 
 def while_walking(
@@ -146,8 +150,8 @@ def while_walking(
             panel = panels[rows.index(start), columns.index(trajectory)]
             panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
             for arm, losses in arms.items():
-                label, look = _ARMS[arm]
-                panel.plot(times, np.median(losses, axis=0) / 1e6, **look, label=label)
+                median = np.median(losses, axis=0) / 1e6
+                panel.plot(times, median, **ARM_LINES[arm], label=ARMS[arm])
             panel.set(title=f"{trajectory}, from {start}", ylim=(0, 1.05 * panel.get_ylim()[1]))
         style.set_all(panels[-1], xlabel="time [s]")
         style.set_all(panels[:, 0], ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
