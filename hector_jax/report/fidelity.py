@@ -164,8 +164,8 @@ def drifts(
     start_tick: Int[np.ndarray, " W"],
 ) -> dict[str, Drift]:
     """`drift` of several phi, and of the measured wrench."""
-    named: dict[str, jax.tree_util.Partial | None] = {**effects, "measured": None}
-    return {name: drift(robot, effect, walks, start_tick) for name, effect in named.items()}
+    phis = {**effects, "measured": None}
+    return {name: drift(robot, effect, walks, start_tick) for name, effect in phis.items()}
 
 
 def as_result(

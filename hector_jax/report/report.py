@@ -209,3 +209,8 @@ def render(template: str, **values: Any) -> str:
     """Fill a template of the folder `templates`."""
     environment = _TEX_TEMPLATES if template.endswith(".tex.j2") else _TEMPLATES
     return environment.get_template(template).render(values)
+
+
+def caption(picture: str, **values: Any) -> str:
+    """Caption of a picture of `plots`, by the name of its function."""
+    return getattr(_TEMPLATES.get_template("captions.j2").module, picture)(**values)

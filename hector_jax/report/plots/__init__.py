@@ -7,7 +7,7 @@ draw pictures of their own with `style`.
 """
 
 from hector_jax.report.plots.grfm import open_loop, training, wrenches
-from hector_jax.report.plots.style import named, titles
+from hector_jax.report.plots.style import display_name, titles
 from hector_jax.report.plots.tuning import changes, losses, weights
 from hector_jax.report.plots.walks import collective, distances, path_from_above, tracking
 
@@ -16,7 +16,7 @@ __all__ = [
     "collective",
     "distances",
     "losses",
-    "named",
+    "display_name",
     "open_loop",
     "path_from_above",
     "titles",

@@ -8,7 +8,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from hector_jax.report.plots import style
-from hector_jax.report.plots.style import SETS, drawing, log_axis, looks_of, named
+from hector_jax.report.plots.style import SETS, display_name, drawing, log_axis, looks_of
+from hector_jax.report.report import caption
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
 from hector_jax.tuning.loss import Loss
@@ -39,13 +40,13 @@ def losses(
     with drawing(path, 2.5 * len(parts), 2.7) as figure:
         panels = figure.subplots(1, len(parts))
         for panel, (title, part) in zip(panels, parts.items(), strict=True):
-            panel.axvline(ten, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            panel.axvline(ten, **style.MARK)
             for name, look in looks_of(histories).items():
                 values = np.array([float(part(i.evaluation)) for i in histories[name]]) / 1e6
                 good, bad = np.flatnonzero(accepted[name]), np.flatnonzero(~accepted[name])
                 # a marker at each iteration would hide how the line is dashed
                 marks = {"marker": look.marker, "markersize": 3.2, "markevery": 10}
-                panel.plot(good, values[good], **look.line, **marks, label=named(name))
+                panel.plot(good, values[good], **look.line, **marks, label=display_name(name))
                 if title == "$L$":
                     top = 1.1 * values[good].max()  # a rejected step need not have a finite loss
                     panel.plot(bad, np.where(values < top, values, top)[bad], **cross)
@@ -54,10 +55,7 @@ def losses(
         panels[0].set_ylabel("loss on the model [10$^6$]")
         if not all(flags.all() for flags in accepted.values()):
             panels[0].plot([], [], **cross, label="refused step")
-    return (
-        f"Loss on the model by iteration, whole and by part; the line is iteration {ten}, "
-        "a cross is a refused step; every tenth accepted one has a marker."
-    )
+    return caption("losses", ten=ten)
 
 
 def weights(
@@ -80,7 +78,7 @@ def weights(
             x = np.arange(len(names)) + 0.38 * (i - (len(tuned) - 1) / 2)
             look = {"color": SETS[name]["color"], "hatch": "////" if name == "without" else None}
             look |= {"edgecolor": "white", "linewidth": 0.0}
-            axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=named(name))
+            axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=display_name(name))
         if "expert" in sets:
             look = looks_of(["expert"])["expert"].dot
             axes.plot(ratio["expert"], **look, markerfacecolor="white", label="expert")
@@ -89,7 +87,7 @@ def weights(
         labels = {"rotation": 60, "ha": "right", "va": "center", "rotation_mode": "anchor"}
         style.category_axis(axes, [style.weight_label(name) for name in names], 3, **labels)
         axes.set_ylabel("weight / nominal")
-    return "Tuned weights as ratios to the nominal ones (1); diamonds are the expert's."
+    return caption("weights")
 
 
 def changes(
@@ -120,17 +118,12 @@ def changes(
             percent = lambda r, _: f"{100 * (r - 1):+.0f}" if r != 1 else "0"  # noqa: E731
             row[0].xaxis.set_major_formatter(percent)
         first = panels[0, 0]
-        first.set_yticks(range(len(names)), [named(name) for name in names])
+        first.set_yticks(range(len(names)), [display_name(name) for name in names])
         first.set_ylim(len(names) - 0.5, -0.5)
         first.plot([], [], "o", color="0.4", alpha=0.5, label="one plant")
         cross = {"color": "0.2", "markersize": 11, "mew": 2.2}
         first.plot([], [], "+", **cross, label="median and its interval")
-    return (
-        "L of each set against that of nominal and expert on the same plant, one dot per plant, "
-        "with the median and its 95 % bootstrap interval; left of the line is better. Plants on "
-        "which the set fell have no dot, their number stands at the right; the median counts them. "
-        "Diamonds are the paper's table, after ten iterations."
-    )
+    return caption("changes")
 
 
 def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline: str) -> None:

@@ -5,14 +5,16 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from matplotlib.image import imread
+from scipy.spatial.transform import Rotation
 
 from hector_jax.core.trajectory import Trajectory, from_start
 from hector_jax.report.motion import COLOURS, Motion
-from hector_jax.report.plots.style import CURVES, drawing, looks_of, named, set_all, widen
+from hector_jax.report.plots.style import CURVES, display_name, drawing, looks_of, widen
+from hector_jax.report.report import caption
 
-_FRAME = "Each walk is seen from where it stood and faced at t = 0, so that all have one reference."
 _MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be told apart
 _BEST = "ceiling"
 
@@ -26,25 +28,18 @@ def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
     """
     with drawing(path, 10.0, 4.2) as figure:
         _draw_tracking(figure.subplots(2, 3, sharex=True), walks)
-    return (
-        "Errors of the centre of mass and of the Euler angles, one stand-in walk of each set; "
-        "each against its own reference, ahead and left as the reference faces."
-    )
+    return caption("tracking")
 
 
 def _errors(walk: Trajectory) -> dict[str, Float[np.ndarray, " T"]]:
     """Errors of the six coordinates, along the heading of the reference; NaN after a fall."""
-    yaw = np.asarray(walk.reference.euler)[:, 2]
-    x, y, up = 100 * (np.asarray(walk.state.position) - np.asarray(walk.reference.position)).T
-    angles = np.rad2deg(np.asarray(walk.state.euler) - np.asarray(walk.reference.euler)).T
-    values = {
-        "error ahead [cm]": np.cos(yaw) * x + np.sin(yaw) * y,
-        "error left [cm]": np.cos(yaw) * y - np.sin(yaw) * x,
-        "error up [cm]": up,
-    }
-    for angle, error in zip(("roll", "pitch", "yaw"), angles, strict=True):
-        values[f"error in {angle} [deg]"] = error
-    return {label: np.where(walk.fallen, np.nan, value) for label, value in values.items()}
+    R = Rotation.from_euler("z", np.asarray(walk.reference.euler)[:, 2:])
+    away = R.apply(np.asarray(walk.state.position) - walk.reference.position, inverse=True)
+    angles = np.rad2deg(np.asarray(walk.state.euler) - walk.reference.euler)
+    labels = [f"error {way} [cm]" for way in ("ahead", "left", "up")]
+    labels += [f"error in {angle} [deg]" for angle in ("roll", "pitch", "yaw")]
+    values = np.where(walk.fallen[:, None], np.nan, np.hstack([100 * away, angles]))
+    return dict(zip(labels, values.T, strict=True))
 
 
 def _draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
@@ -52,12 +47,12 @@ def _draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
     for name, look in looks_of(walks).items():
         times = float(walks[name].period) * np.arange(1, len(walks[name].fallen) + 1)
         for panel, (label, values) in zip(panels.flat, _errors(walks[name]).items(), strict=True):
-            panel.plot(times, values, **look.line, label=named(name))
+            panel.plot(times, values, **look.line, label=display_name(name))
             panel.set_ylabel(label)
     for panel in panels.flat:
         panel.axhline(0.0, color="black", linewidth=0.8)
         widen(panel, 1.0)
-    set_all(panels[-1], xlabel="time [s]")
+    setp(panels[-1], xlabel="time [s]")
 
 
 def distances(
@@ -83,7 +78,7 @@ def distances(
             upright = motion.times <= motion.fall_time
             away = np.where(upright, 100 * motion.distance, np.nan)
             mean = np.sqrt(np.mean(away[upright] ** 2)) if upright.any() else np.nan
-            label = f"{named(name)}: {mean:.1f} cm RMS"
+            label = f"{display_name(name)}: {mean:.1f} cm RMS"
             axes.plot(motion.times, away, color=np.divide(colour, 255), ls=style, label=label)
         axes.set_title("distance from the reference [cm]", loc="left")
         axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
@@ -105,7 +100,7 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
     height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9
     with drawing(path, width, height, legend_columns=4) as figure:
         _draw_path(figure.subplots(), walks)
-    return f"Path from above; foot marks are those of `{list(walks)[-1]}`. {_FRAME}"
+    return caption("path_from_above", last=list(walks)[-1])
 
 
 def _span(walks: Mapping[str, Trajectory]) -> Float[np.ndarray, "2"]:
@@ -120,7 +115,7 @@ def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     for name, look in looks_of(walks).items():
         fallen, position = walks[name].fallen, walks[name].state.position
         x, y = np.where(fallen[:, None], np.nan, position)[:, :2].T
-        axes.plot(x, y, **look.line, label=named(name))
+        axes.plot(x, y, **look.line, label=display_name(name))
     last = list(walks.values())[-1]
     axes.plot(*last.reference.position[:, :2].T, **CURVES["reference"], label="reference")
     landed = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
@@ -165,9 +160,4 @@ def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | No
             above, beside = next(rows).subfigures(1, 2, width_ratios=[share, 1.0 - share])
         _draw_path(above.subplots(), walks)
         _draw_tracking(beside.subplots(2, 3, sharex=True), main)
-    seen = "" if image is None else "Snapshots; "
-    return (
-        f"{seen}path of the centre of mass from above, foot marks those of `{list(walks)[-1]}`; "
-        f"errors against the reference of {', '.join(main)}, ahead and left as it faces. "
-        f"One stand-in plant. {_FRAME}"
-    )
+    return caption("collective", snapshots=image is not None, last=list(walks)[-1], main=main)
