@@ -119,9 +119,9 @@ def of_view(
     if tuned:
         plots.losses(folder / "losses.png", loss, tuned)
     say("making the film")
-    titled = motions(robot, dict(zip(plots.titles(walks), walks.values(), strict=True)))
-    write_film(folder / "film.mp4", robot, titled)
-    write_strip(folder / "film.png", robot, titled)
+    pair = motions(robot, dict(zip(plots.titles(walks), walks.values(), strict=True)))
+    write_film(folder / "film.mp4", robot, pair)
+    write_strip(folder / "film.png", robot, pair)
 
 
 def film(

@@ -10,7 +10,7 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from importlib.util import find_spec
 from itertools import cycle
@@ -24,6 +24,7 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import COLOURS, INK, Motion
+from hector_jax.report.report import render
 from hector_jax.runs.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
 
 _RATE = 30.0  # displayed ticks per second, at most
@@ -138,17 +139,16 @@ def serve(
             server.stop()
 
 
-def _free_port(host: str, wanted: int) -> int:
-    """The wanted port, or a free one where it is taken."""
-    for port in (wanted, 0):
-        try:
-            with socket.create_server((host, port)) as listening:
-                return listening.getsockname()[1]
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                reason = f"cannot listen on {host}, port {port}: {error.strerror}"
-                raise InputError(reason) from None
-    raise InputError(f"no free port on {host}")
+def _free_port(host: str, port: int) -> int:
+    """The port, or a free one where it is taken."""
+    try:
+        with socket.create_server((host, port)) as listener:
+            return listener.getsockname()[1]
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE and port:
+            return _free_port(host, 0)
+        reason = f"cannot listen on {host}, port {port}: {error.strerror}"
+        raise InputError(reason) from None
 
 
 class Page:
@@ -200,8 +200,9 @@ class Page:
             self._speed = gui.add_slider("speed", 0.05, 2.0, 0.05, 0.5)
             self._follow = gui.add_checkbox("follow the robots", True)
         with gui.add_folder("Ground on the feet"):
-            gui.add_html(_legend(first.wrenches))
-            words = {source: _SOURCES[source].words for source in first.wrenches}
+            sources = {source: _SOURCES[source] for source in first.wrenches}
+            gui.add_html(render("legend.html.j2", sources=sources.values()))
+            words = {source: one.words for source, one in sources.items()}
             words |= {"force": "forces", "moment": "moments"}
             self._boxes = {k: gui.add_checkbox(w, k != "moment") for k, w in words.items()}
         with gui.add_folder("Tuning"):
@@ -318,14 +319,6 @@ def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]
     return ({"label": x_name}, *lines)
 
 
-def _legend(sources: Iterable[str]) -> str:
-    """Colours of the sources and the scale, as HTML."""
-    mark = '<span style="color:rgb{1}">&#9650;</span>&nbsp;{0}'
-    marks = " &ensp;".join(mark.format(*_SOURCES[source]) for source in sources)
-    scale = "thin: forces, 35 cm are 120 N; thick: moments, 35 cm are 12 N m"  # see _SCALES
-    return f'<div style="padding:0 1em; font-size:smaller">{marks}<br>{scale}</div>'
-
-
 def _pale(colour: tuple[int, int, int]) -> tuple[int, ...]:
     return tuple(int(c + 0.55 * (255 - c)) for c in colour)
 
@@ -351,7 +344,7 @@ def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int
     from trimesh.creation import box, capsule, cylinder, icosphere
 
     kinds = mujoco.mjtGeom
-    solids = {  # from MuJoCo's sizes
+    solids = {  # from MuJoCo's sizes; the edges of the first two are sharp
         kinds.mjGEOM_BOX: lambda size: box(extents=2.0 * size),
         kinds.mjGEOM_CYLINDER: lambda size: cylinder(radius=size[0], height=2.0 * size[1]),
         kinds.mjGEOM_CAPSULE: lambda size: capsule(radius=size[0], height=2.0 * size[1]),
@@ -359,20 +352,18 @@ def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int
         kinds.mjGEOM_ELLIPSOID: lambda size: icosphere(subdivisions=2).apply_scale(size),
     }
     meshes: dict[int, list[Any]] = {}
-    for i in np.nonzero((model.geom_bodyid > 0) & (model.geom_group <= 2))[0]:
-        kind = kinds(model.geom_type[i])
-        if kind not in solids:
+    for geom in map(model.geom, range(model.ngeom)):
+        body, kind, material = geom.bodyid[0], kinds(geom.type[0]), geom.matid[0]
+        if body == 0 or geom.group[0] > 2 or kind not in solids:
             continue
-        mesh = solids[kind](model.geom_size[i])
-        if kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER):
-            mesh.unmerge_vertices()  # sharp edges
-        material = model.geom_matid[i]
-        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[i]
+        mesh = solids[kind](geom.size)
+        if kind in list(solids)[:2]:
+            mesh.unmerge_vertices()
+        rgba = model.mat_rgba[material] if material >= 0 else geom.rgba
         if material >= 0 and model.material(material).name == "accent":
             rgba = np.array([*accent, 255]) / 255.0
-        T = trimesh.transformations.quaternion_matrix(model.geom_quat[i])
-        T[:3, 3] = model.geom_pos[i]
-        mesh.apply_transform(T)
+        mesh.apply_transform(trimesh.transformations.quaternion_matrix(geom.quat))
+        mesh.apply_translation(geom.pos)
         mesh.visual.vertex_colors = np.round(255.0 * np.asarray(rgba)).astype(np.uint8)
-        meshes.setdefault(int(model.geom_bodyid[i]), []).append(mesh)
+        meshes.setdefault(int(body), []).append(mesh)
     return {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}

@@ -14,9 +14,9 @@ from hector_jax.report.plots.walks import collective, distances, path_from_above
 __all__ = [
     "changes",
     "collective",
+    "display_name",
     "distances",
     "losses",
-    "display_name",
     "open_loop",
     "path_from_above",
     "titles",
