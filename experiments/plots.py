@@ -306,13 +306,9 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
     with drawing(path, 4.6, 4.4, legend_columns=3) as figure:
         axes: Any = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
         for name, look in looks_of(endured).items():
-            line = {
-                "marker": look.marker,
-                "markersize": 3.5,
-                "label": display_name(name),
-                **look.line,
-            }
-            axes.plot(angles, np.append(endured[name], endured[name][0]), markersize=3.5, **line)
+            line = {"marker": look.marker, "label": display_name(name), **look.line}
+            forces = np.append(endured[name], endured[name][0])
+            axes.plot(angles, forces, markersize=3.5, **line)
         axes.set_rmin(0.0)
         axes.set_rlabel_position(22.5)
         axes.yaxis.set_major_formatter(lambda force, _: f"{force:g} N")

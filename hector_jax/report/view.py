@@ -243,12 +243,14 @@ class Page:
     def _add_walk(self, i: int) -> dict[str, Any]:
         """Add one walk to the scene; returns the handles of what moves."""
         scene, one, root, colour = self._server.scene, self._motions[i], f"/world/{i}", COLOURS[i]
-        lines = {
-            "footholds": (_on_floor(one.soles, 0.003), _pale(colour), 0.03),
-            "path": (_on_floor(_pieces(one.path, 2), 0.006), colour, 0.008),
-            "reference": (_on_floor(_pieces(one.reference, 6)[::2], 0.008), INK, 0.01),
+        pale = tuple(int(c + 0.55 * (255 - c)) for c in colour)
+        lines = {  # on the floor, each at a height [m] of its own so that nothing flickers
+            "footholds": (one.soles, 0.003, pale, 0.03),
+            "path": (_pieces(one.path, 2), 0.006, colour, 0.008),
+            "reference": (_pieces(one.reference, 6)[::2], 0.008, INK, 0.01),
         }
-        for line, (points, shade, thickness) in lines.items():
+        for line, (pieces, height, shade, thickness) in lines.items():
+            points = pieces * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
             scene.add_line_segments(f"{root}/{line}", points, shade, thickness=thickness)
         label = {"anchor": "bottom-center", "font_screen_scale": 1.4}
         return {
@@ -319,18 +321,9 @@ def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]
     return ({"label": x_name}, *lines)
 
 
-def _pale(colour: tuple[int, int, int]) -> tuple[int, ...]:
-    return tuple(int(c + 0.55 * (255 - c)) for c in colour)
-
-
 def _pieces(points: Float[np.ndarray, "T 3"], ticks: int) -> Float[np.ndarray, "n 2 3"]:
     """A path as pieces of some ticks each."""
     return np.stack([points[:-ticks:ticks], points[ticks::ticks]], axis=1)
-
-
-def _on_floor(pieces: Float[np.ndarray, "n 2 3"], height: float) -> Float[np.ndarray, "n 2 3"]:
-    """What lies on the floor under them, at its own height [m] so that nothing flickers."""
-    return pieces * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
 
 
 def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
