@@ -42,8 +42,8 @@ def write_report(
         The path of the report.
     """
     about = environment()
-    shown = [f"![{file}]({file})\n\n{caption}" for file, caption in (pictures or {}).items()]
-    text = [f"# {title}", made_at(about), *paragraphs, *shown]
+    images = [f"![{file}]({file})\n\n{caption}" for file, caption in (pictures or {}).items()]
+    text = [f"# {title}", made_at(about), *paragraphs, *images]
     write_json(path.parent / json_name, {"environment": about, **numbers})
     write_file(path, ("\n\n".join(text) + "\n").encode())
     return path
@@ -102,7 +102,7 @@ def walk_groups(
         for name, jobs in groups.items()
     }
 
-    def make(missing: list[str], found: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
+    def make(missing: list[str], _: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
         jobs = [job for name in missing for job in groups[name]]
         with bar(f"{plural(len(jobs), 'walk')}{title}") as tell:
             tell(0, len(jobs), "compiling")

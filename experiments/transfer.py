@@ -169,8 +169,8 @@ def tuned_sets(
     }
     commit = environment().get("commit", "")
     title = "tuning, ten iterations"
-    found = tunings.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
-    return {**given, **{name: tuned.tuning.ten for name, tuned in found.items()}}
+    results = tunings.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
+    return {**given, **{name: tuned.tuning.ten for name, tuned in results.items()}}
 
 
 def _walked(walk: Trajectory) -> Walked:
@@ -229,9 +229,9 @@ def _model_job(
     rows = []
     for weights, command, tick in points:
         anchor = standing_anchor(robot, tick)
-        found = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
-        row = alignment.as_directions(weights, found.gradient)
-        rows.append(np.where(rejection_reason(config, found), np.nan, row))
+        evaluation = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
+        row = alignment.as_directions(weights, evaluation.gradient)
+        rows.append(np.where(rejection_reason(config, evaluation), np.nan, row))
     losses = [
         float(_model_loss(config, robot, weights, command, standing_anchor(robot, tick), effect))
         for weights, command, tick in others
@@ -289,12 +289,12 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
             for done, _ in enumerate(as_completed(running.values()), 1):
                 on(done, len(running), "")
     shape = len(flags.sets), len(commands), len(flags.phases)
-    believed = [np.where(walked[key].fallen, np.nan, walked[key].loss) for key in starts]
+    losses = [np.where(walked[key].fallen, np.nan, walked[key].loss) for key in starts]
     clouds = len(commands), len(FACTORS), flags.ranks, len(flags.phases)
     return Result(
         engine,
         walked,
-        truth=alignment.slopes(np.reshape(believed, (*shape, -1, 2))),
+        truth=alignment.slopes(np.reshape(losses, (*shape, -1, 2))),
         gradients={kind: job.result()[0].reshape(*shape, -1) for kind, job in running.items()},
         hfs_losses=np.reshape([walked[key].loss for key in sampled], clouds),
         losses={kind: job.result()[1].reshape(clouds) for kind, job in running.items()},
@@ -361,8 +361,8 @@ def report(flags: Flags, result: Result) -> Path:
         "engine": result.engine,
         "weights": DIRECTION_NAMES,
         "rows": {
-            which: {": ".join(key): alignment.as_result(row) for key, row in found.items()}
-            for which, found in rows.items()
+            which: {": ".join(key): alignment.as_result(row) for key, row in of_set.items()}
+            for which, of_set in rows.items()
         },
         "ranks": {": ".join(key): row for key, row in ranks.items()},
         "fell": fell,

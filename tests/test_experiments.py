@@ -201,5 +201,5 @@ def test_batch_has_nothing_to_compare_with_where_nominal_is_refused(monkeypatch)
     problems = [batch.problem(nominal(), [batch.scenario(load_robot(), batch.HELD_BACK)])] * 2
     arguments = batch.Starts(), None, None, problems, "starts"
     with pytest.raises(InputError, match="starts: the nominal weights are refused at their first"):
-        batch.tuned(*arguments)
-    assert batch.tuned(*arguments, slice(1)) is tunings  # the others do not start at nominal
+        batch.tune(*arguments)
+    assert batch.tune(*arguments, slice(1)) is tunings  # the others do not start at nominal

@@ -93,7 +93,7 @@ def _ahead(
     def step(state: State, j: Int[Array, ""]) -> tuple[State, State]:
         yaw = state.euler[2]
         if effect is None:
-            returned, push = jax.tree.map(lambda w: w[j], walk.effect), None
+            ground, push = jax.tree.map(lambda w: w[j], walk.effect), None
         else:
             past = j - jnp.arange(HISTORY)
             window = Window(
@@ -103,10 +103,10 @@ def _ahead(
                 base=from_yaw_frame(state),
             )
             effects = effect(window)
-            returned, push = turn(effects.wrench, yaw), turn(effects.legs, yaw)
+            ground, push = turn(effects.wrench, yaw), turn(effects.legs, yaw)
         feet = 0.5 * (walk.feet[j - 1] + walk.feet[j])
-        moved = srbm.step(robot, state, returned, feet, config.tick, push)
-        return moved, moved
+        later = srbm.step(robot, state, ground, feet, config.tick, push)
+        return later, later
 
     begin = jax.tree.map(lambda s: s[first - 1], walk.state)
     return jax.lax.scan(step, begin, first + jnp.arange(ticks))[1]

@@ -118,13 +118,13 @@ def change_text(comparison: Comparison, part: str = "L", void: str = f" \\{VOID}
 
 def legend(verdict: Verdict) -> list[str]:
     """What the columns of a verdict mean, line by line."""
-    compared = [one for s in summaries(verdict).values() for one in s.against.values()]
+    comparisons = [one for s in summaries(verdict).values() for one in s.against.values()]
     text = render(
         "legend.txt.j2",
         verdict=verdict,
         seeds=seeds_text(verdict.seeds),
         has_intervals=len(verdict.seeds) >= FEWEST,
-        mark=None if all(one.counts for one in compared) else VOID,
+        mark=None if all(one.counts for one in comparisons) else VOID,
     )
     return text.splitlines()
 

@@ -160,8 +160,8 @@ def _write(scene: Scene, path: Path) -> str:
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder, failures = Path(name), []
         (folder / "scene.pickle").write_bytes(pickle.dumps(scene))
-        chosen = os.environ.get("MUJOCO_GL")
-        for back_end in (chosen,) if chosen else BACK_ENDS:
+        setting = os.environ.get("MUJOCO_GL")
+        for back_end in (setting,) if setting else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
             if not failure:
                 shutil.move(folder / scene.file, path)
@@ -179,7 +179,7 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
     # MuJoCo first, with this back end; the package would import it without any
     program = f"import mujoco; from {__package__} import render; render.main()"
     try:
-        done = subprocess.run(
+        child = subprocess.run(
             [sys.executable, "-c", program],
             cwd=folder,  # MuJoCo logs into the working directory
             env=environment,
@@ -191,9 +191,9 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
         )
     except subprocess.TimeoutExpired:
         return f"not done after {_TIMEOUT:.0f} s"
-    if done.returncode == 0:
+    if child.returncode == 0:
         return ""
     # the end of the first traceback; those that follow are of what it left open
-    first = done.stderr.split("Traceback (most recent call last):")[:2][-1]
+    first = child.stderr.split("Traceback (most recent call last):")[:2][-1]
     faults = [line for line in first.splitlines() if line.strip() and line[0] != " "]
-    return one_line(faults[0])[:100] if faults else f"ended with code {done.returncode}"
+    return one_line(faults[0])[:100] if faults else f"ended with code {child.returncode}"

@@ -71,11 +71,11 @@ def weights(
     ratio = {
         name: np.asarray(values) / np.asarray(sets["nominal"]) for name, values in sets.items()
     }
-    tuned = [name for name in ("without", "with") if name in sets]
+    bars = [name for name in ("without", "with") if name in sets]
     with drawing(path, 10.0, 3.4) as figure:
         axes = figure.subplots()
-        for i, name in enumerate(tuned):
-            x = np.arange(len(names)) + 0.38 * (i - (len(tuned) - 1) / 2)
+        for i, name in enumerate(bars):
+            x = np.arange(len(names)) + 0.38 * (i - (len(bars) - 1) / 2)
             look = {"color": SETS[name]["color"], "hatch": "////" if name == "without" else None}
             look |= {"edgecolor": "white", "linewidth": 0.0}
             axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=display_name(name))

@@ -118,10 +118,10 @@ def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
         axes.plot(x, y, **look.line, label=display_name(name))
     last = list(walks.values())[-1]
     axes.plot(*last.reference.position[:, :2].T, **CURVES["reference"], label="reference")
-    landed = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
+    touchdowns = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
     mark = {"linestyle": "none", "color": "0.6", "markersize": 6, "zorder": 1}
     for foot, (side, marker) in enumerate((("left", 4), ("right", 5))):
-        spots = last.feet[landed[:, foot] & ~last.fallen, foot]
+        spots = last.feet[touchdowns[:, foot] & ~last.fallen, foot]
         axes.plot(*spots[:, :2].T, **mark, marker=marker, label=f"{side} foot set down")
     axes.set(xlabel="x, ahead [m]", ylabel="y, left [m]", aspect="equal")
     axes.margins(0.05, 0.1)
