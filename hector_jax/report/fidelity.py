@@ -138,23 +138,23 @@ def drift(
     if not len(starts):
         raise InputError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
 
-    def errors(
+    def ahead(
         effect: jax.tree_util.Partial | None, walk: Trajectory, start_tick: Array, first: Array
-    ) -> tuple[Array, Array]:
-        guess = _ahead(config, robot, effect, walk, start_tick, first, ticks)
-        true = jax.tree.map(lambda s: jax.lax.dynamic_slice_in_dim(s, first, ticks), walk.state)
-        return (
-            jnp.sum((guess.position - true.position) ** 2, axis=-1),
-            jnp.sum((guess.euler - true.euler) ** 2, axis=-1),
-        )
+    ) -> State:
+        return _ahead(config, robot, effect, walk, start_tick, first, ticks)
 
-    over_starts = jax.vmap(errors, in_axes=(None, None, None, 0))
-    position, euler = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
+    over_starts = jax.vmap(ahead, in_axes=(None, None, None, 0))
+    guess = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
         effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
     )
-    whole = np.stack([~fallen[:, s : s + ticks].any(axis=1) for s in starts], axis=1)
-    rms = lambda square: np.sqrt(_mean(np.asarray(square)[whole]))  # noqa: E731
-    return Drift(config.tick * np.arange(1, ticks + 1), rms(position), rms(euler))
+    spans = starts[:, None] + np.arange(ticks)
+    whole = ~fallen[:, spans].any(axis=-1)
+
+    def rms(name: str) -> Float[np.ndarray, " ticks"]:
+        error = np.asarray(getattr(guess, name)) - getattr(walks.state, name)[:, spans]
+        return np.sqrt(_mean(np.sum(error**2, axis=-1)[whole]))
+
+    return Drift(config.tick * np.arange(1, ticks + 1), rms("position"), rms("euler"))
 
 
 def drifts(

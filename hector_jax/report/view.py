@@ -2,7 +2,7 @@
 
 A displayed tick is one batch of updates. The walks stand beside one another, shifted across their
 way. To follow them the world moves under the camera, so that turning the camera by hand keeps
-working. The page is visible by viser, of the extra `view`, and asks no other machine for anything.
+working. The page is drawn by viser, of the extra `view`, and asks no other machine for anything.
 """
 
 import errno
@@ -32,7 +32,7 @@ _PAUSE = 1.0  # [s] between readings of the metrics
 _APART = 0.8  # [m] between the two walks
 # [m/N], [m/(N m)] of the arrows: that of the robot's weight has 35 cm
 _SCALES = {"force": 0.35 / 120.0, "moment": 0.35 / 12.0}
-_MIN_ARROW = 0.03  # [m]; shorter ones are not visible
+_MIN_ARROW = 0.03  # [m]; shorter ones are not drawn
 _RADII = {"force": 0.008, "moment": 0.014}  # [m] of their shafts
 # colours and dashes of lines in plots, for before, after and what else there is
 _STROKES = (
@@ -80,7 +80,7 @@ def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T 2 2 3
 
 
 def check_viser() -> None:
-    """Check, before anything is walked, that the page can be visible.
+    """Check, before anything is walked, that the page can be drawn.
 
     Raises:
         InputError: viser is not installed.
@@ -167,11 +167,9 @@ class Page:
         self._model, self._data = model, mujoco.MjData(model)
         self._names, self._motions = list(motions), list(motions.values())
         self._length = min(len(one.times) for one in self._motions)
-        self._playing, self._tick = True, -1  # the tick that is shown; -1: to be visible anew
-        self._metrics_state, self._since = (
-            (-1, False),
-            np.inf,
-        )  # size of the metrics, run done; [s] ago
+        self._playing, self._tick = True, -1  # the tick that is shown; -1: to be drawn anew
+        self._metrics_state = (-1, False)  # their size when they were read, and whether it was done
+        self._since = np.inf  # [s] since then
         self._build_panel(story)
         self._build_world()
         self.advance(0.0)
