@@ -1,6 +1,8 @@
 """TensorBoard's event files from a run's metrics.jsonl, which stays the truth."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
@@ -37,24 +39,19 @@ def write_events(folder: Path, out: Path) -> list[Path]:
         for old in place.glob("events.out.tfevents.*"):
             old.unlink()
         with SummaryWriter(str(place)) as writer:
-            for line in lines:
-                if line["set"] == name:
-                    for tag, value in _scalars(line).items():
-                        writer.add_scalar(tag, value, line["iteration"])
+            for line in (line for line in lines if line["set"] == name):
+                for room, values in _scalars(line).items():
+                    for key, value in values.items():
+                        if value is not None:  # it was not finite
+                            writer.add_scalar(f"{room}/{key}", float(value), line["iteration"])
     return list(folders.values())
 
 
-def _scalars(line: dict) -> dict[str, float]:
-    """Numbers of an iteration by tag; those that were not finite are left out."""
-    rooms = {
+def _scalars(line: Mapping[str, Any]) -> dict[str, Mapping[str, float | None]]:
+    """Numbers of an iteration, by group and name."""
+    return {
         "loss": {name: line[name] for name in line if name == "L" or name.startswith("L_")},
         "step": {name: line.get(name) for name in ("step", "accepted", "residual")},
         "weights": line["weights"],
         "gradient_log": line["gradient_log"],
-    }
-    return {
-        f"{room}/{name}": float(value)
-        for room, values in rooms.items()
-        for name, value in values.items()
-        if value is not None
     }
