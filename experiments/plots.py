@@ -9,14 +9,7 @@ from jaxtyping import Float
 from matplotlib.artist import setp
 
 from hector_jax.report.plots import style
-from hector_jax.report.plots.style import (
-    SETS,
-    category_axis,
-    display_name,
-    drawing,
-    log_axis,
-    looks_of,
-)
+from hector_jax.report.plots.style import SETS, category_axis, drawing, label_of, log_axis, looks_of
 
 
 def ratios(
@@ -34,7 +27,7 @@ def ratios(
         axes, looks = figure.subplots(), looks_of(sets)
         for i, (name, values) in enumerate(sets.items()):
             x = np.arange(len(columns)) + width * (i - (len(sets) - 1) / 2)
-            axes.plot(x, values, markersize=6, label=display_name(name), **looks[name].dot)
+            axes.plot(x, values, markersize=6, label=label_of(name), **looks[name].dot)
         axes.axhline(1.0, color="black", linewidth=0.8)
         category_axis(axes, columns)
         log_axis(axes, "y")
@@ -53,7 +46,7 @@ def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> st
         axes = figure.subplots()
         for name, look in looks_of(sets).items():
             share = 100 * (np.arange(len(sets[name])) + 0.5) / len(sets[name])
-            line = {"marker": look.marker, "label": display_name(name), **look.line}
+            line = {"marker": look.marker, "label": label_of(name), **look.line}
             axes.plot(share, np.sort(sets[name]) / 1e6, **line)
         log_axis(axes, "y")
         axes.set(xlabel="plants [%], by their loss", ylabel="L [10$^6$]", xlim=(0, 100))
@@ -72,7 +65,7 @@ def front(
         path: file to write.
         prices: factors of the paper's loss weights.
         worlds: by name, tracking and L_ctrl by price.
-        others: the same of other weight sets, in the world display_name last.
+        others: the same of other weight sets, in the world named last.
     """
     with drawing(path, 4.0 * len(worlds), 3.6) as figure:
         panels = figure.subplots(1, len(worlds), squeeze=False)[0]
@@ -82,7 +75,7 @@ def front(
             panel.plot(*points.T, "o-", color=style.GREEN, label="tuned")
             if world == list(worlds)[-1]:
                 for name, look in looks_of(others).items():
-                    panel.plot(*np.divide(others[name], 1e6), label=display_name(name), **look.dot)
+                    panel.plot(*np.divide(others[name], 1e6), label=label_of(name), **look.dot)
             paper = int(np.argmin(np.abs(np.log(factors))))
             places = {0: (6, 0, "left"), paper: (-6, -4, "right"), -1: (0, 6, "center")}
             for i, (x, y, side) in places.items():
@@ -281,7 +274,7 @@ def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
             ratio = np.array([row[name].ratio for row in rows.values()])
             stood = 100 * np.array([row[name].survived for row in rows.values()])
             for panel, (value, low, high) in zip(panels, (ratio.T, stood.T), strict=True):
-                panel.plot(value, y, **look.dot, label=display_name(name))
+                panel.plot(value, y, **look.dot, label=label_of(name))
                 panel.hlines(y, low, high, color=look.color, linewidth=1.2)
         panels[0].axvline(1.0, color="black", linewidth=0.8, zorder=1)
         panels[0].set_xlabel(f"median of L / L of {baseline}")
@@ -306,7 +299,7 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
     with drawing(path, 4.6, 4.4, legend_columns=3) as figure:
         axes: Any = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
         for name, look in looks_of(endured).items():
-            line = {"marker": look.marker, "label": display_name(name), **look.line}
+            line = {"marker": look.marker, "label": label_of(name), **look.line}
             forces = np.append(endured[name], endured[name][0])
             axes.plot(angles, forces, markersize=3.5, **line)
         axes.set_rmin(0.0)

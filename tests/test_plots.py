@@ -97,7 +97,7 @@ def test_the_four_sets_of_most_pictures_stay_apart_in_grey():
 
 def test_a_legend_begins_with_the_names_of_the_tables():
     for name in (*FOUR, "with_ten", "shared_mean", "ceiling", "mine"):
-        assert plots.display_name(name).split(" (")[0] == name
+        assert plots.label_of(name).split(" (")[0] == name
 
 
 def test_the_collective_figure_has_the_four_sets_and_the_ceiling(tmp_path, drawn, walks):
@@ -106,10 +106,10 @@ def test_the_collective_figure_has_the_four_sets_and_the_ceiling(tmp_path, drawn
     assert "of nominal, expert, without, with," in caption
     path, *panels = drawn[0].axes
     drawn_lines = {label for label in lines(path) if not label.endswith("set down")}
-    assert drawn_lines == {plots.display_name(name) for name in (*FOUR, "ceiling")} | {"reference"}
+    assert drawn_lines == {plots.label_of(name) for name in (*FOUR, "ceiling")} | {"reference"}
     for panel in panels:
         assert {label for label in lines(panel) if label[0] != "_"} == set(
-            map(plots.display_name, FOUR)
+            map(plots.label_of, FOUR)
         )
 
 

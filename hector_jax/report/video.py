@@ -26,7 +26,7 @@ from hector_jax.core.console import Broken
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
 from hector_jax.report.motion import Motion
-from hector_jax.report.plots.style import display_name
+from hector_jax.report.plots.style import label_of
 from hector_jax.robot.model import Robot
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
@@ -139,7 +139,7 @@ def make_scene(
         config=config,
         model=str(robot.description.model.resolve()),
         top=_TOP * float(robot.standing_height),
-        motions={display_name(name): motion for name, motion in motions.items()},
+        motions={label_of(name): motion for name, motion in motions.items()},
         times=_snapshot_times(next(iter(motions.values())), seconds, config.tiles)
         if strip
         else np.arange(0.0, seconds + 1e-9, 1.0 / config.rate),

@@ -7,15 +7,15 @@ draw pictures of their own with `style`.
 """
 
 from hector_jax.report.plots.grfm import open_loop, training, wrenches
-from hector_jax.report.plots.style import display_name, titles
+from hector_jax.report.plots.style import label_of, titles
 from hector_jax.report.plots.tuning import changes, losses, weights
 from hector_jax.report.plots.walks import collective, distances, path_from_above, tracking
 
 __all__ = [
     "changes",
     "collective",
-    "display_name",
     "distances",
+    "label_of",
     "losses",
     "open_loop",
     "path_from_above",

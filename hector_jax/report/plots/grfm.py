@@ -10,7 +10,7 @@ from hector_jax.core.trajectory import LEFT, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.plots import style
-from hector_jax.report.plots.style import CURVES, ORANGE, SETS, display_name, drawing, looks_of
+from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
 
 
@@ -39,7 +39,7 @@ def wrenches(
         panels = figure.subplots(2, 3, sharex=True)
         for name in (name for name in order if name in curves):
             both = np.concatenate([np.asarray(part)[:count, foot] for part in curves[name]], axis=1)
-            look = {"baseline": None, "label": display_name(name), **CURVES[name]}
+            look = {"baseline": None, "label": label_of(name), **CURVES[name]}
             for panel, values in zip(panels.flat, both.T, strict=True):
                 panel.stairs(values, period * np.arange(count + 1), **look)
         for panel, label in zip(panels.flat, labels, strict=True):
@@ -62,7 +62,7 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
         for row, (world, drifts) in zip(panels, worlds.items(), strict=True):
             for name, look in looks_of(drifts, CURVES).items():
                 time, position, euler = drifts[name]
-                row[0].plot(time, 100 * position, label=display_name(name), **look.line)
+                row[0].plot(time, 100 * position, label=label_of(name), **look.line)
                 row[1].plot(time, np.rad2deg(euler), **look.line)
             row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
             row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))

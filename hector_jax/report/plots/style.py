@@ -91,7 +91,7 @@ def looks_of(names: Iterable[str], table: Mapping[str, Any] = SETS) -> dict[str,
     return looks
 
 
-def display_name(name: str) -> str:
+def label_of(name: str) -> str:
     """Words of a legend for a weight set, by its name in the tables, or for a curve."""
     return _NAMES.get(name, name)
 
@@ -99,8 +99,7 @@ def display_name(name: str) -> str:
 def titles(names: Iterable[str]) -> list[str]:
     """Words that stand above two walks, before and after."""
     return [
-        f"{when}: {display_name(name)}"
-        for when, name in zip(("before", "after"), names, strict=True)
+        f"{when}: {label_of(name)}" for when, name in zip(("before", "after"), names, strict=True)
     ]
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from hector_jax.report.plots import style
-from hector_jax.report.plots.style import SETS, display_name, drawing, log_axis, looks_of
+from hector_jax.report.plots.style import SETS, drawing, label_of, log_axis, looks_of
 from hector_jax.report.report import caption
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
@@ -46,7 +46,7 @@ def losses(
                 good, bad = np.flatnonzero(accepted[name]), np.flatnonzero(~accepted[name])
                 # a marker at each iteration would hide how the line is dashed
                 marks = {"marker": look.marker, "markersize": 3.2, "markevery": 10}
-                panel.plot(good, values[good], **look.line, **marks, label=display_name(name))
+                panel.plot(good, values[good], **look.line, **marks, label=label_of(name))
                 if title == "$L$":
                     top = 1.1 * values[good].max()  # a rejected step need not have a finite loss
                     panel.plot(bad, np.where(values < top, values, top)[bad], **cross)
@@ -78,7 +78,7 @@ def weights(
             x = np.arange(len(names)) + 0.38 * (i - (len(bars) - 1) / 2)
             look = {"color": SETS[name]["color"], "hatch": "////" if name == "without" else None}
             look |= {"edgecolor": "white", "linewidth": 0.0}
-            axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=display_name(name))
+            axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=label_of(name))
         if "expert" in sets:
             look = looks_of(["expert"])["expert"].dot
             axes.plot(ratio["expert"], **look, markerfacecolor="white", label="expert")
@@ -118,7 +118,7 @@ def changes(
             percent = lambda r, _: f"{100 * (r - 1):+.0f}" if r != 1 else "0"  # noqa: E731
             row[0].xaxis.set_major_formatter(percent)
         first = panels[0, 0]
-        first.set_yticks(range(len(names)), [display_name(name) for name in names])
+        first.set_yticks(range(len(names)), [label_of(name) for name in names])
         first.set_ylim(len(names) - 0.5, -0.5)
         first.plot([], [], "o", color="0.4", alpha=0.5, label="one plant")
         cross = {"color": "0.2", "markersize": 11, "mew": 2.2}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.trajectory import Trajectory, from_start
 from hector_jax.report.motion import COLOURS, Motion
-from hector_jax.report.plots.style import CURVES, display_name, drawing, looks_of, widen
+from hector_jax.report.plots.style import CURVES, drawing, label_of, looks_of, widen
 from hector_jax.report.report import caption
 
 _MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be told apart
@@ -47,7 +47,7 @@ def _draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
     for name, look in looks_of(walks).items():
         times = float(walks[name].period) * np.arange(1, len(walks[name].fallen) + 1)
         for panel, (label, values) in zip(panels.flat, _errors(walks[name]).items(), strict=True):
-            panel.plot(times, values, **look.line, label=display_name(name))
+            panel.plot(times, values, **look.line, label=label_of(name))
             panel.set_ylabel(label)
     for panel in panels.flat:
         panel.axhline(0.0, color="black", linewidth=0.8)
@@ -78,7 +78,7 @@ def distances(
             upright = motion.times <= motion.fall_time
             away = np.where(upright, 100 * motion.distance, np.nan)
             mean = np.sqrt(np.mean(away[upright] ** 2)) if upright.any() else np.nan
-            label = f"{display_name(name)}: {mean:.1f} cm RMS"
+            label = f"{label_of(name)}: {mean:.1f} cm RMS"
             axes.plot(motion.times, away, color=np.divide(colour, 255), ls=style, label=label)
         axes.set_title("distance from the reference [cm]", loc="left")
         axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
@@ -115,7 +115,7 @@ def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     for name, look in looks_of(walks).items():
         fallen, position = walks[name].fallen, walks[name].state.position
         x, y = np.where(fallen[:, None], np.nan, position)[:, :2].T
-        axes.plot(x, y, **look.line, label=display_name(name))
+        axes.plot(x, y, **look.line, label=label_of(name))
     last = list(walks.values())[-1]
     axes.plot(*last.reference.position[:, :2].T, **CURVES["reference"], label="reference")
     touchdowns = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
