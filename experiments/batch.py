@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net
@@ -59,8 +60,11 @@ class Flags:
     """What all sub-commands ask."""
 
     net: Path | None = None  # GRFM-Net to tune through; none: the plain rigid body
-    iterations: int = 100  # at most
-    processes: int = 2  # that walk in MuJoCo, one core each
+    iterations: Annotated[int, AT_LEAST_ONE] = 100  # at most
+    processes: Annotated[int, AT_LEAST_ONE] = 2  # that walk in MuJoCo, one core each
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @dataclass(frozen=True)
@@ -77,9 +81,9 @@ class Robust(Flags):
 
     out: Path = Path("runs/batch/robust")  # folder of the report
     traj: str = "straight"
-    variations: int = 16
+    variations: Annotated[int, AT_LEAST_ONE] = 16
     noise: bool = False  # the controller sees the state with white noise
-    plants: int = 20  # drawn around the hfs, to judge by
+    plants: Annotated[int, AT_LEAST_ONE] = 20  # drawn around the hfs, to judge by
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,8 @@ class Front(Flags):
 
     out: Path = Path("runs/batch/front")  # folder of the report
     traj: str = "straight"
-    points: int = 9
-    decades: float = 2.0  # to either side of the paper's weights
+    points: Annotated[int, Range(2)] = 9
+    decades: Annotated[float, POSITIVE] = 2.0  # to either side of the paper's weights
 
 
 @dataclass(frozen=True)
@@ -98,8 +102,8 @@ class Starts(Flags):
 
     out: Path = Path("runs/batch/starts")  # folder of the report
     traj: str = "straight"
-    starts: int = 32
-    factor: float = 3.0  # within which of nominal
+    starts: Annotated[int, AT_LEAST_ONE] = 32
+    factor: Annotated[float, Range(1.0, above=True)] = 3.0  # within which of nominal
 
 
 @dataclass(frozen=True)
@@ -108,18 +112,36 @@ class Verdict:
 
     out: Path  # folder of the report
     traj: str = "straight"
-    seeds: int = 8
-    first_seed: int = 0
-    processes: int = 2  # one core each
+    seeds: Annotated[int, AT_LEAST_ONE] = 8
+    first_seed: Annotated[int, SEED] = 0
+    processes: Annotated[int, AT_LEAST_ONE] = 2  # one core each
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
-def tuned(
-    flags: Flags, robot: Robot, effects: Any, problems: Sequence[Problem], title: str
+def tune(
+    flags: Flags,
+    robot: Robot,
+    effects: Any,
+    problems: Sequence[Problem],
+    title: str,
+    nominal_rows: slice = slice(None),
 ) -> Tunings:
-    """Tune problems as one batch."""
+    """Tune problems as one batch; those of `nominal_rows` start at the nominal weights.
+
+    Raises:
+        InputError: the nominal weights are refused, so there is nothing to compare with.
+    """
+    config = TuneConfig(iterations=flags.iterations)
     with bar(f"{title}: {len(problems)} tunings on {len(jax.devices())} devices") as tell:
-        config = TuneConfig(iterations=flags.iterations)
-        return tune_batch(config, robot, stack(problems), effects, tell=tell)
+        tunings = tune_batch(config, robot, stack(problems), effects, tell=tell)
+    if np.any(np.asarray(tunings.stop)[nominal_rows] == Stop.BAD_START):
+        raise InputError(
+            f"{title}: the nominal weights are refused at their first walk: a fall, a plan that is "
+            "not solved, or numbers that are not finite; expected weights that walk on the model"
+        )
+    return tunings
 
 
 def whole_net(flags: Flags, robot: Robot) -> jax.tree_util.Partial:
@@ -160,21 +182,21 @@ def one_of(tree: Any, row: int) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[row], tree)
 
 
-def final_terms(found: Tunings) -> Terms:
+def final_terms(tunings: Tunings) -> Terms:
     """Terms of the loss on the model of each converged set."""
-    rows = np.arange(found.history.evaluation.loss.shape[1])
-    ran = rows <= np.asarray(found.iterations)[:, None]
-    last = np.max(np.where(ran & found.history.accepted, rows, 0), axis=1)
-    return jax.tree.map(lambda x: x[np.arange(len(last)), last], found.history.evaluation.terms)
+    rows = np.arange(tunings.history.evaluation.loss.shape[1])
+    ran = rows <= np.asarray(tunings.iterations)[:, None]
+    last = np.max(np.where(ran & tunings.history.accepted, rows, 0), axis=1)
+    return jax.tree.map(lambda x: x[np.arange(len(last)), last], tunings.history.evaluation.terms)
 
 
-def ended(flags: Flags, found: Tunings, row: int) -> str:
+def end_of(flags: Flags, tunings: Tunings, row: int) -> str:
     """Why a tuning ended, and when."""
-    words = stop_reason(TuneConfig(iterations=flags.iterations), Stop(int(found.stop[row])))
-    return f"{words} (after {found.iterations[row]})"
+    words = stop_reason(TuneConfig(iterations=flags.iterations), Stop(int(tunings.stop[row])))
+    return f"{words} (after {tunings.iterations[row]})"
 
 
-def judged(
+def scores_on(
     pool: Any,
     robot: Robot,
     sets: Mapping[str, Weights],
@@ -185,8 +207,8 @@ def judged(
 ) -> dict[str, Score]:
     """Scores of weight sets on plants, stacked over these."""
     seeds = range(first_seed, first_seed + len(plants))
-    found = verdicts.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title=title)
-    return {name: metrics.stack_scores(scores) for name, scores in found.scores.items()}
+    judgement = verdicts.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title=title)
+    return {name: metrics.stack_scores(scores) for name, scores in judgement.scores.items()}
 
 
 def million(x: Any) -> str:
@@ -225,13 +247,13 @@ def shared(flags: Shared) -> None:
     """(a) One weight set for many trajectories, against one for each."""
     robot, names = load_robot(), flags.trajectories
     effects, commands = whole_net(flags, robot), {n: named_command(n) for n in names}
-    asked = [problem(nominal(), [scenario(robot, c)]) for c in commands.values()]
-    alone = tuned(flags, robot, effects, asked, "one set for each")
+    problems = [problem(nominal(), [scenario(robot, c)]) for c in commands.values()]
+    alone = tune(flags, robot, effects, problems, "one set for each")
     scales = alone.history.evaluation.loss[:, 0]
     walks = [scenario(robot, c, scale=k) for c, k in zip(commands.values(), scales, strict=True)]
     tails = {"mean of all": 1.0, "worst of all": 0.0}
-    asked = [problem(nominal(), walks, tail) for tail in tails.values()]
-    together = tuned(flags, robot, effects, asked, "one set for all")
+    problems = [problem(nominal(), walks, tail) for tail in tails.values()]
+    together = tune(flags, robot, effects, problems, "one set for all")
     if not first_host():
         return
 
@@ -240,11 +262,11 @@ def shared(flags: Shared) -> None:
     sets |= {n: one_of(together.converged, i) for i, n in enumerate(tails)}
     with workers(flags.processes) as pool:
         scores = {
-            name: judged(pool, robot, sets, command, [hfs()], f"{name} on the hfs")
+            name: scores_on(pool, robot, sets, command, [hfs()], f"{name} on the hfs")
             for name, command in {**commands, "unseen": HELD_BACK}.items()
         }
-    loss = {n: {c: float(found[n].L[0]) for c, found in scores.items()} for n in sets}
-    fell = {n: [c for c, found in scores.items() if found[n].fallen.any()] for n in sets}
+    loss = {n: {c: float(by_set[n].L[0]) for c, by_set in scores.items()} for n in sets}
+    falls = {n: [c for c, by_set in scores.items() if by_set[n].fallen.any()] for n in sets}
 
     def row(name: str) -> list[str]:
         cells = [
@@ -252,15 +274,15 @@ def shared(flags: Shared) -> None:
             for c, x in loss[name].items()
         ]
         beside = [100 * (loss[name][c] / loss[f"{c} alone"][c] - 1) for c in names]
-        return [name, *cells, f"{max(beside):+.0f} %", ", ".join(fell[name]) or "none"]
+        return [name, *cells, f"{max(beside):+.0f} %", ", ".join(falls[name]) or "none"]
 
     head = ["set", *scores, "worst, to the set tuned singly", "falls"]
     base = np.array(list(loss["nominal"].values()))
     changes = {n: np.array(list(loss[n].values())) / base for n in list(sets)[1:]}
     make_folder(flags.out)
     caption = plots.ratios(flags.out / "shared.png", list(scores), changes)
-    ends = [f"{n} alone: {ended(flags, alone, i)}" for i, n in enumerate(names)]
-    ends += [f"{n}: {ended(flags, together, i)}" for i, n in enumerate(tails)]
+    ends = [f"{n} alone: {end_of(flags, alone, i)}" for i, n in enumerate(names)]
+    ends += [f"{n}: {end_of(flags, together, i)}" for i, n in enumerate(tails)]
     text = [
         "One weight set for several trajectories",
         "Each trajectory's loss is divided by that of its nominal walk before the mean, or the "
@@ -269,7 +291,7 @@ def shared(flags: Shared) -> None:
         markdown_table(head, [row(n) for n in sets]),
         "\n".join(f"- {line}" for line in ends),
     ]
-    write(flags, sets, {"hfs": loss, "falls": fell}, text, ("shared.png", caption))
+    write(flags, sets, {"hfs": loss, "falls": falls}, text, ("shared.png", caption))
 
 
 def drawn_variations(count: int, noise: bool) -> list[Variation]:
@@ -298,16 +320,16 @@ def robust(flags: Robust) -> None:
     if flags.net is not None:  # another variant's net is refused before anything is tuned
         effects = as_effect(member_params(load_net(flags.net, robot, "residual")[0]))
         members = len(jax.tree.leaves(effects)[0])
-    asked = [problem(nominal(), [scenario(robot, command)])]
-    plain = tuned(flags, robot, whole_net(flags, robot), asked, "the model as it is")
+    problems = [problem(nominal(), [scenario(robot, command)])]
+    plain = tune(flags, robot, whole_net(flags, robot), problems, "the model as it is")
     variations = drawn_variations(flags.variations, flags.noise)
     walks = [
         scenario(robot, command, effect=i % members, variation=variation)
         for i, variation in enumerate(variations)
     ]
     tails = {"mean": 1.0, "CVaR": TAIL}
-    asked = [problem(nominal(), walks, tail) for tail in tails.values()]
-    varied = tuned(flags, robot, effects, asked, f"{flags.variations} variations")
+    problems = [problem(nominal(), walks, tail) for tail in tails.values()]
+    varied = tune(flags, robot, effects, problems, f"{flags.variations} variations")
     if not first_host():
         return
 
@@ -315,7 +337,7 @@ def robust(flags: Robust) -> None:
     sets |= {n: one_of(varied.converged, i) for i, n in enumerate(tails)}
     plants = [hfs_varied(seed) for seed in range(flags.plants)]
     with workers(flags.processes) as pool:
-        scores = judged(pool, robot, sets, command, plants, "plants around the hfs")
+        scores = scores_on(pool, robot, sets, command, plants, "plants around the hfs")
     make_folder(flags.out)
     caption = plots.by_plant(flags.out / "robust.png", {n: s.L for n, s in scores.items()})
     text = [
@@ -332,8 +354,8 @@ def robust(flags: Robust) -> None:
         "the hfs (hfs-varied).",
         plant_table(scores, "as it is"),
         "\n".join(
-            f"- {n}: {ended(flags, found, i)}"
-            for n, found, i in [("as it is", plain, 0), ("mean", varied, 0), ("CVaR", varied, 1)]
+            f"- {n}: {end_of(flags, tunings, i)}"
+            for n, tunings, i in [("as it is", plain, 0), ("mean", varied, 0), ("CVaR", varied, 1)]
         ),
     ]
     write(flags, sets, {"hfs-varied": as_numbers(scores)}, text, ("robust.png", caption))
@@ -361,19 +383,19 @@ def front(flags: Front) -> None:
     """(c) Tracking against smoothness."""
     robot, command = load_robot(), named_command(flags.traj)
     prices = 10.0 ** np.linspace(-flags.decades, flags.decades, flags.points)
-    asked = [problem(nominal(), [scenario(robot, command, tracking=p)]) for p in prices]
-    found = tuned(flags, robot, whole_net(flags, robot), asked, "prices of tracking")
+    problems = [problem(nominal(), [scenario(robot, command, tracking=p)]) for p in prices]
+    tunings = tune(flags, robot, whole_net(flags, robot), problems, "prices of tracking")
     if not first_host():
         return
-    sets = {f"tracking x{p:.3g}": one_of(found.converged, i) for i, p in enumerate(prices)}
-    judged_sets = {"nominal": nominal(), "expert": expert(), **sets}
+    sets = {f"tracking x{p:.3g}": one_of(tunings.converged, i) for i, p in enumerate(prices)}
+    all_sets = {"nominal": nominal(), "expert": expert(), **sets}
     with workers(flags.processes) as pool:
-        scores = judged(pool, robot, judged_sets, command, [hfs()], "on the hfs")
+        scores = scores_on(pool, robot, all_sets, command, [hfs()], "on the hfs")
 
     def tracking(terms: Mapping[str, Any]) -> Any:
         return sum(term.weight * terms[term.name] for term in PAPER_LOSS[:2])
 
-    terms = final_terms(found)
+    terms = final_terms(tunings)
     model = np.stack([tracking(terms), terms["L_ctrl"]], axis=1)
     there = {
         n: (float(tracking(s.losses)[0]), float(s.losses["L_ctrl"][0])) for n, s in scores.items()
@@ -382,7 +404,9 @@ def front(flags: Front) -> None:
     for name, (track, control) in there.items():
         own = list(sets).index(name) if name in sets else None
         cells = (
-            ["", "", ""] if own is None else [*map(million, model[own]), ended(flags, found, own)]
+            ["", "", ""]
+            if own is None
+            else [*map(million, model[own]), end_of(flags, tunings, own)]
         )
         fell = "yes" if scores[name].fallen.any() else "no"
         rows.append([name, *cells[:2], million(track), million(control), fell, cells[2]])
@@ -416,22 +440,22 @@ def starts(flags: Starts) -> None:
     """(d) How far the end depends on the start."""
     robot, command = load_robot(), named_command(flags.traj)
     begin = [nominal(), *sample_weights(nominal(), flags.factor, flags.starts - 1)]
-    asked = [problem(w, [scenario(robot, command)]) for w in begin]
-    found = tuned(flags, robot, whole_net(flags, robot), asked, "starts")
+    problems = [problem(w, [scenario(robot, command)]) for w in begin]
+    tunings = tune(flags, robot, whole_net(flags, robot), problems, "starts", slice(1))
     if not first_host():
         return
-    sound = np.asarray(found.stop) != Stop.BAD_START
-    first, last = found.history.evaluation.loss[sound, 0], found.loss[sound]
-    accepted = found.history.accepted
-    ran = np.arange(accepted.shape[1]) <= np.asarray(found.iterations)[:, None]
-    curves = np.where(accepted & ran, found.history.evaluation.loss, np.nan)[sound]
+    sound = np.asarray(tunings.stop) != Stop.BAD_START
+    first, last = tunings.history.evaluation.loss[sound, 0], tunings.loss[sound]
+    accepted = tunings.history.accepted
+    ran = np.arange(accepted.shape[1]) <= np.asarray(tunings.iterations)[:, None]
+    curves = np.where(accepted & ran, tunings.history.evaluation.loss, np.nan)[sound]
     at = lambda x: [million(q) for q in np.quantile(x, (0, 0.25, 0.5, 0.75, 1))]  # noqa: E731
     rows = [["at the start", *at(first)], ["at the end", *at(last)]]
     best = np.flatnonzero(sound)[np.argsort(last)[:3]]
-    sets = {"from nominal": one_of(found.converged, 0)}
-    sets |= {f"best {i + 1}": one_of(found.converged, row) for i, row in enumerate(best)}
+    sets = {"from nominal": one_of(tunings.converged, 0)}
+    sets |= {f"best {i + 1}": one_of(tunings.converged, row) for i, row in enumerate(best)}
     with workers(flags.processes) as pool:
-        scores = judged(pool, robot, sets, command, [hfs()], "on the hfs")
+        scores = scores_on(pool, robot, sets, command, [hfs()], "on the hfs")
     make_folder(flags.out)
     caption = plots.starts(flags.out / "starts.png", curves)
     text = [
@@ -440,8 +464,7 @@ def starts(flags: Starts) -> None:
         f"x/{flags.factor:g} of it; {int((~sound).sum())} are refused at their "
         "first walk: a fall, a plan that is not solved, or numbers that are not finite.",
         markdown_table(["L on the model", "least", "25 %", "median", "75 %", "most"], rows),
-        f"From nominal: {million(last[0] if sound[0] else np.nan)}, "
-        f"{int(np.sum(last < last[0]))} of the others end lower.",
+        f"From nominal: {million(last[0])}, {int(np.sum(last < last[0]))} of the others end lower.",
         markdown_table(
             ["set", "L on the hfs", "fell"],
             [[n, million(s.L[0]), "yes" if s.fallen.any() else "no"] for n, s in scores.items()],
@@ -462,7 +485,7 @@ def verdict(flags: Verdict) -> None:
     command = HELD_BACK if flags.traj == "unseen" else named_command(flags.traj)
     with workers(flags.processes) as pool:
         title = f"{flags.traj} on the hardware stand-in"
-        scores = judged(pool, load_robot(), sets, command, plants, title, flags.first_seed)
+        scores = scores_on(pool, load_robot(), sets, command, plants, title, flags.first_seed)
     last = flags.first_seed + flags.seeds - 1
     about = f"Seeds {flags.first_seed} to {last}. Losses in 1e6."
     path = write_report(

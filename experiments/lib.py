@@ -1,17 +1,17 @@
 """What the experiments share: walks that are kept in groups, and how a report is written."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import shlex
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
-import numpy as np
-
-from hector_jax.core.console import bar, made_at
+from hector_jax.core.console import bar
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_file, write_json
-from hector_jax.core.inputs import plural
+from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import cached, content_key
 from hector_jax.sim.loop import Job
@@ -42,11 +42,33 @@ def write_report(
         The path of the report.
     """
     about = environment()
-    shown = [f"![{file}]({file})\n\n{caption}" for file, caption in (pictures or {}).items()]
-    text = [f"# {title}", made_at(about), *paragraphs, *shown]
+    images = [f"![{file}]({file})\n\n{caption}" for file, caption in (pictures or {}).items()]
+    text = [f"# {title}", made_at(about), *paragraphs, *images]
     write_json(path.parent / json_name, {"environment": about, **numbers})
     write_file(path, ("\n\n".join(text) + "\n").encode())
     return path
+
+
+def check_names(flag: str, names: Iterable[str], choices: Collection[str]) -> None:
+    """Check that all names given to a flag are among those there are.
+
+    Raises:
+        InputError: one line naming the flag, the name and the choices.
+    """
+    for name in names:
+        if name not in choices:
+            raise InputError(f"Flags.{flag} must be of {', '.join(choices)}, got {name!r}")
+
+
+def made_at(environment: Mapping[str, str]) -> str:
+    """Line of a report that tells where it comes from: the commit, and the script with its flags.
+
+    Args:
+        environment: see `core.environment`; without a commit outside of a checkout.
+    """
+    script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
+    command = shlex.join(["python", script, *sys.argv[1:]])
+    return f"Made at {environment.get('commit', 'an unknown commit')} by `{command}`."
 
 
 def walk_groups(
@@ -80,7 +102,7 @@ def walk_groups(
         for name, jobs in groups.items()
     }
 
-    def make(missing: list[str], found: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
+    def make(missing: list[str], _: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
         jobs = [job for name in missing for job in groups[name]]
         with bar(f"{plural(len(jobs), 'walk')}{title}") as tell:
             tell(0, len(jobs), "compiling")
@@ -91,7 +113,7 @@ def walk_groups(
                     rows.append(score(next(walks)))
                     done += 1
                     tell(done, len(jobs), name)
-                yield name, jax.tree.map(lambda *x: np.stack(x), *rows)
+                yield name, stack(rows)
 
     about = {"settings": [repr(part) for part in settings]}
     return cached(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)

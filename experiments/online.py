@@ -29,15 +29,17 @@ import jax
 import numpy as np
 import plots
 import tyro
+from lib import check_names, write_report
+from plots import ARMS
 
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core.console import bar, exit_code, made_at
-from hector_jax.core.environment import environment
-from hector_jax.core.files import write_file, write_json
+from hector_jax.core.console import bar, exit_code
+from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, SEED, validation_error
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
@@ -54,17 +56,9 @@ from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner
 
-ARMS = {
-    "fixed": "weights stay",
-    "until": "tuned until the change",
-    "carried": "tuned all the way",
-    "cut": "sensitivities begun anew in each window",
-    "model": "the model's own walk from each window's first state",
-    "plain": "no net: the plain rigid body",
-}
 CODE = ("tuning.online", "grfm.network", "sim.walk")  # that decides the numbers
 SETS = ("nominal", "expert", "tuned")
-WINDOW = 0.4  # [s] by which losses are told
+WINDOW = 0.4  # [s] of the losses along a walk
 
 
 @dataclass(frozen=True)
@@ -87,12 +81,19 @@ class Flags:
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:
-        for name in self.arms:
-            if name not in ARMS:
-                raise InputError(f"Flags.arms must be of {', '.join(ARMS)}, got {name!r}")
-        for name in self.sets:
-            if name not in SETS:
-                raise InputError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
+        check_names("arms", self.arms, ARMS)
+        check_names("sets", self.sets, SETS)
+        for trajectory in self.trajectories:
+            named_command(trajectory)
+        for name, kind, allowed in (
+            ("varied", tuple[int, ...], SEED),
+            ("standin", tuple[int, ...], SEED),
+            ("payload", float, NOT_NEGATIVE),
+            ("processes", int, AT_LEAST_ONE),
+        ):
+            if error := validation_error(getattr(self, name), kind, allowed):
+                raise InputError(f"Flags.{name} {error}")
+        OnlineConfig(window=self.window, late=self.late)
         count = round(self.seconds / WINDOW)
         if count < 2 or abs(self.seconds - count * WINDOW) > 1e-9:
             raise InputError(
@@ -120,6 +121,7 @@ class Walked(NamedTuple):
     loss: np.ndarray  # (windows,) L of each 0.4 s
     height: np.ndarray  # (2,) [m] mean error of the centre of mass
     fallen: np.ndarray
+    residual: np.ndarray  # largest relative KKT residual of a plan
     weights: np.ndarray  # (steps, 24) in force at the end of each window
     refused: np.ndarray  # (steps,)
     seconds: np.ndarray  # (steps,) [s] of processor time that a window's gradient and step took
@@ -146,7 +148,7 @@ def _walk_case(
 ) -> Walked:
     """One walk of an arm; in a worker."""
     steps: list[Iteration] = []
-    took: list[float] = []
+    spent: list[float] = []
     online = retuner(config, robot, job.weights, job.command, effect, steps.append)
     last_tick = round(moment / config.tune.rollout.walk.gait.tick)
 
@@ -156,33 +158,37 @@ def _walk_case(
         count, start = len(steps), time.process_time()
         carry, weights = online.step(carry, tick, *measured)
         if len(steps) > count:
-            took.append(time.process_time() - start)
+            spent.append(time.process_time() - start)
         return carry, weights
 
     retune = None if arm == "fixed" else online._replace(step=step)
-    told = walk(config.tune.rollout.walk, robot, job, retune=retune)
-    middle, end = round(1e3 * moment), len(told.fallen)
-    found = [_loss(_cut(told, *span)) for span in ((0, middle), (middle, end))]
+    trajectory = walk(config.tune.rollout.walk, robot, job, retune=retune)
+    middle, end = round(1e3 * moment), len(trajectory.fallen)
+    halves = [_loss(_cut(trajectory, *span)) for span in ((0, middle), (middle, end))]
     spans = [(i, i + round(1e3 * WINDOW)) for i in range(0, end, round(1e3 * WINDOW))]
-    error = (told.state.position - told.reference.position)[:, 2]
-    courses = [np.asarray(weights_to_vector(s.weights)) for s in steps]
+    error = (trajectory.state.position - trajectory.reference.position)[:, 2]
+    weights = [np.asarray(weights_to_vector(s.weights)) for s in steps]
     return Walked(
-        halves=np.array([loss for loss, _ in found]),
-        parts=np.stack([parts for _, parts in found]),
-        loss=np.array([_loss(_cut(told, *span))[0] for span in spans]),
+        halves=np.array([loss for loss, _ in halves]),
+        parts=np.stack([parts for _, parts in halves]),
+        loss=np.array([_loss(_cut(trajectory, *span))[0] for span in spans]),
         height=np.array([error[:middle].mean(), error[middle:].mean()]),
-        fallen=np.asarray(told.fallen.any()),
-        weights=np.array(courses).reshape(-1, len(WEIGHT_NAMES)),
+        fallen=np.asarray(trajectory.fallen.any()),
+        residual=np.asarray(trajectory.residual.max()),
+        weights=np.array(weights).reshape(-1, len(WEIGHT_NAMES)),
         refused=np.array([not s.accepted for s in steps], bool),
-        seconds=np.array(took),
+        seconds=np.array(spent),
     )
 
 
 def plants(flags: Flags) -> dict[str, tuple[Imperfections, int]]:
     """Plants by name, and the seeds of their estimators."""
-    found = {"hfs": (named_world("hfs"), 0)}
-    found |= {f"hfs-varied {seed}": (named_world("hfs-varied", seed), 0) for seed in flags.varied}
-    return found | {f"stand-in {seed}": (standin(seed), seed) for seed in flags.standin}
+    varied = {f"hfs-varied {seed}": (named_world("hfs-varied", seed), 0) for seed in flags.varied}
+    return (
+        {"hfs": (named_world("hfs"), 0)}
+        | varied
+        | {f"stand-in {seed}": (standin(seed), seed) for seed in flags.standin}
+    )
 
 
 def start_weights(flags: Flags, trajectory: str, which: str) -> Weights:
@@ -242,7 +248,7 @@ def walk_cases(
                 yield case, future.result()
                 tell(done, len(running), " ".join(case))
 
-    like = Walked(*(np.zeros((0,) * n) for n in (1, 2, 1, 1, 0, 2, 1, 1)))
+    like = Walked(*(np.zeros((0,) * n) for n in (1, 2, 1, 1, 0, 0, 2, 1, 1)))
     paths = {case: path(case) for case in cases}
     return cached(paths, walked, like=lambda _: like, kind="online", robot=robot)
 
@@ -253,13 +259,13 @@ def main() -> None:
     setup_jax()
     starts = {(t, s): start_weights(flags, t, s) for t in flags.trajectories for s in flags.sets}
     robot = jax.tree.map(np.asarray, load_robot())
-    flags.out.mkdir(parents=True, exist_ok=True)
+    make_folder(flags.out)
     with workers(flags.processes) as pool:
         net = nets.ground(pool, robot, flags.data)
         effects = {"command": last_command, "net": as_effect(net.params)}
         effects = {name: jax.tree.map(np.asarray, effect) for name, effect in effects.items()}
-        found = walk_cases(pool, flags, robot, effects, starts)
-    print(report(flags, found))
+        walks = walk_cases(pool, flags, robot, effects, starts)
+    print(report(flags, walks))
 
 
 SPANS: dict[str, Callable[[Walked], float]] = {
@@ -270,11 +276,11 @@ SPANS: dict[str, Callable[[Walked], float]] = {
 
 
 def _changes(
-    found: Mapping[Case, Walked], cases: Sequence[Case], span: str, against: str
+    walks: Mapping[Case, Walked], cases: Sequence[Case], span: str, against: str
 ) -> np.ndarray:
     """By how many % L of a span is above that of the same walks by another arm."""
     of = SPANS[span]
-    return np.array([100 * (of(found[c]) / of(found[c._replace(arm=against)]) - 1) for c in cases])
+    return np.array([100 * (of(walks[c]) / of(walks[c._replace(arm=against)]) - 1) for c in cases])
 
 
 def _median(values: np.ndarray) -> str:
@@ -283,7 +289,7 @@ def _median(values: np.ndarray) -> str:
     return f"{np.median(values):+.1f} [{values.min():+.1f}, {values.max():+.1f}]"
 
 
-def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
+def table(flags: Flags, walks: Mapping[Case, Walked]) -> str:
     """L before and after the change by trajectory, start weights and arm."""
     names = list(plants(flags))
     head = ("trajectory", "start", "arm", "L before, 1e6", "L after, 1e6")
@@ -293,10 +299,10 @@ def table(flags: Flags, found: Mapping[Case, Walked]) -> str:
         for which in flags.sets:
             for arm in flags.arms:
                 cases = [Case(plant, trajectory, which, arm) for plant in names]
-                rows = [found[case] for case in cases]
+                rows = [walks[case] for case in cases]
                 halves = np.median([row.halves for row in rows], axis=0) / 1e6
                 change = [
-                    _median(_changes(found, cases, span, "fixed"))
+                    _median(_changes(walks, cases, span, "fixed"))
                     if arm != "fixed" and "fixed" in flags.arms
                     else ""
                     for span in ("before", "after")
@@ -316,110 +322,114 @@ def _spread(values: np.ndarray) -> str:
     )
 
 
-def verdicts(flags: Flags, found: Mapping[Case, Walked]) -> list[str]:
+def verdicts(flags: Flags, walks: Mapping[Case, Walked]) -> list[str]:
     """What each arm did after the change, over all walks, in a sentence each."""
-    told = []
+    sentences = []
     for arm in flags.arms:
         if arm == "fixed" or "fixed" not in flags.arms:
             continue
-        cases = [case for case in found if case.arm == arm]
-        after, end = (_changes(found, cases, span, "fixed") for span in ("after", "end"))
+        cases = [case for case in walks if case.arm == arm]
+        after, end = (_changes(walks, cases, span, "fixed") for span in ("after", "end"))
         text = (
             f"- `{arm}`, against weights that stay: L after the change {_spread(after)}; "
             f"of the last {2 * WINDOW:g} s {_spread(end)}"
         )
         if arm != "until" and "until" in flags.arms:
-            stopped = _changes(found, cases, "after", "until")
+            stopped = _changes(walks, cases, "after", "until")
             text += (
                 f". Against tuning until the change: {_spread(stopped)}; that is adapting to the "
                 f"payload and {flags.seconds - flags.change:g} s more of ordinary tuning"
             )
-        told.append(text + ".")
-    return told
+        sentences.append(text + ".")
+    return sentences
 
 
-def report(flags: Flags, found: Mapping[Case, Walked]) -> Path:
+def report(flags: Flags, walks: Mapping[Case, Walked]) -> Path:
     """Write the report with its pictures and its numbers as JSON.
 
     Args:
         flags: what was asked for.
-        found: the walks.
+        walks: the walks.
     """
     names = list(plants(flags))
-    took = np.concatenate([row.seconds for row in found.values()] or [np.zeros(0)])
+    spent = np.concatenate([row.seconds for row in walks.values()] or [np.zeros(0)])
     window = flags.window * TuneConfig().rollout.walk.gait.tick
-    times = WINDOW * (np.arange(round(flags.seconds / WINDOW)) + 0.5)
-    pictures = []
-    shown = [arm for arm in ("fixed", "until", "carried") if arm in flags.arms]
-    curves = {
-        (trajectory, which): {
-            arm: np.stack([found[Case(p, trajectory, which, arm)].loss for p in names])
-            for arm in shown
-        }
-        for trajectory in flags.trajectories
-        for which in flags.sets
-    }
-    caption = plots.while_walking(flags.out / "loss.png", flags.change, times, curves)
-    pictures.append(("loss.png", caption))
-    if "carried" in flags.arms:
-        for which in flags.sets:
-            courses = {}
-            for trajectory in flags.trajectories:
-                row = found[Case(names[0], trajectory, which, "carried")]
-                if len(row.weights):
-                    courses[trajectory] = row.weights / row.weights[0]
-            if not courses:  # no window ended within a walk
-                continue
-            ends = window * np.arange(1, 1 + max(len(c) for c in courses.values()))
-            file = f"weights-{which}.png"
-            caption = plots.weight_histories(
-                flags.out / file, flags.change, ends, WEIGHT_NAMES, courses
-            )
-            pictures.append((file, f"Start: {which}, plant {names[0]}. {caption}"))
-    about = environment()
     counts = {"plant": len(names), "trajectory": len(flags.trajectories), "start": len(flags.sets)}
     plural = {"plant": "plants", "trajectory": "trajectories", "start": "starts"}
     crossed = " x ".join(f"{n} {name if n == 1 else plural[name]}" for name, n in counts.items())
+    residual = max((float(row.residual) for row in walks.values()), default=0.0)
     text = [
-        "# Does tuning while walking help when the plant changes?",
-        made_at(about),
         f"A payload of {flags.payload:g} kg is put on the trunk {flags.change:g} s into walks of "
         f"{flags.seconds:g} s, on {', '.join(names)}. The weights take a step of at most 5 % (Q) "
         f"and 8 % (R) of themselves every {window:g} s, in force {10 * flags.late} ms after the "
-        "window that it was computed from.",
+        f"window that it was computed from. Worst relative KKT residual of a plan: {residual:.0e}.",
         "\n".join(f"- `{arm}`: {ARMS[arm]}" for arm in flags.arms),
         "## What came out",
         "Changes of L in %, median over the walks and, in brackets, the least and the largest. "
         f"The {math.prod(counts.values())} walks of an arm are {crossed}, not independent of each "
         "other:",
-        "\n".join(verdicts(flags, found)),
-        f"A gradient over {window:g} s of walking with its step took {1e3 * np.median(took):.0f} "
-        f"ms of processor time in the median, {1e3 * np.percentile(took, 5):.0f} to "
-        f"{1e3 * np.percentile(took, 95):.0f} ms from the 5th to the 95th percentile; the first of "
-        "a process is compiled."
-        if len(took)
+        "\n".join(verdicts(flags, walks)),
+        f"A gradient over {window:g} s of walking with its step took {1e3 * np.median(spent):.0f} "
+        f"ms of processor time in the median, {1e3 * np.percentile(spent, 5):.0f} to "
+        f"{1e3 * np.percentile(spent, 95):.0f} ms from the 5th to the 95th percentile; the first "
+        "of a process is compiled."
+        if len(spent)
         else "No arm was tuned.",
         "Before is the walk until the change and after the rest; where there are several plants, "
         "medians over them, and in brackets the least and the largest.",
-        table(flags, found),
+        table(flags, walks),
         "## Pictures",
-        *(f"![{name}]({name})\n\n{caption}" for name, caption in pictures),
     ]
-    told = {
+    numbers = {
         "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
-        "environment": about,
         "weights": WEIGHT_NAMES,
+        "residual": residual,
         "walks": {
             " / ".join(case): {name: value.tolist() for name, value in row._asdict().items()}
-            for case, row in found.items()
+            for case, row in walks.items()
         },
-        "seconds": {"median": float(np.median(took)), "least": float(took.min())}
-        if len(took)
+        "seconds": {"median": float(np.median(spent)), "least": float(spent.min())}
+        if len(spent)
         else None,
     }
-    write_json(flags.out / "online.json", told)
-    write_file(flags.out / "report.md", ("\n\n".join(text) + "\n").encode())
-    return flags.out / "report.md"
+    return write_report(
+        flags.out / "report.md",
+        "Does tuning while walking help when the plant changes?",
+        text,
+        numbers=numbers,
+        json_name="online.json",
+        pictures=_draw(flags, walks, names, window),
+    )
+
+
+def _draw(
+    flags: Flags, walks: Mapping[Case, Walked], names: Sequence[str], window: float
+) -> dict[str, str]:
+    """Captions of the pictures by their names."""
+    times = WINDOW * (np.arange(round(flags.seconds / WINDOW)) + 0.5)
+    arms = [arm for arm in plots.ARM_LINES if arm in flags.arms]
+    curves = {
+        (trajectory, which): {
+            arm: np.stack([walks[Case(p, trajectory, which, arm)].loss for p in names])
+            for arm in arms
+        }
+        for trajectory in flags.trajectories
+        for which in flags.sets
+    }
+    caption = plots.while_walking(flags.out / "loss.png", flags.change, times, curves)
+    captions = {"loss.png": caption}
+    for which in flags.sets if "carried" in flags.arms else ():
+        rows = {t: walks[Case(names[0], t, which, "carried")].weights for t in flags.trajectories}
+        histories = {t: weights / weights[0] for t, weights in rows.items() if len(weights)}
+        if not histories:  # no window ended within a walk
+            continue
+        ends = window * np.arange(1, 1 + max(map(len, histories.values())))
+        file = f"weights-{which}.png"
+        caption = plots.weight_histories(
+            flags.out / file, flags.change, ends, WEIGHT_NAMES, histories
+        )
+        captions[file] = f"Start: {which}, plant {names[0]}. {caption}"
+    return captions
 
 
 if __name__ == "__main__":

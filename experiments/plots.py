@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.artist import setp
 
 from hector_jax.report.plots import style
-from hector_jax.report.plots.style import SETS, category_axis, drawing, log_axis, looks_of, named
+from hector_jax.report.plots.style import SETS, category_axis, drawing, label_of, log_axis, looks_of
 
 
 def ratios(
@@ -26,7 +27,7 @@ def ratios(
         axes, looks = figure.subplots(), looks_of(sets)
         for i, (name, values) in enumerate(sets.items()):
             x = np.arange(len(columns)) + width * (i - (len(sets) - 1) / 2)
-            axes.plot(x, values, markersize=6, label=named(name), **looks[name].dot)
+            axes.plot(x, values, markersize=6, label=label_of(name), **looks[name].dot)
         axes.axhline(1.0, color="black", linewidth=0.8)
         category_axis(axes, columns)
         log_axis(axes, "y")
@@ -45,7 +46,7 @@ def by_plant(path: Path, sets: Mapping[str, Float[np.ndarray, " plants"]]) -> st
         axes = figure.subplots()
         for name, look in looks_of(sets).items():
             share = 100 * (np.arange(len(sets[name])) + 0.5) / len(sets[name])
-            line = {"marker": look.marker, "label": named(name), **look.line}
+            line = {"marker": look.marker, "label": label_of(name), **look.line}
             axes.plot(share, np.sort(sets[name]) / 1e6, **line)
         log_axis(axes, "y")
         axes.set(xlabel="plants [%], by their loss", ylabel="L [10$^6$]", xlim=(0, 100))
@@ -74,7 +75,7 @@ def front(
             panel.plot(*points.T, "o-", color=style.GREEN, label="tuned")
             if world == list(worlds)[-1]:
                 for name, look in looks_of(others).items():
-                    panel.plot(*np.divide(others[name], 1e6), label=named(name), **look.dot)
+                    panel.plot(*np.divide(others[name], 1e6), label=label_of(name), **look.dot)
             paper = int(np.argmin(np.abs(np.log(factors))))
             places = {0: (6, 0, "left"), paper: (-6, -4, "right"), -1: (0, 6, "center")}
             for i, (x, y, side) in places.items():
@@ -117,11 +118,15 @@ def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
     return "Loss on the model by iteration from each start, and the losses at the end in order."
 
 
-_ARMS = {
-    "fixed": ("weights stay", SETS["nominal"]),
-    "until": ("tuned until the change", SETS["without"]),
-    "carried": ("tuned all the way", SETS["with"]),
+ARMS = {  # what happens to the weights along a walk
+    "fixed": "weights stay",
+    "until": "tuned until the change",
+    "carried": "tuned all the way",
+    "cut": "sensitivities begun anew in each window",
+    "model": "the model's own walk from each window's first state",
+    "plain": "no net: the plain rigid body",
 }
+ARM_LINES = {"fixed": SETS["nominal"], "until": SETS["without"], "carried": SETS["with"]}
 
 
 def while_walking(
@@ -144,13 +149,13 @@ def while_walking(
         panels = figure.subplots(len(rows), len(columns), sharex=True, squeeze=False)
         for (trajectory, start), arms in curves.items():
             panel = panels[rows.index(start), columns.index(trajectory)]
-            panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            panel.axvline(change, **style.MARK)
             for arm, losses in arms.items():
-                label, look = _ARMS[arm]
-                panel.plot(times, np.median(losses, axis=0) / 1e6, **look, label=label)
+                median = np.median(losses, axis=0) / 1e6
+                panel.plot(times, median, **ARM_LINES[arm], label=ARMS[arm])
             panel.set(title=f"{trajectory}, from {start}", ylim=(0, 1.05 * panel.get_ylim()[1]))
-        style.set_all(panels[-1], xlabel="time [s]")
-        style.set_all(panels[:, 0], ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
+        setp(panels[-1], xlabel="time [s]")
+        setp(panels[:, 0], ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
     return "Loss along the walk, median over the plants; the line is where the plant changes."
 
 
@@ -181,7 +186,7 @@ def weight_histories(
     with drawing(path, 3.3 * len(histories) + 0.2, 3.4, legend_columns=0) as figure:
         panels = figure.subplots(1, len(histories), squeeze=False)[0]
         for panel, (trajectory, ratios) in zip(panels, histories.items(), strict=True):
-            panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            panel.axvline(change, **style.MARK)
             moved = np.abs(np.log(ratios[:, single])).max(axis=0)
             for i, (color, mark) in zip(np.argsort(-moved), looks, strict=False):
                 label = style.weight_label(names[single[int(i)]].removesuffix("_left"))
@@ -266,7 +271,7 @@ def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
             ratio = np.array([row[name].ratio for row in rows.values()])
             stood = 100 * np.array([row[name].survived for row in rows.values()])
             for panel, (value, low, high) in zip(panels, (ratio.T, stood.T), strict=True):
-                panel.plot(value, y, **look.dot, label=named(name))
+                panel.plot(value, y, **look.dot, label=label_of(name))
                 panel.hlines(y, low, high, color=look.color, linewidth=1.2)
         panels[0].axvline(1.0, color="black", linewidth=0.8, zorder=1)
         panels[0].set_xlabel(f"median of L / L of {baseline}")
@@ -291,8 +296,9 @@ def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -
     with drawing(path, 4.6, 4.4, legend_columns=3) as figure:
         axes: Any = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
         for name, look in looks_of(endured).items():
-            line = {"marker": look.marker, "markersize": 3.5, "label": named(name), **look.line}
-            axes.plot(angles, np.append(endured[name], endured[name][0]), **line)
+            line = {"marker": look.marker, "label": label_of(name), **look.line}
+            forces = np.append(endured[name], endured[name][0])
+            axes.plot(angles, forces, markersize=3.5, **line)
         axes.set_rmin(0.0)
         axes.set_rlabel_position(22.5)
         axes.yaxis.set_major_formatter(lambda force, _: f"{force:g} N")
@@ -387,6 +393,6 @@ def ranks(
             low, high = panel.get_ylim()
             panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
             log_axis(panel, "y")
-        style.set_all(panels[-1], xlabel="L on the hfs [10$^6$]")
-        style.set_all(panels[:, 0], ylabel="L on the model [10$^6$]")
+        setp(panels[-1], xlabel="L on the hfs [10$^6$]")
+        setp(panels[:, 0], ylabel="L on the model [10$^6$]")
     return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."

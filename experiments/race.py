@@ -28,16 +28,18 @@ import numpy as np
 import optimizers
 import plots
 import tyro
+from lib import write_report
 from lockstep import BenchmarkResult, Round, benchmark, lowest, walks
 from optimizers import Bayes, CmaEs, Differences, Given, Optimizer, Random, Steps, adam, steps_to
 
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.core.console import bar, exit_code, made_at, say
+from hector_jax.core.console import bar, exit_code, say
 from hector_jax.core.environment import environment
-from hector_jax.core.files import make_folder, write_file, write_json
+from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.settings import AT_LEAST_ONE, Range, check
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
@@ -79,9 +81,8 @@ class Flags:
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:
-        for name, least in {"rollouts": 1, "repeats": 1, "batch": 4, "processes": 1}.items():
-            if getattr(self, name) < least:
-                raise InputError(f"--{name} must be at least {least}, got {getattr(self, name)}")
+        one = AT_LEAST_ONE
+        check(self, rollouts=one, repeats=one, ticks=one, batch=Range(4), processes=one)
 
 
 class ModelRun(NamedTuple):
@@ -261,11 +262,10 @@ def race(
         return {name: future.result() for name, future in running.items()}
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        every = {flags.traj: [weights for each in sets.values() for weights in each]}
-        found = searches.losses_on_hfs(pool, config, robot, every, engine=engine, at_once=size)
-        losses = found[flags.traj]
-        ends = np.cumsum([len(each) for each in sets.values()])
-        return dict(zip(sets, np.split(losses, ends[:-1]), strict=True))
+        own = dict.fromkeys(sets, command)
+        return searches.losses_on_hfs(
+            pool, config, robot, sets, engine=engine, at_once=size, own=own
+        )
 
     with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as tell:
 
@@ -366,7 +366,7 @@ def as_numbers(flags: Flags, results: Results) -> dict[str, dict[str, Any]]:
 
 def report(flags: Flags, results: Results) -> Path:
     """Write the report with its pictures and its numbers as JSON; returns its path."""
-    numbers, about = as_numbers(flags, results), environment()
+    numbers = as_numbers(flags, results)
     rows = [
         [
             plots.METHODS[method],
@@ -394,18 +394,20 @@ def report(flags: Flags, results: Results) -> Path:
     data = {
         "flags": {n: str(v) for n, v in asdict(flags).items()},
         "engine": results.engine,
-        "environment": about,
         "start": results.start,
         "prices": results.prices._asdict(),
         "took": results.took,
         "courses": {name: run._asdict() for name, run in results.model.items()},
         "methods": numbers,
     }
-    write_json(out / "race.json", data)
-    text = ["# The race", made_at(about), *_text(flags, results, markdown_table(head, rows))]
-    text += [f"![{name}]({name})\n\n{caption}" for name, caption in captions.items()]
-    write_file(out / "report.md", ("\n\n".join(text) + "\n").encode())
-    return out / "report.md"
+    return write_report(
+        out / "report.md",
+        "The race",
+        _text(flags, results, markdown_table(head, rows)),
+        numbers=data,
+        json_name="race.json",
+        pictures=captions,
+    )
 
 
 def _text(flags: Flags, results: Results, table: str) -> list[str]:

@@ -12,9 +12,9 @@ from table_report import PAPER, paper_change
 from hector_jax.core.console import say
 from hector_jax.core.trajectory import Trajectory, from_start
 from hector_jax.report.motion import motions
-from hector_jax.report.plots.style import drawing, log_axis, looks_of, named
-from hector_jax.report.plots.walks import FRAME, draw_path, draw_tracking, span_of
-from hector_jax.report.report import Picture
+from hector_jax.report.plots.style import drawing, label_of, log_axis, looks_of
+from hector_jax.report.plots.walks import draw_path, draw_tracking, span_of
+from hector_jax.report.report import Picture, caption
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.robot.model import Robot
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
@@ -52,8 +52,8 @@ def draw(
         file = f"pictures/{trajectory}.png"
         with tempfile.TemporaryDirectory() as folder:
             strip = _snapshots(Path(folder) / "strip.png", robot, by_set)
-            caption = collective(out / file, by_set, strip)
-        pictures.append(Picture(file, f"{trajectory}: {caption}"))
+            text = collective(out / file, by_set, strip)
+        pictures.append(Picture(file, f"{trajectory}: {text}"))
     return pictures
 
 
@@ -96,17 +96,12 @@ def changes(
             percent = lambda r, _: f"{100 * (r - 1):+.0f}" if r != 1 else "0"  # noqa: E731
             row[0].xaxis.set_major_formatter(percent)
         first = panels[0, 0]
-        first.set_yticks(range(len(names)), [named(name) for name in names])
+        first.set_yticks(range(len(names)), [label_of(name) for name in names])
         first.set_ylim(len(names) - 0.5, -0.5)
         first.plot([], [], "o", color="0.4", alpha=0.5, label="one plant")
         cross = {"color": "0.2", "markersize": 11, "mew": 2.2}
         first.plot([], [], "+", **cross, label="median and its interval")
-    return (
-        "L of each set against that of nominal and expert on the same plant, one dot per plant, "
-        "with the median and its 95 % bootstrap interval; left of the line is better. Plants on "
-        "which the set fell have no dot, their number stands at the right; the median counts them. "
-        "Diamonds are the paper's table, after ten iterations."
-    )
+    return caption("changes")
 
 
 def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline: str) -> None:
@@ -164,9 +159,4 @@ def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | No
             above, beside = next(rows).subfigures(1, 2, width_ratios=[share, 1.0 - share])
         draw_path(above.subplots(), walks)
         draw_tracking(beside.subplots(2, 3, sharex=True), main)
-    seen = "" if image is None else "Snapshots; "
-    return (
-        f"{seen}path of the centre of mass from above, foot marks those of `{list(walks)[-1]}`; "
-        f"errors against the reference of {', '.join(main)}, ahead and left as it faces. "
-        f"One stand-in plant. {FRAME}"
-    )
+    return caption("collective", snapshots=image is not None, last=list(walks)[-1], main=main)

@@ -22,7 +22,7 @@ from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import alignment
 import jax
@@ -30,7 +30,7 @@ import lib
 import numpy as np
 import plots
 import tyro
-from lib import write_report
+from lib import check_names, write_report
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.legs import LegConfig
@@ -81,22 +81,15 @@ class Flags:
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
     lead: int = 40  # ticks in place before t = 0 on the model, beside none
     ranks: int = 64  # weight sets about nominal for each rank correlation; 0 leaves them out
-    effort_about: str = "zero"  # or weight: see MpcConfig
+    effort_about: Literal["zero", "weight"] = "zero"  # see MpcConfig
     stance_weight: bool = False  # see LegConfig
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:
         if not self.sets:
             raise InputError(f"Flags.sets must name one at least of {', '.join(SETS)}, got none")
-        for name in self.sets:
-            if name not in SETS:
-                raise InputError(f"Flags.sets must be of {', '.join(SETS)}, got {name!r}")
-        for name in self.tuned:
-            if name not in self.trajectories:
-                raise InputError(
-                    f"Flags.tuned must be of the trajectories {', '.join(self.trajectories)}, "
-                    f"got {name!r}"
-                )
+        check_names("sets", self.sets, SETS)
+        check_names("tuned", self.tuned, self.trajectories)
 
 
 class Walked(NamedTuple):
@@ -176,8 +169,8 @@ def tuned_sets(
     }
     commit = environment().get("commit", "")
     title = "tuning, ten iterations"
-    found = tunings.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
-    return {**given, **{name: tuned.tuning.ten for name, tuned in found.items()}}
+    results = tunings.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
+    return {**given, **{name: tuned.tuning.ten for name, tuned in results.items()}}
 
 
 def _walked(walk: Trajectory) -> Walked:
@@ -236,9 +229,9 @@ def _model_job(
     rows = []
     for weights, command, tick in points:
         anchor = standing_anchor(robot, tick)
-        found = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
-        row = alignment.as_directions(weights, found.gradient)
-        rows.append(np.where(rejection_reason(config, found), np.nan, row))
+        evaluation = jax.device_get(tune_step(config, robot, weights, command, anchor, effect))
+        row = alignment.as_directions(weights, evaluation.gradient)
+        rows.append(np.where(rejection_reason(config, evaluation), np.nan, row))
     losses = [
         float(_model_loss(config, robot, weights, command, standing_anchor(robot, tick), effect))
         for weights, command, tick in others
@@ -250,9 +243,7 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
     """Evaluate gradients and losses on the model and on the hfs."""
     robot = jax.tree.map(np.asarray, load_robot())
     walk = WalkConfig(
-        mpc=MpcConfig(
-            effort_reference="gravity" if flags.effort_about == "weight" else flags.effort_about
-        ),
+        mpc=MpcConfig(effort_reference="gravity" if flags.effort_about == "weight" else "zero"),
         legs=LegConfig(gravity_compensation=flags.stance_weight),
     )
     configs = {
@@ -298,12 +289,12 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
             for done, _ in enumerate(as_completed(running.values()), 1):
                 on(done, len(running), "")
     shape = len(flags.sets), len(commands), len(flags.phases)
-    believed = [np.where(walked[key].fallen, np.nan, walked[key].loss) for key in starts]
+    losses = [np.where(walked[key].fallen, np.nan, walked[key].loss) for key in starts]
     clouds = len(commands), len(FACTORS), flags.ranks, len(flags.phases)
     return Result(
         engine,
         walked,
-        truth=alignment.slopes(np.reshape(believed, (*shape, -1, 2))),
+        truth=alignment.slopes(np.reshape(losses, (*shape, -1, 2))),
         gradients={kind: job.result()[0].reshape(*shape, -1) for kind, job in running.items()},
         hfs_losses=np.reshape([walked[key].loss for key in sampled], clouds),
         losses={kind: job.result()[1].reshape(clouds) for kind, job in running.items()},
@@ -370,8 +361,8 @@ def report(flags: Flags, result: Result) -> Path:
         "engine": result.engine,
         "weights": DIRECTION_NAMES,
         "rows": {
-            which: {": ".join(key): alignment.as_result(row) for key, row in found.items()}
-            for which, found in rows.items()
+            which: {": ".join(key): alignment.as_result(row) for key, row in of_set.items()}
+            for which, of_set in rows.items()
         },
         "ranks": {": ".join(key): row for key, row in ranks.items()},
         "fell": fell,

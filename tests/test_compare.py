@@ -11,6 +11,7 @@ from rich.console import Console
 from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
+from hector_jax.core.inputs import InputError
 from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.tensorboard import write_events
 from hector_jax.runs.folder import load_run, read_metrics
@@ -170,6 +171,13 @@ def test_tensorboard_gets_the_numbers_of_the_metrics(runs, tmp_path):
     assert [found["step/accepted", step] for step in range(3)] == [1.0, 0.0, 1.0]
     assert [found["weights/Q_x", step] for step in range(3)] == [50.0, 51.0, 52.0]
     assert found["gradient_log/Q_x", 1] == -1.0
+
+
+def test_events_are_not_written_where_no_folder_can_be(runs, tmp_path):
+    pytest.importorskip("tensorboardX")
+    (tmp_path / "events").write_text("a file")
+    with pytest.raises(InputError, match=r"cannot write to .*/events/with: Not a directory"):
+        write_events(runs[0], tmp_path / "events")
 
 
 def test_without_its_package_tensorboard_says_which(monkeypatch, runs, tmp_path):

@@ -221,7 +221,9 @@ def test_the_site_is_built_without_a_warning_and_asks_nobody_for_anything(tmp_pa
     outside = re.compile(r"<(?:script|link|img|iframe)[^>]+(?:src|href)=\"(?:https?:)?//", re.I)
     for path in (tmp_path / "site").rglob("*.html"):
         assert not outside.search(path.read_text()), path
-    for path in (tmp_path / "site").rglob("*.css"):
+    styles = list((tmp_path / "site").rglob("*.css"))
+    assert styles
+    for path in styles:
         assert not re.search(r"@import|url\([\"']?(?:https?:)?//", path.read_text()), path
     theory = (tmp_path / "site" / "theory.html").read_text()
     assert theory.count("<math") > 40

@@ -1,18 +1,23 @@
 """Scripts of experiments/ refuse what they cannot use, before anything is computed."""
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from lib import made_at
 
 from hector_jax.control.weights import nominal
 from hector_jax.control.weights_file import save_weights
-from hector_jax.core.console import exit_code, made_at
+from hector_jax.core.console import exit_code
 from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError
+from hector_jax.robot.model import load_robot
 
 FOLDER = Path(__file__).parents[1] / "experiments"
 
@@ -124,3 +129,87 @@ def test_a_race_on_another_engine_collects_as_every_run_does(tmp_path, monkeypat
     monkeypatch.setattr(race.nets.TrainedNet, "params", None, raising=False)
     race.prepare(None, race.Flags(engine="c", out=tmp_path), None)
     assert made == [race.nets.CollectConfig()]  # what `ground` takes up
+
+
+@pytest.mark.parametrize(
+    ("flags", "fault"),
+    [
+        ({"trajectories": ("strait",)}, "did you mean 'straight'"),
+        ({"late": 40}, "OnlineConfig.late must be below window, got 40"),
+        ({"payload": -1.0}, "Flags.payload must be a number of at least 0, got -1"),
+        ({"varied": (-1,)}, "Flags.varied must be .* from 0 to 4294967295, got"),
+        ({"processes": 0}, "Flags.processes must be a whole number of at least 1, got 0"),
+    ],
+)
+def test_online_checks_its_flags_before_the_ground_is_made(flags, fault):
+    with pytest.raises(InputError, match=fault):
+        script("online").Flags(**flags)
+
+
+def test_online_reports_the_worst_plan_of_any_walk(tmp_path):
+    online = script("online")
+    arms = ("fixed", "carried")
+    short = {"trajectories": ("s",), "sets": ("nominal",), "seconds": 0.8, "change": 0.4}
+    flags = online.Flags(out=tmp_path, arms=arms, **short)
+    walks = {}
+    for arm, residual in (("fixed", 1e-9), ("carried", 3e-4)):
+        steps = 2 * (arm == "carried")
+        walks[online.Case("hfs", "s", "nominal", arm)] = online.Walked(
+            halves=np.ones(2),
+            parts=np.ones((2, 3)),
+            loss=np.ones(2),
+            height=np.zeros(2),
+            fallen=np.array(False),
+            residual=np.array(residual),
+            weights=np.ones((steps, 24)),
+            refused=np.zeros(steps, bool),
+            seconds=np.full(steps, 0.1),
+        )
+    path = online.report(flags, walks)
+    assert "Worst relative KKT residual of a plan: 3e-04." in path.read_text()
+    assert "![weights-nominal.png](weights-nominal.png)" in path.read_text()
+    numbers = json.loads((tmp_path / "online.json").read_text())
+    assert numbers["residual"] == 3e-4
+    assert numbers["walks"]["hfs / s / nominal / fixed"]["residual"] == 1e-9
+
+
+def test_transfer_prices_effort_about_zero_or_the_weight(monkeypatch, tmp_path, capsys):
+    arguments = ["transfer.py", "--effort-about", "weigth", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit) as ended:
+        script("transfer").main()
+    assert ended.value.code == 2
+    assert "zero" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        ("Shared", {"iterations": 0}),
+        ("Robust", {"variations": 0}),
+        ("Robust", {"plants": -1}),
+        ("Front", {"points": 1}),
+        ("Front", {"decades": float("nan")}),
+        ("Starts", {"factor": 1.0}),
+        ("Starts", {"starts": 0}),
+        ("Verdict", {"out": Path(), "seeds": 0}),
+        ("Verdict", {"out": Path(), "first_seed": -1}),
+    ],
+)
+def test_batch_refuses_numbers_that_it_cannot_use(kind, wrong):
+    name = list(wrong)[-1]
+    with pytest.raises(InputError, match=rf"{kind}.{name} must be a (whole )?number .*, got"):
+        getattr(script("batch"), kind)(**wrong)
+
+
+def test_batch_has_nothing_to_compare_with_where_nominal_is_refused(monkeypatch):
+    batch = script("batch")
+    stops = np.array([batch.Stop.SMALL_STEP, batch.Stop.BAD_START])
+    tunings = SimpleNamespace(stop=stops)
+    monkeypatch.setattr(batch, "tune_batch", lambda *_, **__: tunings)
+    problems = [batch.problem(nominal(), [batch.scenario(load_robot(), batch.HELD_BACK)])] * 2
+    arguments = batch.Starts(), None, None, problems, "starts"
+    with pytest.raises(InputError, match="starts: the nominal weights are refused at their first"):
+        batch.tune(*arguments)
+    assert batch.tune(*arguments, slice(1)) is tunings  # the others do not start at nominal

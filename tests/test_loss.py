@@ -14,7 +14,7 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.grfm.effect import last_command
-from hector_jax.report.report import parts_table, verdict_table
+from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics
 from hector_jax.runs.folder import as_line
@@ -190,8 +190,9 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     assert result["alpha"]["L_sway"] == 1e4
     mean = result["sets"]["mine"]["standin"]["L_sway"]["mean"]
     assert mean == walks[0].losses["L_sway"]
-    assert "L_sway" in verdict_table(verdict).splitlines()[0]
-    assert "L_sway [m^2/s^2]" in parts_table(verdict)
+    text = render("verdict.md.j2", verdict=verdict)
+    assert "L_sway" in text.splitlines()[0]
+    assert "L_sway [m^2/s^2]" in text
     assert TuneConfig.from_table("here", config.as_table(), loss) == config
     with pytest.raises(InputError, match="no term 'L_sway'"):
         TuneConfig.from_table("here", config.as_table())

@@ -14,7 +14,7 @@ from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.motion import COLOURS, motions
-from hector_jax.report.plots.style import looks_of, named
+from hector_jax.report.plots.style import label_of, looks_of
 from hector_jax.report.plots.walks import distances
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -99,7 +99,7 @@ def test_the_four_sets_of_most_pictures_stay_apart_in_grey():
 
 def test_a_legend_begins_with_the_names_of_the_tables():
     for name in (*FOUR, "with_ten", "shared_mean", "ceiling", "mine"):
-        assert named(name).split(" (")[0] == name
+        assert label_of(name).split(" (")[0] == name
 
 
 def test_the_collective_figure_has_the_four_sets_and_the_ceiling(tmp_path, drawn, walks):
@@ -108,9 +108,9 @@ def test_the_collective_figure_has_the_four_sets_and_the_ceiling(tmp_path, drawn
     assert "of nominal, expert, without, with," in caption
     path, *panels = drawn[0].axes
     drawn_lines = {label for label in lines(path) if not label.endswith("set down")}
-    assert drawn_lines == {named(name) for name in (*FOUR, "ceiling")} | {"reference"}
+    assert drawn_lines == {label_of(name) for name in (*FOUR, "ceiling")} | {"reference"}
     for panel in panels:
-        assert {label for label in lines(panel) if label[0] != "_"} == set(map(named, FOUR))
+        assert {label for label in lines(panel) if label[0] != "_"} == set(map(label_of, FOUR))
 
 
 def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):

@@ -106,7 +106,11 @@ def test_the_table_goes_without_baselines_that_were_not_walked():
 
 def test_one_plant_is_told_in_the_singular_and_without_an_interval():
     one = pretend_verdict(1)
-    for text in (_printed(one), report.verdict_table(one), " ".join(report.legend(one))):
+    for text in (
+        _printed(one),
+        report.render("verdict.md.j2", verdict=one),
+        " ".join(report.legend(one)),
+    ):
         assert "1 plants" not in text
         assert "seeds 0" not in text
         assert "[9" not in text

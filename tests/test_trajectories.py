@@ -1,5 +1,6 @@
 """Trajectories of one's own: what a file may say, and what is told of one that asks too much."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -134,8 +135,7 @@ def test_what_is_beyond_the_limits_is_told_by_segment_value_and_range(rows, told
     command = Command(np.ones(len(rows)), rows[:, :2], rows[:, 2])
     said = beyond(LIMITS, command)
     assert said is not None
-    with pytest.raises(ValueError, match=told):
-        raise ValueError(said)
+    assert re.search(told, said)
 
 
 # On the command line

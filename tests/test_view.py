@@ -290,7 +290,7 @@ def test_the_address_is_told_before_anything_is_walked(model, tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        view.serve(walk, model, tmp_path, told.append, port=0)
+        view.serve(walk, model, tmp_path, told.append, host="127.0.0.1", port=0)
     assert told[0].startswith("http://127.0.0.1:")
     assert told[1:] == ["walking"]
 

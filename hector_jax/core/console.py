@@ -3,15 +3,13 @@
 import errno
 import os
 import select
-import shlex
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
@@ -196,14 +194,3 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     except OSError:
         _drop(sys.stderr)
     return code
-
-
-def made_at(environment: Mapping[str, str]) -> str:
-    """Line of a report that tells where it comes from: the commit, and the script with its flags.
-
-    Args:
-        environment: `evaluation.report.environment`; without a commit outside of a checkout.
-    """
-    script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
-    command = shlex.join(["python", script, *sys.argv[1:]])
-    return f"Made at {environment.get('commit', 'an unknown commit')} by `{command}`."

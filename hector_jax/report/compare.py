@@ -1,7 +1,8 @@
 """Several finished runs side by side: as JSON values, and as a table on the terminal."""
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,9 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
 def _verdict(run: Run, name: str) -> dict[str, Any]:
     try:
         verdict = run.result["sets"][name]["standin"]
-        for part in ("L", "L_ctrl"):  # used below: a file without them is refused here
-            float(verdict[part]["mean"])
-        for change in verdict["change"].values():
-            _ = [change[key] for key in ("median", "low", "high", "counts")]
-        return {**verdict, "seeds": len(verdict["seeds"]), "falls": int(verdict["falls"])}
+        verdict = verdict | {"seeds": len(verdict["seeds"]), "falls": int(verdict["falls"])}
+        _cells(name, verdict)  # a file without what is printed is refused here
+        return verdict
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(
             f"{Path(run.name) / RESULT}: set {name} has no verdict on the stand-in"
@@ -84,37 +83,35 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
         comparison: of `compare_runs`.
         console: where to print; None takes stdout.
     """
-    runs = comparison["runs"]
+    runs, differ = comparison["runs"], comparison["differ"]
     console = plain_console(console, width=60 + 60 * len(runs))
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("on the hardware stand-in", no_wrap=True)
     for run in runs:
         table.add_column(Text("/".join(Path(run["run"]).parts[-2:])), justify="right")
 
-    def add(title: str, cells: Sequence[str | None]) -> None:
-        table.add_row(Text(title), *(Text(cell or "-") for cell in cells))
+    def add(title: str, cells: Iterable[Any]) -> None:
+        table.add_row(Text(title), *(Text("-" if cell is None else str(cell)) for cell in cells))
 
     for name in dict.fromkeys(name for run in runs for name in run["sets"]):
-        columns = [_cells(run["sets"][name]) if name in run["sets"] else {} for run in runs]
+        columns = [_cells(name, run["sets"][name]) if name in run["sets"] else {} for run in runs]
         for title in max(columns, key=len):
-            add(title.format(name), [column.get(title) for column in columns])
+            add(title, (column.get(title) for column in columns))
         table.add_section()
     for name in dict.fromkeys(name for run in runs for name in run["tuning"]):
         counts = [run["tuning"].get(name) for run in runs]
-        texts = [one and f"{one['iterations']} ({one['refused']})" for one in counts]
+        texts = (one and f"{one['iterations']} ({one['refused']})" for one in counts)
         add(f"{name}: iterations (refused)", texts)
     seconds = [run["seconds"] for run in runs]
-    add("time [s]", [None if s is None else f"{s:.0f}" for s in seconds])
-    commits = [run["versions"].get("commit", "-").split() for run in runs]
-    add("commit", [" ".join([one[0][:10], *one[1:]]) for one in commits])
-    for kind, rows in comparison["differ"].items():
+    add("time [s]", (None if s is None else f"{s:.0f}" for s in seconds))
+    add("commit", (re.sub(r"^(\w{10})\w*", r"\1", r["versions"].get("commit", "-")) for r in runs))
+    for kind, rows in differ.items():
         table.add_section()
         for name, values in rows.items():
             if name != "commit":
-                texts = [None if value is None else str(value) for value in values]
-                add(f"{kind}: {name}", texts)
+                add(f"{kind}: {name}", values)
     console.print(table)
-    if len(runs) > 1 and not any(comparison["differ"].values()):
+    if len(runs) > 1 and not any(differ.values()):
         console.print("All settings and versions are the same.")
     note = (
         "L and L_ctrl are means over the plants, changes medians of L with 95 % intervals; "
@@ -123,15 +120,16 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
     console.print(Text(note, style="dim"))
 
 
-def _cells(verdict: Mapping[str, Any]) -> dict[str, str]:
+def _cells(name: str, verdict: Mapping[str, Any]) -> dict[str, str]:
     """One weight set of one run, by the title of the row."""
-    cells = {"{}: L [1e6]": f"{verdict['L']['mean'] / 1e6:.3f}"}
+    cells = {f"{name}: L [1e6]": f"{verdict['L']['mean'] / 1e6:.3f}"}
     for baseline in BASELINES:
         if change := verdict["change"].get(baseline):
             # null where there is no interval
             ends = (math.nan if change[key] is None else change[key] for key in ("low", "high"))
             text = Interval(change["median"], *ends).text()
             cells[f"  against {baseline} [%]"] = text + VOID * (not change["counts"])
-    cells["  L_ctrl [1e6]"] = f"{verdict['L_ctrl']['mean'] / 1e6:.3f}"
-    cells["  falls"] = f"{verdict['falls']} of {verdict['seeds']}"
-    return cells
+    return cells | {
+        "  L_ctrl [1e6]": f"{verdict['L_ctrl']['mean'] / 1e6:.3f}",
+        "  falls": f"{verdict['falls']} of {verdict['seeds']}",
+    }

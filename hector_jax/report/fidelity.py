@@ -6,8 +6,7 @@ compared with where the robot was. The row `measured` moves it by the measured w
 that is left there is not due to the ground, but to a rigid body standing for a robot with legs.
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,9 +24,10 @@ from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.grfm.dataset import Dataset, make_dataset
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.grfm.training import predict
-from hector_jax.report.report import WORLDS, Picture, markdown_table, render
+from hector_jax.report.report import WORLDS, Picture, render
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
+from hector_jax.runs.folder import RESULT
 
 PHASES = {  # time [s] since the switch of stance
     "first 30 ms": (0.0, 0.03),
@@ -37,9 +37,8 @@ PHASES = {  # time [s] since the switch of stance
 HORIZONS = (0.2, 0.4)  # [s]
 FIRST, APART = 5, 35  # ticks: of the first prediction in a walk, and from one to the next
 
-_AXES = {"F_x": "N^2", "F_y": "N^2", "F_z": "N^2"}
-_AXES |= {"M_x": "(N m)^2", "M_y": "(N m)^2", "M_z": "(N m)^2"}
-_CONTACTS = ("stance", "swing")
+_UNITS = {"force": "N^2", "moment": "(N m)^2"}
+_AXES = {f"{kind[0].upper()}_{axis}": kind for kind in _UNITS for axis in "xyz"}
 
 
 class Drift(NamedTuple):
@@ -94,7 +93,7 @@ def _ahead(
     def step(state: State, j: Int[Array, ""]) -> tuple[State, State]:
         yaw = state.euler[2]
         if effect is None:
-            returned, push = jax.tree.map(lambda w: w[j], walk.effect), None
+            ground, push = jax.tree.map(lambda w: w[j], walk.effect), None
         else:
             past = j - jnp.arange(HISTORY)
             window = Window(
@@ -104,10 +103,10 @@ def _ahead(
                 base=from_yaw_frame(state),
             )
             effects = effect(window)
-            returned, push = turn(effects.wrench, yaw), turn(effects.legs, yaw)
+            ground, push = turn(effects.wrench, yaw), turn(effects.legs, yaw)
         feet = 0.5 * (walk.feet[j - 1] + walk.feet[j])
-        moved = srbm.step(robot, state, returned, feet, config.tick, push)
-        return moved, moved
+        later = srbm.step(robot, state, ground, feet, config.tick, push)
+        return later, later
 
     begin = jax.tree.map(lambda s: s[first - 1], walk.state)
     return jax.lax.scan(step, begin, first + jnp.arange(ticks))[1]
@@ -137,23 +136,23 @@ def drift(
     if not len(starts):
         raise InputError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
 
-    def errors(
+    def ahead(
         effect: jax.tree_util.Partial | None, walk: Trajectory, start_tick: Array, first: Array
-    ) -> tuple[Array, Array]:
-        guess = _ahead(config, robot, effect, walk, start_tick, first, ticks)
-        true = jax.tree.map(lambda s: jax.lax.dynamic_slice_in_dim(s, first, ticks), walk.state)
-        return (
-            jnp.sum((guess.position - true.position) ** 2, axis=-1),
-            jnp.sum((guess.euler - true.euler) ** 2, axis=-1),
-        )
+    ) -> State:
+        return _ahead(config, robot, effect, walk, start_tick, first, ticks)
 
-    over_starts = jax.vmap(errors, in_axes=(None, None, None, 0))
-    position, euler = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
+    over_starts = jax.vmap(ahead, in_axes=(None, None, None, 0))
+    guess = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
         effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
     )
-    whole = np.stack([~fallen[:, s : s + ticks].any(axis=1) for s in starts], axis=1)
-    rms = lambda square: np.sqrt(_mean(np.asarray(square)[whole]))  # noqa: E731
-    return Drift(config.tick * np.arange(1, ticks + 1), rms(position), rms(euler))
+    spans = starts[:, None] + np.arange(ticks)
+    whole = ~fallen[:, spans].any(axis=-1)
+
+    def rms(name: str) -> Float[np.ndarray, " ticks"]:
+        error = np.asarray(getattr(guess, name)) - getattr(walks.state, name)[:, spans]
+        return np.sqrt(_mean(np.sum(error**2, axis=-1)[whole]))
+
+    return Drift(config.tick * np.arange(1, ticks + 1), rms("position"), rms("euler"))
 
 
 def drifts(
@@ -163,8 +162,8 @@ def drifts(
     start_tick: Int[np.ndarray, " W"],
 ) -> dict[str, Drift]:
     """`drift` of several phi, and of the measured wrench."""
-    named: dict[str, jax.tree_util.Partial | None] = {**effects, "measured": None}
-    return {name: drift(robot, effect, walks, start_tick) for name, effect in named.items()}
+    phis = {**effects, "measured": None}
+    return {name: drift(robot, effect, walks, start_tick) for name, effect in phis.items()}
 
 
 def as_result(
@@ -231,68 +230,28 @@ def write_report(
     Returns:
         report.md.
     """
-    sections = {
-        WORLDS.get(name, name): {
-            "errors": _error_table(world["errors"]),
-            "phases": _phase_table(world["phases"]),
-            "open_loop": _drift_table(world["open_loop"]),
-        }
-        for name, world in worlds.items()
-    }
-    path = folder / "report.md"
-    write_file(path, render("fidelity.md.j2", worlds=sections, pictures=pictures).encode())
-    write_json(folder / "result.json", worlds)
-    return path
+    values = {"worlds": worlds, "pictures": pictures, "WORLDS": WORLDS, "PHASES": PHASES}
+    text = render("fidelity.md.j2", **values, error_rows=error_rows)
+    write_file(folder / "report.md", text.encode())
+    write_json(folder / RESULT, worlds)
+    return folder / "report.md"
 
 
-def error_rows(errors: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
+def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
     """Mean square errors, labelled: of force and moment, then by contact and axis.
 
     Args:
         errors: of several phis, as `training.report` has them.
     """
-    rows = [
-        (f"{kind}, all [{unit}]", [one[kind] for one in errors])
-        for kind, unit in (("force", "N^2"), ("moment", "(N m)^2"))
+    errors = list(errors)
+    return [
+        *(
+            (f"{kind}, all [{unit}]", [one[kind] for one in errors])
+            for kind, unit in _UNITS.items()
+        ),
+        *(
+            (f"{axis}, {contact} [{_UNITS[kind]}]", [one[contact][i] for one in errors])
+            for contact in ("stance", "swing")
+            for i, (axis, kind) in enumerate(_AXES.items())
+        ),
     ]
-    return rows + [
-        (f"{axis}, {contact} [{unit}]", [one[contact][i] for one in errors])
-        for contact in _CONTACTS
-        for i, (axis, unit) in enumerate(_AXES.items())
-    ]
-
-
-def _number(x: float, form: str = ".3g") -> str:
-    """A number of a table; a dash where nothing was there to measure."""
-    return format(x, form) if math.isfinite(x) else "-"
-
-
-def _error_table(errors: Mapping[str, Mapping[str, Any]]) -> str:
-    rows = [[label, *map(_number, values)] for label, values in error_rows([*errors.values()])]
-    return markdown_table(("mean square error", *errors), rows)
-
-
-def _phase_table(phases: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> str:
-    rows = [
-        [
-            f"{phase}, {contact}, {part} [{unit}]",
-            *(_number(float(np.mean(one[phase][contact][axes]))) for one in phases.values()),
-        ]
-        for phase in PHASES
-        for contact in _CONTACTS
-        for part, unit, axes in (("F", "N^2", slice(3)), ("M", "(N m)^2", slice(3, 6)))
-    ]
-    return markdown_table(("mean over the axes", *phases), rows)
-
-
-def _drift_table(drifts: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    units = (("position", "cm", 100.0), ("euler", "deg", 180.0 / np.pi))
-    rows = [
-        [
-            f"{part} after {horizon} [{unit}]",
-            *(_number(scale * one[horizon][part], ".2f") for one in drifts.values()),
-        ]
-        for horizon in next(iter(drifts.values()))
-        for part, unit, scale in units
-    ]
-    return markdown_table(("", *drifts), rows)

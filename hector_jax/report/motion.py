@@ -78,9 +78,7 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
         feet=feet,
         R_yaw=R_yaw,
         wrenches={
-            source: Wrench(
-                *(np.einsum("tij,tfj->tfi", R_yaw, np.asarray(part)[last_seen]) for part in wrench)
-            )
+            source: Wrench(*(np.asarray(part)[last_seen] @ R_yaw.mT for part in wrench))
             for source, wrench in (ground or {}).items()
         },
         soles=soles[:upright][set_down],

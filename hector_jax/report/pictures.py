@@ -94,7 +94,7 @@ def of_view(
     robot: Robot,
     histories: Histories,
     loss: Loss,
-    viewed: Mapping[str, ViewedWalk],
+    views: Mapping[str, ViewedWalk],
 ) -> None:
     """Draw what the page of `view` shows, as a film and pictures.
 
@@ -103,25 +103,25 @@ def of_view(
         robot: the body that walked.
         histories: of the run.
         loss: that its L is of.
-        viewed: walks by the name of their set, before and after.
+        views: walks by the name of their set, before and after.
 
     Raises:
         VideoUnavailable: no film can be made here.
     """
-    walks = {name: one.walk for name, one in viewed.items()}
+    walks = {name: one.walk for name, one in views.items()}
     plots.tracking(folder / "tracking.png", walks)
     plots.path_from_above(folder / "path.png", walks)
-    after = list(viewed.values())[-1]
+    after = list(views.values())[-1]
     period, ticks = float(after.walk.period), len(after.walk.fallen)
     first = min(0.4, period * ticks)  # [s], two steps
     plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
-    tuned = {name: histories[name] for name in ("without", "with") if histories.get(name)}
-    if tuned:
-        plots.losses(folder / "losses.png", loss, tuned)
+    courses = {name: histories[name] for name in ("without", "with") if histories.get(name)}
+    if courses:
+        plots.losses(folder / "losses.png", loss, courses)
     say("making the film")
-    titled = motions(robot, dict(zip(plots.titles(walks), walks.values(), strict=True)))
-    write_film(folder / "film.mp4", robot, titled)
-    write_strip(folder / "film.png", robot, titled)
+    pair = motions(robot, dict(zip(plots.titles(walks), walks.values(), strict=True)))
+    write_film(folder / "film.mp4", robot, pair)
+    write_strip(folder / "film.png", robot, pair)
 
 
 def film(

@@ -13,6 +13,7 @@ import imageio_ffmpeg
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
 from hector_jax.report.motion import COLOURS, INK
@@ -23,7 +24,7 @@ _WINDOW = 4.0  # [s] of the reference that a film keeps in view
 _STRIP_WINDOW = 0.8  # [s], of a snapshot
 _SAMPLE = 0.02  # [s] between the points of the lines on the floor
 _DASH = 4  # of these points
-_DOWN, _ASIDE = np.deg2rad(30.0), np.deg2rad(35.0)  # how the camera looks along the way
+_DOWN, _ASIDE = 30.0, 35.0  # [deg] how the camera looks along the way
 _LAST = 1500  # [ms] that an animated picture stands still before it starts again
 
 
@@ -52,7 +53,7 @@ def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndar
     accent = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MATERIAL, "accent")
     seconds = _STRIP_WINDOW if scene.strip else _WINDOW
     cameras = _cameras(scene, model.vis.global_.fovy, width / height, seconds)
-    both = list(scene.motions.values())
+    both, reference = list(scene.motions.values()), _floor_reference(scene)
     with mujoco.Renderer(model, height, width) as renderer:
 
         def view(i: int, now: int, camera: mujoco.MjvCamera) -> np.ndarray:
@@ -64,12 +65,9 @@ def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndar
             renderer.update_scene(data, camera)
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
             path = motion.path[: min(now + 1, motion.upright) : _spacing(motion.period)]
-            for ends in pairwise(path):
-                _line(renderer.scene, ends, 5.0, 0.003, colour)
-            reference = _floor_reference(scene)
-            starts, stops = reference[:: 2 * _DASH], reference[_DASH :: 2 * _DASH]
-            for ends in zip(starts, stops, strict=False):
-                _line(renderer.scene, ends, 2.5, 0.005, _rgba(INK))
+            _lines(renderer.scene, pairwise(path), 5.0, 0.003, colour)
+            dashes = zip(reference[:: 2 * _DASH], reference[_DASH :: 2 * _DASH], strict=False)
+            _lines(renderer.scene, dashes, 2.5, 0.005, _rgba(INK))
             return renderer.render()
 
         samples = np.stack([motion.sample_at(scene.times) for motion in both], axis=1)
@@ -91,14 +89,16 @@ def _floor_reference(scene: Scene) -> Float[np.ndarray, "n 3"]:
     return last.reference[:: _spacing(last.period)]
 
 
-def _line(scene: Any, ends: Any, pixels: float, height: float, rgba: np.ndarray) -> None:
-    """Draw a line under two points, at a `height` [m]; the higher hides the lower."""
-    geom, kind, zero = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3)
-    rgba = rgba * [0.6, 0.6, 0.6, 1.0]  # MuJoCo draws lines brighter than bodies
-    mujoco.mjv_initGeom(geom, kind, zero, zero, np.eye(3).ravel(), rgba.astype("f"))
-    mujoco.mjv_connector(geom, kind, pixels, *(np.array([*end[:2], height]) for end in ends))
-    geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-    scene.ngeom += 1
+def _lines(scene: Any, lines: Iterable[Any], pixels: float, height: float, rgba: Any) -> None:
+    """Draw lines under pairs of points, at a `height` [m]; the higher hides the lower."""
+    rgba = (rgba * [0.6, 0.6, 0.6, 1.0]).astype("f")  # MuJoCo draws lines brighter than bodies
+    kind, zero, ahead = mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3), np.eye(3).ravel()
+    for ends in lines:
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, zero, zero, ahead, rgba)
+        mujoco.mjv_connector(geom, kind, pixels, *(np.array([*end[:2], height]) for end in ends))
+        geom.category = mujoco.mjtCatBit.mjCAT_DECOR
+        scene.ngeom += 1
 
 
 def _cameras(scene: Scene, fovy: float, aspect: float, seconds: float) -> list[mujoco.MjvCamera]:
@@ -110,27 +110,26 @@ def _cameras(scene: Scene, fovy: float, aspect: float, seconds: float) -> list[m
     reference = _floor_reference(scene) * [1.0, 1.0, 0.0]
     way = reference[-1] - reference[0]
     heading = np.arctan2(way[1], way[0]) if np.linalg.norm(way) > top else 0.0
-    azimuth = heading + _ASIDE
-    ahead = np.array(
-        [np.cos(azimuth) * np.cos(_DOWN), np.sin(azimuth) * np.cos(_DOWN), -np.sin(_DOWN)]
-    )
-    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    axes = np.stack([right, np.cross(right, ahead), ahead], axis=1)
+    azimuth = np.rad2deg(heading) + _ASIDE
+    view = Rotation.from_euler("ZX", [azimuth - 90.0, 90.0 - _DOWN], degrees=True)
     half = np.tan(np.deg2rad(fovy) / 2) * np.array([aspect, 1.0])
     count = min(len(reference), round(seconds / _SAMPLE))
-    middles, distances = [], []
+    cameras = []
     for sample in last.sample_at(scene.times) // _spacing(last.period):
         first = int(np.clip(sample - count // 2, 0, len(reference) - count))
         floor = reference[first : first + count]
-        body = np.concatenate([floor, floor + [0.0, 0.0, top]]) @ axes
-        middle = (body.min(axis=0) + body.max(axis=0)) / 2
-        spread = np.abs(body[:, :2] - middle[:2]) + 0.3 * top * np.array([1.0, 0.4])
-        distances.append(np.max(spread / half - (body[:, 2:] - middle[2])))
-        middles.append(axes @ middle)
-    cameras = [mujoco.MjvCamera() for _ in middles]
-    for camera, middle in zip(cameras, middles, strict=True):
-        camera.lookat[:], camera.distance = middle, max(distances)
-        camera.azimuth, camera.elevation = np.rad2deg(azimuth), -np.rad2deg(_DOWN)
+        points = np.concatenate([floor, floor + [0.0, 0.0, top]])
+        points = view.apply(points, inverse=True)  # right, up, back
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        spread = np.abs(points[:, :2] - middle[:2]) + 0.3 * top * np.array([1.0, 0.4])
+        camera = mujoco.MjvCamera()
+        camera.lookat[:] = view.apply(middle)
+        camera.distance = np.max(spread / half + (points[:, 2:] - middle[2]))
+        camera.azimuth, camera.elevation = azimuth, -_DOWN
+        cameras.append(camera)
+    farthest = max(camera.distance for camera in cameras)
+    for camera in cameras:
+        camera.distance = farthest
     return cameras
 
 

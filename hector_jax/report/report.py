@@ -58,6 +58,11 @@ def power_text(x: float) -> str:
     return f"{x:.0e}".replace("e+0", "e") if x >= 1e3 else f"{x:g}"
 
 
+def number(x: float, form: str = ".3g") -> str:
+    """A number of a table; a dash where nothing was there to measure."""
+    return format(x, form) if math.isfinite(x) else "-"
+
+
 class Column(NamedTuple):
     """How the numbers of a part of the loss are written."""
 
@@ -101,7 +106,7 @@ def summaries(verdict: Verdict) -> dict[str, Summary]:
     return {name: summarize(verdict, name) for name in verdict.scores}
 
 
-def _baselines(verdict: Verdict) -> list[str]:
+def baselines(verdict: Verdict) -> list[str]:
     """Those baselines that another set can be compared with."""
     return [name for name in BASELINES if name in verdict.scores and len(verdict.scores) > 1]
 
@@ -113,18 +118,13 @@ def change_text(comparison: Comparison, part: str = "L", void: str = f" \\{VOID}
 
 def legend(verdict: Verdict) -> list[str]:
     """What the columns of a verdict mean, line by line."""
-    compared = [one for s in summaries(verdict).values() for one in s.against.values()]
-    touching = {name: float(score.legs_touch.sum()) for name, score in verdict.scores.items()}
+    comparisons = [one for s in summaries(verdict).values() for one in s.against.values()]
     text = render(
         "legend.txt.j2",
-        loss=verdict.loss,
-        plants=plural(len(verdict.seeds), "plant"),
-        count=len(verdict.seeds),
+        verdict=verdict,
         seeds=seeds_text(verdict.seeds),
         has_intervals=len(verdict.seeds) >= FEWEST,
-        baselines=_baselines(verdict),
-        mark=None if all(one.counts for one in compared) else VOID,
-        touching=[f"{name} {seconds:.3f} s" for name, seconds in touching.items() if seconds > 0.0],
+        mark=None if all(one.counts for one in comparisons) else VOID,
     )
     return text.splitlines()
 
@@ -161,13 +161,13 @@ def _terminal_table(verdict: Verdict, padding: int) -> Table:
     table.add_column("set\n", no_wrap=True)
     formats = columns(verdict)
     heads = [f"{part}\n{one.unit}" for part, one in formats.items()]
-    heads += ["falls\n", *(f"against {baseline}\n[%]" for baseline in _baselines(verdict))]
+    heads += ["falls\n", *(f"against {baseline}\n[%]" for baseline in baselines(verdict))]
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
     for name, summary in summaries(verdict).items():
         means = [one.text(summary.means[part].value) for part, one in formats.items()]
         falls = Text(str(summary.falls), style="red" if summary.falls else "")
-        changes = [_terminal_change(summary.against.get(b)) for b in _baselines(verdict)]
+        changes = [_terminal_change(summary.against.get(b)) for b in baselines(verdict)]
         table.add_row(name, *means, falls, *changes)
     return table
 
@@ -180,53 +180,9 @@ def _terminal_change(comparison: Comparison | None) -> Text:
     return Text(change_text(comparison, void=VOID), style=style if comparison.counts else "yellow")
 
 
-def verdict_table(verdict: Verdict) -> str:
-    """Means, falls, changes and wins of all sets, in Markdown."""
-    formats, count = columns(verdict), len(verdict.seeds)
-    head = ["set", *(one.head for one in formats.values()), "falls"]
-    for baseline in _baselines(verdict):
-        head += [f"against {baseline} [%]", "wins"]
-    rows = []
-    for name, summary in summaries(verdict).items():
-        means = [formats[part].text(summary.means[part].value) for part in verdict.parts[:-1]]
-        total = summary.means["L"].text(formats["L"].text)
-        row = [f"**{name}**", *means, total, f"{summary.falls} / {count}"]
-        for baseline in _baselines(verdict):
-            one = summary.against.get(baseline)
-            row += ["", ""] if one is None else [change_text(one), wins_text(one, count)]
-        rows.append(row)
-    return markdown_table(head, rows)
-
-
 def wins_text(comparison: Comparison, seeds: int) -> str:
     """Number of seeds on which the set is better."""
     return f"{round(comparison.wins * seeds)} / {seeds}"
-
-
-def parts_table(verdict: Verdict) -> str:
-    """Changes of the parts against each baseline, in Markdown."""
-    rows = [
-        [f"{name} against {other}", *(one.change[term.name].text() for term in verdict.loss)]
-        for name, summary in summaries(verdict).items()
-        for other, one in summary.against.items()
-    ]
-    head = ("change in % of", *(f"{term.name} [{term.unit}]" for term in verdict.loss))
-    return markdown_table(head, rows)
-
-
-def tracking_rows(verdict: Verdict) -> dict[str, np.ndarray]:
-    """RMS errors of all sets: roll, pitch, yaw [deg], x, y, z [cm]."""
-    errors = {name: rms(verdict, name) for name in verdict.scores}
-    return {name: np.append(np.rad2deg(angle), 100 * x) for name, (angle, x) in errors.items()}
-
-
-def switching_rows(verdict: Verdict) -> dict[str, tuple[float, float, float]]:
-    """Mean L_ctrl of all sets: whole, at changes of stance, between them."""
-    rows = {}
-    for name, score in verdict.scores.items():
-        whole, switching = float(score.losses["L_ctrl"].mean()), float(score.switching.mean())
-        rows[name] = whole, switching, whole - switching
-    return rows
 
 
 TEMPLATES = Environment(
@@ -236,21 +192,22 @@ TEMPLATES = Environment(
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-TEMPLATES.globals |= {
-    "BASELINES": BASELINES,
-    "columns": columns,
-    "legend": legend,
-    "parts_table": parts_table,
-    "plural": plural,
-    "power_text": power_text,
-    "switching_rows": switching_rows,
-    "table": markdown_table,
-    "tracking_rows": tracking_rows,
-    "verdict_table": verdict_table,
+_FUNCTIONS = (baselines, change_text, columns, legend, markdown_table, plural, rms, summaries)
+TEMPLATES.globals |= {one.__name__: one for one in (*_FUNCTIONS, wins_text)}
+TEMPLATES.globals["BASELINES"] = BASELINES
+TEMPLATES.filters |= {
+    "degrees": math.degrees,
+    "json": partial(json.dumps, indent=2),
+    "number": number,
+    "power": power_text,
 }
-TEMPLATES.filters["json"] = partial(json.dumps, indent=2)
 
 
 def render(template: str, **values: Any) -> str:
     """Fill a template of the folder `templates`."""
     return TEMPLATES.get_template(template).render(values)
+
+
+def caption(picture: str, **values: Any) -> str:
+    """Caption of a picture of `plots`, by the name of its function."""
+    return getattr(TEMPLATES.get_template("captions.j2").module, picture)(**values)

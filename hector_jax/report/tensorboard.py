@@ -1,7 +1,10 @@
 """TensorBoard's event files from a run's metrics.jsonl, which stays the truth."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.runs.folder import read_metrics
 
@@ -21,8 +24,7 @@ def write_events(folder: Path, out: Path) -> list[Path]:
         The folders, one for each tuned set.
 
     Raises:
-        InputError: no run, or tensorboardX is not installed.
-        InputError: a folder cannot be written.
+        InputError: no run, tensorboardX is not installed, or a folder cannot be written.
     """
     try:
         from tensorboardX import SummaryWriter
@@ -33,24 +35,23 @@ def write_events(folder: Path, out: Path) -> list[Path]:
     lines = read_metrics(folder)
     folders = {name: out / name for name in dict.fromkeys(line["set"] for line in lines)}
     for name, place in folders.items():
-        place.mkdir(parents=True, exist_ok=True)
+        make_folder(place)
         for old in place.glob("events.out.tfevents.*"):
             old.unlink()
         with SummaryWriter(str(place)) as writer:
-            for line in lines:
-                if line["set"] == name:
-                    for tag, value in _scalars(line).items():
-                        writer.add_scalar(tag, value, line["iteration"])
+            for line in (line for line in lines if line["set"] == name):
+                for room, values in _scalars(line).items():
+                    for key, value in values.items():
+                        if value is not None:  # it was not finite
+                            writer.add_scalar(f"{room}/{key}", float(value), line["iteration"])
     return list(folders.values())
 
 
-def _scalars(line: dict) -> dict[str, float]:
-    """Numbers of an iteration by tag; those that were not finite are left out."""
-    rooms = {
-        "loss": [name for name in line if name == "L" or name.startswith("L_")],
-        "step": ("step", "accepted", "residual"),
+def _scalars(line: Mapping[str, Any]) -> dict[str, Mapping[str, float | None]]:
+    """Numbers of an iteration, by group and name."""
+    return {
+        "loss": {name: line[name] for name in line if name == "L" or name.startswith("L_")},
+        "step": {name: line.get(name) for name in ("step", "accepted", "residual")},
+        "weights": line["weights"],
+        "gradient_log": line["gradient_log"],
     }
-    scalars = {f"{room}/{name}": line.get(name) for room, names in rooms.items() for name in names}
-    for room in ("weights", "gradient_log"):
-        scalars |= {f"{room}/{name}": value for name, value in line.get(room, {}).items()}
-    return {tag: float(value) for tag, value in scalars.items() if value is not None}

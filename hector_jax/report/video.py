@@ -26,7 +26,7 @@ from hector_jax.core.console import Broken
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
 from hector_jax.report.motion import Motion
-from hector_jax.report.plots.style import named
+from hector_jax.report.plots.style import label_of
 from hector_jax.robot.model import Robot
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
@@ -139,7 +139,7 @@ def make_scene(
         config=config,
         model=str(robot.description.model.resolve()),
         top=_TOP * float(robot.standing_height),
-        motions={named(name): motion for name, motion in motions.items()},
+        motions={label_of(name): motion for name, motion in motions.items()},
         times=_snapshot_times(next(iter(motions.values())), seconds, config.tiles)
         if strip
         else np.arange(0.0, seconds + 1e-9, 1.0 / config.rate),
@@ -160,8 +160,8 @@ def _write(scene: Scene, path: Path) -> str:
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder, failures = Path(name), []
         (folder / "scene.pickle").write_bytes(pickle.dumps(scene))
-        chosen = os.environ.get("MUJOCO_GL")
-        for back_end in (chosen,) if chosen else BACK_ENDS:
+        setting = os.environ.get("MUJOCO_GL")
+        for back_end in (setting,) if setting else BACK_ENDS:
             failure = _draw_in_child(folder, back_end)
             if not failure:
                 shutil.move(folder / scene.file, path)
@@ -179,7 +179,7 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
     # MuJoCo first, with this back end; the package would import it without any
     program = f"import mujoco; from {__package__} import render; render.main()"
     try:
-        done = subprocess.run(
+        child = subprocess.run(
             [sys.executable, "-c", program],
             cwd=folder,  # MuJoCo logs into the working directory
             env=environment,
@@ -191,9 +191,9 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
         )
     except subprocess.TimeoutExpired:
         return f"not done after {_TIMEOUT:.0f} s"
-    if done.returncode == 0:
+    if child.returncode == 0:
         return ""
     # the end of the first traceback; those that follow are of what it left open
-    first = done.stderr.split("Traceback (most recent call last):")[:2][-1]
+    first = child.stderr.split("Traceback (most recent call last):")[:2][-1]
     faults = [line for line in first.splitlines() if line.strip() and line[0] != " "]
-    return one_line(faults[0])[:100] if faults else f"ended with code {done.returncode}"
+    return one_line(faults[0])[:100] if faults else f"ended with code {child.returncode}"

@@ -10,7 +10,7 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from importlib.util import find_spec
 from itertools import cycle
@@ -24,9 +24,8 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import COLOURS, INK, Motion
+from hector_jax.report.report import render
 from hector_jax.runs.folder import METRICS, RESULT, loss_curves, progress_sentence, read_histories
-
-HOST, PORT = "127.0.0.1", 8080
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics
@@ -99,8 +98,8 @@ def serve(
     folder: Path,
     on_open: Callable[[str], None],
     *,
-    host: str = HOST,
-    port: int = PORT,
+    host: str,
+    port: int,
 ) -> None:
     """Show two walks and the tuning of a run until interrupted.
 
@@ -110,7 +109,7 @@ def serve(
         model: of the body that walks.
         folder: of the run, whose metrics are read again as they grow.
         on_open: called with the page's address once it can be opened.
-        host: address to listen on; the default lets no other machine in.
+        host: address to listen on.
         port: where it is taken, a free one is used instead.
 
     Raises:
@@ -140,17 +139,16 @@ def serve(
             server.stop()
 
 
-def _free_port(host: str, wanted: int) -> int:
-    """The wanted port, or a free one where it is taken."""
-    for port in (wanted, 0):
-        try:
-            with socket.create_server((host, port)) as listening:
-                return listening.getsockname()[1]
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                reason = f"cannot listen on {host}, port {port}: {error.strerror}"
-                raise InputError(reason) from None
-    raise InputError(f"no free port on {host}")
+def _free_port(host: str, port: int) -> int:
+    """The port, or a free one where it is taken."""
+    try:
+        with socket.create_server((host, port)) as listener:
+            return listener.getsockname()[1]
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE and port:
+            return _free_port(host, 0)
+        reason = f"cannot listen on {host}, port {port}: {error.strerror}"
+        raise InputError(reason) from None
 
 
 class Page:
@@ -170,7 +168,8 @@ class Page:
         self._names, self._motions = list(motions), list(motions.values())
         self._length = min(len(one.times) for one in self._motions)
         self._playing, self._tick = True, -1  # the tick that is shown; -1: to be drawn anew
-        self._read, self._since = (-1, False), np.inf  # size of the metrics, run done; [s] ago
+        self._metrics_state = (-1, False)  # their size when they were read, and whether it was done
+        self._since = np.inf  # [s] since then
         self._build_panel(story)
         self._build_world()
         self.advance(0.0)
@@ -202,8 +201,9 @@ class Page:
             self._speed = gui.add_slider("speed", 0.05, 2.0, 0.05, 0.5)
             self._follow = gui.add_checkbox("follow the robots", True)
         with gui.add_folder("Ground on the feet"):
-            gui.add_html(_legend(first.wrenches))
-            words = {source: _SOURCES[source].words for source in first.wrenches}
+            sources = {source: _SOURCES[source] for source in first.wrenches}
+            gui.add_html(render("legend.html.j2", sources=sources.values()))
+            words = {source: one.words for source, one in sources.items()}
             words |= {"force": "forces", "moment": "moments"}
             self._boxes = {k: gui.add_checkbox(w, k != "moment") for k, w in words.items()}
         with gui.add_folder("Tuning"):
@@ -244,12 +244,14 @@ class Page:
     def _add_walk(self, i: int) -> dict[str, Any]:
         """Add one walk to the scene; returns the handles of what moves."""
         scene, one, root, colour = self._server.scene, self._motions[i], f"/world/{i}", COLOURS[i]
-        lines = {
-            "footholds": (_on_floor(one.soles, 0.003), _pale(colour), 0.03),
-            "path": (_on_floor(_pieces(one.path, 2), 0.006), colour, 0.008),
-            "reference": (_on_floor(_pieces(one.reference, 6)[::2], 0.008), INK, 0.01),
+        pale = tuple(int(c + 0.55 * (255 - c)) for c in colour)
+        lines = {  # on the floor, each at a height [m] of its own so that nothing flickers
+            "footholds": (one.soles, 0.003, pale, 0.03),
+            "path": (_pieces(one.path, 2), 0.006, colour, 0.008),
+            "reference": (_pieces(one.reference, 6)[::2], 0.008, INK, 0.01),
         }
-        for line, (points, shade, thickness) in lines.items():
+        for line, (pieces, height, shade, thickness) in lines.items():
+            points = pieces * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
             scene.add_line_segments(f"{root}/{line}", points, shade, thickness=thickness)
         label = {"anchor": "bottom-center", "font_screen_scale": 1.4}
         return {
@@ -283,11 +285,11 @@ class Page:
                 handle.wxyz = self._data.xquat[body].copy()
             for (kind, source), (handle, ends) in handles["arrows"].items():
                 length = np.linalg.norm(ends[tick, :, 1] - ends[tick, :, 0], axis=1)
-                drawn = length > _MIN_ARROW  # false where it is NaN
-                checked = self._boxes[kind].value and self._boxes[source].value
-                handle.visible = bool(checked and drawn.any())
+                visible = length > _MIN_ARROW  # false where it is NaN
+                switched_on = self._boxes[kind].value and self._boxes[source].value
+                handle.visible = bool(switched_on and visible.any())
                 if handle.visible:
-                    handle.points = ends[tick, drawn].astype(np.float32)
+                    handle.points = ends[tick, visible].astype(np.float32)
             handles["aim"].position = one.reference[tick]
             handles["name"].position = one.path[tick] + [0.0, 0.0, 0.36]
             fell = one.times[tick] > one.fall_time
@@ -296,9 +298,9 @@ class Page:
     def _read_metrics(self) -> None:
         path, done = self._folder / METRICS, (self._folder / RESULT).exists()
         now = (path.stat().st_size if path.exists() else 0, done)
-        if now == self._read:
+        if now == self._metrics_state:
             return
-        self._read = now
+        self._metrics_state = now
         histories = read_histories(self._folder)
         lines = loss_curves(histories) or _NO_CURVES
         iterations = np.arange(float(len(next(iter(lines.values())))))
@@ -320,26 +322,9 @@ def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]
     return ({"label": x_name}, *lines)
 
 
-def _legend(sources: Iterable[str]) -> str:
-    """Colours of the sources and the scale, as HTML."""
-    mark = '<span style="color:rgb{1}">&#9650;</span>&nbsp;{0}'
-    marks = " &ensp;".join(mark.format(*_SOURCES[source]) for source in sources)
-    scale = "thin: forces, 35 cm are 120 N; thick: moments, 35 cm are 12 N m"  # see _SCALES
-    return f'<div style="padding:0 1em; font-size:smaller">{marks}<br>{scale}</div>'
-
-
-def _pale(colour: tuple[int, int, int]) -> tuple[int, ...]:
-    return tuple(int(c + 0.55 * (255 - c)) for c in colour)
-
-
 def _pieces(points: Float[np.ndarray, "T 3"], ticks: int) -> Float[np.ndarray, "n 2 3"]:
     """A path as pieces of some ticks each."""
     return np.stack([points[:-ticks:ticks], points[ticks::ticks]], axis=1)
-
-
-def _on_floor(pieces: Float[np.ndarray, "n 2 3"], height: float) -> Float[np.ndarray, "n 2 3"]:
-    """What lies on the floor under them, at its own height [m] so that nothing flickers."""
-    return pieces * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
 
 
 def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
@@ -353,7 +338,7 @@ def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int
     from trimesh.creation import box, capsule, cylinder, icosphere
 
     kinds = mujoco.mjtGeom
-    solids = {  # from MuJoCo's sizes
+    solids = {  # from MuJoCo's sizes; the edges of the first two are sharp
         kinds.mjGEOM_BOX: lambda size: box(extents=2.0 * size),
         kinds.mjGEOM_CYLINDER: lambda size: cylinder(radius=size[0], height=2.0 * size[1]),
         kinds.mjGEOM_CAPSULE: lambda size: capsule(radius=size[0], height=2.0 * size[1]),
@@ -361,20 +346,18 @@ def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int
         kinds.mjGEOM_ELLIPSOID: lambda size: icosphere(subdivisions=2).apply_scale(size),
     }
     meshes: dict[int, list[Any]] = {}
-    for i in np.nonzero((model.geom_bodyid > 0) & (model.geom_group <= 2))[0]:
-        kind = kinds(model.geom_type[i])
-        if kind not in solids:
+    for geom in map(model.geom, range(model.ngeom)):
+        body, kind, material = geom.bodyid[0], kinds(geom.type[0]), geom.matid[0]
+        if body == 0 or geom.group[0] > 2 or kind not in solids:
             continue
-        mesh = solids[kind](model.geom_size[i])
-        if kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER):
-            mesh.unmerge_vertices()  # sharp edges
-        material = model.geom_matid[i]
-        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[i]
+        mesh = solids[kind](geom.size)
+        if kind in list(solids)[:2]:
+            mesh.unmerge_vertices()
+        rgba = model.mat_rgba[material] if material >= 0 else geom.rgba
         if material >= 0 and model.material(material).name == "accent":
             rgba = np.array([*accent, 255]) / 255.0
-        T = trimesh.transformations.quaternion_matrix(model.geom_quat[i])
-        T[:3, 3] = model.geom_pos[i]
-        mesh.apply_transform(T)
+        mesh.apply_transform(trimesh.transformations.quaternion_matrix(geom.quat))
+        mesh.apply_translation(geom.pos)
         mesh.visual.vertex_colors = np.round(255.0 * np.asarray(rgba)).astype(np.uint8)
-        meshes.setdefault(int(model.geom_bodyid[i]), []).append(mesh)
+        meshes.setdefault(int(body), []).append(mesh)
     return {body: trimesh.util.concatenate(parts) for body, parts in meshes.items()}

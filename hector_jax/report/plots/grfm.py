@@ -4,12 +4,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from matplotlib.artist import setp
 
 from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.plots import style
-from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, looks_of, named
+from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
+from hector_jax.report.report import caption
 
 
 def wrenches(
@@ -31,18 +33,15 @@ def wrenches(
         panels = figure.subplots(2, 3, sharex=True)
         for name in (name for name in order if name in curves):
             both = np.concatenate([np.asarray(part)[:count, 0] for part in curves[name]], axis=1)
-            look = {"baseline": None, "label": named(name), **CURVES[name]}
+            look = {"baseline": None, "label": label_of(name), **CURVES[name]}
             for panel, values in zip(panels.flat, both.T, strict=True):
                 panel.stairs(values, period * np.arange(count + 1), **look)
         for panel, label in zip(panels.flat, labels, strict=True):
             panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
             panel.set_ylabel(label)
             style.widen(panel, 5.0 if "[N]" in label else 0.5)
-        style.set_all(panels[-1], xlabel="time [s]")
-    return (
-        "Wrench of the ground on the left foot over the first two steps; "
-        "the line is the switch of stance."
-    )
+        setp(panels[-1], xlabel="time [s]")
+    return caption("wrenches", side="left")
 
 
 def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
@@ -57,16 +56,12 @@ def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
         for row, (world, drifts) in zip(panels, worlds.items(), strict=True):
             for name, look in looks_of(drifts, CURVES).items():
                 time, position, euler = drifts[name]
-                row[0].plot(time, 100 * position, label=named(name), **look.line)
+                row[0].plot(time, 100 * position, label=label_of(name), **look.line)
                 row[1].plot(time, np.rad2deg(euler), **look.line)
             row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
             row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))
-        style.set_all(panels[-1], xlabel="time ahead [s]")
-    return (
-        "How far a rigid body under recorded commands strays from the robot, RMS over starts in "
-        "all phases of the step. `measured` moves it by the measured wrench itself, without what "
-        "the legs do."
-    )
+        setp(panels[-1], xlabel="time ahead [s]")
+    return caption("open_loop")
 
 
 def training(path: Path, history: History) -> str:
@@ -87,7 +82,4 @@ def training(path: Path, history: History) -> str:
             # the first epochs of a fresh net may be far off: they need not be seen whole
             top = 1.6 * np.percentile(np.concatenate([train, valid]), 90)
             panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
-    return (
-        "Errors of GRFM-Net by epoch, mean over the members where it is an ensemble; of each net "
-        "the epoch with the least error on the validation walks is kept."
-    )
+    return caption("training")

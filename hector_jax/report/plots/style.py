@@ -42,6 +42,9 @@ CURVES = {
 """Lines of references and wrenches."""
 CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 
+MARK = {"color": "0.5", "linestyle": (0, (2, 2)), "linewidth": 0.9, "zorder": 0}
+"""A line across a panel: an iteration, or a moment."""
+
 _MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o"}
 _MARKER |= {"ceiling": "*", "shared_mean": "<", "shared_worst": ">"}
 _SPARE_STYLE = {"linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
@@ -88,14 +91,16 @@ def looks_of(names: Iterable[str], table: Mapping[str, Any] = SETS) -> dict[str,
     return looks
 
 
-def named(name: str) -> str:
+def label_of(name: str) -> str:
     """Words of a legend for a weight set, by its name in the tables, or for a curve."""
     return _NAMES.get(name, name)
 
 
 def titles(names: Iterable[str]) -> list[str]:
     """Words that stand above two walks, before and after."""
-    return [f"{when}: {named(name)}" for when, name in zip(("before", "after"), names, strict=True)]
+    return [
+        f"{when}: {label_of(name)}" for when, name in zip(("before", "after"), names, strict=True)
+    ]
 
 
 @contextmanager
@@ -132,12 +137,6 @@ def widen(axes: Axes, least: float) -> None:
     low, high = axes.get_ylim()
     if high - low < 2 * least:
         axes.set_ylim((low + high) / 2 - least, (low + high) / 2 + least)
-
-
-def set_all(panels: Iterable[Axes], **properties: Any) -> None:
-    """Set the same properties of several axes."""
-    for panel in panels:
-        panel.set(**properties)
 
 
 def weight_label(name: str) -> str:

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.artist import setp
 from matplotlib.axes import Axes
+from scipy.spatial.transform import Rotation
 
 from hector_jax.core.trajectory import Trajectory, from_start
 from hector_jax.report.motion import COLOURS, Motion
-from hector_jax.report.plots.style import CURVES, drawing, looks_of, named, set_all, widen
-
-FRAME = "Each walk is seen from where it stood and faced at t = 0, so that all have one reference."
+from hector_jax.report.plots.style import CURVES, drawing, label_of, looks_of, widen
+from hector_jax.report.report import caption
 
 
 def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
@@ -23,25 +24,18 @@ def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
     """
     with drawing(path, 10.0, 4.2) as figure:
         draw_tracking(figure.subplots(2, 3, sharex=True), walks)
-    return (
-        "Errors of the centre of mass and of the Euler angles, one stand-in walk of each set; "
-        "each against its own reference, ahead and left as the reference faces."
-    )
+    return caption("tracking")
 
 
 def _errors(walk: Trajectory) -> dict[str, Float[np.ndarray, " T"]]:
     """Errors of the six coordinates, along the heading of the reference; NaN after a fall."""
-    yaw = np.asarray(walk.reference.euler)[:, 2]
-    x, y, up = 100 * (np.asarray(walk.state.position) - np.asarray(walk.reference.position)).T
-    angles = np.rad2deg(np.asarray(walk.state.euler) - np.asarray(walk.reference.euler)).T
-    values = {
-        "error ahead [cm]": np.cos(yaw) * x + np.sin(yaw) * y,
-        "error left [cm]": np.cos(yaw) * y - np.sin(yaw) * x,
-        "error up [cm]": up,
-    }
-    for angle, error in zip(("roll", "pitch", "yaw"), angles, strict=True):
-        values[f"error in {angle} [deg]"] = error
-    return {label: np.where(walk.fallen, np.nan, value) for label, value in values.items()}
+    R = Rotation.from_euler("z", np.asarray(walk.reference.euler)[:, 2:])
+    away = R.apply(np.asarray(walk.state.position) - walk.reference.position, inverse=True)
+    angles = np.rad2deg(np.asarray(walk.state.euler) - walk.reference.euler)
+    labels = [f"error {way} [cm]" for way in ("ahead", "left", "up")]
+    labels += [f"error in {angle} [deg]" for angle in ("roll", "pitch", "yaw")]
+    values = np.where(walk.fallen[:, None], np.nan, np.hstack([100 * away, angles]))
+    return dict(zip(labels, values.T, strict=True))
 
 
 def draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
@@ -49,12 +43,12 @@ def draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
     for name, look in looks_of(walks).items():
         times = float(walks[name].period) * np.arange(1, len(walks[name].fallen) + 1)
         for panel, (label, values) in zip(panels.flat, _errors(walks[name]).items(), strict=True):
-            panel.plot(times, values, **look.line, label=named(name))
+            panel.plot(times, values, **look.line, label=label_of(name))
             panel.set_ylabel(label)
     for panel in panels.flat:
         panel.axhline(0.0, color="black", linewidth=0.8)
         widen(panel, 1.0)
-    set_all(panels[-1], xlabel="time [s]")
+    setp(panels[-1], xlabel="time [s]")
 
 
 def distances(
@@ -80,7 +74,7 @@ def distances(
             upright = motion.times <= motion.fall_time
             away = np.where(upright, 100 * motion.distance, np.nan)
             mean = np.sqrt(np.mean(away[upright] ** 2)) if upright.any() else np.nan
-            label = f"{named(name)}: {mean:.1f} cm RMS"
+            label = f"{label_of(name)}: {mean:.1f} cm RMS"
             axes.plot(motion.times, away, color=np.divide(colour, 255), ls=style, label=label)
         axes.set_title("distance from the reference [cm]", loc="left")
         axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
@@ -102,7 +96,7 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
     height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9
     with drawing(path, width, height, legend_columns=4) as figure:
         draw_path(figure.subplots(), walks)
-    return f"Path from above; foot marks are those of `{list(walks)[-1]}`. {FRAME}"
+    return caption("path_from_above", last=list(walks)[-1])
 
 
 def span_of(walks: Mapping[str, Trajectory]) -> Float[np.ndarray, "2"]:
@@ -117,13 +111,13 @@ def draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     for name, look in looks_of(walks).items():
         fallen, position = walks[name].fallen, walks[name].state.position
         x, y = np.where(fallen[:, None], np.nan, position)[:, :2].T
-        axes.plot(x, y, **look.line, label=named(name))
+        axes.plot(x, y, **look.line, label=label_of(name))
     last = list(walks.values())[-1]
     axes.plot(*last.reference.position[:, :2].T, **CURVES["reference"], label="reference")
-    landed = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
+    touchdowns = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
     mark = {"linestyle": "none", "color": "0.6", "markersize": 6, "zorder": 1}
     for foot, (side, marker) in enumerate((("left", 4), ("right", 5))):
-        spots = last.feet[landed[:, foot] & ~last.fallen, foot]
+        spots = last.feet[touchdowns[:, foot] & ~last.fallen, foot]
         axes.plot(*spots[:, :2].T, **mark, marker=marker, label=f"{side} foot set down")
     axes.set(xlabel="x, ahead [m]", ylabel="y, left [m]", aspect="equal")
     axes.margins(0.05, 0.1)
