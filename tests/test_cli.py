@@ -252,7 +252,7 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     ("wrong", "says"),
     [
         (("--budget", "9"), "budget"),
-        (("--population", "2"), "population"),
+        (("--population", "3"), "--population must be a whole number from 4 to 10000, got 3"),
         (("--seed", "-1"), "--seed must be a whole number from 0 to 4294967295"),
         (("--start", "none.json"), "none.json"),
     ],
