@@ -459,4 +459,4 @@ def test_a_weights_file_is_exported_by_its_name(monkeypatch, tmp_path):
     path = tmp_path / "mine.json"
     save_weights(path, expert())
     assert call(monkeypatch, path, "--json") == 0
-    assert asked == [{"name": "mine.json/mine", "seconds": 1.0}]
+    assert asked == [{"name": "mine", "seconds": 1.0}]
