@@ -40,7 +40,7 @@ from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import Broken
 from hector_jax.core.environment import versions
 from hector_jax.core.files import make_folder, write_file, write_json
-from hector_jax.core.inputs import InputError, unknown
+from hector_jax.core.inputs import InputError, plural, unknown
 from hector_jax.core.settings import from_table, read_json, to_table
 from hector_jax.core.trajectory import State
 from hector_jax.core.tree_file import tree_hash
@@ -268,6 +268,9 @@ def _require_same(result: Check) -> None:
             f"{result.moment:.1e} N m and {result.torque:.1e} N m at the joints, at most "
             f"{TOLERANCE:g} was expected; nothing was written"
         )
+    if result.unsolved:
+        what = plural(result.unsolved, "QP") + (" was" if result.unsolved == 1 else " were")
+        raise Broken(f"{what} not solved on the walk of the check; nothing was written")
 
 
 def export(
