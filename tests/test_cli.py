@@ -509,3 +509,14 @@ def test_a_reader_that_has_enough_is_no_error():
     )
     assert shown.returncode == 141
     assert shown.stderr == ""
+
+
+@pytest.mark.parametrize(("name", "beside"), [("nominal", "expert"), ("mine", "nominal")])
+def test_the_halves_of_a_film_have_names_of_their_own(monkeypatch, tmp_path, name, beside):
+    films = []
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: synthetic_walk(0, 30))
+    monkeypatch.setattr(evaluate.pictures, "film", lambda path, robot, walks: films.append(walks))
+    save_weights(tmp_path / f"{name}.json", expert())
+    words = "--weights", tmp_path / f"{name}.json", "--video", tmp_path / "walk.mp4"
+    assert call(monkeypatch, "walk", *words) == 0
+    assert [list(walks) for walks in films] == [[beside, name]]

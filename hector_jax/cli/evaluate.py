@@ -107,11 +107,12 @@ def walk(args: Walk) -> None:
             f"{float(score.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
         )
     if args.video is not None:
-        beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
+        name = Path(args.weights).stem
+        beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
         say(f"walking with {beside} weights for the other half of the film")
         walks = {
-            beside: arguments.walked(args, robot, course, other(robot)),
-            Path(args.weights).stem: trajectory,
+            beside: arguments.walk_once(args, robot, course, other(robot)),
+            name: trajectory,
         }
         pictures.film(args.video, robot, walks)
 
