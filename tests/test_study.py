@@ -222,11 +222,30 @@ def test_several_trajectories_are_one_run(tmp_path, monkeypatch):
         ({"run": Path("a"), "out": Path("b")}, "--out b and --run a: only one can be given"),
         ({"traj": ("c", "s"), "refresh": 1}, "--refresh takes one trajectory, got 2; add --each"),
         ({"traj": ("c", "short.toml")}, "of one length, got c 4 s, short 2 s; add --each"),
+        ({"traj": ("short.toml", "./short.toml")}, "short.toml and ./short.toml are both named s"),
+        ({"traj": ("short.toml", "./short.toml"), "each": True}, "are both named short"),
     ],
 )
 def test_what_one_set_cannot_be_tuned_for_is_one_line(tmp_path, monkeypatch, changes, message):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tune, "_tune_in", lambda folder, args: None)
     Path("short.toml").write_text('name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n')
     with pytest.raises(InputError, match=message):
         tune.tune(flags.Tune(**changes))
     assert [path.name for path in tmp_path.iterdir()] == ["short.toml"]
+
+
+def test_each_trajectory_of_a_file_has_a_folder_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked = []
+    monkeypatch.setattr(tune, "_tune_in", lambda folder, args: asked.append((folder, args)))
+    path = tmp_path / "files" / "mine.toml"
+    path.parent.mkdir()
+    path.write_text('name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n')
+    several = flags.Tune(traj=("c", str(path)), each=True)
+    tune.tune(replace(several, out=Path("out")))
+    assert [folder for folder, _ in asked] == [Path("out/c"), Path("out/short")]
+    tune.tune(replace(several, resume=Path("out")))
+    assert [folder for folder, _ in asked[2:]] == [Path("out/c"), Path("out/short")]
+    with pytest.raises(InputError, match="out: its trajectories were tuned one by one; add --each"):
+        tune.tune(flags.Tune(traj=(str(path),), resume=Path("out")))

@@ -35,7 +35,7 @@ from hector_jax.report.run import Report, write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
-from hector_jax.runs.folder import read_json
+from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
 from hector_jax.runs.journal import Journal
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
@@ -74,20 +74,22 @@ def _by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
     """The flags of each run by its folder."""
     texts = tuple(t for text in args.traj for t in (COMMANDS if text == "all" else (text,)))
     texts = tuple(dict.fromkeys(texts))
-    if args.resume and not args.each and (args.resume / texts[0] / "config.json").exists():
+    names: dict[str, str] = {}  # texts by name
+    for text in texts:
+        name = arguments.course(text, robot).name
+        if name in names:
+            raise InputError(f"--traj {names[name]} and {text} are both named {name}")
+        names[name] = text
+    if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
         raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
     now = f"{datetime.now():{run_folder.TIME}}"
     parent = arguments.folder_of(args.runs, args.robot, robot)
     # beside --resume a trajectory that was not given is that of the run
     shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=texts)
-    runs = {}
-    for one in [replace(args, traj=(text,)) for text in texts] if args.each else [shared]:
-        if base is None:
-            name = "-".join(arguments.course(text, robot).name for text in one.traj)
-            runs[parent / name / now] = one
-        else:
-            runs[base / one.traj[0] if args.each else base] = one
-    return runs
+    if args.each:
+        each = {name: replace(args, traj=(text,)) for name, text in names.items()}
+        return {base / n if base else parent / n / now: one for n, one in each.items()}
+    return {base or parent / "-".join(names) / now: shared}
 
 
 def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
