@@ -396,3 +396,13 @@ def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
         )
     with pytest.raises(ValueError, match="config.json: tune: no settings: 5"):
         run_folder.check_agreement(tmp_path, {"tune": 5}, {"tune": {"iterations": 10}})
+
+
+def test_a_run_folder_that_cannot_be_made_is_not_said_to_exist(tmp_path, monkeypatch):
+    def full(path, target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "rename", full)
+    for named in ({"out": tmp_path / "run"}, {"runs": tmp_path}):
+        with pytest.raises(InputError, match=f"^cannot write {tmp_path}.*: No space left on device$"):
+            command.tune(flags.Tune(traj=("c",), **named))

@@ -58,9 +58,11 @@ def begin(folder: Path, args: Tune) -> Path:
         while True:
             try:
                 return new.rename(folder)
-            except OSError:
-                if args.out or args.run or not folder.exists():
-                    raise taken(folder) from None
+            except OSError as error:
+                if not folder.exists():
+                    raise InputError(f"cannot write {folder}: {error.strerror}") from None
+                if args.out or args.run:
+                    raise exists_error(folder) from None
             later = datetime.strptime(folder.name, TIME) + timedelta(seconds=1)
             folder = folder.with_name(f"{later:{TIME}}")
 
