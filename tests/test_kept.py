@@ -173,6 +173,22 @@ def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
         assert np.isfinite(np.concatenate(walk.last)).all()
 
 
+@pytest.mark.parametrize("residual", [1.0, np.nan])
+def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, residual):
+    def walks_of(pool, config, robot, jobs, title):
+        for job in jobs:
+            walk = pretend_walk(job.seed, 0.03, 1.0)
+            yield walk._replace(residual=np.where(job.seed == 1, residual, walk.residual))
+
+    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    for _ in range(2):  # as walked, and as kept
+        judge(tmp_path, {"mine": nominal()})
+        said = " ".join(capsys.readouterr().err.split())
+        assert f"mine: at least one QP of its walks was not solved (residual {residual:.0e})" in said
+    judge(tmp_path, {"mine": nominal()}, seeds=(0,))
+    assert capsys.readouterr().err == ""
+
+
 CODE = ("tuning.difftune",)
 
 

@@ -1,6 +1,5 @@
 """Evaluation of weight sets, walks and runs."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +22,7 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, verdicts
 from hector_jax.runs.folder import RESULT, load_run
-from hector_jax.runs.metrics import Score, Verdict
-from hector_jax.tuning.loss import PAPER_LOSS, Loss
+from hector_jax.tuning.loss import PAPER_LOSS
 
 
 def evaluate(args: Evaluate) -> None:
@@ -43,7 +41,7 @@ def evaluate(args: Evaluate) -> None:
         judged = verdicts.judge(
             pool, config, robot, sets, course.command, plants, seeds, title=title, seconds=seconds
         )
-    verdict = verdict_of(config.loss, seeds, judged.scores)
+    verdict = metrics.make_verdict(config.loss, seeds, judged.scores)
     result = metrics.as_result(verdict, args.world)
     if args.out is not None:
         write_json(args.out, result)
@@ -53,16 +51,6 @@ def evaluate(args: Evaluate) -> None:
         names = arguments.short_names(args.weights)
         named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
         print_table(named, f"{course.name}, {plural(count, 'plant')}", args.world)
-
-
-def verdict_of(loss: Loss, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]) -> Verdict:
-    """`metrics.make_verdict`, saying where a QP of the walks was not solved."""
-    verdict = metrics.make_verdict(loss, seeds, scores)
-    for name, score in verdict.scores.items():
-        if score.residual.max() > SOLVED:
-            worst = f"{score.residual.max():.0e}"
-            say(f"{name}: at least one QP of its walks was not solved (residual {worst})")
-    return verdict
 
 
 def walk(args: Walk) -> None:

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 
 from hector_jax.cli import arguments, run_folder
-from hector_jax.cli.evaluate import verdict_of
 from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.control.reference import COMMANDS
@@ -318,7 +317,7 @@ def _result(
         each = [judged[name][world] for name in names]
         scores = {n: [s for one in each for s in one.scores[n]] for n in tuned.sets}
         seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
-        return verdict_of(run.config.loss, seeds, scores)
+        return metrics.make_verdict(run.config.loss, seeds, scores)
 
     def content(names: Sequence[str], one: Verdict) -> dict[str, Any]:
         result = metrics.as_result(one)

@@ -12,12 +12,12 @@ from jaxtyping import Float
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.grfm.collection import Walks, walks_like
-from hector_jax.grfm.dataset import at_interval
+from hector_jax.grfm.dataset import SOLVED, at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
@@ -162,6 +162,10 @@ def judge(
         like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
         results = cached(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
+    for name in sets:
+        worst = np.max([walks[name, seed].score.residual for seed in seeds])
+        if not worst <= SOLVED:
+            say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
     return Judged(
         {name: [walks[name, seed] for seed in seeds] for name in sets},
         {name: results[name, seeds[0]][1] for name in sets if with_walk((name, seeds[0]))},
