@@ -262,7 +262,15 @@ def race(
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
         every = {flags.traj: [weights for each in sets.values() for weights in each]}
-        found = searches.losses_on_hfs(pool, config, robot, every, engine=engine, at_once=size)
+        found = searches.losses_on_hfs(
+            pool,
+            config,
+            robot,
+            every,
+            commands={flags.traj: command},
+            engine=engine,
+            at_once=size,
+        )
         losses = found[flags.traj]
         ends = np.cumsum([len(each) for each in sets.values()])
         return dict(zip(sets, np.split(losses, ends[:-1]), strict=True))

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pretend import pretend_history
+from pretend import pretend_history, pretend_walk
 from synthetic import synthetic_walk
 
 from hector_jax.cli import commands, flags
@@ -266,13 +266,34 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, r
     pool.shutdown(wait=False)
 
 
+def test_a_search_says_which_walks_had_an_unsolved_qp(robot, capsys):
+    def toys(pool, config, robot, jobs, **options):
+        for job in jobs:
+            walk = pretend_walk(0, 0.03, 1.0)
+            wrong = float(job.weights.Q.euler[0]) == float(expert().Q.euler[0])
+            yield walk._replace(residual=np.full_like(walk.residual, np.nan if wrong else 0.0))
+
+    sets = {"c": [nominal(), expert()], "s": [nominal()]}
+    commands = {name: named_command(name) for name in sets}
+    engine = MUJOCO_C._replace(walk=toys)
+    pool = ThreadPoolExecutor(1)
+    searches.losses_on_hfs(
+        pool, TuneConfig(), robot, sets, commands=commands, engine=engine, at_once=3
+    )
+    said = " ".join(capsys.readouterr().err.split())
+    assert said == "c: a QP was not solved in 1 of 2 walks"
+
+
 @pytest.mark.slow
 def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine(robot):
     config = TuneConfig(rollout=RolloutConfig(ticks=4))
     sets = {"c": [nominal(), expert()], "s": [nominal()]}
+    commands = {name: named_command(name) for name in sets}
     pool = ThreadPoolExecutor(1)
     told = {
-        name: searches.losses_on_hfs(pool, config, robot, sets, engine=engine, at_once=3)
+        name: searches.losses_on_hfs(
+            pool, config, robot, sets, commands=commands, engine=engine, at_once=3
+        )
         for name, engine in ENGINES.items()
     }
     for name, each in sets.items():

@@ -32,7 +32,7 @@ def asked(monkeypatch):
     """What the steps that take long were asked for; nothing is walked, tuned or drawn in 3D."""
     told = {"walks": 0, "tunings": []}
 
-    def search(pool, config, tune, robot, starts, *, engine, folder):
+    def search(pool, config, tune, robot, starts, *, commands, engine, folder):
         told["search"] = config
         generation = Generation(np.zeros((10, 18)), np.full(10, 2e6))
         one = SearchResult(expert(), 2e6, 7, [generation] * 2, "2 generations")

@@ -245,6 +245,7 @@ def _search(bench: _Bench) -> dict[str, SearchResult]:
         plan.tune,
         bench.robot,
         dict.fromkeys(plan.commands, nominal()),
+        commands=plan.commands,
         engine=engine,
         folder=bench.kept / f"search-{key}",
     )
