@@ -83,7 +83,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
     residual = np.where(fallen, np.inf, 0.0)
     wrong = walk._replace(fallen=fallen, residual=residual)
-    monkeypatch.setattr(arguments, "walked", lambda *args: wrong)
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: wrong)
     assert call(monkeypatch, "walk") == 1
     out, err = capsys.readouterr()
     assert "nominal weights: ended after 0.20 s" in out
@@ -92,7 +92,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     found = json.loads(capsys.readouterr().out)
     assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
     assert found["residual"] is None
-    monkeypatch.setattr(arguments, "walked", lambda *args: walk._replace(fallen=fallen))
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: walk._replace(fallen=fallen))
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
 
@@ -100,7 +100,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
 def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):
     path = tmp_path / "two\nlines.json"
     save_weights(path, expert())
-    monkeypatch.setattr(arguments, "walked", lambda *args: synthetic_walk(0, 30))
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: synthetic_walk(0, 30))
     assert call(monkeypatch, "walk", "--weights", path) == 0
     assert "two lines.json weights: walked" in capsys.readouterr().out.splitlines()[0]
 

@@ -128,7 +128,7 @@ def lasting(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
     return replace(config, rollout=replace(config.rollout, ticks=ticks))
 
 
-def walked(
+def walk_once(
     args: Walk | View, robot: Robot, trajectory: NamedCommand, weights: Weights
 ) -> Trajectory:
     """One walk in the world of the flags."""

@@ -64,7 +64,7 @@ def walk(args: Walk) -> None:
     robot = load_robot(args.robot)
     weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = arguments.walked(args, robot, course, weights)
+    trajectory = arguments.walk_once(args, robot, course, weights)
     score = metrics.score(PAPER_LOSS, trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan

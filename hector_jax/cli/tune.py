@@ -62,7 +62,7 @@ def tune(args: Tune) -> None:
         for folder, one in runs.items():
             _trajectories(one, robot)
             if base and folder.exists():
-                raise run_folder.taken(folder)
+                raise run_folder.exists_error(folder)
         runs = {run_folder.begin(folder, one): one for folder, one in runs.items()}
     for folder, one in runs.items():
         with locked(folder):
@@ -177,7 +177,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         judged = _judge(pool, run, tuned.sets)
     result, by_name = _result(run, tuned, judged)
     seconds = f"{time.monotonic() - begun:.0f}"
-    write_json(folder / "versions.json", made_with | {"seconds": seconds})
+    write_json(folder / VERSIONS, made_with | {"seconds": seconds})
     verdict, (standin, on_hfs) = by_name[run.name], judged[trajectories[0].name]
     report = write_report(
         folder,
@@ -222,8 +222,8 @@ def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, dict[str, float]]
 
 def _note_settings(run: _Run) -> dict[str, Any]:
     """Write what the run follows from beside its flags; InputError where it was otherwise."""
-    path = run.folder / "config.json"
-    begun = read_json(path)
+    path = run.folder / CONFIG
+    begun = read_object(path)
     commands = [
         {name: np.asarray(x).tolist() for name, x in one.command._asdict().items()}
         for one in run.trajectories
@@ -245,7 +245,7 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     options: dict[str, Any] = {
         "start": run.start,
         "commit": run.commit,
-        "journal": Journal(run.folder / "metrics.jsonl"),
+        "journal": Journal(run.folder / METRICS),
         "dumps": run.folder / "dumps",
     }
     step = partial(tunings.tune, pool, run.config, run.robot, folder=run.kept, **options)
@@ -333,7 +333,7 @@ def _result(
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.shifts:
         result["refresh"] = tuned.shifts
-    write_json(run.folder / "result.json", result)
+    write_json(run.folder / RESULT, result)
     return result, by_name
 
 

@@ -50,7 +50,7 @@ def view_run(args: View) -> None:
         story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
-            walked = arguments.walked(args, robot, course, weights)
+            walked = arguments.walk_once(args, robot, course, weights)
             loss = metrics.score(begun.loss, walked).L / 1e6
             story.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
             say(f"  {story[-1]}")

@@ -66,7 +66,7 @@ def load_run(folder: Path) -> Run:
     Raises:
         InputError: one line naming the file that is missing or is not what a run leaves.
     """
-    result, config, made_with = (read_json(folder / name) for name in (RESULT, CONFIG, VERSIONS))
+    result, config, made_with = (read_object(folder / name) for name in (RESULT, CONFIG, VERSIONS))
     if not isinstance(result.get("sets"), dict):
         raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
     return Run(str(folder), result, read_metrics(folder), _flat(config), made_with)
@@ -78,7 +78,7 @@ def read_request(folder: Path) -> RunRequest:
     Raises:
         InputError: the folder is none of a run.
     """
-    config = read_json(folder / CONFIG)
+    config = read_object(folder / CONFIG)
     try:
         # a run that has only just begun has its flags there and nothing else
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
@@ -195,7 +195,7 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
     )
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_object(path: Path) -> dict[str, Any]:
     """Read a JSON object of a run's folder.
 
     Raises:
