@@ -172,7 +172,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
     if not folder.exists():
         shutil.rmtree(part, ignore_errors=True)  # a cut would leave its seconds unknown
         begin = time.monotonic()
-        nets.collect(pool, nets.CollectConfig(), robot, part / "walks")  # see `ground`
+        nets.collect(pool, nets.CollectConfig(), robot, part / "walks")  # see `load_or_train`
         collected = time.monotonic()
         path = nets.net_path(part, TrainConfig().variant)
         nets.train(TrainConfig(), robot, part / "walks", path)
@@ -180,7 +180,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
         write_json(part / "seconds.json", took)
         part.rename(folder)
     took = json.loads((folder / "seconds.json").read_text())
-    return nets.ground(pool, robot, folder).params, took
+    return nets.load_or_train(pool, robot, folder).params, took
 
 
 def on_model(

@@ -23,7 +23,7 @@ from hector_jax.cli.parse import from_file
 from hector_jax.control.weights import WEIGHT_NAMES, expert, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.tree_file import read_card
-from hector_jax.grfm.collection import load_walks, walked_with
+from hector_jax.grfm.collection import fingerprint, load_walks
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
@@ -354,8 +354,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert result["refresh"][0].keys() == {"old", "new"}
     assert len(load_walks(run / "refresh-1" / "walks", load_robot()).job.seed) == 4
     card = read_card(run / "refresh-1" / "refreshed.npz")["about"]
-    assert card["made_of"] == walked_with(tmp_path / "data" / "walks")
-    assert card["and_of"] == [walked_with(run / "refresh-1" / "walks")]
+    assert card["made_of"] == fingerprint(tmp_path / "data" / "walks")
+    assert card["and_of"] == [fingerprint(run / "refresh-1" / "walks")]
     assert "### Refresh 1" in (run / "report.md").read_text()
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):

@@ -184,7 +184,9 @@ def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, resid
     for _ in range(2):  # as walked, and as kept
         judge(tmp_path, {"mine": nominal()})
         said = " ".join(capsys.readouterr().err.split())
-        assert f"mine: at least one QP of its walks was not solved (residual {residual:.0e})" in said
+        assert (
+            f"mine: at least one QP of its walks was not solved (residual {residual:.0e})" in said
+        )
     judge(tmp_path, {"mine": nominal()}, seeds=(0,))
     assert capsys.readouterr().err == ""
 

@@ -54,7 +54,7 @@ def gather(folder, robot, draw=0, **others):
 
 
 def ground(folder, robot, variant=None):
-    return nets.ground(ThreadPoolExecutor(1), robot, folder, variant)
+    return nets.load_or_train(ThreadPoolExecutor(1), robot, folder, variant)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def test_no_walk_is_in_two_parts(tmp_path, robot):
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 5
     net = nets.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
-    held = nets.held_out(robot, net)
+    held = nets.held_out_walks(robot, net)
     assert set(np.asarray(held.job.seed)) == walks[2]
 
 
@@ -91,7 +91,7 @@ def test_a_net_is_trained_once(tmp_path, robot, quick, monkeypatch):
     for one, other in ((first.params, again.params), (first.linear, again.linear)):
         jax.tree.map(np.testing.assert_array_equal, one, other)
     assert again.errors == first.errors
-    assert again.held_out == first.held_out
+    assert again.held_out_walks == first.held_out_walks
     card = read_card(tmp_path / "grfm.npz")["about"]
     assert card["settings"]["variant"] == "residual"
     assert card["made_of"]["controller"] == repr(WalkConfig())

@@ -58,7 +58,7 @@ def asked(monkeypatch):
     class Net:
         params = None
 
-    monkeypatch.setattr(nets, "ground", lambda *args: Net)
+    monkeypatch.setattr(nets, "load_or_train", lambda *args: Net)
     monkeypatch.setattr(searches, "search", search)
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
     monkeypatch.setattr(tunings, "tune_measured", tune_measured)

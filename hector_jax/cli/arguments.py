@@ -120,7 +120,7 @@ def seconds(flag: float, trajectory: NamedCommand) -> float:
     return trajectory.seconds
 
 
-def lasting(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
+def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
     """The tuning with rollouts as long as the trajectory, where its file says how long."""
     if trajectory.seconds is None:
         return config

@@ -28,7 +28,7 @@ def search(args: Search) -> None:
     commands = {one.name: one.command for one in courses}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = choose_engine(args.engine)
-    tune = arguments.lasting(arguments.tune_config(robot), courses[0])
+    tune = arguments.with_length(arguments.tune_config(robot), courses[0])
     start = arguments.weights(args.start, robot)
     out = arguments.default_of(args.out, Search.out, args.robot, robot)
     make_folder(out)

@@ -44,7 +44,7 @@ from hector_jax.runs.cache import content_key
 from hector_jax.runs.metrics import BASELINES, Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
-from hector_jax.runs.verdicts import Judged
+from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import Imperfections, hfs
@@ -197,7 +197,7 @@ def _make_table(
         make_folder(folder)
     made_with = environment()
     with workers(args.processes) as pool:
-        net = nets.ground(pool, robot, args.data)
+        net = nets.load_or_train(pool, robot, args.data)
         bench = _Bench(pool, plan, robot, net, shelf, made_with.get("commit", ""))
         searched = _search(bench)
         tuned = {name: _tune(bench, name) for name in plan.commands}
@@ -292,7 +292,7 @@ def _sets(
 
 def _judge(
     bench: _Bench, name: str, plants: list[Imperfections], sets: Mapping[str, Weights]
-) -> Judged:
+) -> ScoredWalks:
     plan = bench.plan
     return verdicts.judge(
         bench.pool,
@@ -308,11 +308,11 @@ def _judge(
     )
 
 
-def _verdict(plan: _Plan, judged: Judged) -> Verdict:
+def _verdict(plan: _Plan, judged: ScoredWalks) -> Verdict:
     return metrics.make_verdict(plan.tune.loss, plan.seeds, judged.scores)
 
 
-def _falls(plan: _Plan, trajectory: str, judged: Judged) -> list[Fall]:
+def _falls(plan: _Plan, trajectory: str, judged: ScoredWalks) -> list[Fall]:
     return [
         Fall(
             trajectory,
@@ -334,7 +334,7 @@ def _search_in_table(plan: _Plan, result: SearchResult) -> Search:
 
 
 def _draw(
-    out: Path, robot: Robot, verdicts: Mapping[str, Verdict], judged: Mapping[str, Judged]
+    out: Path, robot: Robot, verdicts: Mapping[str, Verdict], judged: Mapping[str, ScoredWalks]
 ) -> list[Picture]:
     """All pictures, in the order of the report."""
     say("drawing the pictures")

@@ -39,7 +39,7 @@ from hector_jax.runs.journal import Journal
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
-from hector_jax.runs.verdicts import Judged
+from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import aligned
@@ -129,7 +129,7 @@ class _Run(NamedTuple):
     commit: str
 
     @property
-    def kept(self) -> Path:
+    def artefacts(self) -> Path:
         """Folder of the artefacts."""
         return self.folder / "kept"
 
@@ -167,7 +167,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             arguments.weights(args.start, robot),
             trajectories,
             trajectories[0].seconds or Walk.seconds,
-            arguments.lasting(config, trajectories[0]),
+            arguments.with_length(config, trajectories[0]),
             _net(pool, args, robot),
             made_with.get("commit", ""),
         )
@@ -206,7 +206,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
 def _net(pool: Executor, args: Tune, robot: Robot) -> TrainedNet:
     if args.net is not None:
         return nets.load_net(args.net, robot, args.variant)[0]
-    return nets.ground(pool, robot, arguments.folder_of(args.data, args.robot, robot), args.variant)
+    return nets.load_or_train(
+        pool, robot, arguments.folder_of(args.data, args.robot, robot), args.variant
+    )
 
 
 def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, dict[str, float]]]:
@@ -248,7 +250,7 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         "journal": Journal(run.folder / METRICS),
         "dumps": run.folder / "dumps",
     }
-    step = partial(tunings.tune, pool, run.config, run.robot, folder=run.kept, **options)
+    step = partial(tunings.tune, pool, run.config, run.robot, folder=run.artefacts, **options)
     problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
     tuned = step(problems, title=f"tuning {run.name} without and with GRFM-Net")
     net, name, shifts = run.net, "with", []
@@ -280,7 +282,7 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
 
 def _judge(
     pool: Executor, run: _Run, sets: Mapping[str, Weights]
-) -> dict[str, tuple[Judged, Judged]]:
+) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
     """Walks of all sets on the stand-in plants and on the hfs, by trajectory."""
     seeds = range(run.args.seeds)
     judge = partial(verdicts.judge, pool, run.config, run.robot, sets)
@@ -293,7 +295,7 @@ def _judge(
             arguments.plants("standin", seeds),
             seeds,
             title=f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}",
-            folder=run.kept / "standin",
+            folder=run.artefacts / "standin",
             **options,
         )
         on_hfs = judge(
@@ -301,7 +303,7 @@ def _judge(
             [hfs()],
             [0],
             title=f"walking{where} on the high-fidelity simulator",
-            folder=run.kept / "hfs",
+            folder=run.artefacts / "hfs",
             **options,
         )
         judged[name] = standin, on_hfs
@@ -309,7 +311,7 @@ def _judge(
 
 
 def _result(
-    run: _Run, tuned: _Tuned, judged: Mapping[str, tuple[Judged, Judged]]
+    run: _Run, tuned: _Tuned, judged: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
 ) -> tuple[dict[str, Any], dict[str, Verdict]]:
     """Write result.json; its content, and the verdicts: of all walks, and by trajectory."""
 
@@ -337,7 +339,7 @@ def _result(
     return result, by_name
 
 
-def _draw(run: _Run, tuned: _Tuned, judged: Judged, on_hfs: Judged) -> list[Picture]:
+def _draw(run: _Run, tuned: _Tuned, judged: ScoredWalks, on_hfs: ScoredWalks) -> list[Picture]:
     net = run.net
     effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
     sampled = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
@@ -348,7 +350,7 @@ def _draw(run: _Run, tuned: _Tuned, judged: Judged, on_hfs: Judged) -> list[Pict
     )
 
 
-def _film(run: _Run, judged: Judged) -> Picture | str:
+def _film(run: _Run, judged: ScoredWalks) -> Picture | str:
     """The film of a run, or why there is none."""
     if not run.args.video:
         return "left out (--no-video)"

@@ -89,7 +89,7 @@ def replay_dump(args: Replay) -> None:
     Raises:
         Broken: it does not come out the same.
     """
-    replayed = replay.again(args.dump)
+    replayed = replay.replay(args.dump)
     print(as_json(replayed._asdict(), indent=2) if args.json else replay.in_words(replayed))
     if not replayed.same:
         raise Broken(f"{args.dump}: {replay.verdict(replayed)}")

@@ -115,7 +115,7 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
     return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
 
 
-def walked_with(folder: Path) -> dict[str, Any]:
+def fingerprint(folder: Path) -> dict[str, Any]:
     """What tells one collection from another: a hash of its walks, and its settings.
 
     Raises:

@@ -60,7 +60,7 @@ def load_artefact(path: Path, like: Tree, *, kind: str, robot: Robot) -> Tree | 
         return None
 
 
-def cached(
+def load_or_make(
     paths: Mapping[Key, Path],
     make: Callable[[list[Key], Mapping[Key, Tree]], Iterable[tuple[Key, Tree]]],
     *,

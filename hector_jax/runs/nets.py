@@ -77,7 +77,7 @@ class TrainedNet(NamedTuple):
     course: History
     config: TrainConfig
     folders: tuple[Path, ...]  # of the walks; none for a net that came alone
-    held_out: list[int]  # numbers of the walks that no training saw
+    held_out_walks: list[int]  # numbers of the walks that no training saw
 
 
 def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
@@ -162,10 +162,10 @@ def _samples(robot: Robot, folder: Path) -> Samples:
     return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
 
 
-def held_out(robot: Robot, net: TrainedNet) -> Walks:
+def held_out_walks(robot: Robot, net: TrainedNet) -> Walks:
     """The walks that no training of a net saw, of the folder that it was trained on."""
     walks = collection.load_walks(net.folders[0], robot)
-    return jax.tree.map(lambda x: x[net.held_out], walks)
+    return jax.tree.map(lambda x: x[net.held_out_walks], walks)
 
 
 def train(
@@ -185,7 +185,7 @@ def train(
 def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> TrainedNet:
     with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
         parts = samples(robot, *folders)
-    made_of = [collection.walked_with(each) for each in folders]
+    made_of = [collection.fingerprint(each) for each in folders]
     with bar(
         f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
     ) as tell:
@@ -257,7 +257,9 @@ def training_settings(config: TrainConfig) -> dict[str, Any]:
     return {**asdict(config), "code": code_hash(*TRAINING_CODE)}
 
 
-def ground(pool: Executor, robot: Robot, data: Path, variant: str | None = None) -> TrainedNet:
+def load_or_train(
+    pool: Executor, robot: Robot, data: Path, variant: str | None = None
+) -> TrainedNet:
     """A GRFM-Net with its walks under `data`: made now, or from disk where it would be made so.
 
     Args:
@@ -275,7 +277,7 @@ def ground(pool: Executor, robot: Robot, data: Path, variant: str | None = None)
     settings = collection_settings(CollectConfig(), robot)
     if not (walks / "card.json").exists():
         collect(pool, CollectConfig(), robot, walks)
-    made_of = collection.walked_with(walks)
+    made_of = collection.fingerprint(walks)
     check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
     with locked(data):  # a second process that begins now waits, and finds the net
         if not path.exists():

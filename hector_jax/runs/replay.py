@@ -151,7 +151,7 @@ def _on_cpu() -> AbstractContextManager[Any]:
     return jax.default_device(jax.local_devices(backend="cpu")[0])
 
 
-def again(path: Path) -> Replayed:
+def replay(path: Path) -> Replayed:
     """Do the evaluation of a dump again, on the CPU, where tunings run.
 
     Raises:

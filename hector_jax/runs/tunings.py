@@ -25,7 +25,7 @@ from hector_jax.grfm import network
 from hector_jax.grfm.network import Params
 from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
-from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.journal import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -221,7 +221,7 @@ def tune(
             yield name, _stored(Tuned(tuning, commit))
 
     like = partial(_stored_like, config.loss)
-    stored = cached(paths, make, like=like, kind=_KIND, robot=robot)
+    stored = load_or_make(paths, make, like=like, kind=_KIND, robot=robot)
     tuned = {name: _restored(one) for name, one in stored.items()}
     if journal is not None:
         journal.write({name: one.tuning.history for name, one in tuned.items()})
@@ -299,7 +299,7 @@ def tune_measured(
 
     paths = {"walks": folder / f"tuning-walks-{key}.npz"}
     like = partial(_stored_like, config.loss)
-    return _restored(cached(paths, make, like=like, kind=_KIND, robot=robot)["walks"])
+    return _restored(load_or_make(paths, make, like=like, kind=_KIND, robot=robot)["walks"])
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:

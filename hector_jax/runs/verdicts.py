@@ -21,7 +21,7 @@ from hector_jax.grfm.dataset import SOLVED, at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
-from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
@@ -36,7 +36,7 @@ Case = tuple[str, int]
 """A set and a seed."""
 
 
-class JudgedWalk(NamedTuple):
+class ScoredWalk(NamedTuple):
     """What is kept of one walk."""
 
     score: Score
@@ -45,10 +45,10 @@ class JudgedWalk(NamedTuple):
     commit: str  # at which it was walked; empty where that is not known
 
 
-class Judged(NamedTuple):
+class ScoredWalks(NamedTuple):
     """Walks of several sets on the same plants."""
 
-    walks: dict[str, list[JudgedWalk]]  # by set, in the order of the plants
+    walks: dict[str, list[ScoredWalk]]  # by set, in the order of the plants
     first: dict[str, Trajectory]  # by set, the walk on the first plant; empty where none is kept
 
     @property
@@ -86,18 +86,18 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
-def _judged(config: Loss, walk: Trajectory, commit: str) -> JudgedWalk:
+def _judged(config: Loss, walk: Trajectory, commit: str) -> ScoredWalk:
     up = int(np.sum(~np.asarray(walk.fallen)))
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
     upright = np.asarray(up * float(walk.period))
-    return JudgedWalk(metrics.score(config, walk), upright, last, commit)
+    return ScoredWalk(metrics.score(config, walk), upright, last, commit)
 
 
 def _like(loss: Loss, with_walk: bool) -> Any:
     """Layout of the artefact of one walk, with its trajectory or without."""
     walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like().trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
-    one: Any = JudgedWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
+    one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
     return one, walk if with_walk else None
 
 
@@ -119,7 +119,7 @@ def judge(
     seconds: float = 4.0,
     folder: Path | None = None,
     commit: str = "",
-) -> Judged:
+) -> ScoredWalks:
     """Walk every weight set on every plant and score the walks.
 
     Args:
@@ -160,13 +160,13 @@ def judge(
             key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
             paths[case] = _path(folder, case, key, with_walk(case))
         like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
-        results = cached(paths, make, like=like, kind="walk", robot=robot)
+        results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
     for name in sets:
         worst = np.max([walks[name, seed].score.residual for seed in seeds])
         if not worst <= SOLVED:
             say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
-    return Judged(
+    return ScoredWalks(
         {name: [walks[name, seed] for seed in seeds] for name in sets},
         {name: results[name, seeds[0]][1] for name in sets if with_walk((name, seeds[0]))},
     )
