@@ -251,6 +251,11 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
             jax.tree.map(np.testing.assert_array_equal, first, each[0])
 
 
+def test_what_takes_the_mean_over_commands_is_in_the_key_of_a_tuning():
+    modules = {f"hector_jax.{name}" for name in tunings.TUNING_CODE}
+    assert tunings.difftune.mean_over_commands.__module__ in modules
+
+
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
     def job(config, robot, start, problem, name, heard):
         if name == "with":

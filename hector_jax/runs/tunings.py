@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
@@ -94,6 +93,8 @@ def _tune_job(
     scales = np.ones(1)
     if problem.others:
         losses = np.array([one.loss for one in evaluate(start)])
+    evaluate = difftune.mean_over_commands(evaluations, start)
+    return difftune.descend(config, start, evaluate, lambda one: messages.put((name, one)))
         scales = losses / losses.mean()
     evaluate_mean = partial(_mean, evaluate, scales)
     return difftune.descend(config, start, evaluate_mean, lambda one: heard.put((name, one)))
@@ -111,18 +112,10 @@ def _evaluate(
     ]
 
 
-def _mean(
-    evaluate: Callable[[Weights], list[Evaluation]],
-    scales: Float[np.ndarray, " commands"],
-    weights: Weights,
-) -> Evaluation:
-    """The mean over the commands, each divided by its scale, as one evaluation."""
-    each = jax.device_get(evaluate(weights))
-    whole = jax.tree.map(
-        lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
-    )
-    worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
-    return whole._replace(**worst)
+def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[tuple[Any, ...]]:
+    """Command, anchor and effect of the rollout on each command of a problem."""
+    effect = network.effect_of(problem.params, config.rollout.walk.gait)
+    return [(command, standing_anchor(robot), effect) for command in problem.commands]
 
 
 def _tunings(
