@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, weights_to_vector
+from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -81,8 +82,21 @@ def gradient_norms(
 
 
 def aligned(loss: Loss, norms: dict[str, float], to: str = "L_ctrl") -> Loss:
-    """Loss whose terms have gradients of the order of that of one of them (footnote of Eq. 11)."""
-    one = {term.name: term.weight for term in loss}[to]
+    """Loss whose terms have gradients of the order of that of one of them (footnote of Eq. 11).
+
+    Args:
+        loss: terms and weights.
+        norms: of the gradient of each term, see `gradient_norms`.
+        to: the term that keeps its weight.
+
+    Raises:
+        InputError: a term that the loss does not have, or without a norm.
+    """
+    weights = {term.name: term.weight for term in loss}
+    for name in (to, *weights):
+        if name not in weights or name not in norms:
+            raise InputError(unknown("term of the loss", name, weights.keys() & norms.keys()))
+    one = weights[to]
 
     def power(ratio: float) -> float:
         return float(10.0 ** np.round(np.log10(max(ratio, 1e-12))))
