@@ -11,7 +11,6 @@ What is random is repeated with other seeds. All go in lock-step, so that a roun
 MJX, or walks on the processes. Everything is kept under OUT and taken up again.
 """
 
-import json
 import shutil
 import statistics
 import sys
@@ -38,6 +37,7 @@ from hector_jax.core.environment import environment
 from hector_jax.core.files import make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.settings import read_json
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
@@ -179,7 +179,7 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
         took = {"collection": collected - begin, "training": time.monotonic() - collected}
         write_json(part / "seconds.json", took)
         part.rename(folder)
-    took = json.loads((folder / "seconds.json").read_text())
+    took = read_json(folder / "seconds.json", "the seconds of a collection and a training")
     return nets.load_or_train(pool, robot, folder).params, took
 
 
@@ -207,7 +207,7 @@ def on_model(
             }
             runs = {name: future.result()._asdict() for name, future in running.items()}
         write_json(path, {"walk": price, "courses": runs})
-    data = json.loads(path.read_text())
+    data = read_json(path, "runs on the model")
     return {name: ModelRun(**data["courses"][name]) for name in ON_MODEL}, data["walk"]
 
 
