@@ -36,7 +36,7 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net, member_effects
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import metrics, verdicts
+from hector_jax.runs import verdicts
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
@@ -185,7 +185,7 @@ def judged(
     """Scores of weight sets on plants, stacked over these."""
     seeds = range(first_seed, first_seed + len(plants))
     found = verdicts.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title=title)
-    return {name: metrics.stack_scores(scores) for name, scores in found.scores.items()}
+    return {name: stack(scores) for name, scores in found.scores.items()}
 
 
 def million(x: Any) -> str:

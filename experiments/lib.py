@@ -4,14 +4,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
-import numpy as np
-
 from hector_jax.core.console import bar, made_at
 from hector_jax.core.environment import environment
 from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.sim.loop import Job
@@ -91,7 +89,7 @@ def walk_groups(
                     rows.append(score(next(walks)))
                     done += 1
                     tell(done, len(jobs), name)
-                yield name, jax.tree.map(lambda *x: np.stack(x), *rows)
+                yield name, stack(rows)
 
     about = {"settings": [repr(part) for part in settings]}
     return load_or_make(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)

@@ -20,7 +20,7 @@ from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, verdicts
+from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.folder import RESULT, load_run
 from hector_jax.tuning.loss import PAPER_LOSS
 
@@ -37,7 +37,7 @@ def evaluate(args: Evaluate) -> None:
     plants = arguments.plants(args.world, seeds)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        config = arguments.tune_config(robot)
+        config = tunings.tune_config(robot)
         judged = verdicts.judge(
             pool, config, robot, sets, course.command, plants, seeds, title=title, seconds=seconds
         )

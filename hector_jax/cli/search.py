@@ -14,7 +14,7 @@ from hector_jax.core.environment import versions
 from hector_jax.core.files import as_json, make_folder, write_json
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import searches
+from hector_jax.runs import searches, tunings
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim.engine import choose_engine
 from hector_jax.tuning.loss import alphas
@@ -28,7 +28,7 @@ def search(args: Search) -> None:
     commands = {one.name: one.command for one in courses}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = choose_engine(args.engine)
-    tune = arguments.with_length(arguments.tune_config(robot), courses[0])
+    tune = arguments.with_length(tunings.tune_config(robot), courses[0])
     start = arguments.weights(args.start, robot)
     out = arguments.default_of(args.out, Search.out, args.robot, robot)
     make_folder(out)

@@ -18,6 +18,7 @@ from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, check, from_table
+from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings
 from hector_jax.grfm import collection, dataset, network, training
 from hector_jax.grfm.collection import Walks
@@ -30,7 +31,7 @@ from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.tunings import TUNING_CODE, compile_programs, path_config, tuning_paths
+from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 from hector_jax.sim.engine import ENGINES, Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
@@ -82,7 +83,7 @@ class TrainedNet(NamedTuple):
 
 def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
     """All that the walks of a collection follow from, as JSON values for their card."""
-    paths = path_config(robot)
+    paths = tune_config(robot)
     return {
         **asdict(config),
         "controller": repr(paths.rollout.walk),
@@ -317,7 +318,7 @@ def refresh(
     """
     walks = folder / "walks"
     late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
-    path = jax.tree.map(lambda *w: np.stack(w), tuning.ten, *late)
+    path = stack([tuning.ten, *late])
     jobs = draw_jobs_near(config.seed, config.walks, command, path=path, seconds=config.seconds)
     with locked(walks):
         # the jobs say the rest

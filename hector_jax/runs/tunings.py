@@ -86,30 +86,15 @@ def _restored(stored: Any) -> Tuned:
 
 
 def _tune_job(
-    config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, heard: Any
+    config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, messages: Any
 ) -> Tuning:
-    """One tuning in a worker; the queue `heard` is told of each iteration."""
-    evaluate = partial(_evaluate, config, robot, problem)
-    scales = np.ones(1)
-    if problem.others:
-        losses = np.array([one.loss for one in evaluate(start)])
+    """One tuning in a worker; the queue `messages` gets each iteration."""
+    step = partial(difftune.tune_step, config, robot)
+    evaluations = [
+        lambda weights, m=model: step(weights, *m) for model in _models(config, robot, problem)
+    ]
     evaluate = difftune.mean_over_commands(evaluations, start)
     return difftune.descend(config, start, evaluate, lambda one: messages.put((name, one)))
-        scales = losses / losses.mean()
-    evaluate_mean = partial(_mean, evaluate, scales)
-    return difftune.descend(config, start, evaluate_mean, lambda one: heard.put((name, one)))
-
-
-def _evaluate(
-    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights
-) -> list[Evaluation]:
-    """One rollout on each command of a problem, with its gradient."""
-    anchor = standing_anchor(robot)
-    effect = network.effect_of(problem.params, config.rollout.walk.gait)
-    return [
-        difftune.tune_step(config, robot, weights, command, anchor, effect)
-        for command in problem.commands
-    ]
 
 
 def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[tuple[Any, ...]]:
@@ -129,16 +114,16 @@ def _tunings(
 ) -> Iterator[tuple[str, Tuning]]:
     """Tune several problems side by side; yields each tuning with its name when it has ended."""
     done, total = 0, config.iterations * len(problems)
-    with message_queue() as heard, bar(title) as tell:
+    with message_queue() as messages, bar(title) as tell:
         running: dict[Future[Tuning], str] = {
-            pool.submit(_tune_job, config, robot, start, problem, name, heard): name
+            pool.submit(_tune_job, config, robot, start, problem, name, messages): name
             for name, problem in problems.items()
         }
         tell(done, total, "compiling")
         while running:
             ended = wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done
-            while not heard.empty():  # also all that those told which have ended
-                name, iteration = heard.get()
+            while not messages.empty():  # also all that those told which have ended
+                name, iteration = messages.get()
                 done += int(iteration.iteration > 0)
                 tell(done, total, f"{name}: L {float(iteration.evaluation.loss) / 1e6:.3f}e6")
                 on_iteration(name, iteration)
@@ -296,14 +281,8 @@ def tune_measured(
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
-    anchor = standing_anchor(robot)
-    effect = network.effect_of(problem.params, config.rollout.walk.gait)
-    each = [
-        evaluate.gradient_norms(
-            config.rollout, robot, nominal(robot), command, anchor, effect, config.loss
-        )
-        for command in problem.commands
-    ]
+    norms = partial(evaluate.gradient_norms, config.rollout, robot, nominal(robot))
+    each = [norms(*model, config.loss) for model in _models(config, robot, problem)]
     return jax.tree.map(lambda *x: float(np.mean(x)), *each)
 
 
@@ -323,25 +302,23 @@ def gradient_norms(
         return {name: future.result() for name, future in running.items()}
 
 
-def path_config(robot: Robot) -> TuneConfig:
-    """Settings of the tunings whose weights the data cover: the same whatever is tuned later."""
-    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)))
+def tune_config(robot: Robot, **others: Any) -> TuneConfig:
+    """Settings of a tuning, with the controller that the robot's description asks for."""
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **others)
 
 
 def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     """Weights that plain tunings of the trajectories pass through, stacked: data covers them.
 
-    The tunings are kept in `folder`.
+    The tunings are kept in `folder`; their settings are the same whatever is tuned later.
     """
-    config = path_config(robot)
+    config = tune_config(robot)
     problems = {name: Problem(named_command(name), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
     tuned = tune(pool, config, robot, problems, folder, title=title)
-    stacked = []
-    for name in COMMANDS:
-        passed = [i.weights for i in tuned[name].tuning.history if i.accepted]
-        stacked.append(jax.tree.map(lambda *w: np.stack(w), *passed))
-    return stacked
+    return [
+        stack([i.weights for i in tuned[name].tuning.history if i.accepted]) for name in COMMANDS
+    ]
 
 
 def _compile_tuning(config: TuneConfig, robot: Robot) -> None:
@@ -355,7 +332,7 @@ def _compile_walking(config: WalkConfig, robot: Robot) -> None:
 
 def compile_programs(pool: Executor, robot: Robot) -> None:
     """Compile what tunings and walks run, each program in one process; the others load it."""
-    config = path_config(robot)
+    config = tune_config(robot)
     with bar("compiling, once on a machine") as tell:
         jobs = [
             pool.submit(_compile_tuning, config, robot),
