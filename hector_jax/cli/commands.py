@@ -3,7 +3,7 @@
 from functools import singledispatch
 from typing import Any
 
-from hector_jax.cli import data, evaluate, export, search, table, tune, view
+from hector_jax.cli import data, doctor, evaluate, export, search, table, tune, view
 
 
 @singledispatch
@@ -30,6 +30,6 @@ for _command in (
     view.replay_dump,
     view.tensorboard,
     export.export_controller,
-    export.examine,
+    doctor.doctor,
 ):
     run.register(_command)

@@ -1,10 +1,10 @@
-"""A tuned controller for other machines, and how this one is."""
+"""A tuned controller for other machines."""
 
-from hector_jax.cli import arguments, doctor
-from hector_jax.cli.flags import Doctor, Export
+from hector_jax.cli import arguments
+from hector_jax.cli.flags import Export
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core.console import Broken, say
+from hector_jax.core.console import say
 from hector_jax.core.files import as_json, locked
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
@@ -40,20 +40,3 @@ def export_controller(args: Export) -> None:
         times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
         print(f"a call {text} [ms]: {times.format(**check[what])}")
     say(f"the export is in {folder}")
-
-
-def examine(args: Doctor) -> None:
-    """Tell what is installed here, and whether it works.
-
-    Raises:
-        Broken: something does not.
-    """
-    say("testing this machine: two short walks and a film")
-    facts, faults = doctor.examine()
-    if args.json:
-        print(as_json({**facts, "faults": faults}))
-    else:
-        for name, text in facts.items():
-            print(f"{name:12s} {text}")
-    if faults:
-        raise Broken("; ".join(faults))
