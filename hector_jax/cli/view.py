@@ -92,7 +92,7 @@ def replay_dump(args: Replay) -> None:
     replayed = replay.replay(args.dump)
     print(as_json(replayed._asdict(), indent=2) if args.json else replay.in_words(replayed))
     if not replayed.same:
-        raise Broken(f"{args.dump}: {replay.verdict(replayed)}")
+        raise Broken(f"{args.dump}: {replayed.verdict}")
 
 
 def tensorboard(args: Tensorboard) -> None:
