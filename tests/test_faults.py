@@ -24,7 +24,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import replay, tunings
-from hector_jax.runs.journal import Journal
+from hector_jax.runs.folder import Journal
 from hector_jax.runs.tunings import Problem
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import TuneConfig, descend

@@ -13,9 +13,9 @@ from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import journal, metrics, tunings, verdicts
+from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key
-from hector_jax.runs.folder import as_line
+from hector_jax.runs.folder import Journal, as_line
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
@@ -99,7 +99,7 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
 
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
-        lines_of = journal.Journal(folder / "metrics.jsonl")
+        lines_of = Journal(folder / "metrics.jsonl")
         tunings.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=lines_of)
         return (folder / "metrics.jsonl").read_text()
 

@@ -34,8 +34,7 @@ from hector_jax.report.run import Report, write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
-from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, read_object
-from hector_jax.runs.journal import Journal
+from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
@@ -244,13 +243,17 @@ def _note_settings(run: _Run) -> dict[str, Any]:
 
 def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     """Tune without and with the net, and again with it refreshed; writes the weights."""
-    options: dict[str, Any] = {
-        "start": run.start,
-        "commit": run.commit,
-        "journal": Journal(run.folder / METRICS),
-        "dumps": run.folder / "dumps",
-    }
-    step = partial(tunings.tune, pool, run.config, run.robot, folder=run.artefacts, **options)
+    step = partial(
+        tunings.tune,
+        pool,
+        run.config,
+        run.robot,
+        folder=run.artefacts,
+        start=run.start,
+        commit=run.commit,
+        journal=Journal(run.folder / METRICS),
+        dumps=run.folder / "dumps",
+    )
     problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
     tuned = step(problems, title=f"tuning {run.name} without and with GRFM-Net")
     net, name, shifts = run.net, "with", []

@@ -4,7 +4,7 @@ A tuning runs on one core, because a closed loop is one long chain of small oper
 side by side.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from functools import partial
 from itertools import repeat
@@ -25,7 +25,7 @@ from hector_jax.grfm.network import Params
 from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
 from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.runs.journal import Journal
+from hector_jax.runs.folder import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
@@ -38,7 +38,6 @@ from hector_jax.tuning.rollout import RolloutConfig
 
 # modules that decide the numbers, for `content_key`
 TUNING_CODE = ("tuning.difftune", "grfm.network")
-_KIND = "tuning"  # of a file
 
 
 class Problem(NamedTuple):
@@ -83,6 +82,26 @@ def _restored(stored: Any) -> Tuned:
     ]
     tuning = Tuning(history, tuning.ten, tuning.converged, str(tuning.stop))
     return Tuned(tuning, str(stored.commit))
+
+
+def _load_or_tune(
+    paths: Mapping[str, Path],
+    make: Callable[[list[str], Mapping[str, Tuned]], Iterable[tuple[str, Tuning]]],
+    *,
+    loss: Loss,
+    robot: Robot,
+    commit: str,
+) -> dict[str, Tuned]:
+    """Tunings by name, see `load_or_make`."""
+
+    def make_stored(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+        tuned = {name: _restored(one) for name, one in stored.items()}
+        for name, tuning in make(missing, tuned):
+            yield name, _stored(Tuned(tuning, commit))
+
+    like = partial(_stored_like, loss)
+    stored = load_or_make(paths, make_stored, like=like, kind="tuning", robot=robot)
+    return {name: _restored(one) for name, one in stored.items()}
 
 
 def _tune_job(
@@ -131,23 +150,6 @@ def _tunings(
                 yield running.pop(future), future.result()
 
 
-def _note(
-    config: TuneConfig,
-    robot: Robot,
-    problems: Mapping[str, Problem],
-    journal: Journal | None,
-    dumps: Path | None,
-    name: str,
-    iteration: Iteration,
-) -> None:
-    """Write what a tuning did to the journal, and to a dump where it was refused."""
-    if journal is not None:
-        journal.add(name, iteration)
-    command, params, others = problems[name]
-    if dumps is not None and not others:
-        replay.keep(dumps, name, iteration, config=config, robot=robot, command=command, net=params)
-
-
 def tune(
     pool: Executor,
     config: TuneConfig,
@@ -189,18 +191,23 @@ def tune(
         key = content_key(config, robot, start, *problem, code=TUNING_CODE)
         paths[name] = folder / f"tuning-{name}-{key}.npz"
 
-    def make(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    def on_iteration(name: str, iteration: Iteration) -> None:
         if journal is not None:
-            there = {name: _restored(one).tuning.history for name, one in stored.items()}
+            journal.add(name, iteration)
+        command, net, others = problems[name]
+        if dumps is not None and not others:
+            replay.keep(
+                dumps, name, iteration, config=config, robot=robot, command=command, net=net
+            )
+
+    def make(missing: list[str], tuned: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuning]]:
+        if journal is not None:
+            there = {name: one.tuning.history for name, one in tuned.items()}
             journal.write({name: there.get(name, ()) for name in problems})  # in their order
         wanted = {name: problems[name] for name in missing}
-        note = partial(_note, config, robot, problems, journal, dumps)
-        for name, tuning in _tunings(pool, config, robot, start, wanted, title, note):
-            yield name, _stored(Tuned(tuning, commit))
+        return _tunings(pool, config, robot, start, wanted, title, on_iteration)
 
-    like = partial(_stored_like, config.loss)
-    stored = load_or_make(paths, make, like=like, kind=_KIND, robot=robot)
-    tuned = {name: _restored(one) for name, one in stored.items()}
+    tuned = _load_or_tune(paths, make, loss=config.loss, robot=robot, commit=commit)
     if journal is not None:
         journal.write({name: one.tuning.history for name, one in tuned.items()})
     return tuned
@@ -260,7 +267,7 @@ def tune_measured(
     key = content_key(config, robot, weights, command, params, *plants, code=code)
     job = partial(_measured_job, config, robot, command, params)
 
-    def make(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    def make(missing: list[str], tuned: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuning]]:
         with bar(title) as tell:
             tell(0, config.iterations, "compiling")
             tuning = measured.tune_measured(
@@ -273,11 +280,10 @@ def tune_measured(
                     f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6",
                 ),
             )
-        yield "walks", _stored(Tuned(tuning, commit))
+        yield "walks", tuning
 
     paths = {"walks": folder / f"tuning-walks-{key}.npz"}
-    like = partial(_stored_like, config.loss)
-    return _restored(load_or_make(paths, make, like=like, kind=_KIND, robot=robot)["walks"])
+    return _load_or_tune(paths, make, loss=config.loss, robot=robot, commit=commit)["walks"]
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
