@@ -288,27 +288,16 @@ def _judge(
 ) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
     """Walks of all sets on the stand-in plants and on the hfs, by trajectory."""
     seeds = range(run.args.seeds)
-    judge = partial(verdicts.judge, pool, run.config, run.robot, sets)
-    options: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
+    plants = arguments.plants("standin", seeds)
+    notes: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
+    judge = partial(verdicts.judge, pool, run.config, run.robot, sets, **notes)
     judged = {}
     for name, command, _ in run.trajectories:
         where = f" {name}" if len(run.trajectories) > 1 else ""
-        standin = judge(
-            command,
-            arguments.plants("standin", seeds),
-            seeds,
-            title=f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}",
-            folder=run.artefacts / "standin",
-            **options,
-        )
-        on_hfs = judge(
-            command,
-            [hfs()],
-            [0],
-            title=f"walking{where} on the high-fidelity simulator",
-            folder=run.artefacts / "hfs",
-            **options,
-        )
+        title = f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}"
+        standin = judge(command, plants, seeds, title=title, folder=run.artefacts / "standin")
+        title = f"walking{where} on the high-fidelity simulator"
+        on_hfs = judge(command, [hfs()], [0], title=title, folder=run.artefacts / "hfs")
         judged[name] = standin, on_hfs
     return judged
 

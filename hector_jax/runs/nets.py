@@ -32,7 +32,7 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, robot_hash
 from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
-from hector_jax.sim.engine import ENGINES, Engine, choose_engine
+from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
 
@@ -105,17 +105,18 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
         settings = collection_settings(config, robot)
-        _keep_walks(pool, choose_engine(config.engine), robot, jobs, folder, settings)
+        _collect(pool, config, robot, jobs, folder, settings)
 
 
-def _keep_walks(
+def _collect(
     pool: Executor,
-    engine: Engine,
+    config: CollectConfig,
     robot: Robot,
     jobs: Sequence[Job],
     folder: Path,
     settings: Mapping[str, Any],
 ) -> None:
+    engine = choose_engine(config.engine)
     what = f"{plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine.name}"
     with bar(f"collecting {what}") as tell:
         collection.collect(
@@ -145,13 +146,9 @@ def samples(robot: Robot, *folders: Path) -> Samples:
     walks are numbered by folder.
     """
     each = [_samples(robot, folder) for folder in folders]
-    join = lambda *parts: jax.tree.map(lambda *x: np.concatenate(x), *parts)  # noqa: E731
-    return Samples(
-        join(*(one.training for one in each)),
-        join(*(one.validation for one in each)),
-        join(*(one.held_out for one in each)),
-        sum(one.dropped for one in each),
-    )
+    *parts, dropped = zip(*each, strict=True)
+    joined = (jax.tree.map(lambda *x: np.concatenate(x), *part) for part in parts)
+    return Samples(*joined, sum(dropped))
 
 
 def _samples(robot: Robot, folder: Path) -> Samples:
@@ -323,7 +320,7 @@ def refresh(
     with locked(walks):
         # the jobs say the rest
         settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}
-        _keep_walks(pool, choose_engine(config.engine), robot, jobs, walks, settings)
+        _collect(pool, config, robot, jobs, walks, settings)
     oldest, *newer = (*net.folders, walks)
     after = train(net.config, robot, oldest, folder / "refreshed.npz", newer)
     effects = {

@@ -86,7 +86,7 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
-def _judged(config: Loss, walk: Trajectory, commit: str) -> ScoredWalk:
+def _score_walk(config: Loss, walk: Trajectory, commit: str) -> ScoredWalk:
     up = int(np.sum(~np.asarray(walk.fallen)))
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
     upright = np.asarray(up * float(walk.period))
@@ -99,11 +99,6 @@ def _like(loss: Loss, with_walk: bool) -> Any:
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
     one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
     return one, walk if with_walk else None
-
-
-def _path(folder: Path, case: Case, key: str, with_walk: bool) -> Path:
-    name, seed = case
-    return folder / f"{'walk' if with_walk else 'score'}-{name}-{seed}-{key}.npz"
 
 
 def judge(
@@ -150,15 +145,16 @@ def judge(
         walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
         for case, walk in zip(missing, walks, strict=True):
             samples = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
-            yield case, (_judged(config.loss, walk, commit), samples)
+            yield case, (_score_walk(config.loss, walk, commit), samples)
 
     if folder is None:
         results = dict(make(list(jobs), {}))
     else:
         paths = {}
-        for case, job in jobs.items():
+        for (name, seed), job in jobs.items():
             key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
-            paths[case] = _path(folder, case, key, with_walk(case))
+            word = "walk" if with_walk((name, seed)) else "score"
+            paths[name, seed] = folder / f"{word}-{name}-{seed}-{key}.npz"
         like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
