@@ -17,7 +17,7 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.control.reference import COMMANDS
-from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import say
@@ -74,7 +74,7 @@ def _by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
     texts = tuple(dict.fromkeys(texts))
     names: dict[str, str] = {}  # texts by name
     for text in texts:
-        name = arguments.course(text, robot).name
+        name = command_of(text).name
         if name in names:
             raise InputError(f"--traj {names[name]} and {text} are both named {name}")
         names[name] = text
