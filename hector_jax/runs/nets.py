@@ -17,7 +17,7 @@ from hector_jax.core.console import bar, say_if_slow
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError, plural, short_repr
-from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, check, from_table
+from hector_jax.core.settings import POSITIVE, SEED, Range, check, from_table
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings
 from hector_jax.grfm import collection, dataset, network, training
@@ -52,12 +52,8 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         # devices stay unasked: their number may not be set up yet
-        check(self, walks=AT_LEAST_ONE, seconds=POSITIVE, seed=SEED, engine=("auto", *ENGINES))
-        if self.walks < 3:
-            raise InputError(
-                "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
-                f"by), got {self.walks}"
-            )
+        # three walks: to learn from, to choose by, to judge by
+        check(self, walks=Range(3), seconds=POSITIVE, seed=SEED, engine=("auto", *ENGINES))
         least = HISTORY * GaitConfig.tick
         if self.seconds < least:
             raise InputError(
@@ -147,8 +143,10 @@ def samples(robot: Robot, *folders: Path) -> Samples:
     """
     each = [_samples(robot, folder) for folder in folders]
     *parts, dropped = zip(*each, strict=True)
-    joined = (jax.tree.map(lambda *x: np.concatenate(x), *part) for part in parts)
-    return Samples(*joined, sum(dropped))
+    training, validation, held_out = (
+        jax.tree.map(lambda *x: np.concatenate(x), *part) for part in parts
+    )
+    return Samples(training, validation, held_out, sum(dropped))
 
 
 def _samples(robot: Robot, folder: Path) -> Samples:

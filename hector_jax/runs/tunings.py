@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from hector_jax.control.controller import WalkConfig, walk_config
+from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
@@ -288,7 +288,10 @@ def tune_measured(
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     norms = partial(evaluate.gradient_norms, config.rollout, robot, nominal(robot))
-    each = [norms(*model, config.loss) for model in _models(config, robot, problem)]
+    each = [
+        norms(command, anchor, effect, config.loss)
+        for command, anchor, effect in _models(config, robot, problem)
+    ]
     return jax.tree.map(lambda *x: float(np.mean(x)), *each)
 
 
@@ -327,22 +330,20 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     ]
 
 
-def _compile_tuning(config: TuneConfig, robot: Robot) -> None:
-    command, effect = named_command("straight"), network.effect_of(None, config.rollout.walk.gait)
-    difftune.tune_step(config, robot, nominal(robot), command, standing_anchor(robot), effect)
-
-
-def _compile_walking(config: WalkConfig, robot: Robot) -> None:
-    walk(config, robot, Job(nominal(robot), named_command("straight"), hfs(), config.gait.tick))
+def _compile_tuning(config: TuneConfig, robot: Robot, command: Command) -> None:
+    (model,) = _models(config, robot, Problem(command, None))
+    difftune.tune_step(config, robot, nominal(robot), *model)
 
 
 def compile_programs(pool: Executor, robot: Robot) -> None:
     """Compile what tunings and walks run, each program in one process; the others load it."""
     config = tune_config(robot)
+    controller, straight = config.rollout.walk, named_command("straight")
+    tick = Job(nominal(robot), straight, hfs(), controller.gait.tick)
     with bar("compiling, once on a machine") as tell:
         jobs = [
-            pool.submit(_compile_tuning, config, robot),
-            pool.submit(_compile_walking, config.rollout.walk, robot),
+            pool.submit(_compile_tuning, config, robot, straight),
+            pool.submit(walk, controller, robot, tick),
         ]
         for done, job in enumerate(jobs):
             tell(done, len(jobs), "")
