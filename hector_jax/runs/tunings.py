@@ -112,8 +112,8 @@ def _tune_job(
     evaluations = [
         lambda weights, m=model: step(weights, *m) for model in _models(config, robot, problem)
     ]
-    evaluate = difftune.mean_over_commands(evaluations, start)
-    return difftune.descend(config, start, evaluate, lambda one: messages.put((name, one)))
+    mean = evaluate.mean_over_commands(evaluations, start)
+    return difftune.descend(config, start, mean, lambda one: messages.put((name, one)))
 
 
 def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[tuple[Any, ...]]:

@@ -14,7 +14,7 @@ The rule by which all that is decided is `init` and `update`, functions of array
 from Python, one iteration after the other; `batch` compiles them into its loop on the device.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from functools import partial
@@ -171,29 +171,6 @@ def tune_step(
 ) -> Evaluation:
     """`evaluate` with the rollout and the loss of a tuning, compiled."""
     return evaluate_jit(config.rollout, robot, weights, command, anchor, effect, config.loss)
-
-
-def mean_over_commands(
-    evaluations: Sequence[Callable[[Weights], Evaluation]], start: Weights
-) -> Callable[[Weights], Evaluation]:
-    """One evaluation for several: their mean, with the worst fall and residual of all.
-
-    Each is divided by its share of the losses at `start`, so that all count alike.
-    """
-    scales = np.ones(1)
-    if len(evaluations) > 1:
-        losses = np.array([evaluate(start).loss for evaluate in evaluations])
-        scales = losses / losses.mean()
-
-    def evaluate_mean(weights: Weights) -> Evaluation:
-        each = jax.device_get([evaluate(weights) for evaluate in evaluations])
-        whole = jax.tree.map(
-            lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
-        )
-        worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
-        return whole._replace(**worst)
-
-    return evaluate_mean
 
 
 def relative_step(

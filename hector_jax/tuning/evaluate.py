@@ -1,5 +1,6 @@
 """Loss of a weight set on the model and its gradient, by reverse mode (Eq. 9, 11)."""
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -59,6 +60,29 @@ def evaluate(
 evaluate_jit = jax.jit(evaluate, static_argnums=0)
 """`evaluate`, compiled once per rollout and set of terms: new weights, commands, nets and alphas
 need no compilation."""
+
+
+def mean_over_commands(
+    evaluations: Sequence[Callable[[Weights], Evaluation]], start: Weights
+) -> Callable[[Weights], Evaluation]:
+    """One evaluation for several: their mean, with the worst fall and residual of all.
+
+    Each is divided by its share of the losses at `start`, so that all count alike.
+    """
+    scales = np.ones(1)
+    if len(evaluations) > 1:
+        losses = np.array([evaluate(start).loss for evaluate in evaluations])
+        scales = losses / losses.mean()
+
+    def evaluate_mean(weights: Weights) -> Evaluation:
+        each = jax.device_get([evaluate(weights) for evaluate in evaluations])
+        whole = jax.tree.map(
+            lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
+        )
+        worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
+        return whole._replace(**worst)
+
+    return evaluate_mean
 
 
 def gradient_norms(
