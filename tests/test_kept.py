@@ -93,6 +93,23 @@ def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
     assert tuned == ["without"]
 
 
+def test_a_tuning_from_weights_with_other_numbers_comes_back(tmp_path, monkeypatch):
+    made, start = [], nominal()._replace(others={"footstep_feedback": np.array(0.1)})
+    history = [
+        one._replace(weights=start, evaluation=one.evaluation._replace(gradient=start))
+        for one in TUNING.history
+    ]
+
+    def side_by_side(pool, config, robot, start, problems, title, on_iteration):
+        made.append(title)
+        yield "without", Tuning(history, start, start, "12 iterations")
+
+    monkeypatch.setattr(tunings, "_tunings", side_by_side)
+    for _ in range(2):  # as tuned, and as kept
+        same(tune(tmp_path, start=start).tuning.converged, start)
+    assert len(made) == 1
+
+
 def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned):
     """Of two tunings one had ended; the lines that the other had written come once."""
     problems = {"without": Problem(S, None), "with": Problem(named_command("c"), None)}

@@ -32,7 +32,6 @@ from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.tuning import difftune, evaluate, measured
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -66,12 +65,13 @@ def _stored(tuned: Tuned) -> Any:
     return Tuned(tuned.tuning._replace(history=history), tuned.commit)
 
 
-def _stored_like(loss: Loss, _: Any) -> Any:
+def _stored_like(config: TuneConfig, start: Weights, _: Any) -> Any:
     none, text = np.zeros(0), np.array("")
-    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), nominal())
-    seen = Evaluation(none, {term.name: none for term in loss}, rows, none, none)
+    weights = difftune.init(config, start).best  # with the other numbers that are tuned
+    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
+    seen = Evaluation(none, {term.name: none for term in config.loss}, rows, none, none)
     history: Any = Iteration(none, rows, seen, none, none)
-    return Tuned(Tuning(history, nominal(), nominal(), text), text)  # pyright: ignore
+    return Tuned(Tuning(history, weights, weights, text), text)  # pyright: ignore
 
 
 def _restored(stored: Any) -> Tuned:
@@ -88,8 +88,9 @@ def _load_or_tune(
     paths: Mapping[str, Path],
     make: Callable[[list[str], Mapping[str, Tuned]], Iterable[tuple[str, Tuning]]],
     *,
-    loss: Loss,
+    config: TuneConfig,
     robot: Robot,
+    start: Weights,
     commit: str,
 ) -> dict[str, Tuned]:
     """Tunings by name, see `load_or_make`."""
@@ -99,7 +100,7 @@ def _load_or_tune(
         for name, tuning in make(missing, tuned):
             yield name, _stored(Tuned(tuning, commit))
 
-    like = partial(_stored_like, loss)
+    like = partial(_stored_like, config, start)
     stored = load_or_make(paths, make_stored, like=like, kind="tuning", robot=robot)
     return {name: _restored(one) for name, one in stored.items()}
 
@@ -186,10 +187,8 @@ def tune(
             written.
     """
     start = nominal(robot) if start is None else start
-    paths = {}
-    for name, problem in problems.items():
-        key = content_key(config, robot, start, *problem, code=TUNING_CODE)
-        paths[name] = folder / f"tuning-{name}-{key}.npz"
+    key = partial(content_key, config, robot, start, code=TUNING_CODE)
+    paths = {n: folder / f"tuning-{n}-{key(*problem)}.npz" for n, problem in problems.items()}
 
     def on_iteration(name: str, iteration: Iteration) -> None:
         if journal is not None:
@@ -207,7 +206,7 @@ def tune(
         wanted = {name: problems[name] for name in missing}
         return _tunings(pool, config, robot, start, wanted, title, on_iteration)
 
-    tuned = _load_or_tune(paths, make, loss=config.loss, robot=robot, commit=commit)
+    tuned = _load_or_tune(paths, make, config=config, robot=robot, start=start, commit=commit)
     if journal is not None:
         journal.write({name: one.tuning.history for name, one in tuned.items()})
     return tuned
@@ -283,7 +282,8 @@ def tune_measured(
         yield "walks", tuning
 
     paths = {"walks": folder / f"tuning-walks-{key}.npz"}
-    return _load_or_tune(paths, make, loss=config.loss, robot=robot, commit=commit)["walks"]
+    notes: dict[str, Any] = {"config": config, "robot": robot, "start": weights, "commit": commit}
+    return _load_or_tune(paths, make, **notes)["walks"]
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
