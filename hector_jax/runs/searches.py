@@ -119,11 +119,8 @@ def search(
                 for name, history in histories.items()
                 if history
             )
-            tell(
-                done,
-                config.generations * size,
-                "lowest L: " + ", ".join(lowest) if done else "compiling",
-            )
+            remark = "lowest L: " + ", ".join(lowest) if done else "compiling"
+            tell(done, config.generations * size, remark)
 
         return searching.search(
             config, starts, walk, folder=folder, about=about, on_generation=on_generation

@@ -101,6 +101,13 @@ def _like(loss: Loss, with_walk: bool) -> Any:
     return one, walk if with_walk else None
 
 
+def _say_unsolved(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
+    for name, each in walks.items():
+        worst = np.max([walk.score.residual for walk in each])
+        if not worst <= SOLVED:
+            say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
+
+
 def judge(
     pool: Executor,
     config: TuneConfig,
@@ -137,8 +144,7 @@ def judge(
         for name, weights in sets.items()
     }
 
-    def with_walk(case: Case) -> bool:
-        return folder is not None and case[1] == seeds[0]
+    with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
 
     def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
         there = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
@@ -153,16 +159,12 @@ def judge(
         paths = {}
         for (name, seed), job in jobs.items():
             key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
-            word = "walk" if with_walk((name, seed)) else "score"
-            paths[name, seed] = folder / f"{word}-{name}-{seed}-{key}.npz"
+            stem = f"walk-{name}" if with_walk((name, seed)) else f"score-{name}"
+            paths[name, seed] = folder / f"{stem}-{seed}-{key}.npz"
         like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
-    for name in sets:
-        worst = np.max([walks[name, seed].score.residual for seed in seeds])
-        if not worst <= SOLVED:
-            say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
-    return ScoredWalks(
-        {name: [walks[name, seed] for seed in seeds] for name in sets},
-        {name: results[name, seeds[0]][1] for name in sets if with_walk((name, seeds[0]))},
-    )
+    by_set = {name: [walks[name, seed] for seed in seeds] for name in sets}
+    _say_unsolved(by_set)
+    first = {name: results[name, seeds[0]][1] for name in sets if folder is not None}
+    return ScoredWalks(by_set, first)
