@@ -30,7 +30,7 @@ tune: $(STAMP) ## tune a trajectory and evaluate it: make tune TRAJ=straight|c|s
 	@$(BIN)/hector tune --traj $(TRAJ)
 
 table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a trial
-	@$(BIN)/hector table $(if $(QUICK),--quick)
+	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm

@@ -11,6 +11,7 @@ have the names and the tolerances in common; how a commit computes a number is i
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -55,7 +56,9 @@ from hector_jax.tuning.difftune import TuneConfig, tune, tune_step
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
 
-STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+ROOT = Path(__file__).parents[1]
+STRIDER = ROOT / "examples" / "strider" / "robot.toml"
+TABLE = ROOT / "experiments" / "table.py"
 PAPER_FOOTHOLDS = FootstepConfig(rule="paper")
 DOUBLE_SUPPORT = GaitConfig(stance=24, swing=16)
 
@@ -248,8 +251,9 @@ def exported() -> Arrays:
 def table() -> Arrays:
     """A quick table from nothing: data, net, tunings, verdicts."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["table", "--quick", "--data", f"{folder}/data", "--out", f"{folder}/table"]
-        subprocess.run([sys.executable, "-m", "hector_jax.cli.main", *words], check=True)
+        words = ["--quick", "--data", f"{folder}/data", "--out", f"{folder}/table"]
+        here = os.environ | {"PYTHONPATH": str(ROOT)}  # not the package that is installed
+        subprocess.run([sys.executable, TABLE, *words], check=True, env=here)
         told = json.loads((Path(folder) / "table" / "quick" / "table.json").read_text())
     return _numbers(told["trajectories"])
 

@@ -33,7 +33,8 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import all_devices, setup_jax, workers
 from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
-from hector_jax.grfm.network import as_effect, load_net, member_effects
+from hector_jax.grfm.network import as_effect, load_net
+from hector_jax.grfm.residual import member_params
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
@@ -295,7 +296,7 @@ def robust(flags: Robust) -> None:
     robot, command = load_robot(), named_command(flags.traj)
     effects, members = last_command, 1
     if flags.net is not None:  # another variant's net is refused before anything is tuned
-        effects = member_effects(load_net(flags.net, robot, "residual")[0])
+        effects = as_effect(member_params(load_net(flags.net, robot, "residual")[0]))
         members = len(jax.tree.leaves(effects)[0])
     asked = [problem(nominal(), [scenario(robot, command)])]
     plain = tuned(flags, robot, whole_net(flags, robot), asked, "the model as it is")

@@ -160,8 +160,6 @@ def weight_histories(
     times: Float[np.ndarray, " steps"],
     names: Sequence[str],
     histories: Mapping[str, Float[np.ndarray, "steps weights"]],
-    *,
-    count: int = 6,
 ) -> str:
     """Draw the weights that moved most while walking, as ratios to where they started.
 
@@ -171,7 +169,6 @@ def weight_histories(
         times: of the steps [s].
         names: of the weights.
         histories: ratios by trajectory; a walk that ended early has fewer steps.
-        count: how many weights to draw in each panel.
     """
     looks = list(
         zip(
@@ -186,7 +183,7 @@ def weight_histories(
         for panel, (trajectory, ratios) in zip(panels, histories.items(), strict=True):
             panel.axvline(change, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
             moved = np.abs(np.log(ratios[:, single])).max(axis=0)
-            for i, (color, mark) in zip(np.argsort(-moved)[:count], looks, strict=False):
+            for i, (color, mark) in zip(np.argsort(-moved), looks, strict=False):
                 label = style.weight_label(names[single[int(i)]].removesuffix("_left"))
                 look = {"color": color, "marker": mark, "markersize": 2.6, "label": label}
                 panel.plot(times[: len(ratios)], ratios[:, single[i]], **look)
@@ -195,7 +192,7 @@ def weight_histories(
             below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "columnspacing": 1.2}
             panel.legend(ncols=3, **below)
         panels[0].set_ylabel("weight / its start")
-    return f"The {count} weights that moved most; both feet share one R."
+    return f"The {len(looks)} weights that moved most; both feet share one R."
 
 
 METHODS = {  # words for the ways of tuning that race

@@ -7,12 +7,18 @@ import scipy.linalg
 from scipy.optimize import linprog
 
 from hector_jax.core.geometry import rot_z, skew
+from hector_jax.core.trajectory import State
 from hector_jax.qp import QP
 
 
 def dense_rows(A: np.ndarray) -> np.ndarray:
     """Block-diagonal rows (N, r, b) as a plain matrix."""
     return A if A.ndim == 2 else scipy.linalg.block_diag(*A)
+
+
+def pack_state(state: State, gravity):
+    """The paper's x = [e; p; omega; v; g] (Eq. 3)."""
+    return jnp.concatenate([*state, gravity])
 
 
 def walking_qp(seed: int, horizon: int = 10) -> QP:

@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import table_steps
 
 import hector_jax
-from hector_jax.runs import nets, searches
+from hector_jax.runs import nets
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
@@ -104,8 +105,13 @@ def test_of_the_scripts_only_those_with_verdicts_reach_the_stand_in():
         for path in scripts
         if any(name.startswith("hector_jax.sim.standin") for name in imported(path))
     }
-    experiments = {f"experiments.{name}" for name in ("robustness", "online", "batch")}
+    experiments = {f"experiments.{name}" for name in ("robustness", "online", "batch", "table")}
     assert knowing == experiments | {"benchmarks.golden"}
+
+
+def test_the_package_imports_no_script():
+    scripts = {path.stem for path in (ROOT.parent / "experiments").glob("*.py")} | {"experiments"}
+    assert not [(name, target) for name, target in IMPORTS if target.split(".")[0] in scripts]
 
 
 def test_scripts_use_nothing_private_of_the_package():
@@ -155,6 +161,6 @@ def test_what_scripts_import_inside_functions_is_there_too():
     assert missing == []
 
 
-@pytest.mark.parametrize("code", [nets.COLLECTION_CODE, searches.SEARCH_CODE])
+@pytest.mark.parametrize("code", [nets.COLLECTION_CODE, table_steps.SEARCH_CODE])
 def test_what_both_engines_compute_is_in_the_key_of_their_walks(code):
     assert {"sim.walk", "sim.parallel"} <= set(code)

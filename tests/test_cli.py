@@ -12,16 +12,18 @@ from typing import get_args
 import jax
 import numpy as np
 import pytest
+import table
+import table_steps
 from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
 from hector_jax.cli import arguments, doctor, evaluate
-from hector_jax.cli import table as study
 from hector_jax.cli.flags import Command, Tune, command_name
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
 from hector_jax.control.weights import WEIGHT_NAMES, expert, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core.console import exit_code
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm.collection import fingerprint, load_walks
 from hector_jax.grfm.dataset import at_interval
@@ -38,6 +40,11 @@ from hector_jax.tuning.rollout import RolloutConfig
 def call(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["hector", *map(str, arguments)])
     return main()
+
+
+def call_table(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["table.py", *map(str, arguments)])
+    return exit_code("table", table.main)
 
 
 def refused(monkeypatch, capsys, *arguments):
@@ -308,8 +315,8 @@ def test_training_prints_the_errors_and_nothing_else(monkeypatch, capsys, tmp_pa
 def test_a_table_prints_json_and_nothing_else(monkeypatch, capsys, tmp_path):
     verdict = pretend_verdict()
     made = (tmp_path / "report.md", {"c": verdict, "s": verdict})
-    monkeypatch.setattr(study, "make_table", lambda *args: made)
-    assert call(monkeypatch, "table", "--json") == 0
+    monkeypatch.setattr(table, "make_table", lambda *args: made)
+    assert call_table(monkeypatch, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["report"] == str(made[0])
     assert told["trajectories"].keys() == {"c", "s"}
@@ -391,28 +398,57 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     monkeypatch.setattr(nets, "CollectConfig", lambda: small)
     flags = ("--trajectories", "c", "--seeds", "1", "--rollouts", "10", "--iterations", "10")
     flags += ("--steps", "2", "--step-plants", "1")
-    assert call(monkeypatch, "table", *flags) == 0
+    assert call_table(monkeypatch, *flags) == 0
     first = (tmp_path / "runs/table/table.csv").read_bytes()
     monkeypatch.setattr(verdicts, "walk_jobs", None)
     monkeypatch.setattr(tunings, "_tune_job", None)
     monkeypatch.setattr(searches, "losses_on_hfs", None)
+    monkeypatch.setattr(table_steps, "tune_measured", None)
     capsys.readouterr()
-    assert call(monkeypatch, "table", *flags) == 0
+    assert call_table(monkeypatch, *flags) == 0
     assert (tmp_path / "runs/table/table.csv").read_bytes() == first
     out = capsys.readouterr().out
-    for name in study.SETS:
+    for name in table.SETS:
         assert name in out
-    assert call(monkeypatch, "table", *flags, "--json") == 0
+    assert call_table(monkeypatch, *flags, "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert set(study.SETS) <= told["trajectories"]["c"]["sets"].keys()
+    assert set(table.SETS) <= told["trajectories"]["c"]["sets"].keys()
     assert Path(told["report"]).exists()
     assert (tmp_path / "runs/table/pictures/c.png").stat().st_size > 50_000
 
 
 def test_the_table_refuses_wrong_flags_in_one_line(monkeypatch, capsys, tmp_path):
-    flags = ("table", "--out", tmp_path / "out", "--extra")
-    assert "NAME=FOLDER" in refused(monkeypatch, capsys, *flags, "mine")
+    for words, fault in {
+        ("--extra", "mine"): "--extra must be NAME=FOLDER",
+        ("--sedes", "3"): "experiments/table.py has no flag '--sedes'; did you mean '--seeds'?",
+        ("--seeds", "3.5"): "Error parsing --seeds: expected a whole number, got '3.5'",
+        ("--seeds", "3", "--seeds", "4"): "--seeds is given twice",
+        ("3",): "experiments/table.py does not expect '3'; see python experiments/table.py --help",
+    }.items():
+        assert call_table(monkeypatch, "--out", tmp_path / "out", *words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"table: {fault}")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_table_takes_flags_from_a_file_and_the_line_overrides_it(monkeypatch, tmp_path):
+    made = []
+
+    def make_table(flags, plants):
+        made.append(flags)
+        return tmp_path, {}
+
+    monkeypatch.setattr(table, "make_table", make_table)
+    file = tmp_path / "night.toml"
+    file.write_text('seeds = 3\nextra = ["a=x"]\n')
+    assert call_table(monkeypatch, "--config", file, "--seeds", "5") == 0
+    assert made == [table.Flags(config=file, seeds=5, extra=("a=x",))]
+
+
+@pytest.mark.parametrize("more", [(), ("--quick",), ("--help",)])
+def test_the_former_command_of_the_table_says_what_to_call_now(monkeypatch, capsys, more):
+    line = refused(monkeypatch, capsys, "table", *more)
+    assert "python experiments/table.py, with the same flags" in line
 
 
 @pytest.mark.parametrize(
@@ -430,14 +466,18 @@ def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong)
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("name", [command_name(kind) for kind in get_args(Command)])
-def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, name):
+@pytest.mark.parametrize(
+    "program", [*(f"hector {command_name(kind)}" for kind in get_args(Command)), table.PROGRAM]
+)
+def test_every_help_tells_each_flag_and_gives_an_example(monkeypatch, capsys, program):
     monkeypatch.setenv("COLUMNS", "200")
+    words = ["--help"] if program == table.PROGRAM else [program.split()[1], "--help"]
     with pytest.raises(SystemExit) as left:
-        call(monkeypatch, name, "--help")
+        (call_table if program == table.PROGRAM else call)(monkeypatch, *words)
     assert left.value.code == 0
     shown = capsys.readouterr().out
-    assert f"Example: hector {name}" in shown
+    assert f"Example: {program}" in shown
+    assert "None" not in shown
     untold = [
         line for line in shown.splitlines() if re.search(r"--[\w-]+( \S+)?  +\(default", line)
     ]

@@ -9,16 +9,17 @@ from typing import get_args
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from table import Flags as Table
 
 from hector_jax.cli import flags, parse
 from hector_jax.cli import main as cli
-from hector_jax.cli.flags import Command, Configured, Evaluate, Table, Tune
+from hector_jax.cli.flags import Command, Configured, Evaluate, Tune
 from hector_jax.cli.parse import as_table, from_file, from_line
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import validation_error
 from hector_jax.tuning.difftune import PAPER_ITERATIONS
 
-FILES = [kind for kind in get_args(Command) if issubclass(kind, Configured)]
+FILES = [kind for kind in (*get_args(Command), Table) if issubclass(kind, Configured)]
 
 
 def written(folder, text, name="run.toml"):
@@ -86,7 +87,7 @@ def test_what_is_written_is_read_as_it_was(tmp_path, kind):
 
 def test_the_line_that_asks_again_needs_no_file(tmp_path):
     found = parsed("tune", "--config", written(tmp_path, 'traj = "s"\n'), "--seeds", "4")
-    assert parse.as_command("tune", found) == "hector tune --traj s --seeds 4"
+    assert parse.as_command("hector tune", found) == "hector tune --traj s --seeds 4"
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from table import PROGRAM
+from table import Flags as Table
 
 import hector_jax
 from hector_jax.cli import flags, parse
@@ -88,7 +90,14 @@ def lines_of(path, program):
     return [line for line in lines if line.startswith(f"{program} ") and "<" not in line]
 
 
-CALLS = sorted({(path.name, line) for path in READ for line in lines_of(path, "hector")})
+CALLS = sorted(
+    {
+        (path.name, line)
+        for path in READ
+        for name in ("hector", PROGRAM)
+        for line in lines_of(path, name)
+    }
+)
 NAMED = sorted({n for path in READ for n in re.findall(r"`hector ([a-z]+)", path.read_text())})
 
 
@@ -103,13 +112,14 @@ def test_pages_show_commands():
 
 @pytest.mark.parametrize(("page", "line"), CALLS)
 def test_commands_in_pages_parse(page, line, capsys):
-    words = shlex.split(line, comments=True)[1:]
+    table = line.startswith(PROGRAM)
+    words = shlex.split(line, comments=True)[2 if table else 1 :]
     if "--config" in words:  # a file of the reader's
         at = words.index("--config")
         del words[at : at + 2]
     code = 0
     try:
-        parse.from_line(words)
+        parse.read_flags(Table, words, PROGRAM) if table else parse.from_line(words)
     except SystemExit as left:  # after --help, too
         code = left.code
     assert code == 0, capsys.readouterr().err
@@ -135,14 +145,15 @@ def test_files_that_pages_name_are_there(path):
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 
-@pytest.mark.parametrize("kind", get_args(flags.Command), ids=flags.command_name)
+@pytest.mark.parametrize("kind", [*get_args(flags.Command), Table], ids=flags.command_name)
 def test_every_flag_has_a_row_among_the_commands(kind):
     text = (DOCS / "commands.md").read_text()
-    section = text.split(f"\n### hector {flags.command_name(kind)}\n")[1].split("\n#")[0]
+    program = "experiments/table.py" if kind is Table else f"hector {flags.command_name(kind)}"
+    section = text.split(f"\n### {program}\n")[1].split("\n#")[0]
     added = text.split("## Added since e1557c7")[1].split("\n## ")[0]
     for field in fields(kind):
         name = field.name.replace("_", "-")
-        new = f"| `hector {flags.command_name(kind)} --{name}`"
+        new = f"| `{program} --{name}`"
         assert f"| `--{name}` |" in section or f"| `{name.upper()}` |" in section or new in added
 
 

@@ -106,6 +106,16 @@ def test_batch_sets_up_its_devices_and_refuses_a_missing_net(tmp_path):
     assert done.stderr.startswith("batch: cannot read")
 
 
+def test_the_table_refuses_a_wrong_number_as_a_script_in_one_line(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(FOLDER.parent)}
+    words = [sys.executable, FOLDER / "table.py", "--seeds", "0", "--out", tmp_path / "out"]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    expected = "table: --seeds must be a whole number from 1 to 10000, got 0\n"
+    assert done.stderr == expected
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_race_on_another_engine_collects_as_every_run_does(tmp_path, monkeypatch):
     race, made = script("race"), []
     monkeypatch.setattr(race.nets, "collect", lambda pool, config, *rest: made.append(config))

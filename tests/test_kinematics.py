@@ -9,7 +9,7 @@ import pytest
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.robot.description import Description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs, leg_gravity
-from hector_jax.robot.model import load_model, load_robot
+from hector_jax.robot.model import compile_model, describe, load_robot
 
 foot_poses_jit = jax.jit(foot_poses)
 foot_jacobians_jit = jax.jit(foot_jacobians)
@@ -21,7 +21,7 @@ leg_gravity_jit = jax.jit(leg_gravity)
 
 @pytest.fixture(scope="module")
 def model():
-    return load_model()
+    return compile_model(describe())
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +225,7 @@ def test_equation_of_motion_holds_on_recorded_states(model, robot, stand):
 
     Generalised velocity: trunk velocity in the world frame, trunk rotation in its own axes, joints.
     """
-    exact = load_model()
+    exact = compile_model(describe())
     exact.opt.iterations, exact.opt.tolerance = 100, 0.0
     touching = 0
     for qpos, qvel, torque in recorded_states(model, robot, stand):

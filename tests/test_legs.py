@@ -22,7 +22,7 @@ from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.trajectory import State, Wrench, zero_wrench
 from hector_jax.robot.description import Description
 from hector_jax.robot.kinematics import foot_poses, leg_gravity
-from hector_jax.robot.model import load_model, load_robot
+from hector_jax.robot.model import compile_model, describe, load_robot
 
 CONFIG = LegConfig()
 ROBOT = load_robot()
@@ -96,7 +96,7 @@ def test_stance_torques_and_ground_do_no_work_together_at_the_hip():
 
 def statics(share):
     """MuJoCo's joint torques of the standing pose when the left foot carries `share` of it."""
-    model = load_model()
+    model = compile_model(describe())
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key(Description.standing).id)
     mujoco.mj_forward(model, data)

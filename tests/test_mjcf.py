@@ -6,7 +6,7 @@ import pytest
 
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.mjcf import read_mjcf
-from hector_jax.robot.model import load_model
+from hector_jax.robot.model import compile_model, describe
 
 TEXT = MODEL_PATH.read_text()
 HEAD = '<mujoco model="hector">'
@@ -147,7 +147,7 @@ def folder(tmp_path_factory):
 
 def refused(path):
     with pytest.raises(ValueError, match="robot.xml") as caught:
-        load_model(path)
+        compile_model(describe(path))
     message = str(caught.value)
     assert "\n" not in message
     assert len(message) < 1000
@@ -195,7 +195,7 @@ def test_a_mesh_beside_the_file_is_taken(folder):
     text = put('<compiler meshdir="meshes"/>', HEAD)
     text = text.replace(ASSET, ASSET + '<mesh name="tip" file="tip.stl" inertia="shell"/>')
     (folder / "robot.xml").write_text(text)
-    assert load_model(folder / "robot.xml").nmesh == 1
+    assert compile_model(describe(folder / "robot.xml")).nmesh == 1
 
 
 def test_the_packaged_robot_passes():

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from oracles import exact_solution
+from oracles import exact_solution, pack_state
 
 from hector_jax.control.contact import (
     LINE_FOOT,
@@ -32,7 +32,7 @@ from hector_jax.control.weights import (
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import from_table
-from hector_jax.core.trajectory import State, Wrench, pack_state, pack_wrench, unpack_wrench
+from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, Status
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot

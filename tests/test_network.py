@@ -19,12 +19,11 @@ from hector_jax.grfm.network import (
     as_effect,
     effect_of,
     load_net,
-    member_effects,
     save_net,
     variant_of,
 )
 from hector_jax.grfm.paper import fit_linear, fit_scaling
-from hector_jax.grfm.residual import BOUND, plain_net
+from hector_jax.grfm.residual import BOUND, member_params, plain_net
 from hector_jax.robot.model import load_robot
 
 apply = jax.jit(lambda effect, window: effect(window))
@@ -88,7 +87,9 @@ def test_the_effect_follows_the_dtype_of_the_window(either, window, dtype):
 
 def test_the_members_alone_are_on_average_the_ensemble(data, window):
     params = untrained(data)
-    members = jax.jit(jax.vmap(lambda effect: effect(window).wrench))(member_effects(params))
+    members = jax.jit(jax.vmap(lambda effect: effect(window).wrench))(
+        as_effect(member_params(params))
+    )
     whole = apply(as_effect(params), window).wrench
     for each, mean in zip(members, whole, strict=True):
         assert len(each) == 4

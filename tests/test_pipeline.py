@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import table
 from pretend import pretend_history, pretend_walk
 from synthetic import synthetic_walk
 
@@ -109,11 +110,13 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
     monkeypatch.setattr(nets, "collect", collect)
     for command in (
         flags.Tune(iterations=10, data=tmp_path / "data", run=tmp_path / "run"),
-        flags.Table(quick=True, data=tmp_path / "data", out=tmp_path / "table"),
         flags.Grfm(data=tmp_path / "data", out=tmp_path / "grfm"),
     ):
         with pytest.raises(cut):
             commands.run(command)
+    asked = table.Flags(quick=True, data=tmp_path / "data", out=tmp_path / "table")
+    with pytest.raises(cut):
+        table.make_table(asked, lambda seeds: [])
     assert made == 3 * [(CollectConfig(), tmp_path / "data" / "walks")]
 
 

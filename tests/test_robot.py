@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from hector_jax.robot.description import MODEL_PATH, Description
-from hector_jax.robot.model import load_model, load_robot
+from hector_jax.robot.model import compile_model, describe, load_robot
 
 TEXT = MODEL_PATH.read_text()
 
 
 @pytest.fixture(scope="module")
 def model():
-    return load_model()
+    return compile_model(describe())
 
 
 @pytest.fixture(scope="module")
@@ -258,6 +258,26 @@ def drop_line(text, *marks):
             lambda t: t.replace('range="-2.38 -0.10"', 'range="0.10 2.38"'),
             ["range of joint 'left_knee'", "bends backwards only"],
             id="knee that bends forwards",
+        ),
+        pytest.param(
+            lambda t: t.replace('cone="pyramidal"', 'cone="elliptic"'),
+            ["option cone is elliptic, expected pyramidal"],
+            id="elliptic cone",
+        ),
+        pytest.param(
+            lambda t: t.replace('conaffinity="1" condim="3"', 'conaffinity="1" condim="6"'),
+            ["condim of geom 'left_toe' is 6, expected 3"],
+            id="condim of a foot",
+        ),
+        pytest.param(
+            lambda t: t.replace('<geom friction="0.1 ', '<geom friction="0.9 '),
+            ["has friction 0.9", "the floor of a plant decides both"],
+            id="friction that hides the floor's",
+        ),
+        pytest.param(
+            lambda t: t.replace('solmix="0"', 'solmix="1"'),
+            ["solmix 1.0", "the floor of a plant decides both"],
+            id="stiffness that hides the floor's",
         ),
         pytest.param(
             lambda t: t.replace('name="standing"', 'name="stand"'),

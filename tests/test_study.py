@@ -1,26 +1,30 @@
 """The table from flags to files, on walks that no simulator made."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
+import table as study
+import table_plots
+import table_steps
 from pretend import pretend_history, pretend_walk
+from table import Flags
 
 from hector_jax.cli import flags, tune
-from hector_jax.cli import table as study
-from hector_jax.cli.flags import Table
 from hector_jax.cli.parse import as_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.report.video import VideoUnavailable
+from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, searches, tunings, verdicts
 from hector_jax.runs.tunings import Tuned
 from hector_jax.search.cmaes import Generation, SearchResult
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import Tuning
+from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 
 def plants(seeds):
@@ -51,8 +55,7 @@ def asked(monkeypatch):
     def write_strip(*args):
         raise VideoUnavailable("no film: none here")
 
-    def tune_measured(pool, config, robot, weights, command, params, *, plants, **notes):
-        told["steps"] = config.iterations - 10, len(plants)
+    def tune_along_walks(bench, name, start, steps, plants):
         return Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), "")
 
     class Net:
@@ -61,9 +64,9 @@ def asked(monkeypatch):
     monkeypatch.setattr(nets, "load_or_train", lambda *args: Net)
     monkeypatch.setattr(searches, "search", search)
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
-    monkeypatch.setattr(tunings, "tune_measured", tune_measured)
+    monkeypatch.setattr(table_steps, "tune_along_walks", tune_along_walks)
     monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
-    monkeypatch.setattr(study, "write_strip", write_strip)
+    monkeypatch.setattr(table_plots, "write_strip", write_strip)
     return told
 
 
@@ -82,7 +85,7 @@ def test_the_plants_of_the_verdict_are_asked_for_once_and_after_all_that_tunes(t
 
 
 def table(tmp_path, **changes):
-    return Table(**{"out": tmp_path / "out", "ceiling": tmp_path / "ceiling", **changes})
+    return Flags(**{"out": tmp_path / "out", "ceiling": tmp_path / "ceiling", **changes})
 
 
 def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, asked):
@@ -95,7 +98,7 @@ def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, as
     assert asked["search"].budget < 200
     assert [rest for _, *rest in asked["tunings"]] == [["without", "with"]] * 2
     text = told.read_text()
-    assert "hector table --" in text
+    assert "python experiments/table.py --" in text
     assert "--quick" in text
     assert '"seeds": 4' in text  # those that were walked, not those of the whole table
     assert "16 of 64 walks ended in a fall" in text
@@ -111,7 +114,7 @@ def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, as
 def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
     tmp_path, asked, monkeypatch
 ):
-    monkeypatch.setattr(study, "_draw", lambda *args: [])
+    monkeypatch.setattr(study, "draw", lambda *args: [])
     small = {"trajectories": ("s",), "seeds": 2}
     study.make_table(table(tmp_path, **small), plants)
     assert asked["walks"] == 16
@@ -138,7 +141,8 @@ def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
         ({"steps": -1}, "--steps must be a whole number from 0 to 10000, got -1"),
         ({"trajectories": ("turn",)}, "--trajectories must be of straight, c, s, got turn"),
         ({"iterations": 3}, "--iterations must be a whole number from 10 to 10000, got 3"),
-        ({"rollouts": 3}, "budget must be at least the population"),
+        ({"rollouts": 3}, "--rollouts must be a whole number from 10 to 1000000, got 3"),
+        ({"step_plants": 0}, "--step-plants must be a whole number from 1 to 1000, got 0"),
         ({"trajectories": ("moon",)}, "--trajectories must be of straight, c, s, got moon"),
         ({"trajectories": ("s", "s")}, "--trajectories names 's' twice"),
         ({"trajectories": ()}, "--trajectories expects a value, got none"),
@@ -156,11 +160,35 @@ def test_wrong_flags_are_told_before_anything_is_computed(tmp_path, changes, wor
         study.make_table(table(tmp_path, **changes), plants)
 
 
+def test_a_tuning_along_walks_is_stored_for_its_plants_and_steps(tmp_path, monkeypatch):
+    made = []
+
+    def tune_measured(config, start, evaluate, on_iteration):
+        made.append(config.iterations)
+        return Tuning(pretend_history(3), nominal(), expert(), "done")
+
+    monkeypatch.setattr(table_steps, "tune_measured", tune_measured)
+    bench = table_steps.Bench(None, TuneConfig(), load_robot(), None, tmp_path, "abc")
+    for steps, count in ((2, 3), (2, 3), (5, 3), (2, 4)):
+        tuned = table_steps.tune_along_walks(bench, "s", nominal(), steps, count)
+        assert tuned.commit == "abc"
+        assert len(tuned.tuning.history) == 4
+    assert made == [12, 15, 12]
+    assert len(list((tmp_path / "s").glob("tuning-walks-*.npz"))) == 3
+
+
+@pytest.mark.parametrize("field", [x for x in fields(Flags) if type(x.default) is int])
+def test_every_number_has_an_upper_bound_that_is_told(tmp_path, field):
+    rule = get_args(field.type)[1]
+    with pytest.raises(InputError, match=f"from {rule.low} to {rule.high}, got 1000000000000"):
+        study.make_table(table(tmp_path, **{field.name: 10**12}), plants)
+
+
 def test_the_line_that_asks_again_names_what_is_not_default():
-    assert as_command("table", Table()) == "hector table"
-    asked = Table(seeds=4, extra=("a=x", "b=y"), quick=True)
-    assert as_command("table", asked) == "hector table --seeds 4 --extra a=x b=y --quick"
-    assert as_command("tune", flags.Tune(video=False)) == "hector tune --no-video"
+    assert as_command(study.PROGRAM, Flags()) == "python experiments/table.py"
+    line = as_command(study.PROGRAM, Flags(seeds=4, extra=("a=x", "b=y"), quick=True))
+    assert line == "python experiments/table.py --seeds 4 --extra a=x b=y --quick"
+    assert as_command("hector tune", flags.Tune(video=False)) == "hector tune --no-video"
 
 
 def test_runs_of_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):

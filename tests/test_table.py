@@ -6,12 +6,12 @@ import re
 
 import numpy as np
 import pytest
+import table_report as table
 from pretend import pretend_history, pretend_score, pretend_verdict
+from table_report import PAPER, Fall, Search, Table, summaries, write_table
 
 from hector_jax.control.weights import nominal
-from hector_jax.report import table
 from hector_jax.report.report import Picture
-from hector_jax.report.table import PAPER, Fall, Search, Table, summaries, write_table
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import BASELINES
 from hector_jax.tuning.difftune import Tuning
@@ -48,7 +48,7 @@ def whole(**verdicts):
         config={"flags": {"seeds": 4}},
         environment={"jax": "0.10", "commit": "abc"},
         commits=["abc"],
-        command="hector table",
+        command="python experiments/table.py",
     )
 
 
@@ -135,7 +135,7 @@ def test_the_report_tells_everything_that_was_promised(tmp_path):
         "| s: `searched` | 200 | 187 | 1.200 | 20 generations |",
         "ended because: the step became too small to gain",
         "were made at `abc`",
-        "hector table",
+        "python experiments/table.py",
     ):
         assert words in text, words
     for block in text.split("\n\n"):

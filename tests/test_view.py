@@ -20,7 +20,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.report import pictures, view
 from hector_jax.report.motion import motion
 from hector_jax.report.view import ViewedWalk, arrows
-from hector_jax.robot.model import load_model, load_robot
+from hector_jax.robot.model import compile_model, describe, load_robot
 from hector_jax.runs import folder as runs
 
 
@@ -31,7 +31,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def model():
-    return load_model()
+    return compile_model(describe())
 
 
 def viewed(seed=0, **kwargs):

@@ -32,7 +32,7 @@ from hector_jax.sim.world import named_world
 _EXTRAS = {  # by name, the package that it needs and what it is for
     "export": ("flatbuffers", "hector export"),
     "race": ("sklearn", "experiments/race.py"),
-    "search": ("cmaes", "hector search, hector table"),
+    "search": ("cmaes", "hector search, experiments/table.py"),
     "tensorboard": ("tensorboardX", "hector tensorboard"),
     "view": ("viser", "hector view"),
 }

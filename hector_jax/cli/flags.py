@@ -141,31 +141,6 @@ class Search(Configured):
 
 
 @dataclass(frozen=True)
-class Table(Configured):
-    """Make the table of all weight sets: search, tune and evaluate what is not there yet.
-
-    Example: hector table --quick
-    """
-
-    trajectories: tuple[str, ...] = ("straight", "c", "s")  # some of these three
-    seeds: Plants = 32  # stand-in plants
-    first_seed: Seed = 0  # first plant: 0 in development, 1000 for the final evaluation
-    rollouts: Annotated[int, Range(1, 1_000_000)] = 200  # walks of the search, row `searched`
-    iterations: Iterations = 100  # largest number of iterations of each tuning
-    steps: Annotated[int, Range(0, 10_000)] = 30  # steps of row `with_walks`; 0: no such row
-    step_plants: Annotated[int, Range(1, 1000)] = 8  # simulator plants for each of these steps
-    extra: tuple[str, ...] = ()  # more rows, NAME=FOLDER of straight.json, c.json and s.json
-    ceiling: Path = Path("docs/results/ceiling")  # folder of row `ceiling`, if it exists
-    earlier: Path | None = None  # table.json of other plants, to compare the order of the sets
-    data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
-    out: Folder = Path("runs/table")  # folder for the report
-    kept: Path | None = None  # folder of results to reuse; by default OUT/kept
-    quick: bool = False  # a trial with 4 plants and short tunings, into OUT/quick
-    processes: Processes = 2  # worker processes, one core each
-    json: bool = False  # print JSON instead of the tables
-
-
-@dataclass(frozen=True)
 class Evaluate(Configured):
     """Evaluate weight sets on the plants of a world and print a table.
 
@@ -298,7 +273,6 @@ Command = (
     | Grfm
     | Tune
     | Search
-    | Table
     | Evaluate
     | Walk
     | Doctor
@@ -322,6 +296,10 @@ def command(word: str) -> type[Any]:
     Raises:
         InputError: there is no such command.
     """
+    if word == "table":
+        raise InputError(
+            "the table is now made by python experiments/table.py, with the same flags"
+        )
     kinds = {command_name(kind): kind for kind in get_args(Command)}
     if word not in kinds:
         hint = did_you_mean(word, kinds) or f"; the commands are {', '.join(kinds)}"

@@ -56,18 +56,25 @@ def from_line(words: Sequence[str]) -> Any:
             wrong type.
     """
     others = [word for word in words if word not in _HELP]
-    wants_help = len(others) < len(words)
-    if wants_help and not others:
+    helps = list(_HELP[:1] if len(others) < len(words) else ())
+    if helps and not others:
         return _all_commands(["--help"])
-    kind = command(others[0] if others else "")
-    words, options = others[1:], {"prog": f"hector {others[0]}"}
+    name, *rest = others or [""]
+    return read_flags(command(name), [*rest, *helps], f"hector {name}")
+
+
+def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
+    """The flags of a program, as the words after its name give them; see `from_line`."""
+    wants_help = any(word in _HELP for word in words)
+    words, options = [word for word in words if word not in _HELP], {"prog": program}
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
     flags = [name.removeprefix("no-") for name in names]
     for name in flags:
         if flags.count(name) > 1:
             raise InputError(f"--{name} is given twice")
     if "config" in flags:
-        options["default"] = from_file(kind, _quietly(kind, words, **options).config)
+        given: Any = _quietly(kind, words, **options)
+        options["default"] = from_file(kind, given.config)
     return _tyro(kind, ["--help"], **options) if wants_help else _quietly(kind, words, **options)
 
 
@@ -94,7 +101,7 @@ def _quietly(kind: type, words: Sequence[str], **options: Any) -> Any:
         raise InputError(one_line(body[0] if body else title)) from None
     if not rest:
         return flags
-    name, help_line = command_name(kind), f"; see hector {command_name(kind)} --help"
+    name, help_line = options["prog"].split()[-1], f"; see {options['prog']} --help"
     if not rest[0].startswith("--"):
         raise InputError(f"{name} does not expect {short_repr(rest[0])}{help_line}")
     flag = rest[0].partition("=")[0]
@@ -179,9 +186,9 @@ def as_table(flags: Any) -> dict[str, Any]:
     return table
 
 
-def as_command(name: str, flags: Any) -> str:
-    """The line that gives these flags, those at their default left out."""
-    words = ["hector", name]
+def as_command(program: str, flags: Any) -> str:
+    """The line that gives these flags to a program, those at their default left out."""
+    words = program.split()
     for field in fields(flags):
         value, flag = getattr(flags, field.name), field.name.replace("_", "-")
         if value == field.default or field.name == "config":  # its flags are written out

@@ -191,7 +191,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             film=_film(run, standin),
             config=settings,
             environment=made_with,
-            command=as_command("tune", run_folder.as_begun(args)),
+            command=as_command("hector tune", run_folder.as_begun(args)),
         ),
     )
     if args.json:

@@ -81,11 +81,11 @@ def check_tunables(names: Sequence[str]) -> None:
     """
     for name in names:
         if name not in TUNABLES:
-            raise InputError(unknown("tunable", name, TUNABLES))
+            raise InputError(f"TuneConfig.others: {unknown('tunable', name, TUNABLES)}")
         if TUNABLES[name].path.startswith("legs."):
             raise InputError(
-                f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
-                "gradient is zero; a search on walks can"
+                f"TuneConfig.others: {name} cannot be tuned by gradients: the rigid-body model has "
+                "no joints, so its gradient is zero; a search on walks can"
             )
 
 

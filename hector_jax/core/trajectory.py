@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float
 
 from hector_jax.core.geometry import rot_z
 
-LEFT, RIGHT = 0, 1
 MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen
 MAX_TILT = 0.8  # [rad] of roll or pitch; beyond it too
 
@@ -122,16 +121,6 @@ def has_fallen(
     return low | tilted | ~finite
 
 
-def pack_state(state: State, gravity: Float[Array, "3"]) -> Float[Array, "15"]:
-    """The paper's x = [e; p; omega; v; g] (Eq. 3)."""
-    return jnp.concatenate([*state, gravity])
-
-
-def unpack_state(x: Float[Array, "15"]) -> State:
-    """State of x = [e; p; omega; v; g]."""
-    return State(x[0:3], x[3:6], x[6:9], x[9:12])
-
-
 def pack_wrench(wrench: Wrench) -> Float[Array, "12"]:
     """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3).
 
@@ -147,6 +136,6 @@ def unpack_wrench(u: Float[Array, "12"]) -> Wrench:
     return Wrench(u[:6].reshape(2, 3), u[6:].reshape(2, 3))
 
 
-def zero_wrench(shape: tuple[int, ...] = ()) -> Wrench:
-    """No wrench on either foot, with leading axes `shape`."""
-    return Wrench(jnp.zeros((*shape, 2, 3)), jnp.zeros((*shape, 2, 3)))
+def zero_wrench() -> Wrench:
+    """No wrench on either foot."""
+    return Wrench(jnp.zeros((2, 3)), jnp.zeros((2, 3)))

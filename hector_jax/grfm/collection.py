@@ -51,7 +51,6 @@ def collect(
     robot: Robot,
     settings: Mapping[str, Any] | None = None,
     about: Mapping[str, Any] | None = None,
-    interval: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
     """Walk all jobs and keep each walk in a file, taking up what an earlier call left.
@@ -66,7 +65,6 @@ def collect(
         robot: the body; walks of another one are refused.
         settings: JSON values of all that the walks follow from; walks of others are refused.
         about: JSON values for the card, such as the engine that walked.
-        interval: the plan interval [s], that of the robot's gait by default.
         progress: called with walks done and walks in all.
 
     Raises:
@@ -74,7 +72,7 @@ def collect(
             folder cannot be written.
         ValueError: walks are missing or too short.
     """
-    interval = walk_config(robot).gait.tick if interval is None else interval
+    interval = walk_config(robot).gait.tick
     # as it is read back
     made_with = json.loads(json.dumps({"interval": interval, **(settings or {})}))
     facts = {

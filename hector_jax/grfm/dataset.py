@@ -84,7 +84,6 @@ def make_dataset(
     start_tick: Any = 0,
     *,
     push: Push = NO_PUSH,
-    config: GaitConfig | None = None,
 ) -> tuple[Dataset, int]:
     """Samples from walks at the plan interval.
 
@@ -93,14 +92,13 @@ def make_dataset(
         walks: W walks of T ticks, stacked, from t = 0.
         start_tick: gait tick of t = 0, of all walks or of each (W,).
         push: pushes from outside, of all walks or of each (W, ...).
-        config: the gait that was walked, that of the robot's description by default.
 
     Returns:
         The dataset, with numpy arrays, and how many samples were dropped because of a fall, an
         unsolved QP, or a push, which would pass for one by the legs. The first HISTORY - 1 ticks of
         a walk have no full history and are no samples.
     """
-    config = config or walk_config(robot).gait
+    config = walk_config(robot).gait
     count = len(walks.fallen)
     starts = np.broadcast_to(np.asarray(start_tick, np.int32), (count,))
     pushes = jax.tree.map(

@@ -18,7 +18,7 @@ from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.effect import Phi
 from hector_jax.grfm.gated import GATED
 from hector_jax.grfm.paper import LINEAR, PAPER
-from hector_jax.grfm.residual import RESIDUAL, ResidualParams, member_params, plain_net
+from hector_jax.grfm.residual import RESIDUAL, plain_net
 from hector_jax.robot.model import Robot
 
 VARIANTS = {phi.name: phi for phi in (RESIDUAL, PAPER, GATED, LINEAR)}
@@ -42,11 +42,6 @@ def as_effect(params: Params) -> jax.tree_util.Partial:
 def effect_of(params: Params | None, gait: GaitConfig) -> jax.tree_util.Partial:
     """Phi of a net, or of the plain rigid body (None), which needs no program of its own."""
     return as_effect(plain_net(gait) if params is None else params)
-
-
-def member_effects(params: ResidualParams) -> jax.tree_util.Partial:
-    """Phi of each member of the residual nets' ensembles alone, stacked on a first axis."""
-    return as_effect(member_params(params))
 
 
 def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any]) -> None:

@@ -32,7 +32,7 @@ def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
     return differentiable_solve(config, QP(0.5 * (P + P.T), q, A, lower, upper))
 
 
-def check_solved(solution: Solution, what: str = "QP") -> None:
+def check_solved(solution: Solution) -> None:
     """Look at a solution, or a batch of them, outside jit before believing it.
 
     Raises:
@@ -49,7 +49,7 @@ def check_solved(solution: Solution, what: str = "QP") -> None:
     )
     count = f"{len(bad)} of {status.size} problems, first at {first}: " if status.size > 1 else ""
     worth = Status(status[first])
-    raise ValueError(f"{what}: {count}{worth.name} ({residuals}). {worth.meaning}")
+    raise ValueError(f"QP: {count}{worth.name} ({residuals}). {worth.meaning}")
 
 
 def _check_shapes(qp: QP) -> None:

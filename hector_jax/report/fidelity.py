@@ -118,7 +118,6 @@ def drift(
     effect: jax.tree_util.Partial | None,
     walks: Trajectory,
     start_tick: Int[np.ndarray, " W"],
-    config: GaitConfig | None = None,
 ) -> Drift:
     """Open-loop prediction errors of a phi over walks at the plan interval.
 
@@ -127,12 +126,11 @@ def drift(
         effect: phi; None moves the body by the measured wrench.
         walks: W walks of T ticks; what follows a fall is left out.
         start_tick: gait tick of their t = 0.
-        config: the gait that was walked.
 
     Raises:
         InputError: no walk is long enough to predict in.
     """
-    config = config or walk_config(robot).gait
+    config = walk_config(robot).gait
     ticks = round(HORIZONS[-1] / config.tick)
     fallen = np.asarray(walks.fallen)
     starts = np.arange(FIRST, fallen.shape[1] - ticks + 1, APART)

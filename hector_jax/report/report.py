@@ -229,14 +229,14 @@ def switching_rows(verdict: Verdict) -> dict[str, tuple[float, float, float]]:
     return rows
 
 
-_TEMPLATES = Environment(
+TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
     undefined=StrictUndefined,
     trim_blocks=True,
     lstrip_blocks=True,
     keep_trailing_newline=True,
 )
-_TEMPLATES.globals |= {
+TEMPLATES.globals |= {
     "BASELINES": BASELINES,
     "columns": columns,
     "legend": legend,
@@ -248,12 +248,9 @@ _TEMPLATES.globals |= {
     "tracking_rows": tracking_rows,
     "verdict_table": verdict_table,
 }
-_TEMPLATES.filters["json"] = partial(json.dumps, indent=2)
-# LaTeX has braces of its own
-_TEX_TEMPLATES = _TEMPLATES.overlay(variable_start_string="<<", variable_end_string=">>")
+TEMPLATES.filters["json"] = partial(json.dumps, indent=2)
 
 
 def render(template: str, **values: Any) -> str:
     """Fill a template of the folder `templates`."""
-    environment = _TEX_TEMPLATES if template.endswith(".tex.j2") else _TEMPLATES
-    return environment.get_template(template).render(values)
+    return TEMPLATES.get_template(template).render(values)

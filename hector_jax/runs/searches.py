@@ -24,9 +24,6 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
-# modules that decide the numbers, for `content_key`
-SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.walk", "sim.parallel")
-
 
 def losses_on_hfs(
     pool: Executor,

@@ -4,10 +4,9 @@ A tuning runs on one core, because a closed loop is one long chain of small oper
 side by side.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from functools import partial
-from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,11 +27,10 @@ from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.folder import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
-from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.tuning import difftune, evaluate, measured
+from hector_jax.sim.world import hfs
+from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.rollout import RolloutConfig
 
 # modules that decide the numbers, for `content_key`
@@ -84,21 +82,18 @@ def _restored(stored: Any) -> Tuned:
     return Tuned(tuning, str(stored.commit))
 
 
-def _load_or_tune(
-    paths: Mapping[str, Path],
-    make: Callable[[list[str], Mapping[str, Tuned]], Iterable[tuple[str, Tuning]]],
-    *,
+def load_or_tune(
     config: TuneConfig,
     robot: Robot,
     start: Weights,
-    commit: str,
+    paths: Mapping[str, Path],
+    make: Callable[[list[str], Mapping[str, Tuned]], Iterator[tuple[str, Tuned]]],
 ) -> dict[str, Tuned]:
-    """Tunings by name, see `load_or_make`."""
+    """Tunings by name; see `load_or_make`, of which `paths` and `make` are arguments."""
 
     def make_stored(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-        tuned = {name: _restored(one) for name, one in stored.items()}
-        for name, tuning in make(missing, tuned):
-            yield name, _stored(Tuned(tuning, commit))
+        for name, tuned in make(missing, {n: _restored(one) for n, one in stored.items()}):
+            yield name, _stored(tuned)
 
     like = partial(_stored_like, config, start)
     stored = load_or_make(paths, make_stored, like=like, kind="tuning", robot=robot)
@@ -199,91 +194,18 @@ def tune(
                 dumps, name, iteration, config=config, robot=robot, command=command, net=net
             )
 
-    def make(missing: list[str], tuned: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuning]]:
+    def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
         if journal is not None:
-            there = {name: one.tuning.history for name, one in tuned.items()}
+            there = {name: one.tuning.history for name, one in stored.items()}
             journal.write({name: there.get(name, ()) for name in problems})  # in their order
         wanted = {name: problems[name] for name in missing}
-        return _tunings(pool, config, robot, start, wanted, title, on_iteration)
+        for name, tuning in _tunings(pool, config, robot, start, wanted, title, on_iteration):
+            yield name, Tuned(tuning, commit)
 
-    tuned = _load_or_tune(paths, make, config=config, robot=robot, start=start, commit=commit)
+    tuned = load_or_tune(config, robot, start, paths, make)
     if journal is not None:
         journal.write({name: one.tuning.history for name, one in tuned.items()})
     return tuned
-
-
-def measured_plants(count: int) -> list[Imperfections]:
-    """The hfs and plants drawn around it, which tunings on walks go by; others judge variants."""
-    return [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + count))]
-
-
-def _measured_job(
-    config: TuneConfig,
-    robot: Robot,
-    command: Command,
-    params: Params | None,
-    weights: Weights,
-    plant: Imperfections,
-) -> Evaluation:
-    seconds = config.rollout.ticks * config.rollout.walk.gait.tick
-    walked = walk(config.rollout.walk, robot, Job(weights, command, plant, seconds))
-    effect = network.effect_of(params, config.rollout.walk.gait)
-    return evaluate_walk(config, robot, weights, command, effect, walked)
-
-
-def tune_measured(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
-    weights: Weights,
-    command: Command,
-    params: Params | None,
-    *,
-    plants: Sequence[Imperfections],
-    folder: Path,
-    title: str,
-    commit: str = "",
-) -> Tuned:
-    """Tune on along walks on the high-fidelity simulator, one on each plant for every step.
-
-    Args:
-        pool: worker processes.
-        config: how.
-        robot: the body.
-        weights: where to start: those of a tuning on the model.
-        command: what to walk.
-        params: the net whose Jacobian is used; None: the plain rigid body.
-        plants: see `measured_plants`.
-        folder: of the tuning; one that is there is not tuned again.
-        title: for the person who waits.
-        commit: to note with what is tuned now.
-
-    Raises:
-        InputError: a walk with the starting weights falls or cannot be believed; the folder cannot
-            be written.
-    """
-    code = (*TUNING_CODE, "tuning.measured", "sim.walk")
-    key = content_key(config, robot, weights, command, params, *plants, code=code)
-    job = partial(_measured_job, config, robot, command, params)
-
-    def make(missing: list[str], tuned: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuning]]:
-        with bar(title) as tell:
-            tell(0, config.iterations, "compiling")
-            tuning = measured.tune_measured(
-                config,
-                weights,
-                lambda trial: list(pool.map(job, repeat(trial), plants)),
-                lambda iteration: tell(
-                    int(iteration.iteration),
-                    config.iterations,
-                    f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6",
-                ),
-            )
-        yield "walks", tuning
-
-    paths = {"walks": folder / f"tuning-walks-{key}.npz"}
-    notes: dict[str, Any] = {"config": config, "robot": robot, "start": weights, "commit": commit}
-    return _load_or_tune(paths, make, **notes)["walks"]
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:

@@ -130,22 +130,23 @@ def loss_of(loss: Loss, trajectory: Trajectory) -> Float[Array, ""]:
     return total(loss, losses(loss, trajectory))
 
 
-def check_loss(loss: Loss) -> None:
+def check_loss(loss: Any) -> None:
     """Check the terms of a loss.
 
     Raises:
         InputError: no term, two of one name, a name that does not begin with `L_`, or a weight that
             is negative or not finite.
     """
+    what = "TuneConfig.loss"
     if not all(isinstance(term, LossTerm) for term in loss):
-        raise InputError(f"a loss must be a tuple of LossTerm, got {short_repr(loss)}")
+        raise InputError(f"{what} must be a tuple of LossTerm, got {short_repr(loss)}")
     names = [term.name for term in loss]
     if not names or len(set(names)) < len(names) or not all(n.startswith("L_") for n in names):
-        raise InputError(f"a loss must have terms of unlike names L_..., got {short_repr(names)}")
+        raise InputError(f"{what} must have terms of unlike names L_..., got {short_repr(names)}")
     for term in loss:
         if not isinstance(term.weight, (int, float)) or term.weight not in NOT_NEGATIVE:
             got = short_repr(term.weight)
-            raise InputError(f"weight of {term.name} must be a number of at least 0, got {got}")
+            raise InputError(f"{what}: {term.name} must be a number of at least 0, got {got}")
 
 
 _KEYS = {"L_Eul": "euler", "L_pos": "position"}  # names of the weights in files

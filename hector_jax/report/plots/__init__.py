@@ -7,16 +7,12 @@ draw pictures of their own with `style`.
 """
 
 from hector_jax.report.plots.grfm import open_loop, training, wrenches
-from hector_jax.report.plots.style import named, titles
-from hector_jax.report.plots.tuning import changes, losses, weights
-from hector_jax.report.plots.walks import collective, distances, path_from_above, tracking
+from hector_jax.report.plots.style import titles
+from hector_jax.report.plots.tuning import losses, weights
+from hector_jax.report.plots.walks import path_from_above, tracking
 
 __all__ = [
-    "changes",
-    "collective",
-    "distances",
     "losses",
-    "named",
     "open_loop",
     "path_from_above",
     "titles",

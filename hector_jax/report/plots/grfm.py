@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hector_jax.core.trajectory import LEFT, Wrench
+from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.plots import style
@@ -13,21 +13,15 @@ from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, looks_o
 
 
 def wrenches(
-    path: Path,
-    period: float,
-    curves: Mapping[str, Wrench],
-    *,
-    foot: int = LEFT,
-    seconds: float = 0.4,
+    path: Path, period: float, curves: Mapping[str, Wrench], *, seconds: float = 0.4
 ) -> str:
-    """Draw the commanded, predicted and measured wrench of one foot over the first steps.
+    """Draw the commanded, predicted and measured wrench of the left foot over the first steps.
 
     Args:
         path: file to write.
         period: [s] between samples.
         curves: `commanded`, `predicted`, `paper`, `linear`, `measured`, or some of them, one per
             period, (T, 2, 3) each; held over the period.
-        foot: which.
         seconds: of the walk's beginning; two steps by default.
     """
     count = round(seconds / period)
@@ -36,7 +30,7 @@ def wrenches(
     with drawing(path, 10.0, 4.4) as figure:
         panels = figure.subplots(2, 3, sharex=True)
         for name in (name for name in order if name in curves):
-            both = np.concatenate([np.asarray(part)[:count, foot] for part in curves[name]], axis=1)
+            both = np.concatenate([np.asarray(part)[:count, 0] for part in curves[name]], axis=1)
             look = {"baseline": None, "label": named(name), **CURVES[name]}
             for panel, values in zip(panels.flat, both.T, strict=True):
                 panel.stairs(values, period * np.arange(count + 1), **look)
@@ -46,7 +40,7 @@ def wrenches(
             style.widen(panel, 5.0 if "[N]" in label else 0.5)
         style.set_all(panels[-1], xlabel="time [s]")
     return (
-        f"Wrench of the ground on the {('left', 'right')[foot]} foot over the first two steps; "
+        "Wrench of the ground on the left foot over the first two steps; "
         "the line is the switch of stance."
     )
 

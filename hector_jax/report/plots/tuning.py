@@ -1,33 +1,24 @@
-"""Pictures of a tuning: losses by iteration, weights, and the loss on the stand-in's plants."""
+"""Pictures of a tuning: losses by iteration, and weights."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import SETS, drawing, log_axis, looks_of, named
-from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
 from hector_jax.tuning.loss import Loss
 
 
-def losses(
-    path: Path,
-    loss: Loss,
-    histories: Mapping[str, Sequence[Iteration]],
-    *,
-    ten: int = PAPER_ITERATIONS,
-) -> str:
+def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]]) -> str:
     """Draw the loss on the model by iteration, whole and by part.
 
     Args:
         path: file to write.
         loss: terms, which are multiplied by their weights.
         histories: of the tunings, by weight set: `without` and `with`.
-        ten: the iteration to mark.
     """
     parts = {"$L$": lambda evaluation: evaluation.loss}
     for i, term in enumerate(loss, 1):
@@ -39,7 +30,9 @@ def losses(
     with drawing(path, 2.5 * len(parts), 2.7) as figure:
         panels = figure.subplots(1, len(parts))
         for panel, (title, part) in zip(panels, parts.items(), strict=True):
-            panel.axvline(ten, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0)
+            panel.axvline(
+                PAPER_ITERATIONS, color="0.5", linestyle=(0, (2, 2)), linewidth=0.9, zorder=0
+            )
             for name, look in looks_of(histories).items():
                 values = np.array([float(part(i.evaluation)) for i in histories[name]]) / 1e6
                 good, bad = np.flatnonzero(accepted[name]), np.flatnonzero(~accepted[name])
@@ -55,7 +48,8 @@ def losses(
         if not all(flags.all() for flags in accepted.values()):
             panels[0].plot([], [], **cross, label="refused step")
     return (
-        f"Loss on the model by iteration, whole and by part; the line is iteration {ten}, "
+        "Loss on the model by iteration, whole and by part; the line is iteration "
+        f"{PAPER_ITERATIONS}, "
         "a cross is a refused step; every tenth accepted one has a marker."
     )
 
@@ -90,64 +84,3 @@ def weights(
         style.category_axis(axes, [style.weight_label(name) for name in names], 3, **labels)
         axes.set_ylabel("weight / nominal")
     return "Tuned weights as ratios to the nominal ones (1); diamonds are the expert's."
-
-
-def changes(
-    path: Path, verdicts: Mapping[str, Verdict], paper: Mapping[tuple[str, str, str], float]
-) -> str:
-    """Draw the loss of every weight set against nominal and expert on every plant.
-
-    Args:
-        path: file to write.
-        verdicts: by trajectory.
-        paper: the paper's change [%] by trajectory, set and baseline.
-    """
-    every = dict.fromkeys(name for verdict in verdicts.values() for name in verdict.scores)
-    names = [name for name in every if name not in BASELINES]
-    size = (3.3 * len(verdicts) + 1.2, 2 * (0.27 * len(names) + 0.75) + 0.3)
-    diamond = {"linestyle": "none", "marker": "D", "color": "black", "markerfacecolor": "white"}
-    diamond |= {"markersize": 5, "zorder": 4, "label": "the paper, on the robot"}
-    with drawing(path, *size) as figure:
-        panels = figure.subplots(2, len(verdicts), sharex="row", sharey=True, squeeze=False)
-        for row, baseline in zip(panels, BASELINES, strict=True):
-            for panel, (trajectory, verdict) in zip(row, verdicts.items(), strict=True):
-                _draw_changes(panel, verdict, names, baseline)
-                change = {i: paper.get((trajectory, n, baseline)) for i, n in enumerate(names)}
-                points = [(1 + x / 100, i) for i, x in change.items() if x is not None]
-                panel.plot(*np.reshape(points, (-1, 2)).T, **diamond)
-                panel.set(xlabel=f"change of L against {baseline} [%]", title=trajectory)
-            log_axis(row[0], "x")
-            percent = lambda r, _: f"{100 * (r - 1):+.0f}" if r != 1 else "0"  # noqa: E731
-            row[0].xaxis.set_major_formatter(percent)
-        first = panels[0, 0]
-        first.set_yticks(range(len(names)), [named(name) for name in names])
-        first.set_ylim(len(names) - 0.5, -0.5)
-        first.plot([], [], "o", color="0.4", alpha=0.5, label="one plant")
-        cross = {"color": "0.2", "markersize": 11, "mew": 2.2}
-        first.plot([], [], "+", **cross, label="median and its interval")
-    return (
-        "L of each set against that of nominal and expert on the same plant, one dot per plant, "
-        "with the median and its 95 % bootstrap interval; left of the line is better. Plants on "
-        "which the set fell have no dot, their number stands at the right; the median counts them. "
-        "Diamonds are the paper's table, after ten iterations."
-    )
-
-
-def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline: str) -> None:
-    panel.axvline(1.0, color="black", linewidth=0.9)
-    looks = looks_of(names)
-    for row, name in enumerate(names):
-        if name not in verdict.scores:
-            continue
-        score, color = verdict.scores[name], looks[name].color
-        ratio = (score.L / verdict.scores[baseline].L)[~score.fallen]
-        panel.plot(ratio, [row] * len(ratio), "o", color=color, alpha=0.3, markersize=3, mew=0)
-        if falls := int(score.fallen.sum()):
-            edge = {"transform": panel.get_yaxis_transform(), "ha": "right", "va": "center"}
-            panel.text(0.99, row, f"{falls} fell", color=color, **edge)
-        value, low, high = (1 + x / 100 for x in compare(verdict, name, baseline).change["L"])
-        if len(ratio):  # an interval that falls widen shall not squeeze the axis
-            high = min(high, 1.1 * max(*ratio, value))
-        panel.hlines(row, low, high, color=color, linewidth=2.2, zorder=3)
-        panel.plot(value, row, "|", color=color, markersize=11, mew=2.2, zorder=3)
-    panel.grid(visible=False, axis="y")

@@ -6,15 +6,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.image import imread
 
 from hector_jax.core.trajectory import Trajectory, from_start
 from hector_jax.report.motion import COLOURS, Motion
 from hector_jax.report.plots.style import CURVES, drawing, looks_of, named, set_all, widen
 
-_FRAME = "Each walk is seen from where it stood and faced at t = 0, so that all have one reference."
-_MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be told apart
-_BEST = "ceiling"
+FRAME = "Each walk is seen from where it stood and faced at t = 0, so that all have one reference."
 
 
 def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
@@ -25,7 +22,7 @@ def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
         walks: by weight set, on the same plant and command.
     """
     with drawing(path, 10.0, 4.2) as figure:
-        _draw_tracking(figure.subplots(2, 3, sharex=True), walks)
+        draw_tracking(figure.subplots(2, 3, sharex=True), walks)
     return (
         "Errors of the centre of mass and of the Euler angles, one stand-in walk of each set; "
         "each against its own reference, ahead and left as the reference faces."
@@ -47,8 +44,8 @@ def _errors(walk: Trajectory) -> dict[str, Float[np.ndarray, " T"]]:
     return {label: np.where(walk.fallen, np.nan, value) for label, value in values.items()}
 
 
-def _draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
-    """Fill 2 x 3 panels."""
+def draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
+    """Draw the errors of position and attitude along each walk into 2 x 3 panels."""
     for name, look in looks_of(walks).items():
         times = float(walks[name].period) * np.arange(1, len(walks[name].fallen) + 1)
         for panel, (label, values) in zip(panels.flat, _errors(walks[name]).items(), strict=True):
@@ -101,21 +98,21 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
         walks: by weight set, on the same plant and command.
     """
     walks = {name: from_start(walk) for name, walk in walks.items()}
-    span, width = _span(walks), 7.0
+    span, width = span_of(walks), 7.0
     height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9
     with drawing(path, width, height, legend_columns=4) as figure:
-        _draw_path(figure.subplots(), walks)
-    return f"Path from above; foot marks are those of `{list(walks)[-1]}`. {_FRAME}"
+        draw_path(figure.subplots(), walks)
+    return f"Path from above; foot marks are those of `{list(walks)[-1]}`. {FRAME}"
 
 
-def _span(walks: Mapping[str, Trajectory]) -> Float[np.ndarray, "2"]:
+def span_of(walks: Mapping[str, Trajectory]) -> Float[np.ndarray, "2"]:
     """Extent of all paths in x and y [m], with room for the feet."""
     reference = next(iter(walks.values())).reference.position
     points = np.concatenate([walk.state.position[~walk.fallen, :2] for walk in walks.values()])
     return np.ptp(np.concatenate([points, reference[:, :2]]), axis=0) + 0.25
 
 
-def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
+def draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     """Draw the paths of walks in the frame of their start."""
     for name, look in looks_of(walks).items():
         fallen, position = walks[name].fallen, walks[name].state.position
@@ -130,44 +127,3 @@ def _draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
         axes.plot(*spots[:, :2].T, **mark, marker=marker, label=f"{side} foot set down")
     axes.set(xlabel="x, ahead [m]", ylabel="y, left [m]", aspect="equal")
     axes.margins(0.05, 0.1)
-
-
-def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | None) -> str:
-    """Draw the paper's collective figure: snapshots, path from above, and tracking.
-
-    Args:
-        path: file to write.
-        walks: by weight set, on the same plant and command. Drawn are nominal, expert, without and
-            with, of which there is at least one, and, on the path only, the ceiling.
-        snapshots: picture of the walk, two rows of tiles; None where there is none.
-    """
-    main = {name: walk for name, walk in walks.items() if name in _MAIN}
-    walks = {n: from_start(walk) for n, walk in walks.items() if n in (*_MAIN, _BEST)}
-    width = 10.0
-    image = None if snapshots is None else imread(snapshots)
-    top = 0.0 if image is None else 0.97 * width * image.shape[0] / image.shape[1] + 0.1
-    span = _span(walks)
-    flat = span[0] > 3.0 * span[1]  # a straight line has a row of its own
-    middle, bottom = (0.85 * width * span[1] / span[0] + 0.7 if flat else 0.0), 4.4
-    legend = 0.55
-    with drawing(path, width, top + middle + bottom + legend, legend_columns=4) as figure:
-        heights = [height for height in (top, middle, bottom) if height]
-        rows = iter(figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights).flat)
-        if image is not None:
-            axes = next(rows).subplots()
-            axes.imshow(image)
-            axes.set_axis_off()
-        if flat:
-            above, beside = next(rows), next(rows)
-        else:
-            # as wide as the path needs at the height of the panels
-            share = float(np.clip(bottom * span[0] / span[1] / width, 0.25, 0.42))
-            above, beside = next(rows).subfigures(1, 2, width_ratios=[share, 1.0 - share])
-        _draw_path(above.subplots(), walks)
-        _draw_tracking(beside.subplots(2, 3, sharex=True), main)
-    seen = "" if image is None else "Snapshots; "
-    return (
-        f"{seen}path of the centre of mass from above, foot marks those of `{list(walks)[-1]}`; "
-        f"errors against the reference of {', '.join(main)}, ahead and left as it faces. "
-        f"One stand-in plant. {_FRAME}"
-    )

@@ -1,8 +1,8 @@
-"""The paper's table, made again: all sets on three trajectories, with intervals and every fall.
+"""The four files of the table: report.md, table.csv, table.json and table.tex.
 
-One result is written four times, as report.md, table.csv, table.json and table.tex, beside the
-paper's own losses. The paper measured on a robot with other errors, so its losses are not to be
-compared with ours, but its changes in % are.
+Each has all sets on all trajectories, with intervals and falls, beside the paper's own losses. The
+paper measured on a robot with other errors, so its losses are not to be compared with ours, but its
+changes in % are.
 """
 
 import csv
@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jinja2 import ChoiceLoader, FileSystemLoader
 
 from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import read_json
 from hector_jax.report.report import (
+    TEMPLATES,
     Picture,
     change_text,
     column,
-    markdown_table,
-    render,
     seeds_text,
     wins_text,
 )
@@ -63,6 +63,11 @@ OTHERS = {  # sets that a set is compared with besides the baselines
 }
 
 Summaries = Mapping[tuple[str, str], Summary]  # by trajectory and set
+
+_FOLDER = FileSystemLoader(Path(__file__).parent / "templates")
+_MARKDOWN = TEMPLATES.overlay(loader=ChoiceLoader([_FOLDER, TEMPLATES.loader]))
+# LaTeX has braces of its own
+_TEX = _MARKDOWN.overlay(variable_start_string="<<", variable_end_string=">>")
 
 
 class Fall(NamedTuple):
@@ -108,6 +113,16 @@ class Table(NamedTuple):
     command: str  # that makes this table again
     earlier: Earlier | None = None
 
+    @property
+    def seeds(self) -> np.ndarray:
+        """Of the plants, the same on all trajectories."""
+        return next(iter(self.verdicts.values())).seeds
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Of the terms of the loss."""
+        return {term.name: term.unit for term in next(iter(self.verdicts.values())).loss}
+
 
 def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float | None:
     """Change [%] of a part of the loss in the paper's table, from its rounded losses.
@@ -148,7 +163,7 @@ def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
         rankings = {name: list(one["ranking"]) for name, one in table["trajectories"].items()}
         earlier = Earlier(str(table["seeds"]), rankings)
     except (TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path}: not a table.json of `hector table`: {error!r}") from error
+        raise InputError(f"{path}: not a table.json of experiments/table.py: {error!r}") from error
     if earlier.seeds == seeds_text(seeds):
         raise InputError(
             f"{path}: a table of the same plants, seeds {earlier.seeds}; expected others, to "
@@ -186,69 +201,41 @@ def write_table(folder: Path, table: Table) -> Path:
     sets = summaries(table.verdicts)
     write_file(folder / "table.csv", _csv(table, sets).encode())
     write_json(folder / "table.json", _result(table, sets))
-    write_file(folder / "table.tex", _tex(table.verdicts, sets).encode())
+    write_file(folder / "table.tex", _tex(table, sets).encode())
     write_file(folder / "report.md", _report(table, sets).encode())
     return folder / "report.md"
 
 
 def _report(table: Table, sets: Summaries) -> str:
     scores = [score for verdict in table.verdicts.values() for score in verdict.scores.values()]
-    return render(
-        "table.md.j2",
+    sections = [
+        tuning_section(f"{trajectory}, {name}", tuning)
+        for trajectory, tunings in table.tunings.items()
+        for name, tuning in tunings.items()
+    ]
+    return _MARKDOWN.get_template("table.md.j2").render(
         **table._asdict(),
         PAPER=PAPER,
+        PARTS=PARTS,
         TITLES=TITLES,
+        change_text=change_text,
         degrees=math.degrees,
         paper_change=paper_change,
         ranking=ranking,
-        units=_units(table.verdicts),
-        sets=sets,
-        plants=plural(_seeds(table), "plant"),
-        swapped=table.earlier and swapped_sets(table.verdicts, table.earlier),
-        others_table=_others_table(table, sets),
-        paper_comparison=_paper_comparison(list(table.verdicts), sets),
-        walks=plural(_seeds(table) * len(sets), "walk"),
-        sections=[
-            tuning_section(f"{trajectory}, {name}", tuning)
-            for trajectory, tunings in table.tunings.items()
-            for name, tuning in tunings.items()
+        wins_text=wins_text,
+        count=len(table.seeds),
+        others=[
+            (trajectory, name, other, one)
+            for (trajectory, name), summary in sets.items()
+            for other, one in summary.against.items()
+            if other not in BASELINES
         ],
         residual=f"{max(float(score.residual.max()) for score in scores):.0e}",
+        sections=sections,
+        sets=sets,
+        swapped=table.earlier and swapped_sets(table.verdicts, table.earlier),
+        units=table.units,
     )
-
-
-def _seeds(table: Table) -> int:
-    return len(next(iter(table.verdicts.values())).seeds)
-
-
-def _units(verdicts: Mapping[str, Verdict]) -> dict[str, str]:
-    return {term.name: term.unit for term in next(iter(verdicts.values())).loss}
-
-
-def _others_table(table: Table, sets: Summaries) -> str:
-    rows = []
-    for (trajectory, name), summary in sets.items():
-        for other, one in summary.against.items():
-            if other not in BASELINES:
-                changes = (change_text(one, part) for part in PARTS)
-                label = f"{trajectory}: `{name}` against `{other}`"
-                rows.append([label, *changes, wins_text(one, _seeds(table))])
-    return markdown_table(("", *PARTS, "wins (L)"), rows) if rows else ""
-
-
-def _paper_comparison(trajectories: Sequence[str], sets: Summaries) -> str:
-    rows = []
-    for name, baseline in itertools.product(
-        ("without_ten", "with_ten", "without", "with"), BASELINES
-    ):
-        row = [f"`{name}` against {baseline}"]
-        for t in trajectories:
-            ours = sets[t, name].against.get(baseline) if (t, name) in sets else None
-            paper = paper_change(t, name, baseline)
-            row.append(change_text(ours) if ours else "")
-            row.append("" if paper is None else f"{paper:+.1f}")
-        rows.append(row)
-    return markdown_table(["", *(cell for t in trajectories for cell in (t, "paper"))], rows)
 
 
 def _csv(table: Table, sets: Summaries) -> str:
@@ -257,13 +244,12 @@ def _csv(table: Table, sets: Summaries) -> str:
     head = ["trajectory", "set", "part", "unit", "mean", "mean_low", "mean_high", "falls", "seeds"]
     for other in others:
         head += [f"{key}_{other}" for key in ("median", "low", "high", "wins", "counts")]
-    units = _units(table.verdicts)
     rows: list[list[Any]] = [[*head, "paper", *(f"paper_{baseline}" for baseline in BASELINES)]]
     for (trajectory, name), summary in sets.items():
         paper = PAPER.get(trajectory, {}).get(name)
         for part in PARTS:
-            row = [trajectory, name, part, units.get(part, ""), *summary.means[part]]
-            row += [summary.falls, _seeds(table)]
+            row = [trajectory, name, part, table.units.get(part, ""), *summary.means[part]]
+            row += [summary.falls, len(table.seeds)]
             for other in others:
                 one = summary.against.get(other)
                 wins = one.wins if one and part == "L" else ""
@@ -308,7 +294,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
         "command": table.command,
         "environment": dict(table.environment),
         "commits": list(table.commits),
-        "seeds": seeds_text(next(iter(table.verdicts.values())).seeds),
+        "seeds": seeds_text(table.seeds),
         "config": dict(table.config),
         "swapped": swapped_sets(table.verdicts, table.earlier) if table.earlier else None,
         "falls": [fall._asdict() for fall in table.falls],
@@ -320,7 +306,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
     }
 
 
-_TEX = {
+_ESCAPES = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
@@ -330,7 +316,7 @@ _TEX = {
 
 def tex(text: str) -> str:
     """Escape words for LaTeX."""
-    return "".join(_TEX.get(character, character) for character in text)
+    return "".join(_ESCAPES.get(character, character) for character in text)
 
 
 def _tex_number(x: float) -> str:
@@ -345,12 +331,12 @@ def _tex_change(comparison: Comparison) -> str:
     return " ".join(f"${text}$" for text in (value, *ends)) + void
 
 
-def _tex(verdicts: Mapping[str, Verdict], sets: Summaries) -> str:
+def _tex(table: Table, sets: Summaries) -> str:
     """A tabular that needs no package; the smallest mean of a trajectory is bold."""
-    seeds = next(iter(verdicts.values())).seeds
+    count = len(table.seeds)
     powers = {p: column(p, max(s.means[p].value for s in sets.values())).power for p in PARTS}
     sections = {}
-    for trajectory, verdict in verdicts.items():
+    for trajectory, verdict in table.verdicts.items():
         of = {name: sets[trajectory, name] for name in verdict.scores}
         least = {part: min(s.means[part].value for s in of.values()) for part in PARTS}
         rows = []
@@ -360,20 +346,19 @@ def _tex(verdicts: Mapping[str, Verdict], sets: Summaries) -> str:
                 value = summary.means[part].value
                 text = _tex_number(value / 10.0 ** powers[part])
                 cells.append(rf"\textbf{{{text}}}" if value == least[part] else text)
-            cells.append(f"{summary.falls}/{len(seeds)}")
+            cells.append(f"{summary.falls}/{count}")
             for baseline in BASELINES:
                 one = summary.against.get(baseline)
-                wins = f"{round(one.wins * len(seeds))}/{len(seeds)}" if one else "--"
+                wins = wins_text(one, count).replace(" ", "") if one else "--"
                 paper = paper_change(trajectory, name, baseline)
                 cells += [_tex_change(one) if one else "--", wins]
                 cells.append("--" if paper is None else f"${paper:+.1f}$")
             rows.append(cells)
         sections[tex(TITLES.get(trajectory, trajectory))] = rows
-    return render(
-        "table.tex.j2",
-        plants=plural(len(seeds), "plant"),
-        seeds=seeds_text(seeds),
-        units=_units(verdicts),
+    return _TEX.get_template("table.tex.j2").render(
+        plants=plural(count, "plant"),
+        seeds=seeds_text(table.seeds),
+        units=table.units,
         powers=powers,
         baselines=BASELINES,
         sections=sections,

@@ -1,0 +1,254 @@
+"""The paper's table: search, tune and evaluate every weight set on every trajectory.
+
+    python experiments/table.py --quick
+
+Writes report.md, table.csv, table.json, table.tex and pictures. Each step reads the results that
+are there: an interrupted run continues, and another set or more plants cost only what is new.
+"""
+
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import table_steps as steps
+from table_plots import draw
+from table_report import Earlier, Fall, Search, Table, load_earlier, write_table
+from table_steps import Bench
+
+from hector_jax.cli.flags import Configured, Folder, Iterations, Plants, Processes, Seed
+from hector_jax.cli.parse import as_command, as_table, check, read_flags
+from hector_jax.control.reference import COMMANDS
+from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights_file import load_weights
+from hector_jax.core.console import exit_code, say
+from hector_jax.core.environment import environment
+from hector_jax.core.files import as_json, locked, make_folder
+from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.settings import Range, read_json
+from hector_jax.report.report import print_table
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import metrics, nets
+from hector_jax.runs.metrics import Verdict
+from hector_jax.runs.tunings import Tuned
+from hector_jax.runs.verdicts import ScoredWalks
+from hector_jax.search.cmaes import SearchConfig, SearchResult
+from hector_jax.sim.standin import standin
+from hector_jax.sim.world import Imperfections
+from hector_jax.tuning.difftune import TuneConfig
+
+PROGRAM = "python experiments/table.py"
+DIFFTUNE = ("without", "with")  # tuned on the model
+SETS = (
+    "nominal",
+    "expert",
+    "searched",
+    *(f"{name}_ten" for name in DIFFTUNE),
+    *DIFFTUNE,
+    "with_walks",
+)
+CEILING = "ceiling"
+
+# what `quick` cuts down to, so that all is done in under five minutes on two cores
+_QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "steps": 2}
+
+
+@dataclass(frozen=True)
+class Flags(Configured):
+    """Make the table of all weight sets: search, tune and evaluate what is not there yet.
+
+    Example: python experiments/table.py --quick
+    """
+
+    trajectories: tuple[str, ...] = COMMANDS  # some of these three
+    seeds: Plants = 32  # stand-in plants
+    first_seed: Seed = 0  # first plant: 0 in development, 1000 for the final evaluation
+    # walks of the search, row `searched`
+    rollouts: Annotated[int, Range(SearchConfig.population, 1_000_000)] = 200
+    iterations: Iterations = 100  # largest number of iterations of each tuning
+    steps: Annotated[int, Range(0, 10_000)] = 30  # steps of row `with_walks`; 0: no such row
+    step_plants: Annotated[int, Range(1, 1000)] = 8  # simulator plants for each of these steps
+    extra: tuple[str, ...] = ()  # more rows, NAME=FOLDER of straight.json, c.json and s.json
+    ceiling: Path = Path("docs/results/ceiling")  # folder of row `ceiling`, if it exists
+    earlier: Path | None = None  # table.json of other plants, to compare the order of the sets
+    data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
+    out: Folder = Path("runs/table")  # folder for the report
+    kept: Path | None = None  # folder of results to reuse; by default OUT/kept
+    quick: bool = False  # a trial with 4 plants and short tunings, into OUT/quick
+    processes: Processes = 2  # worker processes, one core each
+    json: bool = False  # print JSON instead of the tables
+
+    @property
+    def plants(self) -> range:
+        """Seeds of the plants."""
+        return range(self.first_seed, self.first_seed + self.seeds)
+
+
+class Files(NamedTuple):
+    """What the flags name, read before anything is computed."""
+
+    sets: Mapping[str, Mapping[str, Weights]]  # the ceiling and extra ones, by trajectory
+    ceilings: Mapping[str, Search]  # the long searches, by trajectory
+    earlier: Earlier | None
+
+
+def main() -> None:
+    """Make the table and print it."""
+    flags = read_flags(Flags, sys.argv[1:], PROGRAM)
+    setup_jax()
+    path, by_trajectory = make_table(flags, lambda seeds: [standin(seed) for seed in seeds])
+    if flags.json:
+        results = {name: metrics.as_result(verdict) for name, verdict in by_trajectory.items()}
+        print(as_json({"report": str(path), "trajectories": results}))
+    else:
+        for name, verdict in by_trajectory.items():
+            print_table(verdict, f"{name}, {plural(len(verdict.seeds), 'plant')}")
+    say(f"the report is {path}")
+
+
+def make_table(
+    flags: Flags, plants: Callable[[range], list[Imperfections]]
+) -> tuple[Path, dict[str, Verdict]]:
+    """Everything from the net to the files.
+
+    Args:
+        flags: what to make.
+        plants: those of the verdict, by their seeds.
+
+    Returns:
+        report.md, and the verdict of each trajectory.
+
+    Raises:
+        InputError: the flags ask for what cannot be, or a file is damaged, or the folder cannot be
+            written.
+    """
+    command, out = as_command(PROGRAM, flags), flags.out
+    if flags.quick:
+        flags = replace(flags, **{n: min(getattr(flags, n), most) for n, most in _QUICK.items()})
+        out = out / "quick"
+    check(flags)
+    files = read_files(flags)
+    with locked(out):
+        return _make_table(flags, files, out, plants, command)
+
+
+def read_files(flags: Flags) -> Files:
+    """Read the files that the flags name.
+
+    Raises:
+        InputError: one line with the flag or the file.
+    """
+    folders: dict[str, Path] = {}
+    for text in flags.extra:
+        name, _, folder = text.partition("=")
+        if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not folder:
+            raise InputError(f"--extra must be NAME=FOLDER, NAME of letters and digits, got {text}")
+        if name in (*SETS, CEILING, *folders):
+            raise InputError(f"--extra {text}: there is a set '{name}' already")
+        folders[name] = Path(folder)
+    sets, ceilings = {}, {}
+    for name in flags.trajectories:
+        if name not in COMMANDS:
+            raise InputError(f"--trajectories must be of {', '.join(COMMANDS)}, got {name}")
+        paths = {key: folder / f"{name}.json" for key, folder in folders.items()}
+        if (ceiling := flags.ceiling / f"{name}.json").exists():
+            paths = {CEILING: ceiling, **paths}
+            ceilings[name] = _read_card(ceiling.with_name(f"{name}-card.json"))
+        sets[name] = {key: load_weights(path) for key, path in paths.items()}
+    earlier = None if flags.earlier is None else load_earlier(flags.earlier, flags.plants)
+    return Files(sets, ceilings, earlier)
+
+
+def _read_card(path: Path) -> Search:
+    content = read_json(path, "the card of a search")
+    try:
+        return Search(content["walks"], content["best_at"], content["L"]["best"], content["stop"])
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: not the card of a search: {error!r}") from None
+
+
+def _make_table(
+    flags: Flags,
+    files: Files,
+    out: Path,
+    plants: Callable[[range], list[Imperfections]],
+    command: str,
+) -> tuple[Path, dict[str, Verdict]]:
+    robot, folder, about = load_robot(), flags.kept or flags.out / "kept", environment()
+    config, budget = TuneConfig(iterations=flags.iterations), SearchConfig(budget=flags.rollouts)
+    for path in (out / "pictures", folder):
+        make_folder(path)
+    with workers(flags.processes) as pool:
+        params = nets.load_or_train(pool, robot, flags.data).params
+        bench = Bench(pool, config, robot, params, folder, about.get("commit", ""))
+        searches = steps.search(bench, budget, flags.trajectories)
+        tunings = {
+            name: steps.tune(bench, name, flags.steps, flags.step_plants)
+            for name in flags.trajectories
+        }
+        # nothing that tunes or searches runs once the plants of the verdict are known
+        standins, walks = plants(flags.plants), {}
+        for name, extra in files.sets.items():
+            sets = _rows(tunings[name], searches[name], extra)
+            walks[name] = steps.judge(bench, name, sets, standins, flags.plants)
+    by_trajectory = {
+        name: metrics.make_verdict(config.loss, flags.plants, one.scores)
+        for name, one in walks.items()
+    }
+    commits = {one.commit for each in tunings.values() for one in each.values()}
+    commits |= {w.commit for one in walks.values() for each in one.walks.values() for w in each}
+    settings = {"flags": as_table(flags), "tune": config.as_table(), "search": asdict(budget)}
+    content = Table(
+        by_trajectory,
+        falls=[fall for name, one in walks.items() for fall in _falls(name, one, flags.plants)],
+        tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tunings.items()},
+        searches={
+            name: Search(len(one.history) * budget.population, one.walk, one.loss, one.stop)
+            for name, one in searches.items()
+        },
+        ceilings=files.ceilings,
+        pictures=draw(out, robot, by_trajectory, {n: one.first for n, one in walks.items()}),
+        config=settings,
+        environment=about,
+        commits=sorted(commits),
+        command=command,
+        earlier=files.earlier,
+    )
+    return write_table(out, content), by_trajectory
+
+
+def _rows(
+    tunings: Mapping[str, Tuned], search: SearchResult, extra: Mapping[str, Weights]
+) -> dict[str, Weights]:
+    """All weight sets of a trajectory, in the order of the table."""
+    return {
+        "nominal": nominal(),
+        "expert": expert(),
+        "searched": search.weights,
+        **{f"{name}_ten": tunings[name].tuning.ten for name in DIFFTUNE},
+        **{name: one.tuning.converged for name, one in tunings.items()},
+        **extra,
+    }
+
+
+def _falls(trajectory: str, walks: ScoredWalks, seeds: Sequence[int]) -> list[Fall]:
+    return [
+        Fall(
+            trajectory,
+            name,
+            seed,
+            float(walk.upright),
+            float(walk.last.position[2]),
+            *(float(angle) for angle in walk.last.euler[:2]),
+        )
+        for name, each in walks.walks.items()
+        for seed, walk in zip(seeds, each, strict=True)
+        if walk.score.fallen
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(exit_code("table", main))

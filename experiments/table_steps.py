@@ -1,0 +1,154 @@
+"""The steps of the table: search, tune, tune along walks, and walk for the verdict.
+
+Each keeps its results as artefacts and reads those that are there.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+from itertools import repeat
+from pathlib import Path
+from typing import NamedTuple
+
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import Weights, nominal
+from hector_jax.core.console import bar, say
+from hector_jax.core.inputs import InputError, plural
+from hector_jax.grfm.network import Params, effect_of
+from hector_jax.robot.model import Robot
+from hector_jax.runs import searches, tunings, verdicts
+from hector_jax.runs.cache import content_key
+from hector_jax.runs.tunings import Problem, Tuned
+from hector_jax.runs.verdicts import ScoredWalks
+from hector_jax.search.cmaes import SearchConfig, SearchResult
+from hector_jax.sim.engine import choose_engine
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.measured import evaluate_walk, tune_measured
+
+# modules that decide the numbers, for `content_key`
+SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.walk", "sim.parallel")
+WALKS_CODE = (*tunings.TUNING_CODE, "tuning.measured", "sim.walk")
+
+
+class Bench(NamedTuple):
+    """What the steps share."""
+
+    pool: Executor
+    tune: TuneConfig
+    robot: Robot
+    params: Params  # of the net
+    folder: Path  # of the artefacts
+    commit: str  # to note with them
+
+
+def search(
+    bench: Bench, config: SearchConfig, trajectories: Sequence[str]
+) -> dict[str, SearchResult]:
+    """Search without derivatives from nominal, for all trajectories in lock-step."""
+    engine, tune = choose_engine("auto"), bench.tune
+    settings = replace(config, budget=config.population)  # a record serves any budget
+    model = engine.name, tune.rollout, repr(tune.loss)
+    key = content_key(*model, settings, bench.robot, hfs(), nominal(), code=SEARCH_CODE)
+    return searches.search(
+        bench.pool,
+        config,
+        tune,
+        bench.robot,
+        dict.fromkeys(trajectories, nominal()),
+        commands={name: named_command(name) for name in trajectories},
+        engine=engine,
+        folder=bench.folder / f"search-{key}",
+    )
+
+
+def tune(bench: Bench, name: str, steps: int, plants: int) -> dict[str, Tuned]:
+    """Tune for one trajectory without and with the net; the latter on along walks, if any steps."""
+    pool, config, robot, params, folder, commit = bench
+    command, folder = named_command(name), folder / name
+    problems = {"without": Problem(command, None), "with": Problem(command, params)}
+    title = f"tuning {name} without and with GRFM-Net"
+    results = tunings.tune(pool, config, robot, problems, folder, title=title, commit=commit)
+    if steps:
+        start = results["with"].tuning.converged
+        try:
+            results["with_walks"] = tune_along_walks(bench, name, start, steps, plants)
+        except InputError as error:  # a walk with the tuned weights falls
+            say(f"{name}: no row with_walks: {error}")
+    return results
+
+
+def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants: int) -> Tuned:
+    """Tune on along walks on the high-fidelity simulator, one on each plant for every step.
+
+    Args:
+        bench: its net's Jacobian is used.
+        name: of the trajectory.
+        start: weights of a tuning on the model.
+        steps: most of them.
+        plants: how many: the hfs, and others drawn around it; verdicts are on others.
+
+    Raises:
+        InputError: a walk with the starting weights falls or cannot be believed; the folder cannot
+            be written.
+    """
+    config = TuneConfig(iterations=PAPER_ITERATIONS + steps)
+    problem = Problem(named_command(name), bench.params)
+    simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
+    known = config, bench.robot, start, problem.command, problem.params
+    key = content_key(*known, *simulators, code=WALKS_CODE)
+    job = partial(_walk_job, config, bench.robot, problem)
+
+    def make(missing: list[str], _: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
+        with bar(f"tuning {name} further, along walks on the simulator") as tell:
+            tell(0, config.iterations, "compiling")
+            tuning = tune_measured(
+                config,
+                start,
+                lambda trial: list(bench.pool.map(job, repeat(trial), simulators)),
+                lambda one: tell(
+                    int(one.iteration),
+                    config.iterations,
+                    f"L {float(one.evaluation.loss) / 1e6:.3f}e6",
+                ),
+            )
+        yield "walks", Tuned(tuning, bench.commit)
+
+    paths = {"walks": bench.folder / name / f"tuning-walks-{key}.npz"}
+    return tunings.load_or_tune(config, bench.robot, start, paths, make)["walks"]
+
+
+def _walk_job(
+    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights, plant: Imperfections
+) -> Evaluation:
+    controller, command = config.rollout.walk, problem.command
+    seconds = config.rollout.ticks * controller.gait.tick
+    walked = walk(controller, robot, Job(weights, command, plant, seconds))
+    effect = effect_of(problem.params, controller.gait)
+    return evaluate_walk(config, robot, weights, command, effect, walked)
+
+
+def judge(
+    bench: Bench,
+    name: str,
+    sets: Mapping[str, Weights],
+    plants: Sequence[Imperfections],
+    seeds: Sequence[int],
+) -> ScoredWalks:
+    """Walk all sets on the plants, along one trajectory."""
+    return verdicts.judge(
+        bench.pool,
+        bench.tune,
+        bench.robot,
+        sets,
+        named_command(name),
+        plants,
+        seeds,
+        title=f"evaluating {name} on {plural(len(plants), 'stand-in plant')}",
+        folder=bench.folder / name,
+        commit=bench.commit,
+    )

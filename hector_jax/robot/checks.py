@@ -1,0 +1,199 @@
+"""Check that a compiled MJCF is a biped that this package can walk.
+
+A free trunk; two mirrored legs with hip yaw, hip roll, hip pitch, knee and ankle; one motor per
+joint; line feet that touch at a toe and a heel, with contacts that the floor of each plant decides;
+a standing pose that stands.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError, did_you_mean
+from hector_jax.robot.description import HECTOR_AXES, Description
+
+_AXES = dict(zip("xyz", np.eye(3), strict=True))
+_SAME = 1e-6  # [m], [-]: numbers in a description that should agree
+_ON_FLOOR = 1e-3  # [m]
+_MOST_FRICTION = 0.2  # of the robot's geoms; of two that touch the larger one counts
+
+
+def check_model(description: Description, model: mujoco.MjModel) -> None:
+    """Check a compiled model.
+
+    Raises:
+        InputError: one line saying what came, what was expected and what there is.
+    """
+    _check_base(description.model, model)
+    _check_joints(description, model)
+    _check_motors(description, model)
+    _check_feet(description, model)
+    _check_contacts(description, model)
+    _check_standing(description, model)
+
+
+def _check_base(path: Path, model: mujoco.MjModel) -> None:
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+    joints = _listed(_joints(model))
+    text = f"{len(free)} free joints, expected exactly one, the first; joints: {joints}"
+    _expect(path, list(free) == [0], text)
+
+
+def _check_joints(description: Description, model: mujoco.MjModel) -> None:
+    path, joints = description.model, description.joints
+    names = _joints(model)
+    for name in joints:
+        _require(path, "joint", name, names)
+    got = [name for name in names if name in joints]
+    expected = f"expected a free joint, then {_listed(joints)}"
+    right = got == list(joints) and len(names) == 1 + len(joints)
+    _expect(path, right, f"joints are {_listed(names)}; {expected}")
+    for index, name in enumerate(joints):
+        joint = model.joint(name)
+        which, body, this = index % 5, joint.bodyid[0], f"joint {name!r}"
+        _expect(path, joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE, f"{this} is not a hinge")
+        axis = _AXES[description.axes[which]]
+        right = np.allclose(joint.axis, axis, atol=_SAME)
+        _expect(path, right, f"axis of {this} is {joint.axis}, expected {axis}")
+        _expect(path, joint.limited[0], f"{this} has no range, expected limits in radians")
+        parent = model.body_parentid[body]
+        above = trunk_body(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
+        on, expected = model.body(parent).name, model.body(above).name
+        _expect(path, parent == above, f"{this} is on body {on!r}, expected {expected!r}")
+        right = np.abs(joint.pos).max() <= _SAME and abs(model.body_quat[body][0]) >= 1 - _SAME
+        expected = "expected neither pos on the joint nor an orientation on the body"
+        _expect(path, right, f"{this} is off its body's origin or its body is turned, {expected}")
+        # Two parallel links in one plane: what the closed-form inverse kinematics solves.
+        at = model.body_pos[body]
+        closed = description.axes == HECTOR_AXES and which >= 3
+        right = not closed or (at[0] == 0.0 and at[2] < 0.0)
+        _expect(path, right, f"body of {this} is at {at}, expected x = 0 and z < 0")
+        # a stretched leg has no derivative there, and the closed form bends the knee backwards only
+        low, high = joint.range
+        right = not closed or which != 3 or -np.pi < low < high < 0.0
+        text = f"range of {this} is {joint.range}, expected -pi < lower < upper < 0"
+        _expect(path, right, f"{text}: it bends backwards only")
+
+
+def _check_motors(description: Description, model: mujoco.MjModel) -> None:
+    path, joints = description.model, description.joints
+    expected = f"expected {len(joints)}, one per joint: {_listed(joints)}"
+    _expect(path, model.nu == len(joints), f"{model.nu} actuators, {expected}")
+    for index, name in enumerate(joints):
+        motor = model.actuator(index)
+        driven, limits, gear = model.joint(motor.trnid[0]).name, motor.ctrlrange, motor.gear[0]
+        text = f"actuator {index} drives joint {driven!r}, expected {name!r}"
+        _expect(path, driven == name, text)
+        text = f"actuator of joint {name!r} has ctrlrange {limits} and gear {gear}"
+        right = motor.ctrllimited[0] and limits[1] > 0 and gear == 1.0
+        _expect(path, right, f"{text}, expected a torque range and gear 1")
+
+
+def _check_feet(description: Description, model: mujoco.MjModel) -> None:
+    path, toes, heels = description.model, description.toes, description.heels
+    _require(path, "keyframe", description.standing, [model.key(i).name for i in range(model.nkey)])
+    sites = [model.site(i).name for i in range(model.nsite)]
+    geoms = [model.geom(i).name for i in range(model.ngeom)]
+    for side, foot in enumerate(description.foot_points):
+        _require(path, "site", foot, sites)
+        body, site = model.joint(description.joints[5 * side + 4]).bodyid[0], model.site(foot)
+        name = model.body(body).name
+        _expect(path, site.bodyid[0] == body, f"site {foot!r} is not on the foot, body {name!r}")
+        for end, ahead in ((toes[side], 1), (heels[side], -1)):
+            _require(path, "geom", end, geoms)
+            geom = model.geom(end)
+            right = geom.bodyid[0] == body and geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
+            _expect(path, right, f"geom {end!r} is not a sphere on body {name!r}")
+            reach = geom.pos - [0, 0, geom.size[0]] - site.pos
+            expected = f"expected it {'ahead' if ahead > 0 else 'behind'} on the same sole"
+            text = f"lowest point of geom {end!r} is {reach} from site {foot!r}, {expected}"
+            _expect(path, ahead * reach[0] > 0 and np.abs(reach[1:]).max() <= 1e-3, text)
+    for names in (toes, heels):
+        left, right = (model.geom(name).pos[0] for name in names)
+        text = f"{names[0]} at x = {left}, {names[1]} at x = {right}, expected the same"
+        _expect(path, abs(left - right) <= _SAME, text)
+
+
+def _check_contacts(description: Description, model: mujoco.MjModel) -> None:
+    """What would walk and be read wrongly, or leave a plant's floor without effect."""
+    path, trunk = description.model, trunk_body(model)
+    pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    _expect(path, pyramidal, "option cone is elliptic, expected pyramidal")
+    for name in (*description.toes, *description.heels):
+        dimensions = model.geom(name).condim[0]
+        _expect(path, dimensions == 3, f"condim of geom {name!r} is {dimensions}, expected 3")
+    for index in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+        if model.body_rootid[model.geom_bodyid[index]] != trunk:
+            continue
+        friction, solmix = model.geom_friction[index, 0], model.geom_solmix[index]
+        text = f"geom {model.geom(index).name or index!r} has friction {friction} and solmix "
+        right = friction <= _MOST_FRICTION and solmix == 0.0
+        expected = f"expected at most {_MOST_FRICTION} and 0: the floor of a plant decides both"
+        _expect(path, right, f"{text}{solmix}, {expected}")
+
+
+def _check_standing(description: Description, model: mujoco.MjModel) -> None:
+    """The standing pose is within the limits, on the floor and in balance, and can be held."""
+    path, data, this = description.model, mujoco.MjData(model), f"keyframe {description.standing!r}"
+    mujoco.mj_resetDataKeyframe(model, data, model.key(description.standing).id)
+    mujoco.mj_forward(model, data)
+    for name in description.joints:
+        angle, limits = data.joint(name).qpos[0], model.joint(name).range
+        text = f"{this} has joint {name!r} at {angle:.4g}, expected it in its range {limits}"
+        _expect(path, limits[0] <= angle <= limits[1], text)
+    ends = [(name, data.geom(name).xpos) for name in (*description.toes, *description.heels)]
+    for name, place in ends:
+        height = place[2] - model.geom(name).size[0]
+        text = f"{this} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
+        _expect(path, abs(height) <= _ON_FLOOR, text)
+    com = data.subtree_com[trunk_body(model)]
+    low, high = (side([place[:2] for _, place in ends], axis=0) for side in (np.min, np.max))
+    right = np.all(low <= com[:2]) and np.all(com[:2] <= high)
+    text = f"{this} has the centre of mass at {com[:2]}, expected it over the feet"
+    _expect(path, right, f"{text}, from {low} to {high}")
+    _check_load(description, model, data)
+
+
+def _check_load(description: Description, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Each motor can hold its joint in the standing pose, the feet sharing the weight."""
+    com, torques = data.subtree_com[trunk_body(model)], data.qfrc_bias.copy()
+    force = -0.5 * model.opt.gravity * model.body_subtreemass[trunk_body(model)]
+    for name in description.foot_points:
+        J_v, J_w, place = np.zeros((3, model.nv)), np.zeros((3, model.nv)), data.site(name).xpos
+        mujoco.mj_jacSite(model, data, J_v, J_w, model.site(name).id)
+        # the pressure is under the centre of mass along the foot and under the foot across it
+        ahead = np.array([com[0] - place[0], 0.0, 0.0])
+        torques -= J_v.T @ force + J_w.T @ np.cross(ahead, force)
+    for index, name in enumerate(description.joints):
+        torque, limit = torques[model.joint(name).dofadr[0]], model.actuator(index).ctrlrange[1]
+        text = f"standing takes {abs(torque):.3g} N m of joint {name!r}, which has {limit:g}"
+        _expect(description.model, abs(torque) <= limit, text)
+
+
+def _expect(path: Path, right: Any, message: str) -> None:
+    if not right:
+        raise InputError(f"{path}: {message}")
+
+
+def trunk_body(model: mujoco.MjModel) -> int:
+    """Body that the free joint moves."""
+    return int(model.jnt_bodyid[0])
+
+
+def _joints(model: mujoco.MjModel) -> list[str]:
+    return [model.joint(i).name for i in range(model.njnt)]
+
+
+def _require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
+    _expect(path, name in names, _missing(kind, name, names))
+
+
+def _missing(kind: str, name: str, names: Sequence[str]) -> str:
+    return f"no {kind} {name!r}{did_you_mean(name, names)}; {kind}s: {_listed(names)}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(name for name in names if name) or "none"
