@@ -16,6 +16,7 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.control.mpc import Horizon, MpcProblem, build_qp
 from hector_jax.control.weights import Weights, expert, vector_to_weights, weights_to_vector
 from hector_jax.core.trajectory import State
+from hector_jax.core.tree import stack
 from hector_jax.qp import QP
 from hector_jax.robot.model import Robot
 
@@ -79,8 +80,7 @@ def _problem(config: WalkConfig, robot: Robot, seed: int) -> Problem:
 
 def draw_problems(config: WalkConfig, robot: Robot, count: int) -> Problem:
     """The first `count` problems, stacked; numpy in 64 bits."""
-    problems = [_problem(config, robot, seed) for seed in range(count)]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *problems)
+    return stack([_problem(config, robot, seed) for seed in range(count)])
 
 
 def pick(problems: Problem, index: int | slice) -> Problem:

@@ -38,7 +38,7 @@ from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.grfm.residual import member_params
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import metrics, verdicts
+from hector_jax.runs import verdicts
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
@@ -208,7 +208,7 @@ def scores_on(
     """Scores of weight sets on plants, stacked over these."""
     seeds = range(first_seed, first_seed + len(plants))
     judgement = verdicts.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title=title)
-    return {name: metrics.stack_scores(scores) for name, scores in judgement.scores.items()}
+    return {name: stack(scores) for name, scores in judgement.scores.items()}
 
 
 def million(x: Any) -> str:

@@ -13,7 +13,7 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.robot.model import Robot
-from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.sim.loop import Job
 
 Tree = TypeVar("Tree")
@@ -116,4 +116,4 @@ def walk_groups(
                 yield name, stack(rows)
 
     about = {"settings": [repr(part) for part in settings]}
-    return cached(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)
+    return load_or_make(paths, make, like=lambda _: like, kind=kind, robot=robot, about=about)

@@ -46,7 +46,7 @@ from hector_jax.grfm.network import as_effect
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import nets
-from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.sim.changes import Change
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
@@ -250,7 +250,7 @@ def walk_cases(
 
     like = Walked(*(np.zeros((0,) * n) for n in (1, 2, 1, 1, 0, 0, 2, 1, 1)))
     paths = {case: path(case) for case in cases}
-    return cached(paths, walked, like=lambda _: like, kind="online", robot=robot)
+    return load_or_make(paths, walked, like=lambda _: like, kind="online", robot=robot)
 
 
 def main() -> None:
@@ -261,7 +261,7 @@ def main() -> None:
     robot = jax.tree.map(np.asarray, load_robot())
     make_folder(flags.out)
     with workers(flags.processes) as pool:
-        net = nets.ground(pool, robot, flags.data)
+        net = nets.load_or_train(pool, robot, flags.data)
         effects = {"command": last_command, "net": as_effect(net.params)}
         effects = {name: jax.tree.map(np.asarray, effect) for name, effect in effects.items()}
         walks = walk_cases(pool, flags, robot, effects, starts)

@@ -11,7 +11,6 @@ What is random is repeated with other seeds. All go in lock-step, so that a roun
 MJX, or walks on the processes. Everything is kept under OUT and taken up again.
 """
 
-import json
 import shutil
 import statistics
 import sys
@@ -39,7 +38,7 @@ from hector_jax.core.environment import environment
 from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, Range, check
+from hector_jax.core.settings import AT_LEAST_ONE, Range, check, read_json
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import Params, effect_of, load_net
 from hector_jax.grfm.training import TrainConfig
@@ -173,15 +172,15 @@ def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[st
     if not folder.exists():
         shutil.rmtree(part, ignore_errors=True)  # a cut would leave its seconds unknown
         begin = time.monotonic()
-        nets.collect(pool, nets.CollectConfig(), robot, part / "walks")  # see `ground`
+        nets.collect(pool, nets.CollectConfig(), robot, part / "walks")  # see `load_or_train`
         collected = time.monotonic()
         path = nets.net_path(part, TrainConfig().variant)
         nets.train(TrainConfig(), robot, part / "walks", path)
         took = {"collection": collected - begin, "training": time.monotonic() - collected}
         write_json(part / "seconds.json", took)
         part.rename(folder)
-    took = json.loads((folder / "seconds.json").read_text())
-    return nets.ground(pool, robot, folder).params, took
+    took = read_json(folder / "seconds.json", "the seconds of a collection and a training")
+    return nets.load_or_train(pool, robot, folder).params, took
 
 
 def on_model(
@@ -208,7 +207,7 @@ def on_model(
             }
             runs = {name: future.result()._asdict() for name, future in running.items()}
         write_json(path, {"walk": price, "courses": runs})
-    data = json.loads(path.read_text())
+    data = read_json(path, "runs on the model")
     return {name: ModelRun(**data["courses"][name]) for name in ON_MODEL}, data["walk"]
 
 
@@ -262,9 +261,9 @@ def race(
         return {name: future.result() for name, future in running.items()}
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        own = dict.fromkeys(sets, command)
+        commands = dict.fromkeys(sets, command)
         return searches.losses_on_hfs(
-            pool, config, robot, sets, engine=engine, at_once=size, own=own
+            pool, config, robot, sets, engine=engine, at_once=size, commands=commands
         )
 
     with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as tell:

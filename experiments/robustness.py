@@ -41,6 +41,7 @@ from hector_jax.core.console import exit_code
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report.report import WORLDS
@@ -159,7 +160,7 @@ def main() -> None:
             settings=(config, repr(loss)),
         )
     scores = {
-        (level, name): metrics.stack_scores([walked[group(level, name, seed)] for seed in seeds])
+        (level, name): stack([walked[group(level, name, seed)] for seed in seeds])
         for level in scenes
         for name in sets
     }

@@ -18,7 +18,6 @@ from table_plots import draw
 from table_report import Earlier, Fall, Search, Table, load_earlier, write_table
 from table_steps import Bench
 
-from hector_jax.cli.evaluate import verdict_of
 from hector_jax.cli.flags import Configured, Folder, Iterations, Plants, Processes, Seed
 from hector_jax.cli.parse import as_command, as_table, check, read_flags
 from hector_jax.control.reference import COMMANDS
@@ -35,7 +34,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, nets
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.tunings import Tuned
-from hector_jax.runs.verdicts import Judged
+from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections
@@ -183,7 +182,7 @@ def _make_table(
     for path in (out / "pictures", folder):
         make_folder(path)
     with workers(flags.processes) as pool:
-        params = nets.ground(pool, robot, flags.data).params
+        params = nets.load_or_train(pool, robot, flags.data).params
         bench = Bench(pool, config, robot, params, folder, about.get("commit", ""))
         searches = steps.search(bench, budget, flags.trajectories)
         tunings = {
@@ -196,7 +195,8 @@ def _make_table(
             sets = _rows(tunings[name], searches[name], extra)
             walks[name] = steps.judge(bench, name, sets, standins, flags.plants)
     by_trajectory = {
-        name: verdict_of(config.loss, flags.plants, one.scores) for name, one in walks.items()
+        name: metrics.make_verdict(config.loss, flags.plants, one.scores)
+        for name, one in walks.items()
     }
     commits = {one.commit for each in tunings.values() for one in each.values()}
     commits |= {w.commit for one in walks.values() for each in one.walks.values() for w in each}
@@ -234,7 +234,7 @@ def _rows(
     }
 
 
-def _falls(trajectory: str, walks: Judged, seeds: Sequence[int]) -> list[Fall]:
+def _falls(trajectory: str, walks: ScoredWalks, seeds: Sequence[int]) -> list[Fall]:
     return [
         Fall(
             trajectory,

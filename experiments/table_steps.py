@@ -20,7 +20,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs import searches, tunings, verdicts
 from hector_jax.runs.cache import content_key
 from hector_jax.runs.tunings import Problem, Tuned
-from hector_jax.runs.verdicts import Judged
+from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
@@ -60,6 +60,7 @@ def search(
         tune,
         bench.robot,
         dict.fromkeys(trajectories, nominal()),
+        commands={name: named_command(name) for name in trajectories},
         engine=engine,
         folder=bench.folder / f"search-{key}",
     )
@@ -118,7 +119,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
         yield "walks", Tuned(tuning, bench.commit)
 
     paths = {"walks": bench.folder / name / f"tuning-walks-{key}.npz"}
-    return tunings.cached_tunings(config, bench.robot, paths, make)["walks"]
+    return tunings.load_or_tune(config, bench.robot, start, paths, make)["walks"]
 
 
 def _walk_job(
@@ -137,7 +138,7 @@ def judge(
     sets: Mapping[str, Weights],
     plants: Sequence[Imperfections],
     seeds: Sequence[int],
-) -> Judged:
+) -> ScoredWalks:
     """Walk all sets on the plants, along one trajectory."""
     return verdicts.judge(
         bench.pool,

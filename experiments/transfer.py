@@ -51,7 +51,7 @@ from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.trajectory import Load, Trajectory
-from hector_jax.grfm.collection import walked_with
+from hector_jax.grfm.collection import fingerprint
 from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect
 from hector_jax.robot.model import Robot, load_robot
@@ -135,13 +135,13 @@ def phis(
     walks = data / "walks"
     effects = {"command": last_command}
     if (walks / "card.json").exists():
-        if walked_with(walks).get("controller") != repr(config.rollout.walk):
+        if fingerprint(walks).get("controller") != repr(config.rollout.walk):
             say(
                 f"{walks}: walked by another controller; only the command itself is compared. "
                 "A --data folder of its own gives this one nets"
             )
             return effects, None
-    net, paper = (nets.ground(pool, robot, data, name) for name in (None, "paper"))
+    net, paper = (nets.load_or_train(pool, robot, data, name) for name in (None, "paper"))
     default = as_effect(net.params)
     effects |= {
         "linear": as_effect(net.linear),

@@ -31,7 +31,7 @@ from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, tunings, verdicts
-from hector_jax.runs.journal import Journal
+from hector_jax.runs.folder import Journal
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, descend

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.runs.metrics import Score, Verdict, stack_scores
+from hector_jax.core.tree import stack
+from hector_jax.runs.metrics import Score, Verdict
 from hector_jax.tuning.difftune import Iteration, StepStatus
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, total
@@ -116,7 +117,7 @@ def pretend_verdict(seeds=8, fallen=()):
             pretend_score(level[name] * plant[i] * np.exp(0.05 * row[i]), (name, i) in fallen)
             for i in range(seeds)
         ]
-        scores[name] = stack_scores(rows)
+        scores[name] = stack(rows)
     return Verdict(np.arange(seeds), scores, PAPER_LOSS)
 
 

@@ -25,7 +25,7 @@ from hector_jax.control.weights import WEIGHT_NAMES, expert, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import exit_code
 from hector_jax.core.tree_file import read_card
-from hector_jax.grfm.collection import load_walks, walked_with
+from hector_jax.grfm.collection import fingerprint, load_walks
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
@@ -90,7 +90,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
     residual = np.where(fallen, np.inf, 0.0)
     wrong = walk._replace(fallen=fallen, residual=residual)
-    monkeypatch.setattr(arguments, "walked", lambda *args: wrong)
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: wrong)
     assert call(monkeypatch, "walk") == 1
     out, err = capsys.readouterr()
     assert "nominal weights: ended after 0.20 s" in out
@@ -99,7 +99,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     found = json.loads(capsys.readouterr().out)
     assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
     assert found["residual"] is None
-    monkeypatch.setattr(arguments, "walked", lambda *args: walk._replace(fallen=fallen))
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: walk._replace(fallen=fallen))
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
 
@@ -107,7 +107,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
 def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):
     path = tmp_path / "two\nlines.json"
     save_weights(path, expert())
-    monkeypatch.setattr(arguments, "walked", lambda *args: synthetic_walk(0, 30))
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: synthetic_walk(0, 30))
     assert call(monkeypatch, "walk", "--weights", path) == 0
     assert "two lines.json weights: walked" in capsys.readouterr().out.splitlines()[0]
 
@@ -259,7 +259,7 @@ def test_wrong_robots(monkeypatch, capsys, tmp_path, change, expected):
     ("wrong", "says"),
     [
         (("--budget", "9"), "budget"),
-        (("--population", "2"), "population"),
+        (("--population", "3"), "--population must be a whole number from 4 to 10000, got 3"),
         (("--seed", "-1"), "--seed must be a whole number from 0 to 4294967295"),
         (("--start", "none.json"), "none.json"),
     ],
@@ -275,7 +275,7 @@ def test_a_search_refuses_wrong_input_before_it_makes_a_folder(
 def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch, capsys, tmp_path):
     """Two generations of short walks on all trajectories; the second call finds all done."""
     short = TuneConfig(rollout=RolloutConfig(ticks=20))
-    monkeypatch.setattr(arguments, "TuneConfig", lambda rollout: short)
+    monkeypatch.setattr(tunings, "TuneConfig", lambda rollout: short)
     flags = ("search", "--traj", "all", "--budget", "9", "--population", "4", "--engine", "c")
     folders = ("--out", tmp_path / "found", "--record", tmp_path / "record", "--processes", "1")
     assert call(monkeypatch, *flags, *folders) == 0
@@ -361,8 +361,8 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert result["refresh"][0].keys() == {"old", "new"}
     assert len(load_walks(run / "refresh-1" / "walks", load_robot()).job.seed) == 4
     card = read_card(run / "refresh-1" / "refreshed.npz")["about"]
-    assert card["made_of"] == walked_with(tmp_path / "data" / "walks")
-    assert card["and_of"] == [walked_with(run / "refresh-1" / "walks")]
+    assert card["made_of"] == fingerprint(tmp_path / "data" / "walks")
+    assert card["and_of"] == [fingerprint(run / "refresh-1" / "walks")]
     assert "### Refresh 1" in (run / "report.md").read_text()
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
@@ -549,3 +549,14 @@ def test_a_reader_that_has_enough_is_no_error():
     )
     assert shown.returncode == 141
     assert shown.stderr == ""
+
+
+@pytest.mark.parametrize(("name", "beside"), [("nominal", "expert"), ("mine", "nominal")])
+def test_the_halves_of_a_film_have_names_of_their_own(monkeypatch, tmp_path, name, beside):
+    films = []
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: synthetic_walk(0, 30))
+    monkeypatch.setattr(evaluate.pictures, "film", lambda path, robot, walks: films.append(walks))
+    save_weights(tmp_path / f"{name}.json", expert())
+    words = "--weights", tmp_path / f"{name}.json", "--video", tmp_path / "walk.mp4"
+    assert call(monkeypatch, "walk", *words) == 0
+    assert [list(walks) for walks in films] == [[beside, name]]

@@ -10,7 +10,7 @@ from synthetic import CYCLE, synthetic_walk, turn_walk
 
 from hector_jax.control.reference import Anchor, named_command, reference_at
 from hector_jax.control.weights import expert, nominal, weights_to_vector
-from hector_jax.grfm.collection import collect, load_walks, walked_with
+from hector_jax.grfm.collection import collect, fingerprint, load_walks
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
 from hector_jax.grfm.jobs import KINDS, NEAR, PIECES, draw_jobs, draw_jobs_near
@@ -311,12 +311,12 @@ def test_a_collection_is_identified_by_its_walks_and_settings(tmp_path, robot):
     for i, (seed, ticks) in enumerate([(0, 4), (0, 4), (1, 4), (0, 5)]):
         folder = tmp_path / str(i)
         collect(folder, draw_jobs(seed, 2), walker(), robot=robot, settings={"ticks": ticks})
-        known.append(walked_with(folder))
+        known.append(fingerprint(folder))
     assert known[0] == known[1]
     assert known[0]["content"] != known[2]["content"]
     assert (known[0]["ticks"], known[3]["ticks"]) == (4, 5)
     with pytest.raises(ValueError, match="no finished collection"):
-        walked_with(tmp_path / "none")
+        fingerprint(tmp_path / "none")
 
 
 def test_the_legs_get_what_the_wrench_does_not_explain(three, robot):

@@ -308,6 +308,16 @@ def test_the_loss_is_that_of_its_parts():
     assert rejection_reason(SHORT, jax.tree.map(np.asarray, found)) == ""
 
 
+def test_a_loss_is_not_aligned_to_a_term_that_is_not_there():
+    norms = {"L_Eul": 0.3, "L_pos": 4e-3, "L_ctrl": 2e4}
+    with pytest.raises(
+        InputError, match="unknown term of the loss 'L_crtl'; did you mean 'L_ctrl'"
+    ):
+        aligned(PAPER_LOSS, norms, to="L_crtl")
+    with pytest.raises(InputError, match="unknown term of the loss 'L_pos'"):
+        aligned(PAPER_LOSS, {"L_Eul": 0.3, "L_ctrl": 2e4})
+
+
 def test_aligned_loss_weights_are_powers_of_ten_that_level_the_gradients():
     config = aligned(PAPER_LOSS, {"L_Eul": 0.3, "L_pos": 4e-3, "L_ctrl": 2e4})
     assert config == with_alphas({"L_Eul": 1e5, "L_pos": 1e7})

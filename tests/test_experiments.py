@@ -125,7 +125,9 @@ def test_a_race_on_another_engine_collects_as_every_run_does(tmp_path, monkeypat
     race, made = script("race"), []
     monkeypatch.setattr(race.nets, "collect", lambda pool, config, *rest: made.append(config))
     monkeypatch.setattr(race.nets, "train", lambda *rest: (tmp_path / "data.part").mkdir())
-    monkeypatch.setattr(race.nets, "ground", lambda pool, robot, folder: race.nets.TrainedNet)
+    monkeypatch.setattr(
+        race.nets, "load_or_train", lambda pool, robot, folder: race.nets.TrainedNet
+    )
     monkeypatch.setattr(race.nets.TrainedNet, "params", None, raising=False)
     race.prepare(None, race.Flags(engine="c", out=tmp_path), None)
     assert made == [race.nets.CollectConfig()]  # what `ground` takes up

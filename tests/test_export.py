@@ -367,13 +367,21 @@ def test_the_command_writes_files_that_run_without_us(monkeypatch, capsys, run):
         example.main(folder)
 
 
-def test_what_differs_from_the_live_controller_is_not_written(monkeypatch, capsys, run):
+@pytest.mark.parametrize(
+    ("found", "fault"),
+    [
+        (Check(2e-6, 0.0, 0.0, 0, {}, {}), "2.0e-06 N"),
+        (Check(0.0, 0.0, 0.0, 3, {}, {}), "3 QPs were not solved"),
+    ],
+)
+def test_what_differs_from_the_live_controller_is_not_written(
+    monkeypatch, capsys, run, found, fault
+):
     for part in ("export_controller", "record", "load_controller"):
         monkeypatch.setattr(export, part, lambda *args, **named: None)
-    found = Check(2e-6, 0.0, 0.0, 0, {}, {})
     monkeypatch.setattr(export, "check", lambda *known: found)
     assert call(monkeypatch, run) == 1
-    assert "2.0e-06 N" in capsys.readouterr().err
+    assert fault in capsys.readouterr().err
     assert list((run / "export").glob("[!.]*")) == []
 
 
@@ -459,4 +467,4 @@ def test_a_weights_file_is_exported_by_its_name(monkeypatch, tmp_path):
     path = tmp_path / "mine.json"
     save_weights(path, expert())
     assert call(monkeypatch, path, "--json") == 0
-    assert asked == [{"name": "mine.json/mine", "seconds": 1.0}]
+    assert asked == [{"name": "mine", "seconds": 1.0}]

@@ -24,7 +24,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import replay, tunings
-from hector_jax.runs.journal import Journal
+from hector_jax.runs.folder import Journal
 from hector_jax.runs.tunings import Problem
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import TuneConfig, descend
@@ -175,7 +175,7 @@ def test_a_fault_is_refused_and_shrunk_and_the_run_goes_on(tmp_path, params, fau
     assert [path.name for path in dumps[:2]] == [f"with-00{i}-{kind}.npz" for i in (1, 2)]
     assert len(dumps) == replay.MOST
     for path in dumps:
-        done = replay.again(path)
+        done = replay.replay(path)
         assert done.same
         assert done.recorded["reason"] == done.again["reason"] == REASONS[fault]
         assert done.first == FIRST[fault]

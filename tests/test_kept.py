@@ -13,9 +13,9 @@ from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import journal, metrics, tunings, verdicts
+from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key
-from hector_jax.runs.folder import as_line
+from hector_jax.runs.folder import Journal, as_line
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
@@ -93,13 +93,30 @@ def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
     assert tuned == ["without"]
 
 
+def test_a_tuning_from_weights_with_other_numbers_comes_back(tmp_path, monkeypatch):
+    made, start = [], nominal()._replace(others={"footstep_feedback": np.array(0.1)})
+    history = [
+        one._replace(weights=start, evaluation=one.evaluation._replace(gradient=start))
+        for one in TUNING.history
+    ]
+
+    def side_by_side(pool, config, robot, start, problems, title, on_iteration):
+        made.append(title)
+        yield "without", Tuning(history, start, start, "12 iterations")
+
+    monkeypatch.setattr(tunings, "_tunings", side_by_side)
+    for _ in range(2):  # as tuned, and as kept
+        same(tune(tmp_path, start=start).tuning.converged, start)
+    assert len(made) == 1
+
+
 def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned):
     """Of two tunings one had ended; the lines that the other had written come once."""
     problems = {"without": Problem(S, None), "with": Problem(named_command("c"), None)}
 
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
-        lines_of = journal.Journal(folder / "metrics.jsonl")
+        lines_of = Journal(folder / "metrics.jsonl")
         tunings.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=lines_of)
         return (folder / "metrics.jsonl").read_text()
 
@@ -171,6 +188,24 @@ def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
         assert walk.score.fallen
         assert float(walk.upright) == pytest.approx(0.5)
         assert np.isfinite(np.concatenate(walk.last)).all()
+
+
+@pytest.mark.parametrize("residual", [1.0, np.nan])
+def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, residual):
+    def walks_of(pool, config, robot, jobs, title):
+        for job in jobs:
+            walk = pretend_walk(job.seed, 0.03, 1.0)
+            yield walk._replace(residual=np.where(job.seed == 1, residual, walk.residual))
+
+    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    for _ in range(2):  # as walked, and as kept
+        judge(tmp_path, {"mine": nominal()})
+        said = " ".join(capsys.readouterr().err.split())
+        assert (
+            f"mine: at least one QP of its walks was not solved (residual {residual:.0e})" in said
+        )
+    judge(tmp_path, {"mine": nominal()}, seeds=(0,))
+    assert capsys.readouterr().err == ""
 
 
 CODE = ("tuning.difftune",)

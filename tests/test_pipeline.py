@@ -1,5 +1,6 @@
 """A net is reused only for its own walks and controller; a loss is one number on either engine."""
 
+import ast
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -10,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import table
-from pretend import pretend_history
+from pretend import pretend_history, pretend_walk
 from synthetic import synthetic_walk
 
 from hector_jax.cli import commands, flags
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.core import environment
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm import dataset
@@ -33,7 +35,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, Tuning
-from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.evaluate import Evaluation, mean_over_commands
 from hector_jax.tuning.rollout import RolloutConfig
 
 
@@ -55,7 +57,7 @@ def gather(folder, robot, draw=0, **others):
 
 
 def ground(folder, robot, variant=None):
-    return nets.ground(ThreadPoolExecutor(1), robot, folder, variant)
+    return nets.load_or_train(ThreadPoolExecutor(1), robot, folder, variant)
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ def test_no_walk_is_in_two_parts(tmp_path, robot):
     assert all(walks)
     assert sum(map(len, walks)) == len(set.union(*walks)) == 5
     net = nets.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
-    held = nets.held_out(robot, net)
+    held = nets.held_out_walks(robot, net)
     assert set(np.asarray(held.job.seed)) == walks[2]
 
 
@@ -92,7 +94,7 @@ def test_a_net_is_trained_once(tmp_path, robot, quick, monkeypatch):
     for one, other in ((first.params, again.params), (first.linear, again.linear)):
         jax.tree.map(np.testing.assert_array_equal, one, other)
     assert again.errors == first.errors
-    assert again.held_out == first.held_out
+    assert again.held_out_walks == first.held_out_walks
     card = read_card(tmp_path / "grfm.npz")["about"]
     assert card["settings"]["variant"] == "residual"
     assert card["made_of"]["controller"] == repr(WalkConfig())
@@ -254,6 +256,12 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
             jax.tree.map(np.testing.assert_array_equal, first, each[0])
 
 
+def test_what_takes_the_mean_over_commands_is_in_the_key_of_a_tuning():
+    source = environment._source("tuning.difftune").read_bytes()
+    modules = {*tunings.TUNING_CODE, *environment._imported(ast.parse(source))}
+    assert mean_over_commands.__module__.removeprefix("hector_jax.") in modules
+
+
 def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, robot):
     def job(config, robot, start, problem, name, heard):
         if name == "with":
@@ -269,13 +277,34 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, r
     pool.shutdown(wait=False)
 
 
+def test_a_search_says_which_walks_had_an_unsolved_qp(robot, capsys):
+    def toys(pool, config, robot, jobs, **options):
+        for job in jobs:
+            walk = pretend_walk(0, 0.03, 1.0)
+            wrong = float(job.weights.Q.euler[0]) == float(expert().Q.euler[0])
+            yield walk._replace(residual=np.full_like(walk.residual, np.nan if wrong else 0.0))
+
+    sets = {"c": [nominal(), expert()], "s": [nominal()]}
+    commands = {name: named_command(name) for name in sets}
+    engine = MUJOCO_C._replace(walk=toys)
+    pool = ThreadPoolExecutor(1)
+    searches.losses_on_hfs(
+        pool, TuneConfig(), robot, sets, commands=commands, engine=engine, at_once=3
+    )
+    said = " ".join(capsys.readouterr().err.split())
+    assert said == "c: a QP was not solved in 1 of 2 walks"
+
+
 @pytest.mark.slow
 def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine(robot):
     config = TuneConfig(rollout=RolloutConfig(ticks=4))
     sets = {"c": [nominal(), expert()], "s": [nominal()]}
+    commands = {name: named_command(name) for name in sets}
     pool = ThreadPoolExecutor(1)
     told = {
-        name: searches.losses_on_hfs(pool, config, robot, sets, engine=engine, at_once=3)
+        name: searches.losses_on_hfs(
+            pool, config, robot, sets, commands=commands, engine=engine, at_once=3
+        )
         for name, engine in ENGINES.items()
     }
     for name, each in sets.items():

@@ -24,7 +24,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.runs.cache import cached
+from hector_jax.runs.cache import load_or_make
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
@@ -42,7 +42,7 @@ def tune(folder):
         yield "toy", descend(CONFIG, nominal(), lambda w: look(folder, w)).converged
 
     paths = {"toy": folder / "tuning.npz"}
-    return cached(paths, make, like=lambda _: nominal(), kind="weights", robot=ROBOT)["toy"]
+    return load_or_make(paths, make, like=lambda _: nominal(), kind="weights", robot=ROBOT)["toy"]
 
 
 def files(folder):
@@ -104,7 +104,7 @@ def test_a_spoilt_artefact_is_named_and_made_anew(tmp_path, capsys, how):
             made.append(missing)
             yield "a", STATE
 
-        return cached({"a": path}, make, like=lambda _: STATE, kind="thing", robot=ROBOT)["a"]
+        return load_or_make({"a": path}, make, like=lambda _: STATE, kind="thing", robot=ROBOT)["a"]
 
     assert state()["x"].tolist() == state()["x"].tolist() == [0.0, 1.0, 2.0]
     assert len(made) == 1
@@ -396,3 +396,15 @@ def test_a_run_of_another_trajectory_is_not_taken_up(tmp_path):
         )
     with pytest.raises(ValueError, match="config.json: tune: no settings: 5"):
         run_folder.check_agreement(tmp_path, {"tune": 5}, {"tune": {"iterations": 10}})
+
+
+def test_a_run_folder_that_cannot_be_made_is_not_said_to_exist(tmp_path, monkeypatch):
+    def full(path, target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "rename", full)
+    for named in ({"out": tmp_path / "run"}, {"runs": tmp_path}):
+        with pytest.raises(
+            InputError, match=f"^cannot write {tmp_path}.*: No space left on device$"
+        ):
+            command.tune(flags.Tune(traj=("c",), **named))

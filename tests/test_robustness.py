@@ -23,7 +23,7 @@ from scenes import (
 from hector_jax.control.reference import UNSEEN
 from hector_jax.control.weights import nominal
 from hector_jax.core.files import as_json
-from hector_jax.runs.metrics import stack_scores
+from hector_jax.core.tree import stack
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 
@@ -37,7 +37,7 @@ def scores(losses, fallen=()):
         [pretend_score(loss, (i, j) in fallen) for j, loss in enumerate(row)]
         for i, row in enumerate(losses)
     ]
-    return stack_scores([stack_scores(row) for row in rows])
+    return stack([stack(row) for row in rows])
 
 
 def test_pushes_come_from_eight_sides_at_all_phases_of_a_cycle():

@@ -36,7 +36,7 @@ def asked(monkeypatch):
     """What the steps that take long were asked for; nothing is walked, tuned or drawn in 3D."""
     told = {"walks": 0, "tunings": []}
 
-    def search(pool, config, tune, robot, starts, *, engine, folder):
+    def search(pool, config, tune, robot, starts, *, commands, engine, folder):
         told["search"] = config
         generation = Generation(np.zeros((10, 18)), np.full(10, 2e6))
         one = SearchResult(expert(), 2e6, 7, [generation] * 2, "2 generations")
@@ -61,7 +61,7 @@ def asked(monkeypatch):
     class Net:
         params = None
 
-    monkeypatch.setattr(nets, "ground", lambda *args: Net)
+    monkeypatch.setattr(nets, "load_or_train", lambda *args: Net)
     monkeypatch.setattr(searches, "search", search)
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
     monkeypatch.setattr(table_steps, "tune_along_walks", tune_along_walks)
@@ -250,11 +250,30 @@ def test_several_trajectories_are_one_run(tmp_path, monkeypatch):
         ({"run": Path("a"), "out": Path("b")}, "--out b and --run a: only one can be given"),
         ({"traj": ("c", "s"), "refresh": 1}, "--refresh takes one trajectory, got 2; add --each"),
         ({"traj": ("c", "short.toml")}, "of one length, got c 4 s, short 2 s; add --each"),
+        ({"traj": ("short.toml", "./short.toml")}, "short.toml and ./short.toml are both named s"),
+        ({"traj": ("short.toml", "./short.toml"), "each": True}, "are both named short"),
     ],
 )
 def test_what_one_set_cannot_be_tuned_for_is_one_line(tmp_path, monkeypatch, changes, message):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tune, "_tune_in", lambda folder, args: None)
     Path("short.toml").write_text('name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n')
     with pytest.raises(InputError, match=message):
         tune.tune(flags.Tune(**changes))
     assert [path.name for path in tmp_path.iterdir()] == ["short.toml"]
+
+
+def test_each_trajectory_of_a_file_has_a_folder_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked = []
+    monkeypatch.setattr(tune, "_tune_in", lambda folder, args: asked.append((folder, args)))
+    path = tmp_path / "files" / "mine.toml"
+    path.parent.mkdir()
+    path.write_text('name = "short"\n[[segment]]\nseconds = 2.0\nv_x = 0.2\n')
+    several = flags.Tune(traj=("c", str(path)), each=True)
+    tune.tune(replace(several, out=Path("out")))
+    assert [folder for folder, _ in asked] == [Path("out/c"), Path("out/short")]
+    tune.tune(replace(several, resume=Path("out")))
+    assert [folder for folder, _ in asked[2:]] == [Path("out/c"), Path("out/short")]
+    with pytest.raises(InputError, match="out: its trajectories were tuned one by one; add --each"):
+        tune.tune(flags.Tune(traj=(str(path),), resume=Path("out")))

@@ -179,8 +179,8 @@ def test_what_is_beyond_the_robot_is_walked_with_a_warning(monkeypatch, capsys, 
 
 def test_rollouts_are_as_long_as_the_file_says():
     config = TuneConfig()
-    assert arguments.lasting(config, command_of(str(SLALOM))).rollout.ticks == 600
-    assert arguments.lasting(config, command_of("c")) == config
+    assert arguments.with_length(config, command_of(str(SLALOM))).rollout.ticks == 600
+    assert arguments.with_length(config, command_of("c")) == config
 
 
 def test_a_refresh_of_too_many_segments_is_refused_before_anything(monkeypatch, capsys, tmp_path):

@@ -187,7 +187,7 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     filmed = []
     for write in ("write_film", "write_strip"):
         monkeypatch.setattr(pictures, write, lambda *film: filmed.append(film))
-    monkeypatch.setattr(arguments, "walked", lambda *_: pretend_walk(seconds=0.3))
+    monkeypatch.setattr(arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
     monkeypatch.setattr(view, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]

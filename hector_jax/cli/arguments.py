@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hector_jax.cli.flags import View, Walk
 from hector_jax.control import trajectories
@@ -23,7 +22,6 @@ from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.rollout import RolloutConfig
 
 
 def weights(text: str, robot: Robot) -> Weights:
@@ -50,11 +48,6 @@ def short_names(texts: Sequence[str]) -> dict[str, str]:
         unique = (tail for tail in tails if not any(o[-len(tail) :] == tail for o in others))
         names[text] = "/".join(next(unique, (text,)))
     return names
-
-
-def tune_config(robot: Robot, **others: Any) -> TuneConfig:
-    """Settings of a tuning, with the controller that the robot's description asks for."""
-    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **others)
 
 
 def folder_of(folder: Path, path: Path | None, robot: Robot) -> Path:
@@ -120,7 +113,7 @@ def seconds(flag: float, trajectory: NamedCommand) -> float:
     return trajectory.seconds
 
 
-def lasting(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
+def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
     """The tuning with rollouts as long as the trajectory, where its file says how long."""
     if trajectory.seconds is None:
         return config
@@ -128,7 +121,7 @@ def lasting(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
     return replace(config, rollout=replace(config.rollout, ticks=ticks))
 
 
-def walked(
+def walk_once(
     args: Walk | View, robot: Robot, trajectory: NamedCommand, weights: Weights
 ) -> Trajectory:
     """One walk in the world of the flags."""

@@ -3,7 +3,7 @@
 from functools import singledispatch
 from typing import Any
 
-from hector_jax.cli import data, evaluate, export, search, tune, view
+from hector_jax.cli import data, doctor, evaluate, export, search, tune, view
 
 
 @singledispatch
@@ -29,6 +29,6 @@ for _command in (
     view.replay_dump,
     view.tensorboard,
     export.export_controller,
-    export.examine,
+    doctor.doctor,
 ):
     run.register(_command)

@@ -63,10 +63,10 @@ def grfm(args: Grfm) -> None:
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
     with workers(args.processes) as pool:
-        net = nets.ground(pool, robot, args.data)
-        paper = nets.ground(pool, robot, args.data, "paper")
+        net = nets.load_or_train(pool, robot, args.data)
+        paper = nets.load_or_train(pool, robot, args.data, "paper")
         with say_if_slow("reading the walks that no training saw"):
-            worlds = {"hfs": nets.held_out(robot, net)}
+            worlds = {"hfs": nets.held_out_walks(robot, net)}
         if args.seeds:
             worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
     effects = {"raw": last_command, "linear": as_effect(net.linear)}

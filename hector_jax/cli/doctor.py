@@ -9,10 +9,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from hector_jax.cli.flags import Doctor
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert
+from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import environment
+from hector_jax.core.files import as_json
 from hector_jax.core.inputs import one_line
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import Trajectory
@@ -33,6 +36,23 @@ _EXTRAS = {  # by name, the package that it needs and what it is for
     "tensorboard": ("tensorboardX", "hector tensorboard"),
     "view": ("viser", "hector view"),
 }
+
+
+def doctor(args: Doctor) -> None:
+    """Tell what is installed here, and whether it works.
+
+    Raises:
+        Broken: something does not.
+    """
+    say("testing this machine: two short walks and a film")
+    facts, faults = examine()
+    if args.json:
+        print(as_json({**facts, "faults": faults}))
+    else:
+        for name, text in facts.items():
+            print(f"{name:12s} {text}")
+    if faults:
+        raise Broken("; ".join(faults))
 
 
 def examine() -> tuple[dict[str, str], list[str]]:

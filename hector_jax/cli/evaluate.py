@@ -1,6 +1,5 @@
 """Evaluation of weight sets, walks and runs."""
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +20,9 @@ from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, verdicts
+from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.folder import RESULT, load_run
-from hector_jax.runs.metrics import Score, Verdict
-from hector_jax.tuning.loss import PAPER_LOSS, Loss
+from hector_jax.tuning.loss import PAPER_LOSS
 
 
 def evaluate(args: Evaluate) -> None:
@@ -39,11 +37,11 @@ def evaluate(args: Evaluate) -> None:
     plants = arguments.plants(args.world, seeds)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        config = arguments.tune_config(robot)
+        config = tunings.tune_config(robot)
         judged = verdicts.judge(
             pool, config, robot, sets, course.command, plants, seeds, title=title, seconds=seconds
         )
-    verdict = verdict_of(config.loss, seeds, judged.scores)
+    verdict = metrics.make_verdict(config.loss, seeds, judged.scores)
     result = metrics.as_result(verdict, args.world)
     if args.out is not None:
         write_json(args.out, result)
@@ -53,16 +51,6 @@ def evaluate(args: Evaluate) -> None:
         names = arguments.short_names(args.weights)
         named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
         print_table(named, f"{course.name}, {plural(count, 'plant')}", args.world)
-
-
-def verdict_of(loss: Loss, seeds: Sequence[int], scores: Mapping[str, Sequence[Score]]) -> Verdict:
-    """`metrics.make_verdict`, saying where a QP of the walks was not solved."""
-    verdict = metrics.make_verdict(loss, seeds, scores)
-    for name, score in verdict.scores.items():
-        if score.residual.max() > SOLVED:
-            worst = f"{score.residual.max():.0e}"
-            say(f"{name}: at least one QP of its walks was not solved (residual {worst})")
-    return verdict
 
 
 def walk(args: Walk) -> None:
@@ -76,7 +64,7 @@ def walk(args: Walk) -> None:
     robot = load_robot(args.robot)
     weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = arguments.walked(args, robot, course, weights)
+    trajectory = arguments.walk_once(args, robot, course, weights)
     score = metrics.score(PAPER_LOSS, trajectory)
     upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
     samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
@@ -107,11 +95,12 @@ def walk(args: Walk) -> None:
             f"{float(score.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
         )
     if args.video is not None:
-        beside, other = ("nominal", nominal) if args.weights != "nominal" else ("expert", expert)
+        name = Path(args.weights).stem
+        beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
         say(f"walking with {beside} weights for the other half of the film")
         walks = {
-            beside: arguments.walked(args, robot, course, other(robot)),
-            Path(args.weights).stem: trajectory,
+            beside: arguments.walk_once(args, robot, course, other(robot)),
+            name: trajectory,
         }
         pictures.film(args.video, robot, walks)
 

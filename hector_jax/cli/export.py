@@ -1,10 +1,10 @@
-"""A tuned controller for other machines, and how this one is."""
+"""A tuned controller for other machines."""
 
-from hector_jax.cli import arguments, doctor
-from hector_jax.cli.flags import Doctor, Export
+from hector_jax.cli import arguments
+from hector_jax.cli.flags import Export
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core.console import Broken, say
+from hector_jax.core.console import say
 from hector_jax.core.files import as_json, locked
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
@@ -21,7 +21,8 @@ def export_controller(args: Export) -> None:
     begun = read_request(args.run) if is_run else None
     robot = arguments.robot_of(args.run, begun) if begun else load_robot(args.robot)
     course = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
-    weights, name = load_weights(path), f"{args.run.name}/{path.stem}"
+    weights = load_weights(path)
+    name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
     say("exporting the controller and comparing it with the live one on a walk")
     controller = config or walk_config(robot)
@@ -39,20 +40,3 @@ def export_controller(args: Export) -> None:
         times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
         print(f"a call {text} [ms]: {times.format(**check[what])}")
     say(f"the export is in {folder}")
-
-
-def examine(args: Doctor) -> None:
-    """Tell what is installed here, and whether it works.
-
-    Raises:
-        Broken: something does not.
-    """
-    say("testing this machine: two short walks and a film")
-    facts, faults = doctor.examine()
-    if args.json:
-        print(as_json({**facts, "faults": faults}))
-    else:
-        for name, text in facts.items():
-            print(f"{name:12s} {text}")
-    if faults:
-        raise Broken("; ".join(faults))

@@ -127,7 +127,7 @@ class Search(Configured):
 
     traj: Trajectory = "straight"  # straight, c, s, all or a TOML file
     budget: Annotated[int, Range(1, 1_000_000)] = 200  # most walks per trajectory
-    population: Annotated[int, Range(1, 10_000)] = 10  # walks in a generation
+    population: Annotated[int, Range(4, 10_000)] = 10  # walks in a generation
     seed: Seed = 0  # seed of the search
     # initial standard deviation of each log-weight
     spread: Annotated[float, Range(0, 10, above=True)] = 1.0

@@ -33,7 +33,7 @@ def _run(words: Sequence[str]) -> None:
         if (cache := cache_folder()) != (usual := home_cache()):
             say(f"{usual} cannot be written: compiled programs are kept in {cache}")
         with say_if_slow("loading JAX and MuJoCo"):
-            check_jax(on_cpu=isinstance(args, Export))  # see hector_jax.runs.export
+            check_jax(on_cpu=isinstance(args, Export))  # see hector_jax.runs.export_controller
             setup_jax()
             from hector_jax.cli import commands  # after the flags: `hector --help` answers at once
     except InputError as error:

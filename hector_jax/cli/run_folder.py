@@ -16,7 +16,7 @@ from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.cache import robot_hash
-from hector_jax.runs.folder import read_json
+from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
 
 TIME = "%Y%m%d-%H%M%S"  # names a run
@@ -26,7 +26,7 @@ _OF_A_CALL = ("config", "each", "out", "resume", "run", "runs")
 _FREE = ("data", "json", "processes", "video")  # may be others when a run is resumed
 
 
-def taken(folder: Path) -> InputError:
+def exists_error(folder: Path) -> InputError:
     """The error of a run folder that exists."""
     return InputError(
         f"run folder {folder} exists; continue it with --resume or name another with --out"
@@ -47,20 +47,22 @@ def begin(folder: Path, args: Tune) -> Path:
     make_folder(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
         new = Path(part) / "run"
-        write_json(new / "versions.json", environment())
+        write_json(new / VERSIONS, environment())
         config = {
             "flags": as_table(as_begun(args)),
             "directory": str(Path.cwd()),
             "robot": robot_hash(load_robot(args.robot)),
             "code": code_hash(*_CODE),
         }
-        write_json(new / "config.json", config)
+        write_json(new / CONFIG, config)
         while True:
             try:
                 return new.rename(folder)
-            except OSError:
-                if args.out or args.run or not folder.exists():
-                    raise taken(folder) from None
+            except OSError as error:
+                if not folder.exists():
+                    raise InputError(f"cannot write {folder}: {error.strerror}") from None
+                if args.out or args.run:
+                    raise exists_error(folder) from None
             later = datetime.strptime(folder.name, TIME) + timedelta(seconds=1)
             folder = folder.with_name(f"{later:{TIME}}")
 
@@ -75,8 +77,8 @@ def resume(folder: Path, args: Tune) -> Tune:
         InputError: one line naming the file: no run, one of other flags, other code, another robot,
             or one whose data are not here.
     """
-    path, flags = folder / "config.json", {}
-    config, made_with = read_json(path), read_json(folder / "versions.json")
+    path, flags = folder / CONFIG, {}
+    config, made_with = read_object(path), read_object(folder / VERSIONS)
     for name in ("robot", "code", "directory"):
         if not isinstance(config.get(name), str):
             raise InputError(f"{path}: {name} must be text, got {short_repr(config.get(name))}")
@@ -117,7 +119,7 @@ def check_agreement(folder: Path, begun: Mapping[str, Any], now: Mapping[str, An
         if isinstance(value, dict):
             before = begun.get(name, {})
             if not isinstance(before, dict):
-                raise InputError(f"{folder / 'config.json'}: {name}: no settings: {before!r}")
+                raise InputError(f"{folder / CONFIG}: {name}: no settings: {before!r}")
             check_agreement(folder, before, value)
         elif begun.get(name, value) != value:
             raise InputError(f"{folder}: begun with {name} {begun[name]}, here is {value}")

@@ -14,7 +14,7 @@ from hector_jax.core.environment import versions
 from hector_jax.core.files import as_json, make_folder, write_json
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import searches
+from hector_jax.runs import searches, tunings
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim.engine import choose_engine
 from hector_jax.tuning.loss import alphas
@@ -25,10 +25,10 @@ def search(args: Search) -> None:
     robot = load_robot(args.robot)
     texts = COMMANDS if args.traj == "all" else (args.traj,)
     courses = [arguments.course(text, robot) for text in texts]
-    own = {one.name: one.command for one in courses}
+    commands = {one.name: one.command for one in courses}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = choose_engine(args.engine)
-    tune = arguments.lasting(arguments.tune_config(robot), courses[0])
+    tune = arguments.with_length(tunings.tune_config(robot), courses[0])
     start = arguments.weights(args.start, robot)
     out = arguments.default_of(args.out, Search.out, args.robot, robot)
     make_folder(out)
@@ -38,16 +38,16 @@ def search(args: Search) -> None:
             config,
             tune,
             robot,
-            dict.fromkeys(own, start),
+            dict.fromkeys(commands, start),
+            commands=commands,
             engine=engine,
             folder=args.record or out,
-            own=own,
         )
         say("walking with the start, expert and best weights")
-        sets = {name: [start, expert(robot), results[name].weights] for name in own}
-        at_once = config.population * len(own)
+        sets = {name: [start, expert(robot), results[name].weights] for name in commands}
+        at_once = config.population * len(commands)
         compared = searches.losses_on_hfs(
-            pool, tune, robot, sets, engine=engine, at_once=at_once, own=own
+            pool, tune, robot, sets, commands=commands, engine=engine, at_once=at_once
         )
     cards = {}
     for name, one in results.items():

@@ -14,11 +14,10 @@ import jax
 import numpy as np
 
 from hector_jax.cli import arguments, run_folder
-from hector_jax.cli.evaluate import verdict_of
 from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.control.reference import COMMANDS
-from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import say
@@ -35,12 +34,11 @@ from hector_jax.report.run import Report, write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
-from hector_jax.runs.folder import read_json
-from hector_jax.runs.journal import Journal
+from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
-from hector_jax.runs.verdicts import Judged
+from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import aligned
@@ -63,7 +61,7 @@ def tune(args: Tune) -> None:
         for folder, one in runs.items():
             _trajectories(one, robot)
             if base and folder.exists():
-                raise run_folder.taken(folder)
+                raise run_folder.exists_error(folder)
         runs = {run_folder.begin(folder, one): one for folder, one in runs.items()}
     for folder, one in runs.items():
         with locked(folder):
@@ -74,20 +72,22 @@ def _by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
     """The flags of each run by its folder."""
     texts = tuple(t for text in args.traj for t in (COMMANDS if text == "all" else (text,)))
     texts = tuple(dict.fromkeys(texts))
-    if args.resume and not args.each and (args.resume / texts[0] / "config.json").exists():
+    names: dict[str, str] = {}  # texts by name
+    for text in texts:
+        name = command_of(text).name
+        if name in names:
+            raise InputError(f"--traj {names[name]} and {text} are both named {name}")
+        names[name] = text
+    if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
         raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
     now = f"{datetime.now():{run_folder.TIME}}"
     parent = arguments.folder_of(args.runs, args.robot, robot)
     # beside --resume a trajectory that was not given is that of the run
     shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=texts)
-    runs = {}
-    for one in [replace(args, traj=(text,)) for text in texts] if args.each else [shared]:
-        if base is None:
-            name = "-".join(arguments.course(text, robot).name for text in one.traj)
-            runs[parent / name / now] = one
-        else:
-            runs[base / one.traj[0] if args.each else base] = one
-    return runs
+    if args.each:
+        each = {name: replace(args, traj=(text,)) for name, text in names.items()}
+        return {base / n if base else parent / n / now: one for n, one in each.items()}
+    return {base or parent / "-".join(names) / now: shared}
 
 
 def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
@@ -128,7 +128,7 @@ class _Run(NamedTuple):
     commit: str
 
     @property
-    def kept(self) -> Path:
+    def artefacts(self) -> Path:
         """Folder of the artefacts."""
         return self.folder / "kept"
 
@@ -156,7 +156,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     begun, made_with = time.monotonic(), environment()
     robot = load_robot(args.robot)
     trajectories = _trajectories(args, robot)
-    config = arguments.tune_config(robot, iterations=args.iterations)
+    config = tunings.tune_config(robot, iterations=args.iterations)
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         run = _Run(
@@ -166,7 +166,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             arguments.weights(args.start, robot),
             trajectories,
             trajectories[0].seconds or Walk.seconds,
-            arguments.lasting(config, trajectories[0]),
+            arguments.with_length(config, trajectories[0]),
             _net(pool, args, robot),
             made_with.get("commit", ""),
         )
@@ -176,7 +176,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         judged = _judge(pool, run, tuned.sets)
     result, by_name = _result(run, tuned, judged)
     seconds = f"{time.monotonic() - begun:.0f}"
-    write_json(folder / "versions.json", made_with | {"seconds": seconds})
+    write_json(folder / VERSIONS, made_with | {"seconds": seconds})
     verdict, (standin, on_hfs) = by_name[run.name], judged[trajectories[0].name]
     report = write_report(
         folder,
@@ -205,7 +205,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
 def _net(pool: Executor, args: Tune, robot: Robot) -> TrainedNet:
     if args.net is not None:
         return nets.load_net(args.net, robot, args.variant)[0]
-    return nets.ground(pool, robot, arguments.folder_of(args.data, args.robot, robot), args.variant)
+    return nets.load_or_train(
+        pool, robot, arguments.folder_of(args.data, args.robot, robot), args.variant
+    )
 
 
 def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, dict[str, float]]]:
@@ -221,8 +223,8 @@ def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, dict[str, float]]
 
 def _note_settings(run: _Run) -> dict[str, Any]:
     """Write what the run follows from beside its flags; InputError where it was otherwise."""
-    path = run.folder / "config.json"
-    begun = read_json(path)
+    path = run.folder / CONFIG
+    begun = read_object(path)
     commands = [
         {name: np.asarray(x).tolist() for name, x in one.command._asdict().items()}
         for one in run.trajectories
@@ -241,13 +243,17 @@ def _note_settings(run: _Run) -> dict[str, Any]:
 
 def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     """Tune without and with the net, and again with it refreshed; writes the weights."""
-    options: dict[str, Any] = {
-        "start": run.start,
-        "commit": run.commit,
-        "journal": Journal(run.folder / "metrics.jsonl"),
-        "dumps": run.folder / "dumps",
-    }
-    step = partial(tunings.tune, pool, run.config, run.robot, folder=run.kept, **options)
+    step = partial(
+        tunings.tune,
+        pool,
+        run.config,
+        run.robot,
+        folder=run.artefacts,
+        start=run.start,
+        commit=run.commit,
+        journal=Journal(run.folder / METRICS),
+        dumps=run.folder / "dumps",
+    )
     problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
     tuned = step(problems, title=f"tuning {run.name} without and with GRFM-Net")
     net, name, shifts = run.net, "with", []
@@ -279,36 +285,25 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
 
 def _judge(
     pool: Executor, run: _Run, sets: Mapping[str, Weights]
-) -> dict[str, tuple[Judged, Judged]]:
+) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
     """Walks of all sets on the stand-in plants and on the hfs, by trajectory."""
     seeds = range(run.args.seeds)
-    judge = partial(verdicts.judge, pool, run.config, run.robot, sets)
-    options: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
+    plants = arguments.plants("standin", seeds)
+    notes: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
+    judge = partial(verdicts.judge, pool, run.config, run.robot, sets, **notes)
     judged = {}
     for name, command, _ in run.trajectories:
         where = f" {name}" if len(run.trajectories) > 1 else ""
-        standin = judge(
-            command,
-            arguments.plants("standin", seeds),
-            seeds,
-            title=f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}",
-            folder=run.kept / "standin",
-            **options,
-        )
-        on_hfs = judge(
-            command,
-            [hfs()],
-            [0],
-            title=f"walking{where} on the high-fidelity simulator",
-            folder=run.kept / "hfs",
-            **options,
-        )
+        title = f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}"
+        standin = judge(command, plants, seeds, title=title, folder=run.artefacts / "standin")
+        title = f"walking{where} on the high-fidelity simulator"
+        on_hfs = judge(command, [hfs()], [0], title=title, folder=run.artefacts / "hfs")
         judged[name] = standin, on_hfs
     return judged
 
 
 def _result(
-    run: _Run, tuned: _Tuned, judged: Mapping[str, tuple[Judged, Judged]]
+    run: _Run, tuned: _Tuned, judged: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
 ) -> tuple[dict[str, Any], dict[str, Verdict]]:
     """Write result.json; its content, and the verdicts: of all walks, and by trajectory."""
 
@@ -316,7 +311,7 @@ def _result(
         each = [judged[name][world] for name in names]
         scores = {n: [s for one in each for s in one.scores[n]] for n in tuned.sets}
         seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
-        return verdict_of(run.config.loss, seeds, scores)
+        return metrics.make_verdict(run.config.loss, seeds, scores)
 
     def content(names: Sequence[str], one: Verdict) -> dict[str, Any]:
         result = metrics.as_result(one)
@@ -332,11 +327,11 @@ def _result(
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.shifts:
         result["refresh"] = tuned.shifts
-    write_json(run.folder / "result.json", result)
+    write_json(run.folder / RESULT, result)
     return result, by_name
 
 
-def _draw(run: _Run, tuned: _Tuned, judged: Judged, on_hfs: Judged) -> list[Picture]:
+def _draw(run: _Run, tuned: _Tuned, judged: ScoredWalks, on_hfs: ScoredWalks) -> list[Picture]:
     net = run.net
     effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
     sampled = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
@@ -347,7 +342,7 @@ def _draw(run: _Run, tuned: _Tuned, judged: Judged, on_hfs: Judged) -> list[Pict
     )
 
 
-def _film(run: _Run, judged: Judged) -> Picture | str:
+def _film(run: _Run, judged: ScoredWalks) -> Picture | str:
     """The film of a run, or why there is none."""
     if not run.args.video:
         return "left out (--no-video)"

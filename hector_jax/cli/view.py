@@ -50,7 +50,7 @@ def view_run(args: View) -> None:
         story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
-            walked = arguments.walked(args, robot, course, weights)
+            walked = arguments.walk_once(args, robot, course, weights)
             loss = metrics.score(begun.loss, walked).L / 1e6
             story.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
             say(f"  {story[-1]}")
@@ -89,10 +89,10 @@ def replay_dump(args: Replay) -> None:
     Raises:
         Broken: it does not come out the same.
     """
-    replayed = replay.again(args.dump)
+    replayed = replay.replay(args.dump)
     print(as_json(replayed._asdict(), indent=2) if args.json else replay.in_words(replayed))
     if not replayed.same:
-        raise Broken(f"{args.dump}: {replay.verdict(replayed)}")
+        raise Broken(f"{args.dump}: {replayed.verdict}")
 
 
 def tensorboard(args: Tensorboard) -> None:

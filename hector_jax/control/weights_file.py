@@ -9,7 +9,7 @@ import numpy as np
 
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.weights import Weights
-from hector_jax.core.files import write_file
+from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.settings import Range, read_json, validation_error
 from hector_jax.core.trajectory import State, Wrench
@@ -38,7 +38,7 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
         WriteError: where the file cannot be written.
     """
     tree = {} if schema is None else {"$schema": schema}
-    write_file(path, (json.dumps(tree | weights_tree(weights), indent=2) + "\n").encode())
+    write_json(path, tree | weights_tree(weights))
 
 
 def load_weights(path: Path) -> Weights:

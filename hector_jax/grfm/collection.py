@@ -17,8 +17,9 @@ import numpy as np
 
 from hector_jax.control.controller import walk_config
 from hector_jax.core.console import say
-from hector_jax.core.files import write_file
+from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import Trajectory, no_samples
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings, load_tree, read_card, save_tree
@@ -98,7 +99,7 @@ def collect(
         raise ValueError(f"{folder}: {len(jobs)} walks asked for, {len(complete)} came")
     falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in complete)
     card = {"walks": len(jobs), "falls": falls, "shards": [path.name for path in paths], **facts}
-    write_file(Path(folder) / "card.json", (json.dumps(card, indent=2) + "\n").encode())
+    write_json(Path(folder) / "card.json", card)
 
 
 def load_walks(folder: Path, robot: Robot) -> Walks:
@@ -113,7 +114,7 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
     return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
 
 
-def walked_with(folder: Path) -> dict[str, Any]:
+def fingerprint(folder: Path) -> dict[str, Any]:
     """What tells one collection from another: a hash of its walks, and its settings.
 
     Raises:
@@ -128,16 +129,14 @@ def walked_with(folder: Path) -> dict[str, Any]:
 
 def _read_collection(folder: Path) -> dict[str, Any]:
     path = Path(folder) / "card.json"
+    if not path.exists():
+        raise InputError(f"{folder}: no finished collection (no card.json); collect first")
     try:
-        card = json.loads(path.read_text())
+        card = read_json(path, "the card of a collection")
         shards, settings = card["shards"], dict(card["settings"])
         if not shards or not all(re.fullmatch(r"(shard|walk)-\d+\.npz", name) for name in shards):
             raise ValueError(f"shards are {short_repr(shards)}")
-    except FileNotFoundError:
-        raise InputError(
-            f"{folder}: no finished collection (no card.json); collect first"
-        ) from None
-    except (ValueError, KeyError, TypeError, OSError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: no card of a collection; collect again") from error
     for name in shards:
         if not (Path(folder) / name).is_file():

@@ -49,18 +49,7 @@ def content_key(*parts: Any, code: Sequence[str]) -> str:
     return hashlib.sha256(key.encode()).hexdigest()[:12]
 
 
-def load_artefact(path: Path, like: Tree, *, kind: str, robot: Robot) -> Tree | None:
-    """Read an artefact; None where there is none, or, with a line on stderr, a damaged one."""
-    if not path.exists():
-        return None
-    try:
-        return load_tree(path, like, kind=kind, robot=robot)[0]
-    except InputError as error:
-        say(f"made anew: {error}")
-        return None
-
-
-def cached(
+def load_or_make(
     paths: Mapping[Key, Path],
     make: Callable[[list[Key], Mapping[Key, Tree]], Iterable[tuple[Key, Tree]]],
     *,
@@ -86,11 +75,13 @@ def cached(
     if not paths:
         return {}
     with locked(next(iter(paths.values())).parent):
-        loaded = {
-            key: load_artefact(path, like(key), kind=kind, robot=robot)
-            for key, path in paths.items()
-        }
-        trees = {key: tree for key, tree in loaded.items() if tree is not None}
+        trees = {}
+        for key, path in paths.items():
+            try:
+                if path.exists():
+                    trees[key] = load_tree(path, like(key), kind=kind, robot=robot)[0]
+            except InputError as error:
+                say(f"made anew: {error}")
         missing = [key for key in paths if key not in trees]
         for key, tree in make(missing, dict(trees)) if missing else ():
             save_tree(paths[key], tree, kind=kind, robot=robot, about=about)

@@ -25,7 +25,7 @@ from hector_jax.control.weights import (
 )
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core import inputs, settings
-from hector_jax.core.files import as_json
+from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import Iteration, status_of
@@ -66,7 +66,7 @@ def load_run(folder: Path) -> Run:
     Raises:
         InputError: one line naming the file that is missing or is not what a run leaves.
     """
-    result, config, made_with = (read_json(folder / name) for name in (RESULT, CONFIG, VERSIONS))
+    result, config, made_with = (read_object(folder / name) for name in (RESULT, CONFIG, VERSIONS))
     if not isinstance(result.get("sets"), dict):
         raise InputError(f"{folder / RESULT}: no `sets` in it; expected the result of a tuning")
     return Run(str(folder), result, read_metrics(folder), _flat(config), made_with)
@@ -78,7 +78,7 @@ def read_request(folder: Path) -> RunRequest:
     Raises:
         InputError: the folder is none of a run.
     """
-    config = read_json(folder / CONFIG)
+    config = read_object(folder / CONFIG)
     try:
         # a run that has only just begun has its flags there and nothing else
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
@@ -119,6 +119,32 @@ def as_line(name: str, iteration: Iteration) -> str:
         "gradient_log": named(gradient),
     }
     return as_json(row) + "\n"
+
+
+class Journal:
+    """metrics.jsonl, a line for each iteration: as they come; in order when tunings are over."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._histories: dict[str, Sequence[Iteration]] = {}
+
+    def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
+        """Write the file anew, with these tunings after or instead of those written before.
+
+        Raises:
+            WriteError: where the file cannot be written; the old one stays.
+        """
+        self._histories.update(histories)
+        lines = (as_line(name, i) for name, history in self._histories.items() for i in history)
+        write_file(self.path, "".join(lines).encode())
+
+    def add(self, name: str, iteration: Iteration) -> None:
+        """Write one line more.
+
+        Raises:
+            WriteError: where the file cannot be written.
+        """
+        append_file(self.path, as_line(name, iteration).encode())
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -195,7 +221,7 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
     )
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_object(path: Path) -> dict[str, Any]:
     """Read a JSON object of a run's folder.
 
     Raises:

@@ -14,11 +14,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.tree import stack
 from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, losses, switch_loss, total
 
 BASELINES = ("nominal", "expert")
@@ -123,11 +123,6 @@ def score_like(*axes: int, loss: Loss = PAPER_LOSS) -> Score:
     return Score(parts, one, three, three, one.astype(bool), one, one)
 
 
-def stack_scores(scores: Sequence[Score]) -> Score:
-    """Stack scores along a new first axis."""
-    return jax.tree.map(lambda *rows: np.stack(rows), *scores)
-
-
 def _rms(error: Float[np.ndarray, "T 3"], rows: Bool[np.ndarray, " T"]) -> Float[np.ndarray, "3"]:
     """Root mean square over some rows; NaN where there are none."""
     return np.sqrt(np.mean(error[rows] ** 2, axis=0)) if rows.any() else np.full(3, np.nan)
@@ -152,7 +147,7 @@ def make_verdict(
     for name, walks in scores.items():
         if len(walks) != len(seeds):
             raise ValueError(f"set '{name}' has {len(walks)} walks for {len(seeds)} seeds")
-        stacked[name] = stack_scores(walks)
+        stacked[name] = stack(walks)
         wrong = [s for s, L in zip(seeds, stacked[name].L, strict=True) if not np.isfinite(L)]
         if wrong:
             raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")

@@ -17,7 +17,8 @@ from hector_jax.core.console import bar, say_if_slow
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError, plural, short_repr
-from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, check, from_table
+from hector_jax.core.settings import POSITIVE, SEED, Range, check, from_table
+from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings
 from hector_jax.grfm import collection, dataset, network, training
 from hector_jax.grfm.collection import Walks
@@ -30,8 +31,8 @@ from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.tunings import TUNING_CODE, compile_programs, path_config, tuning_paths
-from hector_jax.sim.engine import ENGINES, Engine, choose_engine
+from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
+from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
 
@@ -51,12 +52,8 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         # devices stay unasked: their number may not be set up yet
-        check(self, walks=AT_LEAST_ONE, seconds=POSITIVE, seed=SEED, engine=("auto", *ENGINES))
-        if self.walks < 3:
-            raise InputError(
-                "CollectConfig.walks must be at least 3 (to learn from, to choose by, to judge "
-                f"by), got {self.walks}"
-            )
+        # three walks: to learn from, to choose by, to judge by
+        check(self, walks=Range(3), seconds=POSITIVE, seed=SEED, engine=("auto", *ENGINES))
         least = HISTORY * GaitConfig.tick
         if self.seconds < least:
             raise InputError(
@@ -77,12 +74,12 @@ class TrainedNet(NamedTuple):
     course: History
     config: TrainConfig
     folders: tuple[Path, ...]  # of the walks; none for a net that came alone
-    held_out: list[int]  # numbers of the walks that no training saw
+    held_out_walks: list[int]  # numbers of the walks that no training saw
 
 
 def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
     """All that the walks of a collection follow from, as JSON values for their card."""
-    paths = path_config(robot)
+    paths = tune_config(robot)
     return {
         **asdict(config),
         "controller": repr(paths.rollout.walk),
@@ -104,17 +101,18 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
         settings = collection_settings(config, robot)
-        _keep_walks(pool, choose_engine(config.engine), robot, jobs, folder, settings)
+        _collect(pool, config, robot, jobs, folder, settings)
 
 
-def _keep_walks(
+def _collect(
     pool: Executor,
-    engine: Engine,
+    config: CollectConfig,
     robot: Robot,
     jobs: Sequence[Job],
     folder: Path,
     settings: Mapping[str, Any],
 ) -> None:
+    engine = choose_engine(config.engine)
     what = f"{plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine.name}"
     with bar(f"collecting {what}") as tell:
         collection.collect(
@@ -144,13 +142,11 @@ def samples(robot: Robot, *folders: Path) -> Samples:
     walks are numbered by folder.
     """
     each = [_samples(robot, folder) for folder in folders]
-    join = lambda *parts: jax.tree.map(lambda *x: np.concatenate(x), *parts)  # noqa: E731
-    return Samples(
-        join(*(one.training for one in each)),
-        join(*(one.validation for one in each)),
-        join(*(one.held_out for one in each)),
-        sum(one.dropped for one in each),
+    *parts, dropped = zip(*each, strict=True)
+    training, validation, held_out = (
+        jax.tree.map(lambda *x: np.concatenate(x), *part) for part in parts
     )
+    return Samples(training, validation, held_out, sum(dropped))
 
 
 def _samples(robot: Robot, folder: Path) -> Samples:
@@ -162,10 +158,10 @@ def _samples(robot: Robot, folder: Path) -> Samples:
     return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
 
 
-def held_out(robot: Robot, net: TrainedNet) -> Walks:
+def held_out_walks(robot: Robot, net: TrainedNet) -> Walks:
     """The walks that no training of a net saw, of the folder that it was trained on."""
     walks = collection.load_walks(net.folders[0], robot)
-    return jax.tree.map(lambda x: x[net.held_out], walks)
+    return jax.tree.map(lambda x: x[net.held_out_walks], walks)
 
 
 def train(
@@ -185,7 +181,7 @@ def train(
 def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> TrainedNet:
     with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
         parts = samples(robot, *folders)
-    made_of = [collection.walked_with(each) for each in folders]
+    made_of = [collection.fingerprint(each) for each in folders]
     with bar(
         f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
     ) as tell:
@@ -257,7 +253,9 @@ def training_settings(config: TrainConfig) -> dict[str, Any]:
     return {**asdict(config), "code": code_hash(*TRAINING_CODE)}
 
 
-def ground(pool: Executor, robot: Robot, data: Path, variant: str | None = None) -> TrainedNet:
+def load_or_train(
+    pool: Executor, robot: Robot, data: Path, variant: str | None = None
+) -> TrainedNet:
     """A GRFM-Net with its walks under `data`: made now, or from disk where it would be made so.
 
     Args:
@@ -275,7 +273,7 @@ def ground(pool: Executor, robot: Robot, data: Path, variant: str | None = None)
     settings = collection_settings(CollectConfig(), robot)
     if not (walks / "card.json").exists():
         collect(pool, CollectConfig(), robot, walks)
-    made_of = collection.walked_with(walks)
+    made_of = collection.fingerprint(walks)
     check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
     with locked(data):  # a second process that begins now waits, and finds the net
         if not path.exists():
@@ -315,12 +313,12 @@ def refresh(
     """
     walks = folder / "walks"
     late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
-    path = jax.tree.map(lambda *w: np.stack(w), tuning.ten, *late)
+    path = stack([tuning.ten, *late])
     jobs = draw_jobs_near(config.seed, config.walks, command, path=path, seconds=config.seconds)
     with locked(walks):
         # the jobs say the rest
         settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}
-        _keep_walks(pool, choose_engine(config.engine), robot, jobs, walks, settings)
+        _collect(pool, config, robot, jobs, walks, settings)
     oldest, *newer = (*net.folders, walks)
     after = train(net.config, robot, oldest, folder / "refreshed.npz", newer)
     effects = {

@@ -2,10 +2,9 @@
 
 A step of a tuning is refused where the walk falls, a QP is not solved or a number is not finite. A
 dump of it holds all that the evaluation followed from (body, weights, command, anchor, net and
-settings) and what it came to; `again` does it once more and says whether the same comes out.
+settings) and what it came to; `replay` does it once more and says whether the same comes out.
 """
 
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,7 +52,7 @@ class Dump(NamedTuple):
     seen: Evaluation
 
 
-class Replayed(NamedTuple):
+class Replay(NamedTuple):
     """A dump, done again."""
 
     name: str  # of the tuning
@@ -63,6 +62,18 @@ class Replayed(NamedTuple):
     first: dict[str, int | None]  # tick, now, that is the first not finite, fallen or unsolved
     same: bool  # to the last bit, the gradient included
     changed: dict[str, list[str | None]]  # versions and machine: then and now, where they differ
+
+    @property
+    def verdict(self) -> str:
+        """Whether it is the same, and which versions or machines are not."""
+        if self.same:
+            return "the same to the last bit"
+        then, now = self.recorded["reason"], self.again["reason"]
+        what = "the same reason, other numbers" if then == now else f"now {now or 'not refused'}"
+        changes = (f"{name} {a or '-'} -> {b or '-'}" for name, (a, b) in self.changed.items())
+        made = ", ".join(changes)
+        made = f"changed since: {made}" if made else "same versions, same machine"
+        return f"not reproduced: {what}; {made}"
 
 
 def keep(
@@ -142,30 +153,22 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
     return dump, config, about
 
 
-_walk = jax.jit(rollout, static_argnums=0)
-
-
-def _on_cpu() -> AbstractContextManager[Any]:
-    if jax.default_backend() == "cpu":
-        return nullcontext()  # naming the device would compile a tuning's program once more
-    return jax.default_device(jax.local_devices(backend="cpu")[0])
-
-
-def again(path: Path) -> Replayed:
+def replay(path: Path) -> Replay:
     """Do the evaluation of a dump again, on the CPU, where tunings run.
 
     Raises:
         InputError: see `load`.
     """
     dump, config, about = load(path)
-    effect = effect_of(dump.params, config.rollout.walk.gait)
-    problem = dump.robot, dump.weights, dump.command, dump.anchor, effect
-    with _on_cpu():
-        evaluation = jax.device_get(tune_step(config, *problem))
-        walked = jax.device_get(_walk(config.rollout, *problem))
+    inputs = *dump[:4], effect_of(dump.params, config.rollout.walk.gait)
+    # where the CPU is the default, naming it would compile a tuning's program once more
+    is_cpu = jax.default_backend() == "cpu"
+    with jax.default_device(None if is_cpu else jax.local_devices(backend="cpu")[0]):
+        evaluation = jax.device_get(tune_step(config, *inputs))
+        walked = jax.device_get(jax.jit(rollout, static_argnums=0)(config.rollout, *inputs))
     same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, evaluation)
     then, now = about["environment"], environment()
-    return Replayed(
+    return Replay(
         name=about["name"],
         iteration=about["iteration"],
         recorded=_summary(about["reason"], dump.seen),
@@ -181,11 +184,10 @@ def again(path: Path) -> Replayed:
 
 
 def _summary(reason: str, evaluation: Evaluation) -> dict[str, Any]:
-    gradient = np.max([np.max(np.abs(g)) for g in jax.tree.leaves(evaluation.gradient)])
     numbers = {
         "loss": evaluation.loss,
         **evaluation.terms,
-        "gradient": gradient,  # its largest entry
+        "gradient": max(np.max(np.abs(g)) for g in jax.tree.leaves(evaluation.gradient)),
         "fallen": evaluation.fallen,
         "residual": evaluation.residual,
     }
@@ -202,7 +204,7 @@ def _first(config: TuneConfig, walked: Trajectory) -> dict[str, int | None]:
     return {name: int(np.argmax(at)) if at.any() else None for name, at in wrong.items()}
 
 
-def in_words(replayed: Replayed) -> str:
+def in_words(replayed: Replay) -> str:
     """A table of what was recorded and what came out, and the verdict."""
     labels = {"gradient": "largest gradient", "fallen": "share fallen", "residual": "QP residual"}
     cell = lambda x: x if isinstance(x, str) else f"{x:.17g}"  # noqa: E731
@@ -211,17 +213,4 @@ def in_words(replayed: Replayed) -> str:
         lines.append(f"{labels.get(name, name):18s}{cell(value):32s}{cell(replayed.again[name])}")
     for name, tick in replayed.first.items():
         lines.append(f"{f'first {name}':18s}{'':32s}{'never' if tick is None else f'tick {tick}'}")
-    return "\n".join([*lines, verdict(replayed)])
-
-
-def verdict(replayed: Replayed) -> str:
-    """Whether it is the same, and which versions or machines are not."""
-    if replayed.same:
-        return "the same to the last bit"
-    then, now = replayed.recorded["reason"], replayed.again["reason"]
-    what = "the same reason, other numbers" if then == now else f"now {now or 'not refused'}"
-    changed = [
-        f"{name} {old or '-'} -> {new or '-'}" for name, (old, new) in replayed.changed.items()
-    ]
-    made = f"changed since: {', '.join(changed)}" if changed else "same versions, same machine"
-    return f"not reproduced: {what}; {made}"
+    return "\n".join([*lines, replayed.verdict])

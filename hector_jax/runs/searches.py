@@ -9,9 +9,11 @@ from jaxtyping import Float
 
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.files import locked
+from hector_jax.core.inputs import plural
 from hector_jax.core.tree_file import tree_hash
+from hector_jax.grfm.dataset import SOLVED
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.search import cmaes as searching
@@ -23,19 +25,15 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
 
-def _command(name: str, own: Mapping[str, Command] | None) -> Command:
-    return own[name] if own and name in own else named_command(name)
-
-
 def losses_on_hfs(
     pool: Executor,
     config: TuneConfig,
     robot: Robot,
     sets: Mapping[str, Sequence[Weights]],
     *,
+    commands: Mapping[str, Command],
     engine: Engine,
     at_once: int,
-    own: Mapping[str, Command] | None = None,
 ) -> dict[str, Float[np.ndarray, " sets"]]:
     """L of weight sets on the high-fidelity simulator, one walk each, as long as the rollouts.
 
@@ -44,21 +42,25 @@ def losses_on_hfs(
         config: controller, length and loss.
         robot: the body.
         sets: by the trajectory that they walk.
+        commands: by trajectory.
         engine: of the walks.
         at_once: walks that a program is compiled for; fewer are filled up to it.
-        own: commands of trajectories that are not built in, by their name.
     """
     walk = config.rollout.walk
     seconds = config.rollout.ticks * walk.gait.tick
     jobs = [
-        Job(weights, _command(name, own), hfs(), seconds)
+        Job(weights, commands[name], hfs(), seconds)
         for name, each in sets.items()
         for weights in each
     ]
     walks = engine.walk(pool, walk, robot, jobs, batch=at_once)
-    losses = [float(loss_of(config.loss, walked)) for walked in walks]
+    rows = [(float(loss_of(config.loss, one)), np.max(one.residual) <= SOLVED) for one in walks]
     ends = np.cumsum([len(each) for each in sets.values()])
-    return dict(zip(sets, np.split(np.array(losses), ends[:-1]), strict=True))
+    by_name = dict(zip(sets, np.split(np.array(rows), ends[:-1]), strict=True))
+    for name, each in by_name.items():
+        if unsolved := int(np.sum(each[:, 1] == 0)):
+            say(f"{name}: a QP was not solved in {unsolved} of {plural(len(each), 'walk')}")
+    return {name: each[:, 0] for name, each in by_name.items()}
 
 
 def search(
@@ -68,9 +70,9 @@ def search(
     robot: Robot,
     starts: Mapping[str, Weights],
     *,
+    commands: Mapping[str, Command],
     engine: Engine,
     folder: Path,
-    own: Mapping[str, Command] | None = None,
 ) -> dict[str, SearchResult]:
     """CMA-ES on the high-fidelity simulator, taking up the records under `folder`.
 
@@ -80,27 +82,29 @@ def search(
         tune: controller, length of the walks and loss, the same as those of tunings.
         robot: the body.
         starts: where to start, by the name of the trajectory; all go in lock-step.
+        commands: by trajectory.
         engine: of the walks.
         folder: of the records.
-        own: commands of trajectories that are not built in, by their name.
 
     Raises:
-        InputError: see `named_command` and `search.cmaes.search`.
-        InputError: the folder cannot be written; told before
-            anything is walked.
+        InputError: the folder cannot be written, and see `search.cmaes.search`; before anything is
+            walked.
     """
     size = config.population * len(starts)
+    every = {name: named_command(name) for name in COMMANDS} | dict(commands)
     about = {  # not the engine: both give a loss to seven digits
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
         "controller": repr(tune.rollout.walk),
         "loss": repr(tune.loss),
         "robot": robot_hash(robot),
         "plant": tree_hash(hfs()),
-        "commands": {name: tree_hash(_command(name, own)) for name in (*COMMANDS, *starts)},
+        "commands": {name: tree_hash(command) for name, command in every.items()},
     }
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        return losses_on_hfs(pool, tune, robot, sets, engine=engine, at_once=size, own=own)
+        return losses_on_hfs(
+            pool, tune, robot, sets, commands=commands, engine=engine, at_once=size
+        )
 
     title = f"searching on the high-fidelity simulator, engine {engine.name}"
     with locked(folder), bar(title) as tell:
@@ -112,11 +116,8 @@ def search(
                 for name, history in histories.items()
                 if history
             )
-            tell(
-                done,
-                config.generations * size,
-                "lowest L: " + ", ".join(lowest) if done else "compiling",
-            )
+            remark = "lowest L: " + ", ".join(lowest) if done else "compiling"
+            tell(done, config.generations * size, remark)
 
         return searching.search(
             config, starts, walk, folder=folder, about=about, on_generation=on_generation

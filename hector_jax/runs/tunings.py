@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
-from hector_jax.control.controller import WalkConfig, walk_config
+from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
@@ -24,15 +23,14 @@ from hector_jax.grfm import network
 from hector_jax.grfm.network import Params
 from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
-from hector_jax.runs.cache import cached, content_key
-from hector_jax.runs.journal import Journal
+from hector_jax.runs.cache import content_key, load_or_make
+from hector_jax.runs.folder import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import RolloutConfig
 
 # modules that decide the numbers, for `content_key`
@@ -65,12 +63,13 @@ def _stored(tuned: Tuned) -> Any:
     return Tuned(tuned.tuning._replace(history=history), tuned.commit)
 
 
-def _stored_like(loss: Loss, _: Any) -> Any:
+def _stored_like(config: TuneConfig, start: Weights, _: Any) -> Any:
     none, text = np.zeros(0), np.array("")
-    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), nominal())
-    seen = Evaluation(none, {term.name: none for term in loss}, rows, none, none)
+    weights = difftune.init(config, start).best  # with the other numbers that are tuned
+    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
+    seen = Evaluation(none, {term.name: none for term in config.loss}, rows, none, none)
     history: Any = Iteration(none, rows, seen, none, none)
-    return Tuned(Tuning(history, nominal(), nominal(), text), text)  # pyright: ignore
+    return Tuned(Tuning(history, weights, weights, text), text)  # pyright: ignore
 
 
 def _restored(stored: Any) -> Tuned:
@@ -83,60 +82,40 @@ def _restored(stored: Any) -> Tuned:
     return Tuned(tuning, str(stored.commit))
 
 
-def cached_tunings(
+def load_or_tune(
     config: TuneConfig,
     robot: Robot,
+    start: Weights,
     paths: Mapping[str, Path],
     make: Callable[[list[str], Mapping[str, Tuned]], Iterator[tuple[str, Tuned]]],
 ) -> dict[str, Tuned]:
-    """Tunings by name; see `cached`, of which `paths` and `make` are arguments."""
+    """Tunings by name; see `load_or_make`, of which `paths` and `make` are arguments."""
 
     def make_stored(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         for name, tuned in make(missing, {n: _restored(one) for n, one in stored.items()}):
             yield name, _stored(tuned)
 
-    like = partial(_stored_like, config.loss)
-    stored = cached(paths, make_stored, like=like, kind="tuning", robot=robot)
+    like = partial(_stored_like, config, start)
+    stored = load_or_make(paths, make_stored, like=like, kind="tuning", robot=robot)
     return {name: _restored(one) for name, one in stored.items()}
 
 
 def _tune_job(
-    config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, heard: Any
+    config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, messages: Any
 ) -> Tuning:
-    """One tuning in a worker; the queue `heard` is told of each iteration."""
-    evaluate = partial(_evaluate, config, robot, problem)
-    scales = np.ones(1)
-    if problem.others:
-        losses = np.array([one.loss for one in evaluate(start)])
-        scales = losses / losses.mean()
-    evaluate_mean = partial(_mean, evaluate, scales)
-    return difftune.descend(config, start, evaluate_mean, lambda one: heard.put((name, one)))
-
-
-def _evaluate(
-    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights
-) -> list[Evaluation]:
-    """One rollout on each command of a problem, with its gradient."""
-    anchor = standing_anchor(robot)
-    effect = network.effect_of(problem.params, config.rollout.walk.gait)
-    return [
-        difftune.tune_step(config, robot, weights, command, anchor, effect)
-        for command in problem.commands
+    """One tuning in a worker; the queue `messages` gets each iteration."""
+    step = partial(difftune.tune_step, config, robot)
+    evaluations = [
+        lambda weights, m=model: step(weights, *m) for model in _models(config, robot, problem)
     ]
+    mean = evaluate.mean_over_commands(evaluations, start)
+    return difftune.descend(config, start, mean, lambda one: messages.put((name, one)))
 
 
-def _mean(
-    evaluate: Callable[[Weights], list[Evaluation]],
-    scales: Float[np.ndarray, " commands"],
-    weights: Weights,
-) -> Evaluation:
-    """The mean over the commands, each divided by its scale, as one evaluation."""
-    each = jax.device_get(evaluate(weights))
-    whole = jax.tree.map(
-        lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
-    )
-    worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
-    return whole._replace(**worst)
+def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[tuple[Any, ...]]:
+    """Command, anchor and effect of the rollout on each command of a problem."""
+    effect = network.effect_of(problem.params, config.rollout.walk.gait)
+    return [(command, standing_anchor(robot), effect) for command in problem.commands]
 
 
 def _tunings(
@@ -150,38 +129,21 @@ def _tunings(
 ) -> Iterator[tuple[str, Tuning]]:
     """Tune several problems side by side; yields each tuning with its name when it has ended."""
     done, total = 0, config.iterations * len(problems)
-    with message_queue() as heard, bar(title) as tell:
+    with message_queue() as messages, bar(title) as tell:
         running: dict[Future[Tuning], str] = {
-            pool.submit(_tune_job, config, robot, start, problem, name, heard): name
+            pool.submit(_tune_job, config, robot, start, problem, name, messages): name
             for name, problem in problems.items()
         }
         tell(done, total, "compiling")
         while running:
             ended = wait(running, timeout=0.1, return_when=FIRST_COMPLETED).done
-            while not heard.empty():  # also all that those told which have ended
-                name, iteration = heard.get()
+            while not messages.empty():  # also all that those told which have ended
+                name, iteration = messages.get()
                 done += int(iteration.iteration > 0)
                 tell(done, total, f"{name}: L {float(iteration.evaluation.loss) / 1e6:.3f}e6")
                 on_iteration(name, iteration)
             for future in ended:
                 yield running.pop(future), future.result()
-
-
-def _note(
-    config: TuneConfig,
-    robot: Robot,
-    problems: Mapping[str, Problem],
-    journal: Journal | None,
-    dumps: Path | None,
-    name: str,
-    iteration: Iteration,
-) -> None:
-    """Write what a tuning did to the journal, and to a dump where it was refused."""
-    if journal is not None:
-        journal.add(name, iteration)
-    command, params, others = problems[name]
-    if dumps is not None and not others:
-        replay.keep(dumps, name, iteration, config=config, robot=robot, command=command, net=params)
 
 
 def tune(
@@ -220,34 +182,37 @@ def tune(
             written.
     """
     start = nominal(robot) if start is None else start
-    paths = {}
-    for name, problem in problems.items():
-        key = content_key(config, robot, start, *problem, code=TUNING_CODE)
-        paths[name] = folder / f"tuning-{name}-{key}.npz"
+    key = partial(content_key, config, robot, start, code=TUNING_CODE)
+    paths = {n: folder / f"tuning-{n}-{key(*problem)}.npz" for n, problem in problems.items()}
+
+    def on_iteration(name: str, iteration: Iteration) -> None:
+        if journal is not None:
+            journal.add(name, iteration)
+        command, net, others = problems[name]
+        if dumps is not None and not others:
+            replay.keep(
+                dumps, name, iteration, config=config, robot=robot, command=command, net=net
+            )
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
         if journal is not None:
             there = {name: one.tuning.history for name, one in stored.items()}
             journal.write({name: there.get(name, ()) for name in problems})  # in their order
         wanted = {name: problems[name] for name in missing}
-        note = partial(_note, config, robot, problems, journal, dumps)
-        for name, tuning in _tunings(pool, config, robot, start, wanted, title, note):
+        for name, tuning in _tunings(pool, config, robot, start, wanted, title, on_iteration):
             yield name, Tuned(tuning, commit)
 
-    tuned = cached_tunings(config, robot, paths, make)
+    tuned = load_or_tune(config, robot, start, paths, make)
     if journal is not None:
         journal.write({name: one.tuning.history for name, one in tuned.items()})
     return tuned
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
-    anchor = standing_anchor(robot)
-    effect = network.effect_of(problem.params, config.rollout.walk.gait)
+    norms = partial(evaluate.gradient_norms, config.rollout, robot, nominal(robot))
     each = [
-        evaluate.gradient_norms(
-            config.rollout, robot, nominal(robot), command, anchor, effect, config.loss
-        )
-        for command in problem.commands
+        norms(command, anchor, effect, config.loss)
+        for command, anchor, effect in _models(config, robot, problem)
     ]
     return jax.tree.map(lambda *x: float(np.mean(x)), *each)
 
@@ -268,43 +233,39 @@ def gradient_norms(
         return {name: future.result() for name, future in running.items()}
 
 
-def path_config(robot: Robot) -> TuneConfig:
-    """Settings of the tunings whose weights the data cover: the same whatever is tuned later."""
-    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)))
+def tune_config(robot: Robot, **others: Any) -> TuneConfig:
+    """Settings of a tuning, with the controller that the robot's description asks for."""
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **others)
 
 
 def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     """Weights that plain tunings of the trajectories pass through, stacked: data covers them.
 
-    The tunings are kept in `folder`.
+    The tunings are kept in `folder`; their settings are the same whatever is tuned later.
     """
-    config = path_config(robot)
+    config = tune_config(robot)
     problems = {name: Problem(named_command(name), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
     tuned = tune(pool, config, robot, problems, folder, title=title)
-    stacked = []
-    for name in COMMANDS:
-        passed = [i.weights for i in tuned[name].tuning.history if i.accepted]
-        stacked.append(jax.tree.map(lambda *w: np.stack(w), *passed))
-    return stacked
+    return [
+        stack([i.weights for i in tuned[name].tuning.history if i.accepted]) for name in COMMANDS
+    ]
 
 
-def _compile_tuning(config: TuneConfig, robot: Robot) -> None:
-    command, effect = named_command("straight"), network.effect_of(None, config.rollout.walk.gait)
-    difftune.tune_step(config, robot, nominal(robot), command, standing_anchor(robot), effect)
-
-
-def _compile_walking(config: WalkConfig, robot: Robot) -> None:
-    walk(config, robot, Job(nominal(robot), named_command("straight"), hfs(), config.gait.tick))
+def _compile_tuning(config: TuneConfig, robot: Robot, command: Command) -> None:
+    (model,) = _models(config, robot, Problem(command, None))
+    difftune.tune_step(config, robot, nominal(robot), *model)
 
 
 def compile_programs(pool: Executor, robot: Robot) -> None:
     """Compile what tunings and walks run, each program in one process; the others load it."""
-    config = path_config(robot)
+    config = tune_config(robot)
+    controller, straight = config.rollout.walk, named_command("straight")
+    tick = Job(nominal(robot), straight, hfs(), controller.gait.tick)
     with bar("compiling, once on a machine") as tell:
         jobs = [
-            pool.submit(_compile_tuning, config, robot),
-            pool.submit(_compile_walking, config.rollout.walk, robot),
+            pool.submit(_compile_tuning, config, robot, straight),
+            pool.submit(walk, controller, robot, tick),
         ]
         for done, job in enumerate(jobs):
             tell(done, len(jobs), "")

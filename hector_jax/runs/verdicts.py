@@ -12,16 +12,16 @@ from jaxtyping import Float
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import State, Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.grfm.collection import Walks, walks_like
-from hector_jax.grfm.dataset import at_interval
+from hector_jax.grfm.dataset import SOLVED, at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
-from hector_jax.runs.cache import cached, content_key
+from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
@@ -36,7 +36,7 @@ Case = tuple[str, int]
 """A set and a seed."""
 
 
-class JudgedWalk(NamedTuple):
+class ScoredWalk(NamedTuple):
     """What is kept of one walk."""
 
     score: Score
@@ -45,10 +45,10 @@ class JudgedWalk(NamedTuple):
     commit: str  # at which it was walked; empty where that is not known
 
 
-class Judged(NamedTuple):
+class ScoredWalks(NamedTuple):
     """Walks of several sets on the same plants."""
 
-    walks: dict[str, list[JudgedWalk]]  # by set, in the order of the plants
+    walks: dict[str, list[ScoredWalk]]  # by set, in the order of the plants
     first: dict[str, Trajectory]  # by set, the walk on the first plant; empty where none is kept
 
     @property
@@ -86,24 +86,26 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
-def _judged(config: Loss, walk: Trajectory, commit: str) -> JudgedWalk:
+def _score_walk(config: Loss, walk: Trajectory, commit: str) -> ScoredWalk:
     up = int(np.sum(~np.asarray(walk.fallen)))
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
     upright = np.asarray(up * float(walk.period))
-    return JudgedWalk(metrics.score(config, walk), upright, last, commit)
+    return ScoredWalk(metrics.score(config, walk), upright, last, commit)
 
 
 def _like(loss: Loss, with_walk: bool) -> Any:
     """Layout of the artefact of one walk, with its trajectory or without."""
     walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like().trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
-    one: Any = JudgedWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
+    one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
     return one, walk if with_walk else None
 
 
-def _path(folder: Path, case: Case, key: str, with_walk: bool) -> Path:
-    name, seed = case
-    return folder / f"{'walk' if with_walk else 'score'}-{name}-{seed}-{key}.npz"
+def _say_unsolved(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
+    for name, each in walks.items():
+        worst = np.max([walk.score.residual for walk in each])
+        if not worst <= SOLVED:
+            say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
 
 
 def judge(
@@ -119,7 +121,7 @@ def judge(
     seconds: float = 4.0,
     folder: Path | None = None,
     commit: str = "",
-) -> Judged:
+) -> ScoredWalks:
     """Walk every weight set on every plant and score the walks.
 
     Args:
@@ -142,27 +144,27 @@ def judge(
         for name, weights in sets.items()
     }
 
-    def with_walk(case: Case) -> bool:
-        return folder is not None and case[1] == seeds[0]
+    with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
 
     def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
         there = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
         walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
         for case, walk in zip(missing, walks, strict=True):
             samples = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
-            yield case, (_judged(config.loss, walk, commit), samples)
+            yield case, (_score_walk(config.loss, walk, commit), samples)
 
     if folder is None:
         results = dict(make(list(jobs), {}))
     else:
         paths = {}
-        for case, job in jobs.items():
+        for (name, seed), job in jobs.items():
             key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
-            paths[case] = _path(folder, case, key, with_walk(case))
+            stem = f"walk-{name}" if with_walk((name, seed)) else f"score-{name}"
+            paths[name, seed] = folder / f"{stem}-{seed}-{key}.npz"
         like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
-        results = cached(paths, make, like=like, kind="walk", robot=robot)
+        results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
-    return Judged(
-        {name: [walks[name, seed] for seed in seeds] for name in sets},
-        {name: results[name, seeds[0]][1] for name in sets if with_walk((name, seeds[0]))},
-    )
+    by_set = {name: [walks[name, seed] for seed in seeds] for name in sets}
+    _say_unsolved(by_set)
+    first = {name: results[name, seeds[0]][1] for name in sets if folder is not None}
+    return ScoredWalks(by_set, first)

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import bounds
+from hector_jax.control.parameters import Q, R, bounds
 from hector_jax.control.weights import (
     DIRECTION_NAMES,
     Weights,
@@ -228,7 +228,8 @@ def log_bounds(start: Weights) -> Float[np.ndarray, "18 2"]:
     if any(np.any(part[0] != part[1]) for part in start.R):
         raise InputError("a search needs a start whose feet share one R; these differ")
     if not ((low <= at) & (at <= high)).all():
-        raise InputError("the start lies outside the box of weights: Q 0.01..1e4, R 1e-7..1")
+        box = ", ".join(f"{part.path[-1]} {part.lower:g} to {part.upper:g}" for part in (Q, R))
+        raise InputError(f"the start lies outside the box of weights: {box}")
     return np.log(np.stack([low, high], axis=1) / at[:, None])[tied]
 
 

@@ -1,5 +1,6 @@
 """Loss of a weight set on the model and its gradient, by reverse mode (Eq. 9, 11)."""
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -9,6 +10,7 @@ from jaxtyping import Array, Float
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, weights_to_vector
+from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -60,6 +62,29 @@ evaluate_jit = jax.jit(evaluate, static_argnums=0)
 need no compilation."""
 
 
+def mean_over_commands(
+    evaluations: Sequence[Callable[[Weights], Evaluation]], start: Weights
+) -> Callable[[Weights], Evaluation]:
+    """One evaluation for several: their mean, with the worst fall and residual of all.
+
+    Each is divided by its share of the losses at `start`, so that all count alike.
+    """
+    scales = np.ones(1)
+    if len(evaluations) > 1:
+        losses = np.array([evaluate(start).loss for evaluate in evaluations])
+        scales = losses / losses.mean()
+
+    def evaluate_mean(weights: Weights) -> Evaluation:
+        each = jax.device_get([evaluate(weights) for evaluate in evaluations])
+        whole = jax.tree.map(
+            lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
+        )
+        worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
+        return whole._replace(**worst)
+
+    return evaluate_mean
+
+
 def gradient_norms(
     config: RolloutConfig,
     robot: Robot,
@@ -81,8 +106,21 @@ def gradient_norms(
 
 
 def aligned(loss: Loss, norms: dict[str, float], to: str = "L_ctrl") -> Loss:
-    """Loss whose terms have gradients of the order of that of one of them (footnote of Eq. 11)."""
-    one = {term.name: term.weight for term in loss}[to]
+    """Loss whose terms have gradients of the order of that of one of them (footnote of Eq. 11).
+
+    Args:
+        loss: terms and weights.
+        norms: of the gradient of each term, see `gradient_norms`.
+        to: the term that keeps its weight.
+
+    Raises:
+        InputError: a term that the loss does not have, or without a norm.
+    """
+    weights = {term.name: term.weight for term in loss}
+    for name in (to, *weights):
+        if name not in weights or name not in norms:
+            raise InputError(unknown("term of the loss", name, weights.keys() & norms.keys()))
+    one = weights[to]
 
     def power(ratio: float) -> float:
         return float(10.0 ** np.round(np.log10(max(ratio, 1e-12))))
