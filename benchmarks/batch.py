@@ -29,8 +29,9 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect, load_net
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.batch import Problem, Scenario, lanes_of, tune_batch
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Stop, TuneConfig, tune
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, tune
 from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.status import Stop
 
 NAME = "straight"
 DRAWN = 256  # different starts within x/1.5 of nominal; larger batches repeat them

@@ -118,7 +118,8 @@ def rank_correlation(
     finite = np.isfinite(model + simulator)
     if finite.sum() < 3:
         return float("nan")
-    return float(spearmanr(model[finite], simulator[finite])[0])
+    found = spearmanr(model[finite], simulator[finite])
+    return float(np.asarray(found)[0])
 
 
 def _text(value: Interval | None) -> str:

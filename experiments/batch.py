@@ -43,9 +43,10 @@ from hector_jax.runs.metrics import Score
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
 from hector_jax.tuning.batch import Problem, Scenario, Tunings, tail_weights, tune_batch
-from hector_jax.tuning.difftune import Stop, TuneConfig, stop_reason
+from hector_jax.tuning.difftune import TuneConfig, stop_reason
 from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
 from hector_jax.tuning.rollout import Variation, no_variation
+from hector_jax.tuning.status import Stop
 
 HELD_BACK = Command(  # ahead, aside and into turns of another rate: no tuning walks it
     np.array([1.0, 1.0, 2.0]),

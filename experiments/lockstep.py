@@ -73,7 +73,7 @@ def benchmark(
     if rollouts < 1:
         raise InputError(f"a race needs at least one rollout, got {rollouts}")
     head = {"format": FORMAT, "rollouts": rollouts, "rivals": sorted(optimizers), **about}
-    rows = read_journal(path, head, what="race", parse=_round_of_each)
+    rows: list[Any] = read_journal(path, head, what="race", parse=_round_of_each)
     if not rows:
         loss = float(walk({START: [start]})[START][0])
         if not np.isfinite(loss):

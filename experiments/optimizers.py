@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -134,7 +134,8 @@ class Bayes:
         losses = np.concatenate([generation.losses for generation in past])
         losses = np.where(np.isfinite(losses), losses, losses[np.isfinite(losses)].max())
         logs = np.log(losses)
-        matern = Matern(np.full(DIM, 3.0), length_scale_bounds=(0.3, 100.0), nu=2.5)
+        lengths: Any = np.full(DIM, 3.0)  # the stubs say float, the page of the class an array too
+        matern = Matern(lengths, length_scale_bounds=(0.3, 100.0), nu=2.5)
         kernel = ConstantKernel(1.0, (1e-2, 1e2)) * matern + WhiteKernel(1e-2, (1e-6, 1.0))
         fitted = GaussianProcessRegressor(
             kernel,
@@ -142,7 +143,8 @@ class Bayes:
             n_restarts_optimizer=1,
             random_state=int(rng.integers(2**31)),
         ).fit(steps, logs)
-        process = GaussianProcessRegressor(fitted.kernel_, optimizer=None, normalize_y=True)
+        keep: Any = None  # the kernel; the stubs do not know that it can be None
+        process = GaussianProcessRegressor(fitted.kernel_, optimizer=keep, normalize_y=True)
         for _ in range(self.most):
             process.fit(steps, logs)
             near = steps[np.argsort(logs)[:5]]

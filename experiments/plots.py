@@ -155,7 +155,7 @@ def while_walking(
                 panel.plot(times, median, **ARM_LINES[arm], label=ARMS[arm])
             panel.set(title=f"{trajectory}, from {start}", ylim=(0, 1.05 * panel.get_ylim()[1]))
         setp(panels[-1], xlabel="time [s]")
-        setp(panels[:, 0], ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
+        setp(panels[:, 0].tolist(), ylabel=f"L of {times[1] - times[0]:.1f} s [10$^6$]")
     return "Loss along the walk, median over the plants; the line is where the plant changes."
 
 
@@ -394,5 +394,5 @@ def ranks(
             panel.set_ylim(low, high * (high / low) ** 0.6)  # room for the numbers
             log_axis(panel, "y")
         setp(panels[-1], xlabel="L on the hfs [10$^6$]")
-        setp(panels[:, 0], ylabel="L on the model [10$^6$]")
+        setp(panels[:, 0].tolist(), ylabel="L on the model [10$^6$]")
     return "Loss of disturbed weight sets, model against hfs; the numbers are rank correlations."

@@ -118,7 +118,10 @@ def compare(
     return Result(
         {level: {n: evaluate_level(scores[level, n], base[level]) for n in sets} for level in base},
         {level: float(np.median(score.L)) for level, score in base.items()},
-        {name: largest_pushes({p.size: scores[p, name].fallen for p in pushes}) for name in sets},
+        {
+            name: largest_pushes({float(p.size): scores[p, name].fallen for p in pushes})
+            for name in sets
+        },
         max(float(score.residual.max()) for score in scores.values()),
     )
 

@@ -65,7 +65,7 @@ OTHERS = {  # sets that a set is compared with besides the baselines
 Summaries = Mapping[tuple[str, str], Summary]  # by trajectory and set
 
 _FOLDER = FileSystemLoader(Path(__file__).parent / "templates")
-_MARKDOWN = TEMPLATES.overlay(loader=ChoiceLoader([_FOLDER, TEMPLATES.loader]))
+_MARKDOWN = TEMPLATES.overlay(loader=ChoiceLoader([_FOLDER, *filter(None, [TEMPLATES.loader])]))
 # LaTeX has braces of its own
 _TEX = _MARKDOWN.overlay(variable_start_string="<<", variable_end_string=">>")
 

@@ -8,9 +8,10 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.core.tree import stack
 from hector_jax.runs.metrics import Score, Verdict
-from hector_jax.tuning.difftune import Iteration, StepStatus
+from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, total
+from hector_jax.tuning.status import StepStatus
 
 SETS = ("nominal", "expert", "without_ten", "with_ten", "without", "with")
 

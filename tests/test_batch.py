@@ -18,10 +18,11 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning import batch, difftune
 from hector_jax.tuning.batch import PER_CALL, Problem, Scenario, lanes_of, tail_weights, tune_batch
-from hector_jax.tuning.difftune import StepStatus, Stop, TuneConfig, tune
+from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, no_variation
+from hector_jax.tuning.status import StepStatus, Stop
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)

@@ -32,7 +32,8 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.mjx_model import batched_model, find_places
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
-from hector_jax.tuning.difftune import StepStatus, TuneConfig
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.status import StepStatus
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 

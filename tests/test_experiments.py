@@ -18,6 +18,7 @@ from hector_jax.core.console import exit_code
 from hector_jax.core.files import WriteError
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
+from hector_jax.tuning.status import Stop
 
 FOLDER = Path(__file__).parents[1] / "experiments"
 
@@ -207,7 +208,7 @@ def test_batch_refuses_numbers_that_it_cannot_use(kind, wrong):
 
 def test_batch_has_nothing_to_compare_with_where_nominal_is_refused(monkeypatch):
     batch = script("batch")
-    stops = np.array([batch.Stop.SMALL_STEP, batch.Stop.BAD_START])
+    stops = np.array([Stop.SMALL_STEP, Stop.BAD_START])
     tunings = SimpleNamespace(stop=stops)
     monkeypatch.setattr(batch, "tune_batch", lambda *_, **__: tunings)
     problems = [batch.problem(nominal(), [batch.scenario(load_robot(), batch.HELD_BACK)])] * 2

@@ -14,8 +14,9 @@ from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import Report, write_report
 from hector_jax.runs.metrics import Verdict
-from hector_jax.tuning.difftune import StepStatus, Tuning
+from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.tuning.status import StepStatus
 
 
 def _printed(verdict, **options):

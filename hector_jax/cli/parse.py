@@ -66,7 +66,8 @@ def from_line(words: Sequence[str]) -> Any:
 def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     """The flags of a program, as the words after its name give them; see `from_line`."""
     wants_help = any(word in _HELP for word in words)
-    words, options = [word for word in words if word not in _HELP], {"prog": program}
+    options: dict[str, Any] = {"prog": program}
+    words = [word for word in words if word not in _HELP]
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
     flags = [name.removeprefix("no-") for name in names]
     for name in flags:
@@ -289,4 +290,4 @@ def resolve_latest(flags: Flags) -> Flags:
             values[field.name] = (
                 tuple(map(newest, value)) if isinstance(value, tuple) else newest(value)
             )
-    return replace(flags, **values)  # pyright: ignore[reportType]
+    return replace(flags, **values)  # pyright: ignore[reportArgumentType]

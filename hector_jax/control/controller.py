@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hector_jax.control import gait, legs
 from hector_jax.control.footstep import (
@@ -29,6 +29,7 @@ from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
 from hector_jax.control.parameters import TUNABLES, Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import check, from_table

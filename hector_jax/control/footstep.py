@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import State

@@ -13,9 +13,10 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from hector_jax.control.footstep import Feet
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, check

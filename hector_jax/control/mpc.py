@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from hector_jax.control.contact import (
     CONSTRAINTS,
@@ -35,6 +35,7 @@ from hector_jax.control.contact import (
     rows,
 )
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.part import choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Real
+from jaxtyping import Float, Int, Real
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot

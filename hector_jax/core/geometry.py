@@ -8,7 +8,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from hector_jax.core.arrays import Array
 
 _CROSS = np.zeros((3, 3, 3))  # e_i x e_j = sum over k of _CROSS[i, k, j] e_k
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):

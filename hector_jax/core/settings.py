@@ -223,7 +223,7 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
             raise InputError(f"{where}: {unknown('field', name, by_name)}")
         type_ = by_name[name].type
         types = [x for x in (type_, *get_args(type_)) if isinstance(x, type)]
-        inner = next(filter(is_dataclass, types), None)
+        inner: Any = next(filter(is_dataclass, types), None)
         if inner and value is not None:
             values[name] = from_table(f"{where}: {name}", inner, value)
             continue

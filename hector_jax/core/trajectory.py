@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 
 MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen

@@ -6,7 +6,9 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
+
+from hector_jax.core.arrays import Array
 
 Tree = TypeVar("Tree")
 

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Bool, Int
 
 from hector_jax.control import gait
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Load, State, Trajectory, Wrench
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import Load, State, Wrench
 

@@ -21,8 +21,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Bool, Float, Key
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Load, Wrench
 from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, in_dtype_of

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Float, Key
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Wrench, zero_wrench
 from hector_jax.grfm import nets
 from hector_jax.grfm.dataset import Dataset, with_mirror

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Float, Key
 
 from hector_jax.control.gait import GaitConfig, since_switch
+from hector_jax.core.arrays import Array
 from hector_jax.grfm import gated, nets
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import Effect, Phi, Window, in_dtype_of

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.tree import where
 from hector_jax.qp import gpu_kernel
 from hector_jax.qp.linear import (

@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array
 
+from hector_jax.core.arrays import Array
 from hector_jax.qp.linear import cholesky, largest, matvec, multiplier, plus_gram, rmatvec
 from hector_jax.qp.problem import SIGN, Normal, Point, Tolerances
 

@@ -19,7 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.experimental import pallas as pl
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
+
+from hector_jax.core.arrays import Array
 
 VARIABLES, ROWS = 64, 128  # of the kernel's tiles: what the registers of a program hold
 _LIMIT = 120  # row changes; the least-index rule from half of it on

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.tree import where
 from hector_jax.qp.certificates import certificates, rays
 from hector_jax.qp.linear import cholesky, largest, matvec, multiplier, plus_gram, rmatvec

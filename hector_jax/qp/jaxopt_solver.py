@@ -2,8 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
+from hector_jax.core.arrays import Array
 from hector_jax.qp.certificates import certificates
 from hector_jax.qp.linear import block_diagonal
 from hector_jax.qp.problem import SIGN, Approach, Normal, Point, Tolerances

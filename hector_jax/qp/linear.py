@@ -4,7 +4,9 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from hector_jax.core.arrays import Array
 
 T = TypeVar("T")
 
@@ -40,7 +42,7 @@ def plus_gram(P: Array, A: Array, w: Array) -> Array:
 
 def cholesky(matrix: Array) -> Array:
     """Lower factor of a symmetric matrix; NaN where it is not positive definite."""
-    return lax.linalg.cholesky(matrix, symmetrize_input=False)
+    return lax.linalg.cholesky(jnp.asarray(matrix), symmetrize_input=False)
 
 
 def largest(v: Array) -> Array:

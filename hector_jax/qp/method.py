@@ -27,8 +27,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.part import Part, choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.tree import where

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from hector_jax.core.arrays import Array
 from hector_jax.qp.linear import largest, matvec, multiplier, rmatvec
 
 INFINITE = 1e20  # a bound as large as this is none, as most solvers have it

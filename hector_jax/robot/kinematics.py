@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_x, rot_y, rot_z
 from hector_jax.robot.description import HECTOR_AXES
 from hector_jax.robot.model import Robot

@@ -9,8 +9,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import euler_rates, rotation_from_euler, skew
 from hector_jax.core.trajectory import Load, State, Wrench
 from hector_jax.robot.model import Robot

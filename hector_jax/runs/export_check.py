@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Wrench
 from hector_jax.qp import Status
@@ -71,7 +72,8 @@ def record(
     def measurements(rows: Array) -> Measurement:
         def one(yaw: Array, row: Array) -> tuple[Array, Measurement]:
             reading = sensing.unpack_reading(row)
-            return sensing.measure(robot, reading, yaw, jnp.zeros(sensing.ERRORS))[::-1]
+            measurement, yaw = sensing.measure(robot, reading, yaw, jnp.zeros(sensing.ERRORS))
+            return yaw, measurement
 
         return lax.scan(one, jnp.zeros(()), rows)[1]
 

@@ -24,13 +24,14 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Int
+from jaxtyping import Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, standing_anchor
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.qp import Status

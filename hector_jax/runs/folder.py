@@ -28,9 +28,10 @@ from hector_jax.core import inputs, settings
 from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.robot.model import Robot
-from hector_jax.tuning.difftune import Iteration, status_of
+from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import Loss, with_alphas
+from hector_jax.tuning.status import status_of
 
 CONFIG, METRICS, RESULT, VERSIONS = "config.json", "metrics.jsonl", "result.json", "versions.json"
 _MOST_BYTES = 100_000_000

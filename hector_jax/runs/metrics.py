@@ -104,7 +104,7 @@ def score(loss: Loss, walk: Trajectory) -> Score:
     """
     terms = losses(loss, walk)
     fallen = np.asarray(walk.fallen)
-    named = terms | {"L": total(loss, terms)}
+    named = {**terms} | {"L": total(loss, terms)}
     return Score(
         losses={part: np.asarray(value, float) for part, value in named.items()},
         switching=np.asarray(switch_loss(walk), float),

@@ -26,7 +26,6 @@ from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.tuning.difftune import (
     Iteration,
-    StepStatus,
     TuneConfig,
     rejection_reason,
     step_status,
@@ -34,6 +33,7 @@ from hector_jax.tuning.difftune import (
 )
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.rollout import rollout
+from hector_jax.tuning.status import StepStatus
 
 MOST = 3
 """Dumps of a tuning for one reason: a bad night must not fill a disk."""

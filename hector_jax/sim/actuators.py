@@ -9,8 +9,9 @@ All of it is linear after the limit and cheap, and the same function serves MuJo
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim.world import MAX_DELAY, Imperfections

@@ -10,12 +10,13 @@ reading (`sensing.unpack_reading`); the continuous yaw is carried beside it.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
 from hector_jax.control.legs import LegParameters, Measurement
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
 from hector_jax.robot.mjcf import TIME_STEP

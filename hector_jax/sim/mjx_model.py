@@ -16,9 +16,10 @@ from hector_jax.core.headless import mujoco  # before MJX loads it with OpenGL
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Bool
 from mujoco import mjx
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.sim import sensing
 from hector_jax.sim.sensing import Contacts

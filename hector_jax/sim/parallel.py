@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, init_memory
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
 from hector_jax.core.tree import stack, where
 from hector_jax.robot.mjcf import TIME_STEP

@@ -10,9 +10,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hector_jax.control.legs import Measurement
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import euler_from_rotation, rotation_from_quaternion, wrap_angle
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import State, Wrench
@@ -102,7 +103,7 @@ def foot_contacts(
     ground = on_floor.any(axis=1) & real
     other = jnp.where(on_floor[:, 0], contacts.geoms[:, 1], contacts.geoms[:, 0])
     foot = jnp.where(ground, foot_of_geom[other], -1)
-    return foot, Touches((ground & (foot < 0)).any(), (real & ~ground).any())
+    return foot, Touches(jnp.any(ground & (foot < 0)), jnp.any(real & ~ground))
 
 
 def ground_wrench(

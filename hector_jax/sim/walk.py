@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hector_jax.control.controller import (
     Memory,
@@ -26,6 +26,7 @@ from hector_jax.control.controller import (
     init_memory,
 )
 from hector_jax.control.reference import anchor_at, standing_anchor
+from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import stack

@@ -15,8 +15,9 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.description import Description

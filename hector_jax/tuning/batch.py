@@ -23,16 +23,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Stop, TuneConfig, TuneState
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, TuneState
 from hector_jax.tuning.evaluate import Evaluation, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.rollout import Variation
+from hector_jax.tuning.status import Stop
 
 AXIS = "problems"
 PER_CALL = PAPER_ITERATIONS + 1  # rollouts of each problem in one call of the device: start and ten
@@ -63,7 +65,7 @@ class Tunings(NamedTuple):
     ten: Weights
     converged: Weights
     loss: Float[np.ndarray, " problems"]  # of the converged weights
-    stop: Int[np.ndarray, " problems"]  # a `difftune.Stop`
+    stop: Int[np.ndarray, " problems"]  # a `status.Stop`
     iterations: Int[np.ndarray, " problems"]  # rollouts behind each, the start not counted
     history: Iteration  # (problems, iterations + 1); zero after the end
 

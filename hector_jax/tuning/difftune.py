@@ -16,7 +16,6 @@ from Python, one iteration after the other; `batch` compiles them into its loop 
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from enum import IntEnum
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,11 +23,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from hector_jax.control.parameters import TUNABLES, bounds, check_tunables
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, from_table
 from hector_jax.core.trajectory import Wrench
@@ -37,6 +37,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, check_loss, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.status import StepStatus, Stop, status_text
 
 PAPER_ITERATIONS = 10
 
@@ -98,26 +99,6 @@ class TuneConfig:
         return replace(from_table(where, cls, rest), loss=weighted)
 
 
-class StepStatus(IntEnum):
-    """Whether an iteration was accepted, or why it was rejected."""
-
-    ACCEPTED = 0
-    NOT_FINITE = 1
-    FELL = 2
-    UNSOLVED = 3  # a QP of the rollout
-    ROSE = 4  # the loss, after the paper's ten iterations
-
-
-class Stop(IntEnum):
-    """Why a tuning ended."""
-
-    GOING = 0
-    LIMIT = 1  # of iterations
-    SMALL_STEP = 2
-    NO_GAIN = 3
-    BAD_START = 4  # refused
-
-
 class TuneState(NamedTuple):
     """Where a tuning stands between two rollouts: the state of the rule."""
 
@@ -149,7 +130,7 @@ class Iteration(NamedTuple):
     @property
     def reason(self) -> str:
         """Why the weights of one iteration were rejected; empty when accepted."""
-        return _in_words(StepStatus(int(self.status)), self.evaluation)
+        return status_text(StepStatus(int(self.status)), self.evaluation)
 
 
 class Tuning(NamedTuple):
@@ -189,14 +170,15 @@ def relative_step(
         by = beta / jnp.where(largest > 0.0, largest, 1.0)
         return jax.tree.map(lambda x, size: -by * x * size, products, sizes)
 
-    def update(gradient: Weights, state: optax.OptState, weights: Weights | None = None):
+    def update(updates: Any, state: optax.OptState, params: Any = None):
+        gradient, weights = updates, params
         if weights is None:
             raise ValueError("relative_step needs the weights: pass params to update")
         widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in weights.others}
         sizes = weights._replace(others=widths)
         return Weights(*map(scaled, gradient, sizes, (beta_q, beta_r, beta_others))), state
 
-    return optax.GradientTransformation(lambda weights: optax.EmptyState(), update)
+    return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
 
 def _optimiser(config: TuneConfig) -> optax.GradientTransformation:
@@ -305,29 +287,9 @@ def update(
     return after, Iteration(iteration, state.trial, evaluation, status.astype(jnp.int32), led)
 
 
-REASONS = {
-    StepStatus.NOT_FINITE: "loss or gradient not finite",
-    StepStatus.FELL: "the robot fell",
-    StepStatus.UNSOLVED: "QP residual",
-    StepStatus.ROSE: "the loss rose",
-}
-"""How the reasons of rejections begin."""
-
-
-def _in_words(status: StepStatus, evaluation: Evaluation) -> str:
-    residual = f" {float(evaluation.residual):.1e} too large"
-    return REASONS.get(status, "") + (residual if status == StepStatus.UNSOLVED else "")
-
-
-def status_of(reason: str) -> StepStatus:
-    """Status of an iteration of which only the reason is there, such as from a file."""
-    statuses = (status for status, text in REASONS.items() if reason.startswith(text))
-    return next(statuses, StepStatus.NOT_FINITE if reason else StepStatus.ACCEPTED)
-
-
 def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:
     """Why an evaluation cannot be used; empty when it can."""
-    return _in_words(StepStatus(int(step_status(config, evaluation))), evaluation)
+    return status_text(StepStatus(int(step_status(config, evaluation))), evaluation)
 
 
 def stop_reason(config: TuneConfig, stop: Stop) -> str:

@@ -6,10 +6,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, weights_to_vector
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas

@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE
 from hector_jax.core.trajectory import Trajectory, Wrench
@@ -56,7 +57,7 @@ jax.tree_util.register_pytree_node(
 Loss = tuple[LossTerm, ...]
 """What a walk costs: the sum of some terms, each times its weight."""
 
-Terms = dict[str, Float[Array, "*batch"]]
+Terms = Mapping[str, Float[Array, "*batch"]]
 """A number for each term of a loss, by its name."""
 
 

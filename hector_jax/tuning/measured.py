@@ -13,12 +13,12 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from hector_jax.control.controller import measured_feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from hector_jax import qp
 from hector_jax.control import gait
@@ -23,6 +23,7 @@ from hector_jax.control.controller import Plan, WalkConfig, contacts_needed, pla
 from hector_jax.control.footstep import Feet, feet_where
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, Range, check

@@ -11,11 +11,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
@@ -80,14 +81,15 @@ def step_sensitivities(
     """
     theta, as_weights = ravel_pytree(weights)
 
-    def move(parts: Varied, theta: Float[Array, " n"]) -> tuple:
+    def move(parts: Varied, theta: Float[jax.Array, " n"]) -> tuple:
         place = Anchor(parts.position, parts.yaw, carry.anchor.tick)
         now = Carry(parts.state, parts.feet, parts.commands, place, carry.fallen)
         then, sample = step_carry(config, robot, as_weights(theta), command, effect, now, tick)
         return (varied(then), sample.state, sample.command), (then, sample)
 
     def along(tangent: Varied, direction: Float[Array, " n"]) -> tuple:
-        return jax.jvp(move, (varied(carry), theta), (tangent, direction), has_aux=True)
+        at = varied(carry), jnp.asarray(theta)
+        return jax.jvp(move, at, (tangent, direction), has_aux=True)
 
     _, (later, state, wrench), (then, sample) = jax.vmap(along, out_axes=(None, 0, None))(
         tangents, jnp.eye(theta.size)
@@ -106,10 +108,10 @@ def propagate(
     """Rollout and its sensitivities by forward recursion. Source: Eq. 10."""
 
     def tick(carried: tuple[Carry, Varied], j: Int[Array, ""]):
-        carry, tangents, *seen = step_sensitivities(
+        carry, tangents, sample, columns = step_sensitivities(
             config, robot, weights, command, effect, *carried, j
         )
-        return (carry, tangents), seen
+        return (carry, tangents), (sample, columns)
 
     carry = init_carry(robot, anchor)
     ticks = walked_ticks(config, anchor)
@@ -131,4 +133,4 @@ def gradient(
         trajectory.state, trajectory.command
     )
     terms = jax.tree.map(lambda g, s: jnp.tensordot(s, g, axes=g.ndim), pull, tuple(sensitivities))
-    return value, ravel_pytree(weights)[1](sum(jax.tree.leaves(terms)))
+    return value, ravel_pytree(weights)[1](jnp.asarray(sum(jax.tree.leaves(terms))))
