@@ -122,9 +122,9 @@ def pretend_verdict(seeds=8, fallen=()):
     return Verdict(np.arange(seeds), scores, PAPER_LOSS)
 
 
-def pretend_history(iterations=30, pace=5.0, refused=()):
-    """A tuning whose loss falls; refused iterations are not finite."""
-    history = []
+def pretend_history(iterations=30, pace=5.0, refused=(), **others):
+    """A tuning whose loss falls; refused iterations are not finite. `others` are tuned too."""
+    history, weights = [], nominal()._replace(others=others)
     for i in range(iterations + 1):
         terms = {
             "L_Eul": np.array(8 * np.exp(-i / pace) + 2),
@@ -132,8 +132,8 @@ def pretend_history(iterations=30, pace=5.0, refused=()):
             "L_ctrl": np.array(5.5e5 + 2e4 * np.sqrt(i)),
         }
         loss = np.array(np.nan if i in refused else float(total(PAPER_LOSS, terms)))
-        found = Evaluation(loss, terms, nominal(), np.array(0.0), np.array(1e-12))
+        found = Evaluation(loss, terms, weights, np.array(0.0), np.array(1e-12))
         status = StepStatus.NOT_FINITE if i in refused else StepStatus.ACCEPTED
-        row = i, nominal(), found, int(status), 1.0 if i else 0.0
+        row = i, weights, found, int(status), 1.0 if i else 0.0
         history.append(Iteration(*jax.tree.map(np.asarray, row)))
     return history

@@ -371,6 +371,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     # one set for two trajectories, from those weights, on the same data
     start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "10")
     several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
+    several += ("--also", "turn_lead")
     assert call(monkeypatch, "tune", *flags, *several) == 0
     out = capsys.readouterr().out
     for title in ("straight, c, 1 plant", "straight, 1 plant", "c, 1 plant"):
@@ -384,9 +385,10 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert result["sets"]["with"]["standin"]["L"]["mean"] == pytest.approx(np.mean(means))
     assert result["sets"]["with"]["hfs"]["L"]["mean"] > 0.0
     lines = [json.loads(line) for line in Path("both/metrics.jsonl").read_text().splitlines()]
-    assert lines[0]["weights"] == pytest.approx(
-        dict(zip(WEIGHT_NAMES, weights_to_vector(load_weights(start)).tolist(), strict=True))
-    )
+    at_start = dict(zip(WEIGHT_NAMES, weights_to_vector(load_weights(start)).tolist(), strict=True))
+    assert lines[0]["weights"] == pytest.approx(at_start | {"turn_lead": 0.5})
+    assert load_weights(Path("both/weights/with.json")).others["turn_lead"] != 0.5
+    assert "- turn_lead: 0.5 at the start" in Path("both/report.md").read_text()
     assert "walking: straight, c" in Path("both/report.md").read_text()
 
 

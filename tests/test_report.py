@@ -12,7 +12,7 @@ from hector_jax.control.parameters import bounds
 from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
-from hector_jax.report.run import Report, write_report
+from hector_jax.report.run import Report, tuning_section, write_report
 from hector_jax.runs.metrics import Verdict
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -189,3 +189,11 @@ def test_the_film_is_linked_where_there_is_one(tmp_path):
         tmp_path, _report(film=Picture("film.mp4", "Before and after."))
     ).read_text()
     assert "[Before and after.](film.mp4)" in text
+
+
+def test_the_report_says_what_was_tuned_beside_the_weights():
+    history = pretend_history(12, turn_lead=0.5)
+    end = bounds(["turn_lead"])[1]
+    text = tuning_section("with", Tuning(history, history[10].weights, end, "12 iterations"))
+    assert "- turn_lead: 0.5 at the start, 2 at the end" in text
+    assert text.count("`turn_lead`") == 1  # at a bound at the end

@@ -28,6 +28,7 @@ Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]
 Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper, of which it tells
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
+Number = Literal["footstep_feedback", "footstep_width", "turn_lead", "effort_reference", "friction"]
 Variant = Literal["residual", "paper"]
 Engine = Literal["auto", "c", "mjx"]
 Robot = Annotated[Path | None, Source.ROBOT]
@@ -101,6 +102,7 @@ class Tune(Configured):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert or a weights file
+    also: tuple[Number, ...] = ()  # numbers of the controller that are tuned beside Q and R
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net

@@ -156,7 +156,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     begun, made_with = time.monotonic(), environment()
     robot = load_robot(args.robot)
     trajectories = _trajectories(args, robot)
-    config = tunings.tune_config(robot, iterations=args.iterations)
+    config = tunings.tune_config(robot, iterations=args.iterations, others=args.also)
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         run = _Run(

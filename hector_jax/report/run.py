@@ -72,6 +72,10 @@ def _refusals(refused: Sequence[Iteration]) -> list[str]:
 
 
 def _at_bounds(weights: Weights) -> str:
-    vector, *box = (np.asarray(weights_to_vector(w)) for w in (weights, *bounds()))
-    close = np.any([np.isclose(vector, bound, rtol=1e-9) for bound in box], axis=0)
-    return ", ".join(f"`{name}`" for name in np.array(WEIGHT_NAMES)[close]) or "none"
+    others = weights.others
+    values, *box = (
+        np.append(weights_to_vector(tree), [tree.others[name] for name in others])
+        for tree in (weights, *bounds(others))
+    )
+    close = np.any([np.isclose(values, bound, rtol=1e-9) for bound in box], axis=0)
+    return ", ".join(f"`{name}`" for name in np.array([*WEIGHT_NAMES, *others])[close]) or "none"

@@ -108,10 +108,12 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
         line=LINE_FRICTION in mpc.constraints,
     )
     Alpha = pack_wrench(Wrench(*map(jnp.asarray, weights.R)))
+    others = weights_tree(weights).get("others", {}).items()
     return "".join(
         [
             header,
             _ATTENTION if mpc.effort_reference == "gravity" else "",
+            *(f"// ATTENTION: tuned with {name} {value}.\n" for name, value in others),
             _block("Q", np.concatenate(weights.Q), _STATES),
             _block("Alpha", Alpha, _INPUTS),
         ]

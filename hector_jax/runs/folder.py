@@ -106,6 +106,9 @@ def as_line(name: str, iteration: Iteration) -> str:
     def named(tree: Weights) -> dict[str, float]:
         return dict(zip(WEIGHT_NAMES, np.asarray(weights_to_vector(tree)).tolist(), strict=True))
 
+    def plain(others: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: np.asarray(value).tolist() for name, value in others.items()}
+
     row = {
         "set": name,
         "iteration": int(iteration.iteration),
@@ -116,9 +119,11 @@ def as_line(name: str, iteration: Iteration) -> str:
         **{name: float(term) for name, term in evaluation.terms.items()},
         "fallen": float(evaluation.fallen),
         "residual": float(evaluation.residual),
-        "weights": named(iteration.weights),
+        "weights": named(iteration.weights) | plain(iteration.weights.others),
         "gradient_log": named(gradient),
     }
+    if iteration.weights.others:  # they may be zero and have no logarithm
+        row["gradient"] = plain(evaluation.gradient.others)
     return as_json(row) + "\n"
 
 
@@ -197,23 +202,27 @@ def _line(path: Path, number: int) -> Iterator[None]:
 def _iteration(row: Mapping[str, Any]) -> Iteration:
     """Read what `as_line` wrote; null, which stands for what is not finite, becomes NaN."""
 
-    def number(x: float | None) -> np.ndarray:
-        return np.array(np.nan if x is None else x, float)
+    def number(x: Any) -> np.ndarray:
+        return np.array(x, float)  # NaN of None
 
     def vector(table: Mapping[str, Any]) -> np.ndarray:
         return np.array([number(table[name]) for name in WEIGHT_NAMES])
 
-    def tree(values: np.ndarray) -> Weights:
-        return jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(values)))
+    def tree(values: np.ndarray, others: Mapping[str, Any]) -> Weights:
+        weights = vector_to_weights(jnp.asarray(values))._replace(others=others)
+        return jax.tree.map(np.asarray, weights)
 
     weights = vector(row["weights"])
+    names = row["weights"].keys() - set(WEIGHT_NAMES)
+    others = {name: number(row["weights"][name]) for name in names}
+    slopes = {name: number(row["gradient"][name]) for name in names}
     return Iteration(
         iteration=np.array(row["iteration"]),
-        weights=tree(weights),
+        weights=tree(weights, others),
         evaluation=Evaluation(
             loss=number(row["L"]),
             terms={name: number(row[name]) for name in row if name.startswith("L_")},
-            gradient=tree(vector(row["gradient_log"]) / weights),
+            gradient=tree(vector(row["gradient_log"]) / weights, slopes),
             fallen=number(row["fallen"]),
             residual=number(row["residual"]),
         ),

@@ -112,6 +112,7 @@ def keep(
         "name": name,
         "iteration": int(iteration.iteration),
         "reason": iteration.reason,
+        "others": list(iteration.weights.others),
         "net": variant and {"variant": variant.name, "hidden": variant.widths(net)},
         "config": config.as_table(),
         "description": to_table(robot.description),
@@ -141,13 +142,14 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         raise InputError(f"{path}: settings that this version does not know: {error}") from error
     config = TuneConfig.from_table(f"{path}: config", about.get("config"))
     terms = {term.name: none for term in config.loss}
+    weights = config.rollout.walk.with_others(nominal(), about.get("others", ()))
     like = Dump(
         load_robot()._replace(description=description),
-        nominal(),
+        weights,
         Command(np.zeros(0), np.zeros((0, 2)), np.zeros(0)),
         Anchor(np.zeros(3), none, none),
         params,
-        Evaluation(none, terms, nominal(), none, none),
+        Evaluation(none, terms, weights, none, none),
     )
     dump, _ = load_tree(path, like, kind=_KIND)
     return dump, config, about

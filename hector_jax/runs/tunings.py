@@ -233,9 +233,9 @@ def gradient_norms(
         return {name: future.result() for name, future in running.items()}
 
 
-def tune_config(robot: Robot, **others: Any) -> TuneConfig:
+def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
     """Settings of a tuning, with the controller that the robot's description asks for."""
-    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **others)
+    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **settings)
 
 
 def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
