@@ -363,7 +363,7 @@ def test_the_command_writes_files_that_run_without_us(monkeypatch, capsys, run):
     example.main(folder)
     assert "1200 calls" in capsys.readouterr().out
     (folder / "controller-cpu.jaxexport").write_bytes(b"another")
-    with pytest.raises(SystemExit, match="not the file"):
+    with pytest.raises(SystemExit, match="does not have the sha256"):
         example.main(folder)
 
 
