@@ -9,6 +9,7 @@ from pretend import SETS, pretend_history, pretend_verdict
 from rich.console import Console
 
 from hector_jax.control.parameters import bounds
+from hector_jax.control.weights import expert
 from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
@@ -192,8 +193,9 @@ def test_the_film_is_linked_where_there_is_one(tmp_path):
 
 
 def test_the_report_says_what_was_tuned_beside_the_weights():
-    history = pretend_history(12, turn_lead=0.5)
-    end = bounds(["turn_lead"])[1]
+    others = {"turn_lead": np.array(2.0), "kp": np.full(5, 60.0)}
+    history = pretend_history(12, turn_lead=0.5, kp=others["kp"])
+    end = expert()._replace(others=others)
     text = tuning_section("with", Tuning(history, history[10].weights, end, "12 iterations"))
-    assert "- turn_lead: 0.5 at the start, 2 at the end" in text
+    assert "- turn_lead: 0.5 at the start, 2.0 at the end" in text
     assert text.count("`turn_lead`") == 1  # at a bound at the end

@@ -72,7 +72,7 @@ def _refusals(refused: Sequence[Iteration]) -> list[str]:
 
 
 def _at_bounds(weights: Weights) -> str:
-    others = weights.others
+    others = [name for name, value in weights.others.items() if np.ndim(value) == 0]
     values, *box = (
         np.append(weights_to_vector(tree), [tree.others[name] for name in others])
         for tree in (weights, *bounds(others))
