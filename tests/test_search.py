@@ -14,6 +14,7 @@ from hector_jax.control.weights import (
     scale_weights,
     weights_to_vector,
 )
+from hector_jax.core.inputs import InputError
 from hector_jax.search.cmaes import SearchConfig, search
 
 GOAL = np.linspace(-2.0, 2.0, 24)
@@ -115,6 +116,19 @@ def test_searches_in_lock_step_are_those_that_go_alone(tmp_path):
 
     same(run(tmp_path / "both", walk=walk, names=("c", "s"))["c"], together["c"])
     assert walked == [["c"]]
+
+
+def test_numbers_beside_the_weights_stay_and_belong_to_the_record(tmp_path):
+    start, seen = nominal()._replace(others={"turn_lead": np.array(0.8)}), []
+
+    def walk(sets):
+        seen.extend(sets["s"])
+        return bowl(sets)
+
+    found = run(tmp_path, SearchConfig(20, 10), walk, start)["s"]
+    assert {float(weights.others["turn_lead"]) for weights in (*seen, found.weights)} == {0.8}
+    with pytest.raises(InputError, match="others"):
+        run(tmp_path, SearchConfig(20, 10), walk, nominal())
 
 
 def test_what_is_asked_lies_in_the_box_and_treats_both_feet_alike(tmp_path):

@@ -31,6 +31,7 @@ from hector_jax.control.weights import (
     scale_weights,
     weights_to_vector,
 )
+from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
@@ -119,6 +120,7 @@ def search(
             "spread": config.spread,
             "start": np.asarray(weights_to_vector(one.start), float).tolist(),
             "directions": list(DIRECTION_NAMES),
+            **({"others": weights_tree(one.start)["others"]} if one.start.others else {}),
             **about,
         }
         one.replay(read_journal(paths[name], head, what="search", parse=one.parse))
@@ -214,7 +216,7 @@ def to_generation(steps: Any, losses: Any) -> Generation:
 
 def project(start: Weights, steps: Float[np.ndarray, "18"]) -> Weights:
     """Weights after steps, inside the box to the last digit, whatever the logarithm rounds to."""
-    return jax.tree.map(np.clip, scale_weights(start, steps), *bounds())
+    return jax.tree.map(np.clip, scale_weights(start, steps), *bounds(start.others))
 
 
 def log_bounds(start: Weights) -> Float[np.ndarray, "18 2"]:
