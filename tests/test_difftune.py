@@ -10,6 +10,9 @@ import pytest
 from model import CONFIG as SHORT
 from model import PLAIN
 
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.footstep import FootstepConfig
+from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.parameters import bounds
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
@@ -29,6 +32,7 @@ from hector_jax.tuning.difftune import (
 )
 from hector_jax.tuning.evaluate import Evaluation, aligned, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
+from hector_jax.tuning.rollout import RolloutConfig
 
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
@@ -344,6 +348,8 @@ def test_ten_iterations_from_nominal_go_down_inside_the_box(name, least):
 # Numbers of the controller beside Q and R
 
 OTHERS = ("footstep_feedback", "friction", "turn_lead")
+PAPERS = RolloutConfig(WalkConfig(footstep=FootstepConfig(rule="paper")))
+SLIPPERY = RolloutConfig(WalkConfig(mpc=MpcConfig(friction=0.05)))
 
 
 def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays():
@@ -373,6 +379,14 @@ def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays(
         ({"others": ("turn_laed",)}, "did you mean 'turn_lead'"),
         ({"others": ("foot_height",)}, "foot_height cannot be tuned by gradients"),
         ({"others": ("friction",), "update": "literal"}, "others expects update relative"),
+        (
+            {"others": ("turn_lead",), "rollout": PAPERS},
+            "turn_lead has no part in the paper's rule",
+        ),
+        (
+            {"others": ("friction",), "rollout": SLIPPERY},
+            "friction starts at 0.05, expected from 0",
+        ),
     ],
 )
 def test_what_cannot_be_tuned_is_named(wrong, fault):

@@ -253,6 +253,10 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
     assert "ATTENTION" not in text
     about_weight = WalkConfig(mpc=MpcConfig(effort_reference="gravity"))
     assert "ATTENTION" in weights_cpp(nominal(), about_weight, ROBOT, name="nominal")
+    others = {"friction": np.array(0.4), "effort_reference": np.array(0.5)}
+    tuned = weights_cpp(nominal()._replace(others=others), CONFIG, ROBOT, name="nominal")
+    assert "<= 0.4 F_z <= 200 N" in tuned
+    assert tuned.count("ATTENTION") == 3
     assert "friction at toe and heel: True" in text
     mpc = MpcConfig(constraints=tuple(c for c in MpcConfig().constraints if c != LINE_FRICTION))
     without = weights_cpp(nominal(), WalkConfig(mpc=mpc), ROBOT, name="nominal")

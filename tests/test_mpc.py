@@ -2,7 +2,7 @@
 
 import json
 import pickle
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 
 import jax
@@ -314,7 +314,8 @@ def test_constraints_are_chosen_by_name_in_files():
     assert pickle.loads(pickle.dumps(CONFIG)) == CONFIG
     former = from_table("robot.toml", MpcConfig, {"effort_about": "weight"})
     assert former == MpcConfig(effort_reference="gravity")
-    assert [str(one) for one in MpcConfig(line_friction=False).constraints] == names[:3]
+    assert [str(one) for one in MpcConfig(line_friction=False).on("inputs")] == names[:3]
+    assert replace(MpcConfig(line_friction=False), line_friction=True) == MpcConfig()
     for wrong in ({"constraints": ["frictoin"]}, {"contact": "point"}, {"constraints": []}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             from_table("robot.toml", MpcConfig, wrong)

@@ -260,6 +260,24 @@ def drop_line(text, *marks):
             id="knee that bends forwards",
         ),
         pytest.param(
+            lambda t: t.replace('<geom friction="0.1 ', '<geom priority="1" friction="0.1 '),
+            ["priority 1", "the floor of a plant decides"],
+            id="priority that hides the floor's",
+        ),
+        pytest.param(
+            lambda t: t.replace('<motor ctrlrange="-33.5 33.5"', '<motor ctrlrange="-10 33.5"'),
+            ["ctrlrange [-10.   33.5]", "expected a torque range about 0"],
+            id="lopsided motor",
+        ),
+        pytest.param(
+            lambda t: t.replace(
+                "</actuator>",
+                '</actuator><contact><pair geom1="left_toe" geom2="floor"/></contact>',
+            ),
+            ["1 contact pairs, expected none"],
+            id="contact pair",
+        ),
+        pytest.param(
             lambda t: t.replace('cone="pyramidal"', 'cone="elliptic"'),
             ["option cone is elliptic, expected pyramidal"],
             id="elliptic cone",
@@ -271,12 +289,12 @@ def drop_line(text, *marks):
         ),
         pytest.param(
             lambda t: t.replace('<geom friction="0.1 ', '<geom friction="0.9 '),
-            ["has friction 0.9", "the floor of a plant decides both"],
+            ["has friction 0.9", "the floor of a plant decides"],
             id="friction that hides the floor's",
         ),
         pytest.param(
             lambda t: t.replace('solmix="0"', 'solmix="1"'),
-            ["solmix 1.0", "the floor of a plant decides both"],
+            ["solmix 1.0", "the floor of a plant decides"],
             id="stiffness that hides the floor's",
         ),
         pytest.param(

@@ -104,6 +104,8 @@ def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
         raise InputError(f"--traj expects trajectories of one length, got {lasts}; add --each")
     if args.refresh and args.net:
         raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
+    if args.refresh and (args.also or arguments.weights(args.start, robot).others):
+        raise InputError("--refresh takes Q and R alone, neither --also nor a start with others")
     if args.refresh and len(courses) > 1:
         raise InputError(f"--refresh takes one trajectory, got {len(courses)}; add --each")
     if args.refresh and len(first.command.duration) > PIECES:
@@ -237,6 +239,12 @@ def _note_settings(run: _Run) -> dict[str, Any]:
         "start": weights_tree(run.start),
     }
     run_folder.check_agreement(run.folder, begun, json.loads(as_json(now)))
+    others = list(begun.get("start", now["start"]).get("others", {}))
+    if others != list(run.start.others):
+        raise InputError(
+            f"{run.folder}: begun with a start that sets {', '.join(others) or 'no other number'}, "
+            f"here it sets {', '.join(run.start.others) or 'none'}"
+        )
     write_json(path, {**begun, **now})
     return {**begun, **now}
 

@@ -79,7 +79,6 @@ class MpcConfig:
         chosen = [
             choose_part("MpcConfig.constraints", one, Constraint, CONSTRAINTS)
             for one in self.constraints
-            if self.line_friction or one != LINE_FRICTION
         ]
         object.__setattr__(self, "contact", model)
         object.__setattr__(self, "constraints", tuple(chosen))
@@ -99,7 +98,8 @@ class MpcConfig:
     def on(self, what: str) -> tuple[Constraint, ...]:
         """The constraints on "inputs" or on "states"."""
         constraints = cast(tuple[Constraint, ...], self.constraints)
-        return tuple(one for one in constraints if one.on == what)
+        left_out = () if self.line_friction else (LINE_FRICTION,)
+        return tuple(one for one in constraints if one.on == what and one not in left_out)
 
 
 class Horizon(NamedTuple):

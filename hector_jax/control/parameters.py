@@ -85,7 +85,7 @@ def check_tunables(names: Sequence[str]) -> None:
         if TUNABLES[name].path.startswith("legs."):
             raise InputError(
                 f"TuneConfig.others: {name} cannot be tuned by gradients: the rigid-body model has "
-                "no joints, so its gradient is zero; a search on walks can"
+                "no joints, so its gradient is zero; a weights file can set it"
             )
 
 

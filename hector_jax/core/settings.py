@@ -216,6 +216,8 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
     values = {}
     for old, (new, words) in getattr(kind, "RENAMED", {}).items():
         if old in table:
+            if new in table:
+                raise InputError(f"{where}: {old} is the former name of {new}; give one of them")
             table = {new if name == old else name: value for name, value in table.items()}
             table[new] = words.get(str(table[new]), table[new])
     for name, value in table.items():

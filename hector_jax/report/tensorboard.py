@@ -42,7 +42,7 @@ def write_events(folder: Path, out: Path) -> list[Path]:
             for line in (line for line in lines if line["set"] == name):
                 for room, values in _scalars(line).items():
                     for key, value in values.items():
-                        if value is not None:  # it was not finite
+                        if isinstance(value, int | float):  # null was not finite, gains are a list
                             writer.add_scalar(f"{room}/{key}", float(value), line["iteration"])
     return list(folders.values())
 

@@ -87,9 +87,15 @@ def _check_motors(description: Description, model: mujoco.MjModel) -> None:
         driven, limits, gear = model.joint(motor.trnid[0]).name, motor.ctrlrange, motor.gear[0]
         text = f"actuator {index} drives joint {driven!r}, expected {name!r}"
         _expect(path, driven == name, text)
+        limits = limits if motor.ctrllimited[0] else "none"
         text = f"actuator of joint {name!r} has ctrlrange {limits} and gear {gear}"
-        right = motor.ctrllimited[0] and limits[1] > 0 and gear == 1.0
-        _expect(path, right, f"{text}, expected a torque range and gear 1")
+        right = motor.ctrllimited[0] and limits[1] > 0 and limits[0] == -limits[1] and gear == 1.0
+        _expect(path, right, f"{text}, expected a torque range about 0 and gear 1")
+        gain = model.actuator_gainprm[index, 0]
+        fixed = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE
+        right = (motor.gaintype[0], motor.biastype[0]) == fixed and gain == 1.0
+        text = f"actuator of joint {name!r} is no motor or has gain {gain}"
+        _expect(path, right, f"{text}, expected a motor of gain 1, whose control is a torque")
 
 
 def _check_feet(description: Description, model: mujoco.MjModel) -> None:
@@ -125,14 +131,16 @@ def _check_contacts(description: Description, model: mujoco.MjModel) -> None:
     for name in (*description.toes, *description.heels):
         dimensions = model.geom(name).condim[0]
         _expect(path, dimensions == 3, f"condim of geom {name!r} is {dimensions}, expected 3")
-    for index in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+    _expect(path, model.npair == 0, f"{model.npair} contact pairs, expected none")
+    for index in map(int, np.flatnonzero(model.geom_contype | model.geom_conaffinity)):
         if model.body_rootid[model.geom_bodyid[index]] != trunk:
             continue
         friction, solmix = model.geom_friction[index, 0], model.geom_solmix[index]
-        text = f"geom {model.geom(index).name or index!r} has friction {friction} and solmix "
-        right = friction <= _MOST_FRICTION and solmix == 0.0
-        expected = f"expected at most {_MOST_FRICTION} and 0: the floor of a plant decides both"
-        _expect(path, right, f"{text}{solmix}, {expected}")
+        priority = model.geom_priority[index]
+        text = f"geom {model.geom(index).name or index!r} has friction {friction}, solmix {solmix}"
+        right = friction <= _MOST_FRICTION and solmix == 0.0 and priority == 0
+        expected = f"expected at most {_MOST_FRICTION}, 0 and 0: the floor of a plant decides"
+        _expect(path, right, f"{text} and priority {priority}, {expected}")
 
 
 def _check_standing(description: Description, model: mujoco.MjModel) -> None:

@@ -95,24 +95,24 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
     Source: DRCL-USC/Hector_Simulation, branch ROS_Simulation, ConvexMPCLocomotion.cpp and
         SolverMPC.cpp at commit 79d545a, read for order and factors.
     """
-    mpc = config.mpc
+    mpc, numbers = config.mpc, config.parameters(weights).mpc
     header = _HEADER.format(
         name=name,
         mass=float(robot.mass),
         dt=config.mpc_step,
         horizon=mpc.horizon,
-        mu=mpc.friction,
-        limit=mpc.friction * mpc.max_force,
+        mu=float(numbers.friction),
+        limit=float(numbers.friction * numbers.max_force),
         toe=float(robot.toe),
         heel=float(robot.heel),
-        line=LINE_FRICTION in mpc.constraints,
+        line=LINE_FRICTION in mpc.on("inputs"),
     )
     Alpha = pack_wrench(Wrench(*map(jnp.asarray, weights.R)))
     others = weights_tree(weights).get("others", {}).items()
     return "".join(
         [
             header,
-            _ATTENTION if mpc.effort_reference == "gravity" else "",
+            _ATTENTION if numbers.effort_reference else "",
             *(f"// ATTENTION: tuned with {name} {value}.\n" for name, value in others),
             _block("Q", np.concatenate(weights.Q), _STATES),
             _block("Alpha", Alpha, _INPUTS),

@@ -138,11 +138,13 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
     try:
         params = None if net is None else layout(net["variant"], tuple(net["hidden"]))
         description = from_table(f"{path}: description", Description, about.get("description", {}))
+        config = TuneConfig.from_table(f"{path}: config", about.get("config"))
+        weights = config.rollout.walk.with_others(nominal(), about.get("others", ()))
+    except InputError:
+        raise
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: settings that this version does not know: {error}") from error
-    config = TuneConfig.from_table(f"{path}: config", about.get("config"))
+        raise InputError(f"{path}: settings that this version does not know: {error!r}") from error
     terms = {term.name: none for term in config.loss}
-    weights = config.rollout.walk.with_others(nominal(), about.get("others", ()))
     like = Dump(
         load_robot()._replace(description=description),
         weights,

@@ -108,6 +108,7 @@ def _tune_job(
     evaluations = [
         lambda weights, m=model: step(weights, *m) for model in _models(config, robot, problem)
     ]
+    start = difftune.init(config, start).best  # with the other numbers that are tuned
     mean = evaluate.mean_over_commands(evaluations, start)
     return difftune.descend(config, start, mean, lambda one: messages.put((name, one)))
 

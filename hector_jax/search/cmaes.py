@@ -230,7 +230,9 @@ def log_bounds(start: Weights) -> Float[np.ndarray, "18 2"]:
     if any(np.any(part[0] != part[1]) for part in start.R):
         raise InputError("a search needs a start whose feet share one R; these differ")
     if not ((low <= at) & (at <= high)).all():
-        box = ", ".join(f"{part.path[-1]} {part.lower:g} to {part.upper:g}" for part in (Q, R))
+        box = ", ".join(
+            f"{part.path.rpartition('.')[2]} {part.lower:g} to {part.upper:g}" for part in (Q, R)
+        )
         raise InputError(f"the start lies outside the box of weights: {box}")
     return np.log(np.stack([low, high], axis=1) / at[:, None])[tied]
 

@@ -27,10 +27,10 @@ from jaxtyping import Float, Int
 
 from hector_jax.control.parameters import TUNABLES, bounds, check_tunables
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import Weights
+from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, from_table
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, Range, check, from_table
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import where
 from hector_jax.robot.model import Robot
@@ -75,6 +75,14 @@ class TuneConfig:
         )
         check_loss(self.loss)
         check_tunables(self.others)
+        walk = self.rollout.walk
+        starts = walk.with_others(nominal(), self.others).others
+        for name, value in starts.items():
+            box = Range(TUNABLES[name].lower, TUNABLES[name].upper)
+            if value not in box:
+                raise InputError(f"TuneConfig.others: {name} starts at {value}, expected {box}")
+            if TUNABLES[name].path.startswith("footstep.") and walk.footstep.rule == "paper":
+                raise InputError(f"TuneConfig.others: {name} has no part in the paper's rule")
         if self.others and self.update != "relative":
             raise InputError("TuneConfig.others expects update relative, got literal")
 
@@ -224,7 +232,7 @@ def init(config: TuneConfig, weights: Weights, first: int = 0) -> TuneState:
     With `tie_feet` both feet start from the geometric mean of their weights in R.
     """
     weights = config.rollout.walk.with_others(weights, config.others)
-    weights = jax.tree.map(jnp.asarray, weights)
+    weights = jax.tree.map(lambda w: jnp.asarray(w, float), weights)
     if config.tie_feet:
         equal = jnp.all(jnp.stack([jnp.array_equal(*w) for w in weights.R]))
         tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights.R)))

@@ -126,5 +126,7 @@ def aligned(loss: Loss, norms: dict[str, float], to: str = "L_ctrl") -> Loss:
     def power(ratio: float) -> float:
         return float(10.0 ** np.round(np.log10(max(ratio, 1e-12))))
 
-    ratios = {name: norms[to] / norm for name, norm in norms.items() if name != to}
+    ratios = {
+        name: norms[to] / max(norm, 1e-12 * norms[to]) for name, norm in norms.items() if name != to
+    }
     return with_alphas({name: one * power(ratio) for name, ratio in ratios.items()}, loss)

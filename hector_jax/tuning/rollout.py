@@ -246,8 +246,7 @@ def step_carry(
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
-    Returns the next carry and the tick's sample of the trajectory (its `initial` and `period` are
-    filled in by `rollout`).
+    Returns the next carry and the tick's sample of the trajectory.
     """
     walk, ticks = config.walk, config.walk.gait
     here = anchor_at(robot, carry.state, carry.anchor.tick)

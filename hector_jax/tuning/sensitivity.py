@@ -1,8 +1,8 @@
 """The paper's own way to the gradient: sensitivities carried forward (Eq. 9, 10).
 
-The recursion needs no memory in T and no reverse mode; the 24 columns of the sensitivity are 24
-tangents of one tick, so that each QP is solved and factorised once. With a network in the loop the
-past commands are part of what is carried. Reverse mode gives the same numbers faster
+The recursion needs no memory in T and no reverse mode; the columns of the sensitivity are tangents
+of one tick, so that each QP is solved and factorised once. With a network in the loop the past
+commands are part of what is carried. Reverse mode gives the same numbers faster
 (`evaluate.evaluate`); this is the check on it, and what online tuning steps along.
 """
 
