@@ -460,6 +460,7 @@ def test_the_former_command_of_the_table_says_what_to_call_now(monkeypatch, caps
         ("--iterations", "3"),
         ("--seeds", "0"),
         ("--refresh", "-1"),
+        ("--refresh", "1", "--also", "friction"),
     ],
 )
 def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
