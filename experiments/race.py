@@ -200,10 +200,10 @@ def on_model(
         with bar("tuning on the model, and the price of a walk") as tell:
             tell(0, len(ON_MODEL), "compiling")
             price = pool.submit(_price_job, config, robot, command).result()
-            nets = {name: params if name in WITH_NET else None for name in ON_MODEL}
+            through = {name: params if name in WITH_NET else None for name in ON_MODEL}
             running = {
                 name: pool.submit(_model_job, name, config, robot, command, net)
-                for name, net in nets.items()
+                for name, net in through.items()
             }
             runs = {name: future.result()._asdict() for name, future in running.items()}
         write_json(path, {"walk": price, "courses": runs})

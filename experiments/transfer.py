@@ -81,8 +81,8 @@ class Flags:
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
     lead: int = 40  # ticks in place before t = 0 on the model, beside none
     ranks: int = 64  # weight sets about nominal for each rank correlation; 0 leaves them out
-    effort_about: Literal["zero", "weight"] = "zero"  # see MpcConfig
-    stance_weight: bool = False  # see LegConfig
+    effort_about: Literal["zero", "weight"] = "zero"  # MpcConfig.effort_reference
+    stance_weight: bool = False  # LegConfig.gravity_compensation
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:

@@ -7,9 +7,9 @@ A kind of part is a subclass that annotates its functions, a part one value of i
 
     JAXOPT = Solver("jaxopt", approach=box_osqp)
 
-A part is a `str` so that configs stay what they were in TOML, JSON, hashes and messages. Two parts
-are equal where name and functions are: a jitted function that has one in its static config is
-compiled anew for another of the same name.
+A part is a `str`, so that TOML, JSON and messages have its name. Two parts are equal where name and
+functions are: a jitted function that has one in its static config is compiled anew for another of
+the same name. Its `repr`, by which stored results are known, names the functions.
 """
 
 from collections.abc import Iterable
@@ -36,6 +36,15 @@ class Part(str):
         return not self == other
 
     __hash__ = str.__hash__
+
+    def __repr__(self) -> str:
+        values = (
+            f"{name}={value.__module__}.{value.__qualname__}"
+            if hasattr(value, "__qualname__")
+            else f"{name}={value!r}"
+            for name, value in self.__dict__.items()
+        )
+        return f"{type(self).__name__}({str(self)!r}, {', '.join(values)})"
 
 
 P = TypeVar("P", bound=Part)

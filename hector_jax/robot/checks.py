@@ -87,9 +87,10 @@ def _check_motors(description: Description, model: mujoco.MjModel) -> None:
         driven, limits, gear = model.joint(motor.trnid[0]).name, motor.ctrlrange, motor.gear[0]
         text = f"actuator {index} drives joint {driven!r}, expected {name!r}"
         _expect(path, driven == name, text)
-        limits = limits if motor.ctrllimited[0] else "none"
-        text = f"actuator of joint {name!r} has ctrlrange {limits} and gear {gear}"
-        right = motor.ctrllimited[0] and limits[1] > 0 and limits[0] == -limits[1] and gear == 1.0
+        limited = motor.ctrllimited[0]
+        range_ = f"ctrlrange {limits}" if limited else "no ctrlrange"
+        text = f"actuator of joint {name!r} has {range_} and gear {gear}"
+        right = limited and limits[1] > 0 and limits[0] == -limits[1] and gear == 1.0
         _expect(path, right, f"{text}, expected a torque range about 0 and gear 1")
         gain = model.actuator_gainprm[index, 0]
         fixed = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE

@@ -1,6 +1,6 @@
 """Loss of a weight set on the model and its gradient, by reverse mode (Eq. 9, 11)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -106,18 +106,19 @@ def gradient_norms(
     return {term.name: norm(term.name) for term in loss}
 
 
-def aligned(loss: Loss, norms: dict[str, float], to: str = "L_ctrl") -> Loss:
+def aligned(loss: Loss, norms: Mapping[str, float], to: str = "") -> Loss:
     """Loss whose terms have gradients of the order of that of one of them (footnote of Eq. 11).
 
     Args:
         loss: terms and weights.
         norms: of the gradient of each term, see `gradient_norms`.
-        to: the term that keeps its weight.
+        to: the term that keeps its weight; by default L_ctrl, or the last where there is none.
 
     Raises:
         InputError: a term that the loss does not have, or without a norm.
     """
     weights = {term.name: term.weight for term in loss}
+    to = to or ("L_ctrl" if "L_ctrl" in weights else loss[-1].name)
     for name in (to, *weights):
         if name not in weights or name not in norms:
             raise InputError(unknown("term of the loss", name, weights.keys() & norms.keys()))

@@ -5,7 +5,8 @@
 
 A loss is a tuple of terms, each a function of a trajectory with a weight alpha; `PAPER_LOSS` has
 the three of the paper. A term of one's own goes into that tuple (docs/howto/loss.md): gradients,
-logs, tables and files go through the terms by name.
+logs, tables and files go through the terms by name. The forward recursion, and with it tuning along
+measured walks, follows a term through the states and commands of a walk only.
 
 A world that ticks slower weighs its tracking sums by the milliseconds a tick stands for; the
 smoothness counts the changes of the held command. A fall is a fall: every missing sample is charged
