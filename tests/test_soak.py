@@ -82,7 +82,7 @@ def test_memory_arrays_and_open_files_stay_flat_over_500_iterations():
 
     def on_iteration(iteration):
         if iteration.iteration % 100 == 0:
-            after[iteration.iteration] = held()
+            after[int(iteration.iteration)] = held()
 
     command = named_command("c")
     found = tune(config, ROBOT, nominal(), command, ANCHOR, last_command, on_iteration)

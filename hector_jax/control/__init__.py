@@ -29,7 +29,7 @@ from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import LegConfig, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
-from hector_jax.control.parameters import TUNABLES, Parameters, Tunable
+from hector_jax.control.parameters import Parameters, Tunable
 from hector_jax.control.reference import (
     Anchor,
     Command,
@@ -45,7 +45,6 @@ __all__ = [
     "GaitConfig",
     "LegConfig",
     "LINE_FOOT",
-    "TUNABLES",
     "Anchor",
     "Command",
     "Contact",
