@@ -214,7 +214,7 @@ def test_either_engine_collects_the_same_walks(monkeypatch, tmp_path):
     for engine in ("c", "mjx"):
         folder = tmp_path / engine
         assert call(monkeypatch, *flags, "--engine", engine, "--out", folder) == 0
-        assert json.loads((folder / "card.json").read_text())["about"]["engine"] == engine
+        assert json.loads((folder / "card.json").read_text())["engine"] == engine
         found[engine] = load_walks(folder, load_robot())
     for one, other in zip(*map(jax.tree.leaves, found.values()), strict=True):
         np.testing.assert_allclose(one, other, atol=0.01)
