@@ -118,8 +118,8 @@ def rank_correlation(
     finite = np.isfinite(model + simulator)
     if finite.sum() < 3:
         return float("nan")
-    found = spearmanr(model[finite], simulator[finite])
-    return float(np.asarray(found)[0])
+    result = spearmanr(model[finite], simulator[finite])
+    return float(np.asarray(result)[0])
 
 
 def _text(value: Interval | None) -> str:

@@ -265,8 +265,8 @@ def adam(
 
     def look(steps: np.ndarray, share: float) -> Iteration:
         at = project(weights, steps)
-        found = jax.tree.map(np.asarray, tune_step(config, robot, at, command, anchor, effect))
-        row = len(history), at, found, step_status(config, found), share
+        evaluation = jax.tree.map(np.asarray, tune_step(config, robot, at, command, anchor, effect))
+        row = len(history), at, evaluation, step_status(config, evaluation), share
         iteration = Iteration(*jax.tree.map(np.asarray, row))
         history.append(iteration)
         on_iteration(iteration)
@@ -280,10 +280,10 @@ def adam(
         flat = jax.tree.map(np.multiply, best.evaluation.gradient, best.weights)
         gradient = directions() @ np.asarray(weights_to_vector(flat))
         update, later = optimiser.update(gradient, state)
-        tried = np.clip(at + share * rate * np.asarray(update), *box.T)
-        found = look(tried, share)
-        if found.accepted:
-            at, best, state, share = tried, found, later, min(1.0, 2.0 * share)
+        trial = np.clip(at + share * rate * np.asarray(update), *box.T)
+        iteration = look(trial, share)
+        if iteration.accepted:
+            at, best, state, share = trial, iteration, later, min(1.0, 2.0 * share)
         else:
             share /= 2.0
         if share < config.smallest_step:

@@ -99,8 +99,8 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
     config = TuneConfig(iterations=PAPER_ITERATIONS + steps)
     problem = Problem(named_command(name), bench.params)
     simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
-    known = config, bench.robot, start, problem.command, problem.params
-    key = content_key(*known, *simulators, code=WALKS_CODE)
+    inputs = config, bench.robot, start, problem.command, problem.params
+    key = content_key(*inputs, *simulators, code=WALKS_CODE)
     job = partial(_walk_job, config, bench.robot, problem)
 
     def make(missing: list[str], _: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:

@@ -20,7 +20,7 @@ from hector_jax.control.controller import (
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import Measurement, stance_torques, trunk_position
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.parameters import FEEDBACK, TUNABLES, Q, check_tunables
+from hector_jax.control.parameters import TUNABLES, Q
 from hector_jax.control.reference import Anchor, named_command
 from hector_jax.control.weights import expert
 from hector_jax.core.geometry import rot_z
@@ -29,6 +29,7 @@ from hector_jax.core.trajectory import State
 from hector_jax.qp import Status
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import load_robot
+from hector_jax.tuning.difftune import TuneConfig
 
 CONFIG = WalkConfig()
 ROBOT = load_robot()
@@ -183,14 +184,14 @@ def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing(
     }
     unfelt = {"gravity_compensation", "foot_height"}
     assert felt == {name: name not in unfelt for name in felt}
-    slope(FEEDBACK.write(parameters, np.array(0.3)), still)
+    slope(TUNABLES["footstep_feedback"].write(parameters, np.array(0.3)), still)
     assert len(compiled) == 1
     assert Q.read(parameters) is parameters.mpc.weights.Q
     for name in ("foot_height", "kp"):
         with pytest.raises(InputError, match=f"{name} cannot be tuned by gradients"):
-            check_tunables([name])
+            TuneConfig(others=(name,))
     with pytest.raises(InputError, match="did you mean 'turn_lead'"):
-        check_tunables(["turn_laed"])
+        TuneConfig(others=("turn_laed",))
 
 
 def test_the_numbers_beside_the_weights_are_those_of_the_weights_or_of_the_config():

@@ -38,10 +38,10 @@ def evaluate(args: Evaluate) -> None:
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         config = tunings.tune_config(robot)
-        judged = verdicts.judge(
+        walks = verdicts.judge(
             pool, config, robot, sets, course.command, plants, seeds, title=title, seconds=seconds
         )
-    verdict = metrics.make_verdict(config.loss, seeds, judged.scores)
+    verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
     result = metrics.as_result(verdict, args.world)
     if args.out is not None:
         write_json(args.out, result)

@@ -175,11 +175,11 @@ def _tune_in(folder: Path, args: Tune) -> None:
         run, norms = _align(pool, run)
         settings = _note_settings(run)
         tuned = _tune_sets(pool, run)
-        judged = _judge(pool, run, tuned.sets)
-    result, by_name = _result(run, tuned, judged)
+        walks = _walk_sets(pool, run, tuned.sets)
+    result, by_name = _result(run, tuned, walks)
     seconds = f"{time.monotonic() - begun:.0f}"
     write_json(folder / VERSIONS, made_with | {"seconds": seconds})
-    verdict, (standin, on_hfs) = by_name[run.name], judged[trajectories[0].name]
+    verdict, (standin, on_hfs) = by_name[run.name], walks[trajectories[0].name]
     report = write_report(
         folder,
         Report(
@@ -238,13 +238,10 @@ def _note_settings(run: _Run) -> dict[str, Any]:
         "seconds": run.seconds,
         "start": weights_tree(run.start),
     }
-    run_folder.check_agreement(run.folder, begun, json.loads(as_json(now)))
-    others = list(begun.get("start", now["start"]).get("others", {}))
-    if others != list(run.start.others):
-        raise InputError(
-            f"{run.folder}: begun with a start that sets {', '.join(others) or 'no other number'}, "
-            f"here it sets {', '.join(run.start.others) or 'none'}"
-        )
+    here = json.loads(as_json(now))
+    run_folder.check_agreement(run.folder, begun, here)
+    if begun.get("start", here["start"]) != here["start"]:  # a number came or went
+        raise InputError(f"{run.folder}: begun with a start of other numbers beside Q and R")
     write_json(path, {**begun, **now})
     return {**begun, **now}
 
@@ -291,7 +288,7 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     return _Tuned(tuned, shifts, sets)
 
 
-def _judge(
+def _walk_sets(
     pool: Executor, run: _Run, sets: Mapping[str, Weights]
 ) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
     """Walks of all sets on the stand-in plants and on the hfs, by trajectory."""
@@ -299,24 +296,24 @@ def _judge(
     plants = arguments.plants("standin", seeds)
     notes: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
     judge = partial(verdicts.judge, pool, run.config, run.robot, sets, **notes)
-    judged = {}
+    walks = {}
     for name, command, _ in run.trajectories:
         where = f" {name}" if len(run.trajectories) > 1 else ""
         title = f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}"
         standin = judge(command, plants, seeds, title=title, folder=run.artefacts / "standin")
         title = f"walking{where} on the high-fidelity simulator"
         on_hfs = judge(command, [hfs()], [0], title=title, folder=run.artefacts / "hfs")
-        judged[name] = standin, on_hfs
-    return judged
+        walks[name] = standin, on_hfs
+    return walks
 
 
 def _result(
-    run: _Run, tuned: _Tuned, judged: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
+    run: _Run, tuned: _Tuned, walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
 ) -> tuple[dict[str, Any], dict[str, Verdict]]:
     """Write result.json; its content, and the verdicts: of all walks, and by trajectory."""
 
     def verdict(names: Sequence[str], world: int) -> Verdict:
-        each = [judged[name][world] for name in names]
+        each = [walks[name][world] for name in names]
         scores = {n: [s for one in each for s in one.scores[n]] for n in tuned.sets}
         seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
         return metrics.make_verdict(run.config.loss, seeds, scores)
@@ -327,7 +324,7 @@ def _result(
             result["sets"][name] |= there
         return result
 
-    names = list(judged)
+    names = list(walks)
     by_name = {run.name: verdict(names, 0)}
     result = content(names, by_name[run.name])
     if len(names) > 1:
@@ -339,22 +336,22 @@ def _result(
     return result, by_name
 
 
-def _draw(run: _Run, tuned: _Tuned, judged: ScoredWalks, on_hfs: ScoredWalks) -> list[Picture]:
+def _draw(run: _Run, tuned: _Tuned, walks: ScoredWalks, on_hfs: ScoredWalks) -> list[Picture]:
     net = run.net
     effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
     sampled = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
     curves = fidelity.curves(run.robot, sampled, effects)
     histories = {name: one.tuning for name, one in tuned.tunings.items()}
     return pictures.of_run(
-        run.folder, run.config, tuned.sets, histories, judged.first, curves, net.course
+        run.folder, run.config, tuned.sets, histories, walks.first, curves, net.course
     )
 
 
-def _film(run: _Run, judged: ScoredWalks) -> Picture | str:
+def _film(run: _Run, walks: ScoredWalks) -> Picture | str:
     """The film of a run, or why there is none."""
     if not run.args.video:
         return "left out (--no-video)"
-    pair = {name: judged.first[name] for name in ("nominal", "with")}
+    pair = {name: walks.first[name] for name in ("nominal", "with")}
     film = run.folder / "film.mp4"
     caption = "Nominal and tuned weights on the first stand-in plant."
     reason = pictures.film(film, run.robot, pair, run.folder / "film.png")

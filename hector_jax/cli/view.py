@@ -43,31 +43,31 @@ def view_run(args: View) -> None:
     data = arguments.folder_of(args.data or begun.data, begun.robot, robot)
     net = begun.net if args.data is None and begun.net else nets.net_path(data, begun.variant)
     effect = _phi_of(net, begun.variant, robot)
-    shown: dict[str, view.ViewedWalk] = {}
+    walks: dict[str, view.ViewedWalk] = {}
 
     def walk() -> str:
         place = WORLDS.get(args.world, args.world)
-        story = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
+        lines = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
-            walked = arguments.walk_once(args, robot, course, weights)
-            loss = metrics.score(begun.loss, walked).L / 1e6
-            story.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
-            say(f"  {story[-1]}")
-            walked = at_interval(walked, walk_config(robot).gait.tick)
-            stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
+            trajectory = arguments.walk_once(args, robot, course, weights)
+            loss = metrics.score(begun.loss, trajectory).L / 1e6
+            lines.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
+            say(f"  {lines[-1]}")
+            trajectory = at_interval(trajectory, walk_config(robot).gait.tick)
+            stacked = jax.tree.map(lambda x: np.asarray(x)[None], trajectory)
             effects = {} if effect is None else {"residual": effect}
-            shown[name] = view.ViewedWalk(walked, fidelity.curves(robot, stacked, effects))
-        return "\n\n".join(story)
+            walks[name] = view.ViewedWalk(trajectory, fidelity.curves(robot, stacked, effects))
+        return "\n\n".join(lines)
 
     def motions() -> tuple[dict[str, Motion], str]:
-        story = walk()
-        moving = (motion(robot, *one) for one in shown.values())
-        return dict(zip(plots.titles(shown), moving, strict=True)), story
+        lines = walk()
+        moving = (motion(robot, *one) for one in walks.values())
+        return dict(zip(plots.titles(walks), moving, strict=True)), lines
 
     if folder is not None:
         walk()
-        pictures.of_view(folder, robot, read_histories(args.run), begun.loss, shown)
+        pictures.of_view(folder, robot, read_histories(args.run), begun.loss, walks)
         say(f"the film and the pictures are in {folder}")
         return
     model = compile_model(robot.description)

@@ -6,9 +6,10 @@ program stays in `WalkConfig`, whose numbers are the defaults:
 >>> from hector_jax.control.controller import WalkConfig
 >>> from hector_jax.control.weights import expert
 >>> parameters = WalkConfig().parameters(expert())
->>> FEEDBACK.read(parameters)
+>>> feedback = TUNABLES["footstep_feedback"]
+>>> feedback.read(parameters)
 0.12
->>> FEEDBACK.write(parameters, 0.2).footstep.feedback
+>>> feedback.write(parameters, 0.2).footstep.feedback
 0.2
 """
 
@@ -23,7 +24,6 @@ from hector_jax.control.footstep import FootstepParameters
 from hector_jax.control.legs import LegParameters
 from hector_jax.control.mpc import MpcParameters
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.core.inputs import InputError, unknown
 
 
 class Parameters(NamedTuple):
@@ -58,9 +58,8 @@ class Tunable(NamedTuple):
 
 
 Q, R = Tunable("mpc.weights.Q", 1e-2, 1e4), Tunable("mpc.weights.R", 1e-7, 1.0)
-FEEDBACK = Tunable("footstep.feedback", 0.0, 0.5)
 TUNABLES = {
-    "footstep_feedback": FEEDBACK,
+    "footstep_feedback": Tunable("footstep.feedback", 0.0, 0.5),
     "footstep_width": Tunable("footstep.width", 0.0, 0.2),
     "turn_lead": Tunable("footstep.turn", 0.0, 2.0),
     "effort_reference": Tunable("mpc.effort_reference", 0.0, 1.0),
@@ -71,22 +70,6 @@ TUNABLES = {
     "kd": Tunable("legs.kd", 0.05, 10.0, (5,)),
 }
 """What can be tuned beside Q and R, by the names that `Weights.others` has for them."""
-
-
-def check_tunables(names: Sequence[str]) -> None:
-    """Check what a tuner that follows the gradient of the rigid-body model is to tune.
-
-    Raises:
-        InputError: a name is unknown, or the model does not feel it: its gradient is zero.
-    """
-    for name in names:
-        if name not in TUNABLES:
-            raise InputError(f"TuneConfig.others: {unknown('tunable', name, TUNABLES)}")
-        if TUNABLES[name].path.startswith("legs."):
-            raise InputError(
-                f"TuneConfig.others: {name} cannot be tuned by gradients: the rigid-body model has "
-                "no joints, so its gradient is zero; a weights file can set it"
-            )
 
 
 def bounds(others: Iterable[str] = ()) -> tuple[Weights, Weights]:

@@ -106,5 +106,5 @@ def certificates(tolerances: Tolerances, qp: Normal, before: Point, point: Point
     rounding = jnp.finfo(x.dtype).eps * jnp.stack(
         [terms, jnp.maximum(largest(jnp.abs(qp.P) @ x), largest(matvec(A, x)))]
     )
-    shown = left + rounding < share
-    return shown & (share > tolerances.certificate * tolerances.residual * sizes)
+    certain = left + rounding < share
+    return certain & (share > tolerances.certificate * tolerances.residual * sizes)

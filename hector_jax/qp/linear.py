@@ -1,14 +1,10 @@
 """Products with rows that may be block-diagonal by step, and what else the methods share."""
 
-from typing import TypeVar
-
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array
-
-T = TypeVar("T")
 
 
 def matvec(A: Array, x: Array) -> Array:

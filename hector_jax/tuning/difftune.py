@@ -25,11 +25,12 @@ import numpy as np
 import optax
 from jaxtyping import Float, Int
 
-from hector_jax.control.parameters import TUNABLES, bounds, check_tunables
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import TUNABLES, bounds
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, Range, check, from_table
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import where
@@ -74,17 +75,10 @@ class TuneConfig:
             residual=POSITIVE,
         )
         check_loss(self.loss)
-        check_tunables(self.others)
-        walk = self.rollout.walk
-        starts = walk.with_others(nominal(), self.others).others
-        for name, value in starts.items():
-            box = Range(TUNABLES[name].lower, TUNABLES[name].upper)
-            if value not in box:
-                raise InputError(f"TuneConfig.others: {name} starts at {value}, expected {box}")
-            if TUNABLES[name].path.startswith("footstep.") and walk.footstep.rule == "paper":
-                raise InputError(f"TuneConfig.others: {name} has no part in the paper's rule")
         if self.others and self.update != "relative":
             raise InputError("TuneConfig.others expects update relative, got literal")
+        for name in self.others:
+            _check_tunable(self.rollout.walk, name)
 
     def as_table(self) -> dict[str, Any]:
         """The settings as JSON values; of the loss its weights."""
@@ -105,6 +99,24 @@ class TuneConfig:
         except InputError as error:
             raise InputError(f"{where}: loss: {error}") from None
         return replace(from_table(where, cls, rest), loss=weighted)
+
+
+def _check_tunable(walk: WalkConfig, name: str) -> None:
+    """Check that a number can be tuned by the gradient of the rigid-body model."""
+    what = f"TuneConfig.others: {name}"
+    if name not in TUNABLES:
+        raise InputError(f"TuneConfig.others: {unknown('tunable', name, TUNABLES)}")
+    path, lower, upper, _ = TUNABLES[name]
+    if path.startswith("legs."):
+        raise InputError(
+            f"{what} cannot be tuned by gradients: the rigid-body model has no joints, so its "
+            "gradient is zero; a weights file can set it"
+        )
+    if path.startswith("footstep.") and walk.footstep.rule == "paper":
+        raise InputError(f"{what} has no part in the paper's rule")
+    start, box = walk.with_others(nominal(), [name]).others[name], Range(lower, upper)
+    if start not in box:
+        raise InputError(f"{what} starts at {start}, expected {box}")
 
 
 class TuneState(NamedTuple):

@@ -171,9 +171,10 @@ def _move(
     variation: Variation | None,
 ) -> State:
     """State at the end of a tick."""
-    before, there = carry.before, carry.feet.position
-    if variation is None or before is None:
+    if variation is None:
         return srbm.step(robot, carry.state, acting.wrench, feet, dt, acting.legs)
+    before, there = carry.before, carry.feet.position
+    assert before is not None  # `rollout` begins with what acts in standing
     return _moved_by(variation, robot, carry.state, acting, feet, before, there, dt)
 
 
@@ -199,7 +200,8 @@ def _on_real_ground(
 ) -> tuple[Effect, Feet]:
     """What acts on the body within the ground's friction, and where the feet really are."""
     touchdown = planned.touchdown
-    if variation is not None and belief.error is not None:
+    if variation is not None:
+        assert belief.error is not None  # see `_believe`
         touchdown = touchdown._replace(position=touchdown.position - belief.error.position)
         acting = acting._replace(wrench=_within_friction(acting.wrench, variation.friction))
     return acting, feet_where(planned.contact, carry.feet, touchdown)
