@@ -378,7 +378,10 @@ def test_other_numbers_step_by_a_share_of_their_box_and_what_is_not_tuned_stays(
     [
         ({"others": ("turn_laed",)}, "did you mean 'turn_lead'"),
         ({"others": ("foot_height",)}, "foot_height cannot be tuned by gradients"),
-        ({"others": ("friction",), "update": "literal"}, "others expects update relative"),
+        (
+            {"others": ("friction",), "update": "literal"},
+            "others must be empty with update literal",
+        ),
         (
             {"others": ("turn_lead",), "rollout": PAPERS},
             "turn_lead has no part in the paper's rule",

@@ -25,7 +25,7 @@ from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.trajectories import load_command
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.inputs import did_you_mean, short_repr
+from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import Range, validation_error
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import collection, network
@@ -388,3 +388,12 @@ def test_an_archive_that_would_swell_is_refused_unread(folder, net):
     path.write_bytes(content + hashlib.sha256(content).hexdigest().encode())
     with pytest.raises(ValueError, match="bomb.npz: no card .*: an entry is compressed"):
         network.load_net(path, ROBOT)
+
+
+@pytest.mark.parametrize("value", [("weigth",), ("",), ("friction", "kp"), ("foot_height",)])
+def test_what_cannot_be_tuned_is_refused_by_field_and_value(value):
+    with pytest.raises(InputError) as caught:
+        made(TuneConfig, others=value)
+    message = one_line(caught.value)
+    assert message.startswith("TuneConfig.others must be ")
+    assert short_repr(value) in message

@@ -30,7 +30,7 @@ from hector_jax.control.parameters import TUNABLES, bounds
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError, unknown
+from hector_jax.core.inputs import InputError, short_repr, unknown
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, Range, check, from_table
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import where
@@ -75,10 +75,13 @@ class TuneConfig:
             residual=POSITIVE,
         )
         check_loss(self.loss)
+        got = short_repr(self.others)
         if self.others and self.update != "relative":
-            raise InputError("TuneConfig.others expects update relative, got literal")
+            raise InputError(f"TuneConfig.others must be empty with update literal, got {got}")
         for name in self.others:
-            _check_tunable(self.rollout.walk, name)
+            if fault := _fault(self.rollout.walk, name):
+                expected = "must be numbers that a gradient can tune"
+                raise InputError(f"TuneConfig.others {expected}, got {got}: {fault}")
 
     def as_table(self) -> dict[str, Any]:
         """The settings as JSON values; of the loss its weights."""
@@ -101,22 +104,20 @@ class TuneConfig:
         return replace(from_table(where, cls, rest), loss=weighted)
 
 
-def _check_tunable(walk: WalkConfig, name: str) -> None:
-    """Check that a number can be tuned by the gradient of the rigid-body model."""
-    what = f"TuneConfig.others: {name}"
+def _fault(walk: WalkConfig, name: str) -> str:
+    """Why a number cannot be tuned by the gradient of the rigid-body model; empty if it can."""
     if name not in TUNABLES:
-        raise InputError(f"TuneConfig.others: {unknown('tunable', name, TUNABLES)}")
+        return unknown("tunable", name, TUNABLES)
     path, lower, upper, _ = TUNABLES[name]
     if path.startswith("legs."):
-        raise InputError(
-            f"{what} cannot be tuned by gradients: the rigid-body model has no joints, so its "
+        return (
+            f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
             "gradient is zero; a weights file can set it"
         )
     if path.startswith("footstep.") and walk.footstep.rule == "paper":
-        raise InputError(f"{what} has no part in the paper's rule")
+        return f"{name} has no part in the paper's rule"
     start, box = walk.with_others(nominal(), [name]).others[name], Range(lower, upper)
-    if start not in box:
-        raise InputError(f"{what} starts at {start}, expected {box}")
+    return "" if start in box else f"{name} starts at {start}, expected {box}"
 
 
 class TuneState(NamedTuple):
