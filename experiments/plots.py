@@ -249,8 +249,8 @@ def race(
         axes.set(xlabel=abscissa, ylabel="lowest L on the simulator so far [10$^6$]")
         log_axis(axes, "y")
     return (
-        f"Lowest loss on the high-fidelity simulator so far, by {abscissa}: median of the repeats, "
-        "each of them thin."
+        f"Lowest loss on the high-fidelity simulator so far, by {abscissa}. Thick: median of "
+        "the repeats; thin: each repeat."
     )
 
 

@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -82,6 +83,27 @@ def test_each_tuning_of_a_batch_is_that_of_a_single_one(on_toy):
         )
     assert len(set(found.iterations)) > 1  # some ended and were frozen before others
     assert max(found.iterations) >= PER_CALL
+
+
+def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
+    def leaning(*model, **options):
+        """The bowl, and another in the lead of turns, about 1.2."""
+        found, lead = toy(*model, **options), model[2].others["turn_lead"]
+        gradient = found.gradient._replace(others={"turn_lead": 2e6 * (lead - 1.2)})
+        return found._replace(loss=found.loss + 1e6 * (lead - 1.2) ** 2, gradient=gradient)
+
+    monkeypatch.setattr(batch, "evaluate", leaning)
+    monkeypatch.setattr(difftune, "evaluate_jit", jax.jit(leaning, static_argnums=0))
+    config = replace(TOY, others=("turn_lead",))
+    asked = stack([problem(start, [scenario("c")]) for start in STARTS[:2]])
+    found = tune_batch(config, ROBOT, asked, last_command)
+    for i, start in enumerate(STARTS[:2]):
+        alone = tune(config, ROBOT, start, named_command("c"), ANCHOR, last_command)
+        lead = alone.converged.others["turn_lead"]
+        assert abs(lead - 1.2) < 0.1
+        np.testing.assert_allclose(found.converged.others["turn_lead"][i], lead, rtol=1e-9)
+        ours = jax.tree.map(lambda x, i=i: x[i], found.converged)
+        np.testing.assert_allclose(vector(ours), vector(alone.converged), rtol=1e-9)
 
 
 def test_how_many_walk_side_by_side_does_not_matter(on_toy):

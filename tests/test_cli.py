@@ -21,7 +21,7 @@ from hector_jax.cli import arguments, doctor, evaluate
 from hector_jax.cli.flags import Command, Tune, command_name
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
-from hector_jax.control.weights import WEIGHT_NAMES, expert, weights_to_vector
+from hector_jax.control.weights import WEIGHT_NAMES, expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import exit_code
 from hector_jax.core.tree_file import read_card
@@ -371,7 +371,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     # one set for two trajectories, from those weights, on the same data
     start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "10")
     several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
-    several += ("--also", "turn_lead")
+    several += ("--also", "turn_lead", "--net", Path("data/grfm.npz"))
     assert call(monkeypatch, "tune", *flags, *several) == 0
     out = capsys.readouterr().out
     for title in ("straight, c, 1 plant", "straight, 1 plant", "c, 1 plant"):
@@ -460,12 +460,21 @@ def test_the_former_command_of_the_table_says_what_to_call_now(monkeypatch, caps
         ("--iterations", "3"),
         ("--seeds", "0"),
         ("--refresh", "-1"),
-        ("--refresh", "1", "--also", "friction"),
     ],
 )
 def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
     line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)
     assert wrong[0].lstrip("-") in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("flag", ["--also", "--start"])
+def test_a_refresh_takes_q_and_r_alone(monkeypatch, capsys, tmp_path, flag):
+    save_weights(tmp_path / "mine.json", nominal()._replace(others={"turn_lead": np.array(0.8)}))
+    value = "friction" if flag == "--also" else tmp_path / "mine.json"
+    run = "--run", tmp_path / "run", "--refresh", "1"
+    line = refused(monkeypatch, capsys, "tune", *run, flag, value)
+    assert "neither --also nor a start with others" in line
     assert not (tmp_path / "run").exists()
 
 

@@ -1,5 +1,7 @@
 """Tuning while walking: the gradient of a window, the guards, a walk that asks for weights."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -143,6 +145,15 @@ def course(monkeypatch, config, follows, windows, start=None):
         carry, now = retune.step(carry, tick, ANCHOR, MEASURED, zero_wrench())
         weights.append(now)
     return weights, steps
+
+
+def test_other_numbers_are_tuned_while_walking(monkeypatch):
+    slope = vector_to_weights(jnp.ones(24))._replace(others={"turn_lead": jnp.array(-3.0)})
+    config = OnlineConfig(tune=replace(TUNE, others=("turn_lead",)), window=5)
+    weights, steps = course(monkeypatch, config, [toy(slope)] * 2, 2)
+    leads = [float(one.others["turn_lead"]) for one in weights]
+    assert leads == pytest.approx([0.5] * 6 + [0.54] * 5 + [0.58])
+    assert [float(one.weights.others["turn_lead"]) for one in steps] == pytest.approx([0.5, 0.54])
 
 
 def test_weights_change_once_a_window_by_at_most_beta(monkeypatch):

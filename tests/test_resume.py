@@ -16,10 +16,11 @@ from killed import look
 
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
+from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core import files as core_files
 from hector_jax.core.console import exit_code
-from hector_jax.core.files import WriteError, locked, write_file
+from hector_jax.core.files import WriteError, locked, write_file, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import load_tree, save_tree
@@ -408,3 +409,29 @@ def test_a_run_folder_that_cannot_be_made_is_not_said_to_exist(tmp_path, monkeyp
             InputError, match=f"^cannot write {tmp_path}.*: No space left on device$"
         ):
             command.tune(flags.Tune(traj=("c",), **named))
+
+
+def test_a_run_is_not_resumed_from_another_start(tmp_path):
+    def run(**others):
+        return command._Run(
+            folder=tmp_path,
+            args=flags.Tune(traj=("straight",)),
+            robot=load_robot(),
+            start=nominal()._replace(others={name: np.array(x) for name, x in others.items()}),
+            trajectories=(command_of("straight"),),
+            seconds=4.0,
+            config=TuneConfig(),
+            net=SimpleNamespace(params=None),
+            commit="0" * 40,
+        )
+
+    for begun, here in ((run(), run(turn_lead=0.8)), (run(turn_lead=0.8), run())):
+        write_json(tmp_path / "config.json", {})
+        noted = command._note_settings(begun)
+        assert command._note_settings(begun) == noted
+        with pytest.raises(InputError, match="start of other numbers beside Q and R"):
+            command._note_settings(here)
+    write_json(tmp_path / "config.json", {})
+    command._note_settings(run(turn_lead=0.8))
+    with pytest.raises(InputError, match=r"begun with turn_lead 0.8, here is 0.9"):
+        command._note_settings(run(turn_lead=0.9))
