@@ -1,12 +1,15 @@
-"""The names, limits, gait and weights of a robot beside its MJCF, in a short TOML.
+"""The names, limits, gait and weights of a robot beside its model, in a short TOML.
 
     name = "strider"                   # its walks and net are kept under this name
-    model = "strider.xml"              # the MJCF, beside this file
-    standing = "standing"              # keyframe of the standing pose
+    model = "strider.xml"              # MJCF or URDF, beside this file
+    standing = "home"                  # keyframe of the standing pose, or angles: { knee = 0.5 }
     [joints]                           # of each leg, from the trunk down
-    left, right = five names each; axes = "zxyyy": z yaw, x roll, y pitch, in the order of the leg
-    [feet]
-    left, right = { point = site on the sole under the ankle, toe = geom, heel = geom }
+    left, right = three to seven names each
+    linkage = [5, 4]                   # the fifth joint's motor turns the fourth too; or none
+    weld = ["waist"]                   # hinges that are fixed in the standing pose
+    [feet]                             # by names in the model, or by places in a body's frame
+    left, right = { point = site on the sole, toe = geom, heel = geom }
+    left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # 1, 2 or 4 contacts
     [limits]
     min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond, it has fallen
     [gait] [mpc] [footstep] [legs]     # fields of GaitConfig, MpcConfig, FootstepConfig, LegConfig
@@ -14,12 +17,13 @@
     nominal, expert = { euler, position, ang_velocity, velocity, force, moment }   # x, y, z or one
 
 What is left out is as in assets/hector.toml. Masses, lengths, joint and torque limits are the
-MJCF's; a description rides on its `Robot` and is static under jit.
+model's; a description rides on its `Robot` and is static under jit.
 """
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import jax
 
@@ -34,7 +38,7 @@ MODEL_PATH = _ASSETS / "hector.xml"
 DESCRIPTION_PATH = _ASSETS / "hector.toml"
 
 LEG_JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle")
-HECTOR_AXES = "zxyyy"
+FEWEST_JOINTS, MOST_JOINTS = 3, 7  # of a leg
 CONTROL = ("gait", "mpc", "footstep", "legs")  # sections that the controller reads
 
 _MAX_BYTES = 100_000
@@ -42,13 +46,20 @@ _MAX_BYTES = 100_000
 Triple = tuple[float, float, float]
 
 
-def _leg(side: str) -> tuple[str, str, str, str, str]:
-    yaw, roll, pitch, knee, ankle = (f"{side}_{joint}" for joint in LEG_JOINTS)
-    return yaw, roll, pitch, knee, ankle
+def _leg(side: str) -> tuple[str, ...]:
+    return tuple(f"{side}_{joint}" for joint in LEG_JOINTS)
 
 
-def _both(ending: str) -> tuple[str, str]:
-    return f"left_{ending}", f"right_{ending}"
+class Foot(NamedTuple):
+    """A foot in the model: names in it, or places in the frame of a body."""
+
+    point: str | Triple | None  # site; or where wrenches act [m]: below the last joint by default
+    contacts: tuple[str, ...] | tuple[Triple, ...]  # spheres; or where the sole touches [m]
+    body: str | None = None  # of places
+
+
+def _named_foot(side: str) -> Foot:
+    return Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel"))
 
 
 @jax.tree_util.register_static
@@ -56,15 +67,14 @@ def _both(ending: str) -> tuple[str, str]:
 class Description:
     """A robot's TOML; the defaults are the names and limits of HECTOR."""
 
-    model: Path = MODEL_PATH  # the MJCF
+    model: Path = MODEL_PATH  # MJCF or URDF
     path: Path = DESCRIPTION_PATH  # where this was read
     name: str = "hector"
-    standing: str = "standing"  # keyframe
+    standing: str | tuple[tuple[str, float], ...] = "standing"  # keyframe, or angles [rad] by joint
     joints: tuple[str, ...] = _leg("left") + _leg("right")
-    axes: str = HECTOR_AXES  # of each leg's joints, from the trunk down
-    foot_points: tuple[str, str] = _both("foot_point")  # sites
-    toes: tuple[str, str] = _both("toe")  # geoms
-    heels: tuple[str, str] = _both("heel")  # geoms
+    linkage: tuple[int, int] | None = (5, 4)  # of a leg, counted from 1: whose motor turns which
+    weld: tuple[str, ...] = ()  # joints
+    feet: tuple[Foot, Foot] = (_named_foot("left"), _named_foot("right"))
     min_height: float = MIN_HEIGHT  # [m] of the centre of mass; below it the robot has fallen
     max_tilt: float = MAX_TILT  # [rad] of roll or pitch; beyond it too
     control: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()  # sections as they came
@@ -80,56 +90,76 @@ class Description:
         return self.min_height, self.max_tilt
 
     @property
-    def yaw_joint(self) -> int:
-        """Which joint of a leg turns it about the vertical."""
-        return self.axes.index("z")
-
-    @property
-    def roll_joint(self) -> int:
-        """Which joint of a leg turns it about the way ahead."""
-        return self.axes.index("x")
-
-    @property
-    def pitch_joints(self) -> tuple[int, int, int]:
-        """Which joints of a leg are hip pitch, knee and ankle."""
-        hip, knee, ankle = (i for i, axis in enumerate(self.axes) if axis == "y")
-        return hip, knee, ankle
+    def leg_joints(self) -> int:
+        """Joints of a leg."""
+        return len(self.joints) // 2
 
 
 @dataclass(frozen=True)
 class _Joints:
-    left: tuple[str, str, str, str, str] = _leg("left")
-    right: tuple[str, str, str, str, str] = _leg("right")
-    axes: str = HECTOR_AXES
+    left: tuple[str, ...] = _leg("left")
+    right: tuple[str, ...] = _leg("right")
+    linkage: tuple[int, int] | None = None
+    weld: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        names = self.left + self.right
-        if len(set(names)) < len(names):
-            raise InputError(f"must be ten different names, got {short_repr(names)}")
-        if sorted(self.axes) != sorted(HECTOR_AXES):
+        names, count = self.left + self.right + self.weld, len(self.left)
+        if not FEWEST_JOINTS <= count <= MOST_JOINTS or count != len(self.right):
             raise InputError(
-                f"axes must be {HECTOR_AXES!r} in the order of the leg, got {short_repr(self.axes)}"
+                f"left and right must be {FEWEST_JOINTS} to {MOST_JOINTS} names each and as many "
+                f"in both, got {count} and {len(self.right)}"
+            )
+        if len(set(names)) < len(names):
+            twin = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"must be different names, got {short_repr(twin)} twice")
+        if self.linkage and (
+            not all(1 <= i <= count for i in self.linkage) or len(set(self.linkage)) < 2
+        ):
+            raise InputError(
+                f"linkage must be two joints of a leg, counted from 1 to {count}, "
+                f"got {list(self.linkage)}"
             )
 
 
 @dataclass(frozen=True)
-class _Left:
-    point: str = Description.foot_points[0]
-    toe: str = Description.toes[0]
-    heel: str = Description.heels[0]
+class _Foot:
+    point: str | Triple | None = None
+    toe: str | None = None
+    heel: str | None = None
+    body: str | None = None
+    contacts: tuple[Triple, ...] = ()
 
+    def __post_init__(self) -> None:
+        named = [self.point, self.toe, self.heel]
+        if self.body is None:
+            right = not self.contacts and all(isinstance(name, str) for name in named)
+        else:
+            right = len(self.contacts) in (1, 2, 4) and named[1:] == [None, None]
+            right = right and not isinstance(self.point, str)
+            places = (*self.contacts, self.point or (0.0, 0.0, 0.0))
+            right = right and all(math.isfinite(x) for place in places for x in place)
+        if not right:
+            raise InputError(
+                "must be names: point (a site), toe and heel (spheres); or a body with 1, 2 or 4 "
+                "contacts [x, y, z] on its sole and, if wanted, a point [x, y, z]"
+            )
 
-@dataclass(frozen=True)
-class _Right:
-    point: str = Description.foot_points[1]
-    toe: str = Description.toes[1]
-    heel: str = Description.heels[1]
+    @property
+    def foot(self) -> Foot:
+        """As the description has it."""
+        ends = self.contacts if self.toe is None or self.heel is None else (self.toe, self.heel)
+        return Foot(self.point, ends, self.body)
 
 
 @dataclass(frozen=True)
 class _Feet:
-    left: _Left = _Left()
-    right: _Right = _Right()
+    left: _Foot
+    right: _Foot
+
+    def __post_init__(self) -> None:
+        count = [len(one.foot.contacts) for one in (self.left, self.right)]
+        if count[0] != count[1]:
+            raise InputError(f"left and right must have as many contacts, got {count}")
 
 
 @dataclass(frozen=True)
@@ -166,9 +196,9 @@ class _Weights:
 class _File:
     name: str | None = None
     model: str = MODEL_PATH.name
-    standing: str = Description.standing
+    standing: str | dict[str, float] = "standing"
     joints: _Joints = _Joints()
-    feet: _Feet = _Feet()
+    feet: _Feet | None = None
     limits: _Limits = _Limits()
     gait: dict | None = None
     mpc: dict | None = None
@@ -177,6 +207,9 @@ class _File:
     weights: _Weights = _Weights()
 
     def __post_init__(self) -> None:
+        angles = self.standing.values() if isinstance(self.standing, dict) else ()
+        if not all(map(math.isfinite, angles)):
+            raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")
         if Path(self.model).name != self.model:
             raise InputError(
                 f"model must be the name of a file beside it, got {short_repr(self.model)}"
@@ -199,17 +232,18 @@ def read_description(path: Path) -> Description:
             f"{path}: name must be letters, digits, - and _ (it names a folder), "
             f"got {short_repr(name)}"
         )
-    left, right, weights = file.feet.left, file.feet.right, file.weights
+    weights, standing, feet = file.weights, file.standing, Description.feet
+    if file.feet is not None:
+        feet = (file.feet.left.foot, file.feet.right.foot)
     return Description(
         model=path.parent / file.model,
         path=path,
         name=name,
-        standing=file.standing,
+        standing=standing if isinstance(standing, str) else tuple(standing.items()),
         joints=file.joints.left + file.joints.right,
-        axes=file.joints.axes,
-        foot_points=(left.point, right.point),
-        toes=(left.toe, right.toe),
-        heels=(left.heel, right.heel),
+        linkage=file.joints.linkage,
+        weld=file.joints.weld,
+        feet=feet,
         min_height=file.limits.min_height,
         max_tilt=file.limits.max_tilt,
         control=tuple(
