@@ -93,9 +93,9 @@ def _score_walk(config: Loss, walk: Trajectory, commit: str) -> ScoredWalk:
     return ScoredWalk(metrics.score(config, walk), upright, last, commit)
 
 
-def _like(loss: Loss, with_walk: bool) -> Any:
+def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
     """Layout of the artefact of one walk, with its trajectory or without."""
-    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like().trajectory)
+    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(robot).trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
     one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
     return one, walk if with_walk else None
@@ -161,7 +161,7 @@ def judge(
             key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
             stem = f"walk-{name}" if with_walk((name, seed)) else f"score-{name}"
             paths[name, seed] = folder / f"{stem}-{seed}-{key}.npz"
-        like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
+        like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
     by_set = {name: [walks[name, seed] for seed in seeds] for name in sets}

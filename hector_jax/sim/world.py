@@ -165,11 +165,11 @@ class World:
     """A MuJoCo model and where the robot's parts are in it."""
 
     model: mujoco.MjModel
-    joint_qpos: np.ndarray  # (10,) motor side, left leg then right
-    joint_dof: np.ndarray  # (10,)
-    slack: np.ndarray  # (10,) backlash joints; empty where there are none
-    slack_qpos: np.ndarray  # (10,) likewise
-    actuator: np.ndarray  # (10,)
+    joint_qpos: np.ndarray  # (joints,) motor side, left leg then right
+    joint_dof: np.ndarray  # (joints,)
+    slack: np.ndarray  # (joints,) backlash joints; empty where there are none
+    slack_qpos: np.ndarray  # (joints,) likewise
+    actuator: np.ndarray  # (joints,)
     foot_of_geom: np.ndarray  # (ngeom,) 0 left, 1 right, -1 no foot
     floor: int  # geom
     trunk: int  # body
@@ -231,7 +231,7 @@ def _compile(description: Description, slack: bool) -> World:
     joints = [model.joint(name) for name in names]
     slacks = [model.joint(name + SLACK) for name in names] if slack else []
     of_joint = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
-    feet = [joint.bodyid[0] for joint in joints[4::5]]
+    feet = [joints[description.leg_joints - 1].bodyid[0], joints[-1].bodyid[0]]
     return World(
         model=model,
         joint_qpos=np.array([joint.qposadr[0] for joint in joints]),
@@ -292,7 +292,7 @@ def build_world(imperfections: Imperfections, description: Description | None = 
 
 
 def standing_qpos(
-    world: World, joints: Float[np.ndarray, "10"], height: float
+    world: World, joints: Float[np.ndarray, " joints"], height: float
 ) -> Float[np.ndarray, " nq"]:
     """Coordinates of a robot standing at the origin: trunk at `height` [m], `joints` [rad]."""
     qpos = np.zeros(world.model.nq)
