@@ -42,7 +42,7 @@ def drop_unused(
             notes.append(f"<{tag}> is not used")
         _remove(root, parts)
     for part in root.findall("actuator"):  # those of tendons, sites and bodies
-        _remove(part, [m for m in part if not m.keys() & {"joint", "jointinparent"}])
+        _remove(part, [m for m in part if not {"joint", "jointinparent"} & set(m.attrib)])
     for part in root.findall("keyframe"):
         _remove(part, [key for key in part if key.get("name") != keyframe])
         for key in part:
