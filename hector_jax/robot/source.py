@@ -85,6 +85,18 @@ def build_spec(description: Description) -> Source:
     return Source(spec, *feet, standing, (*notes, *changes))
 
 
+def compile_spec(description: Description, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The compiled model of a spec.
+
+    Raises:
+        InputError: MuJoCo's refusal in one line.
+    """
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"{description.model}: MuJoCo refuses it: {one_line(error)}") from None
+
+
 def _read(description: Description, root: ElementTree.Element) -> _File:
     """Compile a file without motors and keyframes, and find the robot in it."""
     path = description.model
@@ -102,6 +114,9 @@ def _read(description: Description, root: ElementTree.Element) -> _File:
     names = [model.joint(j).name for j in range(model.njnt)]
     for joint in (*description.joints, *description.weld):
         _require(path, "joint", joint, names)
+    for motor in _motors(spec):
+        text = f"actuator {motor.name!r} drives no joint {motor.target!r}"
+        _expect(path, motor.target in names, text + did_you_mean(motor.target, names))
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _JOINT.mjJNT_FREE]
     _expect(
         path,
@@ -213,7 +228,7 @@ def _motors(spec: mujoco.MjSpec) -> list:
     return [motor for motor in spec.actuators if motor.trntype in joint]
 
 
-def _limited(flag: int, span: Sequence[float]) -> bool:
+def _limited(flag: mujoco.mjtLimited, span: Float[np.ndarray, "2"]) -> bool:
     automatic = flag == mujoco.mjtLimited.mjLIMITED_AUTO
     return bool(span[0] < span[1]) if automatic else bool(flag)
 
