@@ -63,14 +63,17 @@ def _remove(parent: ElementTree.Element, children: Sequence[ElementTree.Element]
     return len(children)
 
 
+def _reads_file(asset: ElementTree.Element) -> bool:
+    return asset.tag in ("mesh", "hfield", "skin") or any(
+        name.startswith("file") for name in asset.attrib
+    )
+
+
 def _drop_files(root: ElementTree.Element) -> int:
     """Drop what is read from other files, and the mention of it. Returns how many."""
-    gone = lambda part: part.tag in ("mesh", "hfield", "skin") or any(  # noqa: E731
-        name.startswith("file") for name in part.attrib
-    )
     dropped = 0
     for assets in root.findall("asset"):
-        dropped += _remove(assets, [part for part in assets if gone(part)])
+        dropped += _remove(assets, [part for part in assets if _reads_file(part)])
     textures = {part.get("name") for part in root.iterfind("asset/texture")}
     for material in root.iter("material"):
         _remove(material, [x for x in material if x.get("texture") not in textures])
@@ -147,7 +150,7 @@ def _geoms(
     """Each geom with its body, the element that holds it and the class that it inherits."""
     places = [(world, world, "main") for world in root.findall("worldbody")]
     while places:
-        body, holder, inherited = places.pop()
+        body, holder, inherited = places.pop(0)
         inherited = holder.get("childclass", inherited)
         for child in list(holder):
             if child.tag == "geom":

@@ -140,5 +140,5 @@ def _composite(model: mujoco.MjModel, bodies: Mapping[int, Pose]) -> dict:
         m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         for (m, _, _), arm in zip(parts, arms, strict=True)
     )
-    inertia = sum(I for _, _, I in parts) + sum(steiner)
+    inertia = sum(spread for _, _, spread in parts) + sum(steiner)
     return {"mass": float(mass), "com": com, "inertia": inertia}

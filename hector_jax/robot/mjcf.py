@@ -36,7 +36,11 @@ _RANGES: Mapping[str, Range] = {
     **dict.fromkeys(_PIXELS.split(), Range(0, 8192)),
     **dict.fromkeys(_COUNTS.split(), _COUNT),
 }
-_RANGES_OF = {("inertial", "mass"): POSITIVE, ("numeric", "size"): _COUNT, ("mass", "value"): NOT_NEGATIVE}
+_RANGES_OF = {
+    ("inertial", "mass"): POSITIVE,
+    ("numeric", "size"): _COUNT,
+    ("mass", "value"): NOT_NEGATIVE,
+}
 _PAIRS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange")
 _MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
 _MOST_MEMORY = 2**30

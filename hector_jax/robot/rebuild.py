@@ -9,7 +9,7 @@ decides friction and stiffness. A sphere, a cylinder or an ellipsoid that collid
 capsule of its length and radius. A link of which nothing is drawn is drawn as a stick.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -75,9 +75,7 @@ def rebuild(description: Description, pieces: Pieces) -> tuple[mujoco.MjSpec, Fe
         _add_joint(pieces.model, link, body)
     for joint, limit in zip(description.joints, pieces.limits, strict=True):
         _add_motor(spec, joint, limit)
-    named = {
-        name for foot in description.feet if foot.body is None for name in foot.contacts
-    }
+    named = {str(name) for foot in description.feet if foot.body is None for name in foot.contacts}
     for index, body in enumerate(bodies):
         _add_geoms(pieces, index, body, named)
     _add_sticks(pieces.links, bodies)
@@ -317,8 +315,8 @@ def _add_standing(
     if max(heights.values()) - low > ON_FLOOR:
         above = ", ".join(f"{name} {1e3 * (h - low):.1f}" for name, h in heights.items())
         raise InputError(
-            f"{description.model}: standing, the soles are not level: contacts above the lowest one "
-            f"[mm]: {above}; expected all within {1e3 * ON_FLOOR:g}: change the angles of `standing`"
+            f"{description.model}: standing, the soles are not level: contacts above the lowest "
+            f"one [mm]: {above}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
         )
     qpos = [0.0, 0.0, -low, *pieces.trunk_quat, *pieces.angles]
     spec.body(pieces.links[0].name).pos = qpos[:3]

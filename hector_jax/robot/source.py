@@ -24,7 +24,6 @@ from hector_jax.robot.rebuild import (
     ON_FLOOR,
     SHAPES,
     SOLVER,
-    Feet,
     Pieces,
     lowest,
     rebuild,
@@ -74,9 +73,7 @@ def build_spec(description: Description) -> Source:
     if not changes:
         points, contacts = zip(*((f.point, f.contacts) for f in description.feet), strict=True)
         return Source(file.spec, points, contacts, standing, tuple(notes))
-    fixed = {
-        j: angle for j, angle in angles.items() if j not in file.joints
-    }
+    fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
     links = links_of(file.model, file.trunk, file.joints, fixed)
     _check_links(description, links)
     legs = [angles[joint] for joint in file.joints]
@@ -162,10 +159,14 @@ def _check_world(file: _File) -> None:
     _expect(path, right, f"gravity is {gravity}, expected 0 0 and a negative number")
     for g in _world_geoms(file):
         plane = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE
-        text = f"geom {model.geom(g).name or g!r} of the world is terrain, expected a plane at z = 0"
+        text = (
+            f"geom {model.geom(g).name or g!r} of the world is terrain, expected a plane at z = 0"
+        )
         _expect(path, plane, text)
         level = abs(model.geom_pos[g][2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
-        text = f"floor {model.geom(g).name or g!r} is at {model.geom_pos[g]}, expected level at z = 0"
+        text = (
+            f"floor {model.geom(g).name or g!r} is at {model.geom_pos[g]}, expected level at z = 0"
+        )
         _expect(path, level, text)
 
 
@@ -251,15 +252,16 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
     static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
     order = [file.free, *file.joints] == list(range(model.njnt))
     at_origin = not np.any(model.jnt_pos) and not np.any(model.qpos0[7:])
-    numbers = [
-        name for name, value in SOLVER.items() if getattr(model.opt, name) != value
-    ]
+    numbers = [name for name, value in SOLVER.items() if getattr(model.opt, name) != value]
     floor = _world_geoms(file)
     lines = (
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {_listed(description.weld)}", description.weld),
         (f"made one with their parents: {_listed(static)}", static),
-        ("joints put in order, left leg first", file.free >= 0 and not order and not description.weld),
+        (
+            "joints put in order, left leg first",
+            file.free >= 0 and not order and not description.weld,
+        ),
         ("frames of the joints put into their anchors", not at_origin and order),
         ("motors replaced by torque motors", not _motors_right(file, limits)),
         (f"option {_listed(numbers)} set", numbers),
@@ -278,7 +280,9 @@ def _motors_right(file: _File, limits: Sequence[float]) -> bool:
         return False
     span = lambda motor: {*map(float, motor.ctrlrange), *map(float, motor.forcerange)}  # noqa: E731
     return all(
-        _is_motor(motor) and motor.gainprm[0] == motor.gear[0] == 1.0 and motor.ctrlrange[1] == limit
+        _is_motor(motor)
+        and motor.gainprm[0] == motor.gear[0] == 1.0
+        and motor.ctrlrange[1] == limit
         and span(motor) <= {-limit, limit, 0.0}
         for motor, limit in zip(motors, limits, strict=True)
     )
@@ -303,7 +307,9 @@ def _contacts_right(file: _File) -> bool:
             above = int(model.body_parentid[above])
         contype, conaffinity = _LEG_BITS[roots.index(above) if above else None]
         end = model.geom(g).name in ends
-        right = not model.geom_contype[g] & ~contype and not model.geom_conaffinity[g] & ~conaffinity
+        right = (
+            not model.geom_contype[g] & ~contype and not model.geom_conaffinity[g] & ~conaffinity
+        )
         right &= model.geom_condim[g] == (3 if end else 1) and model.geom_type[g] in SHAPES
         right &= model.geom_friction[g, 0] <= _MOST_FRICTION
         if not right or model.geom_solmix[g] or model.geom_priority[g]:
