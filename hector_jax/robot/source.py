@@ -120,6 +120,8 @@ def _read(description: Description, root: ElementTree.Element) -> _File:
         len(free) < 2,
         f"{len(free)} free joints, expected exactly one, of the trunk; joints: {_listed(names)}",
     )
+    fixed = [names[j] for j in free if names[j] in description.weld]
+    _expect(path, not fixed, f"weld names {_listed(fixed)}, the free joint, expected hinges")
     joints = [names.index(joint) for joint in description.joints]
     first = int(model.jnt_bodyid[joints[0]])
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first])
