@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import check_model, check_soles, trunk_body
 from hector_jax.robot.description import DESCRIPTION_PATH, Description, read_description
-from hector_jax.robot.mjcf import read_mjcf, refusal
+from hector_jax.robot.source import build_spec, compile_spec
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
 _SAME = 1e-6  # [m], [-]: numbers in a model that should agree
@@ -161,15 +161,10 @@ def compile_model(description: Description) -> mujoco.MjModel:
     """The compiled and checked model of a description.
 
     Raises:
-        InputError: one line saying what came, what was expected and what there is. The MJCF must be
-            one that `mjcf.read_mjcf` lets pass and that compiles to the biped of `checks`.
+        InputError: one line saying what came, what was expected and what there is. The file must be
+            one that `source.build_spec` takes and that compiles to the biped of `checks`.
     """
-    path = description.model
-    root = read_mjcf(path)
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except (ValueError, mujoco.FatalError) as error:
-        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
+    model = compile_spec(description, build_spec(description).spec)
     check_model(description, model)
     return model
 

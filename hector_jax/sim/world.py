@@ -23,6 +23,7 @@ from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import compile_model, quiet_mujoco
+from hector_jax.robot.source import build_spec
 
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold
@@ -191,7 +192,7 @@ def _check(imperfections: Imperfections) -> None:
 
 def _model(description: Description, slack: bool) -> mujoco.MjModel:
     compile_model(description)  # for its checks
-    spec = mujoco.MjSpec.from_file(str(description.model))
+    spec = build_spec(description).spec
     # what is only looked at, and gives its body no mass, costs time and room in every plant
     for geom in list(spec.geoms):
         geom.material = ""
