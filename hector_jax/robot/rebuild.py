@@ -257,6 +257,10 @@ def _add_foot(
         own = [s for s in range(model.nsite) if model.site(s).name == point]
         if not own or int(model.site_bodyid[own[0]]) not in link.bodies:
             raise InputError(f"{path}: no site {point!r} on body {link.name!r}")
+        for name in map(str, foot.contacts):
+            there = spec.geom(name)
+            if there is None or there.parent.name != link.name or there.type != _SPHERE:
+                raise InputError(f"{path}: no sphere {name!r} on body {link.name!r}")
         pose = link.bodies[int(model.site_bodyid[own[0]])]
         _add_site(spec, link, point, pose.p + pose.R @ model.site_pos[own[0]])
         return point, tuple(map(str, foot.contacts))
