@@ -72,6 +72,7 @@ def small(
     knee='range="-0.1 2"',
     thigh='pos="0.01 0 -0.02"',
     motors=MOTORS,
+    ankle=-0.3,
     contacts=((0.07, 0.0, -0.04), (-0.05, 0.0, -0.04)),
     **changes,
 ):
@@ -83,7 +84,7 @@ def small(
     path = folder / "robot.xml"
     path.write_text(BIPED.format(free=free, more=more, arm=arm, motors=motors, **legs))
     angles = {f"{s}_{j}": a for s in ("left", "right") for j, a in ANGLES.items()}
-    angles |= {"waist": 0.4, "shoulder": 1.0}
+    angles |= {"waist": 0.4, "shoulder": 1.0, "left_ankle": ankle, "right_ankle": ankle}
     fields = {
         "model": path,
         "joints": tuple(JOINTS),

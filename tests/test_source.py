@@ -150,8 +150,16 @@ def test_meshes_that_are_missing_are_not_missed_and_no_file_is_opened(tmp_path):
     assert source.spec.compile().nmesh == 0
 
 
-def test_welded_and_jointless_bodies_are_part_of_the_trunk_and_the_feet(tmp_path):
-    description = small(tmp_path)
+TURNED = {  # a body, and a joint that is not zero where the file draws it
+    "thigh": 'pos="0.01 0 -0.02" euler="0 0.2 0"',
+    "knee": 'range="-0.1 2" ref="0.1"',
+    "ankle": -0.4,
+}
+
+
+@pytest.mark.parametrize("legs", [{}, TURNED])
+def test_welded_and_jointless_bodies_are_part_of_the_trunk_and_the_feet(tmp_path, legs):
+    description = small(tmp_path, **legs)
     model = compiled(description)
     names = [model.body(b).name for b in range(1, model.nbody)]
     assert names == ["base"] + [
@@ -203,7 +211,7 @@ def test_solver_motors_and_floor_are_set(tmp_path):
     model = source.spec.compile()
     assert model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     assert (model.opt.timestep, model.opt.iterations) == (0.001, 10)
-    for note in ("motors replaced by torque motors", "floor added"):
+    for note in ("torque motors replace the actuators", "floor added"):
         assert note in source.notes
     assert [model.joint(j).name for j in range(1, 9)] == JOINTS
     np.testing.assert_array_equal(model.actuator_trnid[:, 0], range(1, 9))
@@ -311,3 +319,14 @@ def test_a_wrong_body_of_a_foot_or_order_of_joints_is_refused(tmp_path):
     assert "feet.left.body is 'left_shin'" in refused(small(tmp_path, feet=feet))
     turned = tuple(JOINTS[i] for i in (1, 0, 2, 3, 4, 5, 6, 7))
     assert "name each leg from the trunk down" in refused(small(tmp_path, joints=turned))
+
+
+@pytest.mark.parametrize(("name", "joints", "contacts"), [("h1", 10, 2), ("g1", 12, 4)])
+def test_the_examples_of_published_robots_are_descriptions(name, joints, contacts):
+    """And stand, where the user has put the model beside them."""
+    path = STRIDER.parents[1] / "menagerie" / f"{name}.toml"
+    description = read_description(path)
+    assert len(description.joints) == joints
+    assert [len(foot.contacts) for foot in description.feet] == [contacts] * 2
+    if description.model.exists():
+        assert compiled(description).nu == joints

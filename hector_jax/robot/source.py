@@ -67,7 +67,7 @@ def build_spec(description: Description) -> Source:
     file = _read(description, root)
     angles, trunk_quat = _standing(file, root.tag == "robot")
     limits = [_torque_limit(file, joint) for joint in file.joints]
-    changes = [f"a URDF: {len(limits)} motors and a floor added"] if root.tag == "robot" else []
+    changes = ["a URDF, with neither motors nor a floor"] if root.tag == "robot" else []
     changes += _changes(file, limits)
     standing = standing_name(description)
     if not changes:
@@ -256,7 +256,7 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
     static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
     order = [file.free, *file.joints] == list(range(model.njnt))
     at_origin = not np.any(model.jnt_pos) and not np.any(model.qpos0[7:])
-    floor = _world_geoms(file)
+    floor, motors = _world_geoms(file), "replace the actuators" if file.spec.actuators else "added"
     lines = (
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {_listed(description.weld)}", description.weld),
@@ -266,7 +266,7 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
             file.free >= 0 and not order and not description.weld,
         ),
         ("frames of the joints put into their anchors", not at_origin and order),
-        ("motors replaced by torque motors", not _motors_right(file, limits)),
+        (f"torque motors {motors}", not _motors_right(file, limits)),
         ("floor added" if not floor else "floor replaced", not _floor_right(file)),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
         ("contact bits, friction and shapes set", not _contacts_right(file)),
