@@ -38,7 +38,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.part import choose_part
-from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
+from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SHARE, check
 from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.robot import srbm
@@ -64,6 +64,7 @@ class MpcConfig:
     step_ticks: int = 3  # ticks per step: dt = 0.03 s
     friction: float = 0.6  # mu; at most the floor's own, or the feet slip
     max_force: float = 500.0  # [N] per foot
+    sole: float = 1.0  # share of the sole's lengths that the plan uses, from the foot point
     line_friction: bool = True  # False leaves LINE_FRICTION out of the constraints
     effort_reference: str = (
         "zero"  # R prices u (the paper), or u less "gravity", the weight's share
@@ -73,7 +74,7 @@ class MpcConfig:
     constraints: tuple[str, ...] | None = None  # of Constraint or their names; else the contact's
 
     def __post_init__(self) -> None:
-        rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
+        rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE, "sole": SHARE}
         check(self, **rules, step_ticks=AT_LEAST_ONE, effort_reference=("zero", "gravity"))
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
@@ -217,6 +218,8 @@ def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
     """Rows of the constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
     feet, (robot, parameters, _, horizon) = condensed.feet, problem
     selection = jnp.asarray(config.contact_model.selection, feet.dtype)
+    lengths = {name: config.sole * getattr(robot, name) for name in ("toe", "heel", "half_width")}
+    robot = robot._replace(**lengths)
 
     def of_contact(yaw: Float[Array, ""]) -> Rows:
         contact = Contact(
