@@ -13,6 +13,7 @@ from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.cache import robot_hash
@@ -75,11 +76,11 @@ def default_of(flag: Path, usual: Path, path: Path | None, robot: Robot) -> Path
     return folder_of(Path(usual.parts[0]), path, robot).joinpath(*usual.parts[1:])
 
 
-def plants(world: str, seeds: range) -> list[Imperfections]:
-    """One plant of a world for each seed."""
+def plants(world: str, seeds: range, description: Description) -> list[Imperfections]:
+    """One plant of a world for each seed, sized for the robot of a description."""
     if world == "standin":
-        return [standin(seed) for seed in seeds]
-    return [named_world(world, seed) for seed in seeds]
+        return [standin(seed, description) for seed in seeds]
+    return [named_world(world, seed, description) for seed in seeds]
 
 
 def course(text: str, robot: Robot) -> NamedCommand:

@@ -293,16 +293,16 @@ def _walk_sets(
 ) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
     """Walks of all sets on the stand-in plants and on the hfs, by trajectory."""
     seeds = range(run.args.seeds)
-    plants = arguments.plants("standin", seeds)
+    plants = arguments.plants("standin", seeds, run.robot.description)
     notes: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
     judge = partial(verdicts.judge, pool, run.config, run.robot, sets, **notes)
-    walks = {}
+    simulator, walks = hfs(run.robot.description), {}
     for name, command, _ in run.trajectories:
         where = f" {name}" if len(run.trajectories) > 1 else ""
         title = f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}"
         standin = judge(command, plants, seeds, title=title, folder=run.artefacts / "standin")
         title = f"walking{where} on the high-fidelity simulator"
-        on_hfs = judge(command, [hfs()], [0], title=title, folder=run.artefacts / "hfs")
+        on_hfs = judge(command, [simulator], [0], title=title, folder=run.artefacts / "hfs")
         walks[name] = standin, on_hfs
     return walks
 
