@@ -195,8 +195,8 @@ def report(
         f"Trajectory {flags.scenes.traj}, world {world}, plants {flags.first_seed} to {last}. "
         f"Pushes of 0.1 s on the trunk from eight sides, floors that turn slippery for 2 s, both "
         f"begun at {phases}; slopes of 3 degrees that rise towards the named side; {payload:g} kg "
-        "on top of the trunk; commands that no tuning saw. The controller is told of none of it. Largest "
-        f"relative KKT residual of a plan {result.residual:.0e}{solved}",
+        "on top of the trunk; commands that no tuning saw. The controller is told of none of it. "
+        f"Largest relative KKT residual of a plan {result.residual:.0e}{solved}",
         table(result.cells, result.losses),
         f"L / {BASELINE} is the median of the ratio in the same scene on the same plant, falls "
         "charged as the loss charges them; in brackets its 95 % interval from redrawing the "

@@ -18,7 +18,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import RunRequest
-from hector_jax.sim.loop import Job
+from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
@@ -83,6 +83,19 @@ def plants(world: str, seeds: range, description: Description) -> list[Imperfect
     return [named_world(world, seed, description) for seed in seeds]
 
 
+def plant_of(path: Path | None, robot: Robot) -> Robot | None:
+    """The model of the robot that is walked on, where it is another.
+
+    Raises:
+        InputError: its file is wrong, or its joints are not the robot's.
+    """
+    if path is None:
+        return None
+    plant = load_robot(path)
+    check_plant(robot.description, plant.description)
+    return plant
+
+
 def course(text: str, robot: Robot) -> NamedCommand:
     """What to walk; one line says where a file asks for more than the robot may be able to.
 
@@ -123,12 +136,27 @@ def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
 
 
 def walk_once(
-    args: Walk | View, robot: Robot, trajectory: NamedCommand, weights: Weights
+    args: Walk | View,
+    robot: Robot,
+    trajectory: NamedCommand,
+    weights: Weights,
+    plant: Robot | None = None,
 ) -> Trajectory:
     """One walk in the world of the flags."""
-    lasts = seconds(args.seconds, trajectory)
     if args.world == "srbm":
+        lasts = seconds(args.seconds, trajectory)
         return verdicts.walk_rigid_body(robot, weights, trajectory.command, lasts)
-    plant = plants(args.world, range(args.seed, args.seed + 1))[0]
-    job = Job(weights, trajectory.command, plant, lasts, args.seed)
-    return walk(walk_config(robot), robot, job)
+    return walk(walk_config(robot), robot, job_of(args, robot, trajectory, weights, plant))
+
+
+def job_of(
+    args: Walk | View,
+    robot: Robot,
+    trajectory: NamedCommand,
+    weights: Weights,
+    plant: Robot | None = None,
+) -> Job:
+    """The walk of the flags in a world of MuJoCo; `plant` is another model of the robot."""
+    lasts, body = seconds(args.seconds, trajectory), robot if plant is None else plant
+    (imperfections,) = plants(args.world, range(args.seed, args.seed + 1), body.description)
+    return Job(weights, trajectory.command, imperfections, lasts, args.seed, plant=plant)

@@ -33,8 +33,8 @@ def draw_jobs(
     Trajectories take turns: straight, c, s, random velocities. Weights take turns too: each of the
     24 log-uniform around nominal, around expert and, where tuning paths are given, a point of one.
     Each walk has a plant of its own, drawn around the hfs. A third of the walks, drawn too, is
-    pushed once or twice: 10 to 30 N (times the robot's size) for 0.1 s, from any side. Job i depends on the seed and on i
-    alone, so a longer list begins with the shorter one.
+    pushed once or twice: 10 to 30 N (times the robot's size) for 0.1 s, from any side. Job i
+    depends on the seed and on i alone, so a longer list begins with the shorter one.
 
     Args:
         seed: of everything drawn.

@@ -2,11 +2,11 @@
 
 Imperfections are numbers, so that a world is data: `ideal`, `hfs` (the high-fidelity simulator) and
 plants drawn around the hfs. They are those of HECTOR; a robot's description says how much larger
-its own are (`PlantSizes`), and one without a linkage has none. What a number means is stated here; the motors' part of it (delay, lag,
-gain, linkage) lives in sim.actuators, the estimator's in sim.sensing, the rest becomes a field of
-the MuJoCo model. Backlash is a second hinge on the axis of each joint, free within +-b between
-motor and link; the encoder sits on the motor's side. Everything is looked up by name, so that
-nothing depends on how many joints there are.
+its own are (`PlantSizes`), and one without a linkage has none. What a number means is stated here;
+the motors' part of it (delay, lag, gain, linkage) lives in sim.actuators, the estimator's in
+sim.sensing, the rest becomes a field of the MuJoCo model. Backlash is a second hinge on the axis of
+each joint, free within +-b between motor and link; the encoder sits on the motor's side. Everything
+is looked up by name, so that nothing depends on how many joints there are.
 """
 
 from collections.abc import Sequence
