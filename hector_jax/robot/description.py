@@ -116,10 +116,6 @@ class Description:
         return len(self.joints) // 2
 
 
-HECTOR = Description()
-"""Whose plants are drawn where no description is given."""
-
-
 @dataclass(frozen=True)
 class _Joints:
     left: tuple[str, ...] = _leg("left")
@@ -291,3 +287,7 @@ def _frozen(value: Any) -> Any:
     if isinstance(value, dict):
         value = list(value.items())
     return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+
+
+HECTOR = Description()
+"""Whose plants are drawn where no description is given."""
