@@ -41,7 +41,7 @@ def measure(seconds: float = SECONDS) -> Report:
         rows.append(known[sensing.coordinates(world)])
 
     walked = walk(config, robot, Job(weights, command, ideal(), seconds), on_sample=record)
-    count, no_error = substeps(config), np.zeros(sensing.ERRORS)
+    count, no_error = substeps(config), sensing.no_error(robot)
     readings = rows[-round(seconds * 1000) - 1 :: count][: round(seconds / config.gait.tick)]
 
     @jax.jit

@@ -347,7 +347,7 @@ def walks(folder):
     """A collection of two walks in which nothing moves."""
     home = folder / "walks"
     shape = lambda x: [2, 5][: x.ndim] + list(x.shape[2:])  # noqa: E731
-    like = collection.walks_like()
+    like = collection.walks_like(load_robot())
     still = jax.tree.map(
         lambda x: np.zeros([s or n for s, n in zip(x.shape, shape(x), strict=True)]), like
     )

@@ -100,13 +100,15 @@ def statics(share):
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key(Description.standing).id)
     mujoco.mj_forward(model, data)
-    feet = np.array([data.site(name).xpos for name in Description.foot_points])
+    feet = np.array(
+        [data.site(name).xpos for name in [foot.point for foot in Description().named_feet]]
+    )
     com = data.subtree_com[1]
     force = WEIGHT * np.array([[0.0, 0.0, share], [0.0, 0.0, 1.0 - share]])
     # moments that bring the centre of pressure under the centre of mass
     moment = np.cross(com - feet, force)
     need = data.qfrc_bias.copy()
-    for foot, name in enumerate(Description.foot_points):
+    for foot, name in enumerate([foot.point for foot in Description().named_feet]):
         J_v, J_w = np.zeros((3, model.nv)), np.zeros((3, model.nv))
         mujoco.mj_jacSite(model, data, J_v, J_w, model.site(name).id)
         need -= J_v.T @ force[foot] + J_w.T @ moment[foot]

@@ -90,7 +90,7 @@ def test_actuators_and_joints_come_left_leg_then_right(model):
 def test_standing_trunk_is_at_548_millimetres_with_both_soles_on_the_floor(model, robot):
     data = standing(model)
     assert robot.trunk_height == pytest.approx(0.548, abs=1e-3)
-    for foot, side in zip(Description.foot_points, (1, -1), strict=True):
+    for foot, side in zip([foot.point for foot in Description().named_feet], (1, -1), strict=True):
         np.testing.assert_allclose(
             data.site(foot).xpos, [-0.0135, side * 0.0942, 0.0], rtol=0, atol=1e-6
         )

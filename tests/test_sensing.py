@@ -136,7 +136,7 @@ def test_foot_points_and_joints_count_the_backlash():
 
 
 def test_yaw_goes_on_past_half_a_turn():
-    row = np.zeros(sensing.READING)
+    row = np.zeros(43)
     yaws = np.linspace(0.0, 9.0, 40)
     before = jnp.zeros(())
     for yaw in yaws:
@@ -171,12 +171,12 @@ def test_legs_that_cross_touch_each_other_and_not_the_floor():
 
 
 def test_a_known_state_has_no_errors():
-    assert not sensing.draw_errors(truth(), 0, 10, 20).any()
+    assert not sensing.draw_errors(truth(), 10, 0, 10, 20).any()
 
 
 def test_errors_have_their_stated_sizes():
     estimator = standin(0).estimator
-    runs = np.stack([sensing.draw_errors(estimator, seed, 100, 4000) for seed in range(60)])
+    runs = np.stack([sensing.draw_errors(estimator, 10, seed, 100, 4000) for seed in range(60)])
     start = runs[:, :100]
     sizes = np.repeat([0.005, 0.003, 0.03, 0.03, 0.001], [3, 3, 3, 3, 10])
     np.testing.assert_allclose(start.std(axis=(0, 1)), sizes, rtol=0.1)
@@ -187,6 +187,6 @@ def test_errors_have_their_stated_sizes():
 
 def test_a_seed_gives_the_same_errors():
     estimator = standin(0).estimator
-    first, same, other = (sensing.draw_errors(estimator, s, 10, 50) for s in (1, 1, 2))
+    first, same, other = (sensing.draw_errors(estimator, 10, s, 10, 50) for s in (1, 1, 2))
     np.testing.assert_array_equal(first, same)
     assert (first != other).any()

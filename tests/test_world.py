@@ -55,7 +55,7 @@ def knee_after(imperfections, torque=1.0, steps=20):
 def torques(imperfections, commands):
     """Joint torques (T, 10) for commands (T, 10)."""
     step = lambda motors, command: step_actuators(ROBOT, imperfections, motors, command)  # noqa: E731
-    return np.asarray(jax.lax.scan(step, init_actuators(), jnp.asarray(commands))[1])
+    return np.asarray(jax.lax.scan(step, init_actuators(10), jnp.asarray(commands))[1])
 
 
 def test_the_ideal_plant_is_the_robot_of_the_file():

@@ -17,6 +17,15 @@ Those of the paper (Eq. 4), for each stance foot:
     -l_t F_z <= M_y <= l_h F_z                 LINE_PRESSURE, foot's yaw frame
     |F_y| <= mu' F_z at toe and heel each      LINE_FRICTION, foot's yaw frame
 
+Those of a flat foot, beside the first three, with w its half width:
+
+    |M_x| <= w F_z                             SIDE_PRESSURE
+    |M_z| <= mu' r / 2 F_z                     TORSION, r from the foot's middle to a corner
+
+and instead of TORSION, for feet that have to turn hard, CORNER_FRICTION: the wrench is a sum of
+forces at the four corners, each within the square that fits into their pyramids along the foot
+(Caron, Pham, Nakamura 2015).
+
 Where this leaves the paper: toe and heel of the line foot are in their physical places (pressure at
 the toe gives M_y = -l_t F_z; the paper prints them swapped); toe and heel hold by friction each, or
 the foot would turn on the spot when the pressure is all at one end. Friction is the pyramid of the
@@ -46,9 +55,11 @@ class ContactModel(Part):
     Attributes:
         components: of (F_x, F_y, F_z, M_x, M_y, M_z) those that a stance foot can exert, F in the
             world, M in the foot's yaw frame.
+        constraints: that hold it, where a config names no others.
     """
 
     components: tuple[int, ...]
+    constraints: "tuple[Constraint, ...]"
 
     @property
     def inputs(self) -> int:
@@ -64,11 +75,6 @@ class ContactModel(Part):
         """Force and moment in the world, (3, inputs) each, that the inputs of a foot exert."""
         selection = jnp.asarray(self.selection, jnp.result_type(yaw))
         return selection[:3], rot_z(yaw) @ selection[3:]
-
-
-LINE_FOOT = ContactModel("line", components=(0, 1, 2, 4, 5))
-CONTACT_MODELS = (LINE_FOOT,)
-"""Those that a file can name."""
 
 
 class Contact(NamedTuple):
@@ -144,21 +150,78 @@ def _line_pressure(contact: Contact) -> Rows:
     return Rows(jnp.stack(A), np.array([0.0, -np.inf]), np.array([np.inf, 0.0]))
 
 
+def _grip(contact: Contact) -> Array:
+    """The most that friction holds across the foot, for 1 N of F_z."""
+    return contact.friction * jnp.maximum(
+        jnp.abs(jnp.cos(contact.yaw)), jnp.abs(jnp.sin(contact.yaw))
+    )
+
+
 def _line_friction(contact: Contact) -> Rows:
     (fx, fy, fz), (_, my, mz) = contact.force, contact.moment
     toe, heel = contact.robot.toe, contact.robot.heel
     sin, cos = jnp.sin(contact.yaw), jnp.cos(contact.yaw)
     side = cos * fy - sin * fx  # force across the foot
-    grip = contact.friction * jnp.maximum(jnp.abs(cos), jnp.abs(sin))
+    grip = _grip(contact)
     at_toe, at_heel = mz + heel * side, toe * side - mz
     toe_load, heel_load = grip * (heel * fz - my), grip * (toe * fz + my)
     A = [at_toe - toe_load, at_toe + toe_load, at_heel - heel_load, at_heel + heel_load]
     return Rows(jnp.stack(A), np.array([-np.inf, 0.0] * 2), np.array([0.0, np.inf] * 2))
 
 
+def _side_pressure(contact: Contact) -> Rows:
+    fz, mx, width = contact.force[2], contact.moment[0], contact.robot.half_width
+    A = [mx + width * fz, mx - width * fz]
+    return Rows(jnp.stack(A), np.array([0.0, -np.inf]), np.array([np.inf, 0.0]))
+
+
+def _half_sides(robot: Robot) -> tuple[Any, Any]:
+    """Half length and half width of the sole [m]."""
+    return 0.5 * (robot.toe + robot.heel), robot.half_width
+
+
+def _torsion(contact: Contact) -> Rows:
+    fz, mz = contact.force[2], contact.moment[2]
+    most = 0.5 * _grip(contact) * jnp.hypot(*_half_sides(contact.robot)) * fz
+    A = [mz + most, mz - most]
+    return Rows(jnp.stack(A), np.array([0.0, -np.inf]), np.array([np.inf, 0.0]))
+
+
+def _corner_friction(contact: Contact) -> Rows:
+    (fx, fy, fz), (mx, my, mz) = contact.force, contact.moment
+    X, Y = _half_sides(contact.robot)
+    sin, cos = jnp.sin(contact.yaw), jnp.cos(contact.yaw)
+    mu = 0.5 * contact.friction / jnp.maximum(jnp.abs(cos), jnp.abs(sin))
+    along, across = cos * fx + sin * fy, cos * fy - sin * fx
+    # moments about the middle of the sole, which is ahead of the foot point
+    middle = 0.5 * (contact.robot.toe - contact.robot.heel)
+    my, mz = my + middle * fz, mz - middle * across
+    load = mu * (X + Y) * fz
+    A = [one + sign * mu * fz for one in (along, across) for sign in (1, -1)]
+    for a in (1, -1):
+        for b in (1, -1):
+            low = a * (Y * along - mu * mx) + b * (X * across - mu * my)
+            high = a * (Y * along + mu * mx) + b * (X * across + mu * my)
+            A += [mz + load - low, mz - load + high]
+    bounds = np.array([0.0, -np.inf]), np.array([np.inf, 0.0])
+    return Rows(jnp.stack(A), *(np.tile(bound, len(A) // 2) for bound in bounds))
+
+
 FRICTION = InputConstraint("friction", of=_friction)
 UNILATERAL_FORCE = InputConstraint("unilateral_force", of=_unilateral_force)
 LINE_PRESSURE = InputConstraint("line_pressure", of=_line_pressure)
 LINE_FRICTION = InputConstraint("line_friction", of=_line_friction)
-CONSTRAINTS = (FRICTION, UNILATERAL_FORCE, LINE_PRESSURE, LINE_FRICTION)
-"""Those that a file can name, and the default."""
+SIDE_PRESSURE = InputConstraint("side_pressure", of=_side_pressure)
+TORSION = InputConstraint("torsion", of=_torsion)
+CORNER_FRICTION = InputConstraint("corner_friction", of=_corner_friction)
+_POINT = (FRICTION, UNILATERAL_FORCE)
+_LINE = (*_POINT, LINE_PRESSURE, LINE_FRICTION)
+_FLAT = (*_POINT, LINE_PRESSURE, SIDE_PRESSURE, TORSION)
+CONSTRAINTS = (*_LINE, SIDE_PRESSURE, TORSION, CORNER_FRICTION)
+"""Those that a file can name."""
+
+POINT_FOOT = ContactModel("point", components=(0, 1, 2), constraints=_POINT)
+LINE_FOOT = ContactModel("line", components=(0, 1, 2, 4, 5), constraints=_LINE)
+FLAT_FOOT = ContactModel("flat", components=(0, 1, 2, 3, 4, 5), constraints=_FLAT)
+CONTACT_MODELS = (POINT_FOOT, LINE_FOOT, FLAT_FOOT)
+"""Those that a file can name."""

@@ -83,13 +83,20 @@ class WalkConfig:
 
 
 def walk_config(robot: Robot) -> WalkConfig:
-    """The controller that a robot's description asks for.
+    """The controller that a robot's description asks for, and its feet.
 
     Raises:
         InputError: one line naming the file, the key and what was expected.
     """
+    path = str(robot.description.path)
     given = {name: dict(section) for name, section in robot.description.control}
-    return from_table(str(robot.description.path), WalkConfig, given)
+    given["mpc"] = {"contact": robot.structure.contact, **given.get("mpc", {})}
+    config = from_table(path, WalkConfig, given)
+    try:
+        config.legs.check_joints(robot.description.leg_joints)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return config
 
 
 class Memory(NamedTuple):
@@ -274,7 +281,7 @@ def actuate(
     memory: Memory,
     substep: Int[Array, ""],
     measurement: Measurement,
-) -> Float[Array, "10"]:
+) -> Float[Array, " joints"]:
     """Joint torque commands [N m] of a millisecond.
 
     Args:
@@ -288,7 +295,7 @@ def actuate(
     target, target_rates = legs.swing_joints(
         robot,
         parameters,
-        measurement.state,
+        measurement,
         start=memory.liftoff,
         end=plan.touchdown,
         elapsed=plan.swing_ticks * config.gait.tick + TIME_STEP * substep,

@@ -2,7 +2,7 @@
 
 A stance leg pushes with tau = -J^T wrench, because the wrench is that of the ground on the robot
 (the paper prints no minus). A swing leg follows a smooth path from where the foot left to where it
-is to land, through closed-form inverse kinematics and a joint PD that feeds the path's own joint
+is to land, through inverse kinematics and a joint PD that feeds the path's own joint
 rates and the leg's weight forward. The target lies a little under the ground so that the foot does
 land.
 """
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from hector_jax.control.footstep import Feet
 from hector_jax.core.arrays import Array
-from hector_jax.core.geometry import rot_z, rotation_from_euler, wrap_angle
+from hector_jax.core.geometry import rotation_from_euler, wrap_angle
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import State, Wrench
@@ -29,8 +29,8 @@ class Measurement(NamedTuple):
     """What the robot knows of itself."""
 
     state: State  # estimate of the base
-    joints: Float[Array, "*batch 10"]  # [rad], motor side
-    joint_rates: Float[Array, "*batch 10"]  # [rad/s]
+    joints: Float[Array, "*batch joints"]  # [rad], motor side
+    joint_rates: Float[Array, "*batch joints"]  # [rad/s]
 
 
 class LegParameters(NamedTuple):
@@ -38,8 +38,8 @@ class LegParameters(NamedTuple):
 
     height: Any  # [m] apex of the swing foot
     landing: Any  # [m] height aimed at
-    kp: Any  # (5,) [N m/rad] of the joints of a leg
-    kd: Any  # (5,) [N m s/rad]
+    kp: Any  # (j,) [N m/rad] of the joints of a leg
+    kd: Any  # (j,) [N m s/rad]
     gravity_compensation: Any  # share of the leg's own weight in the stance torque
 
 
@@ -63,9 +63,19 @@ class LegConfig:
 
     def __post_init__(self) -> None:
         check(self, height=NOT_NEGATIVE, kp=NOT_NEGATIVE, kd=NOT_NEGATIVE)
+
+    def check_joints(self, joints: int) -> None:
+        """Check that there is a gain for each joint of a leg.
+
+        Raises:
+            InputError: `legs.kp must be ..., got ...`.
+        """
         for name in ("kp", "kd"):
-            if len(gains := getattr(self, name)) != 5:
-                raise InputError(f"LegConfig.{name} must be five gains, got {short_repr(gains)}")
+            if len(gains := getattr(self, name)) != joints:
+                raise InputError(
+                    f"legs.{name} must be a gain for each of the {joints} joints of a leg, "
+                    f"got {short_repr(gains)}"
+                )
 
     @property
     def parameters(self) -> LegParameters:
@@ -80,13 +90,13 @@ def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:
 
 
 def stance_torques(
-    robot: Robot, state: State, joints: Float[Array, "10"], wrench: Wrench
-) -> Float[Array, "10"]:
+    robot: Robot, state: State, joints: Float[Array, " joints"], wrench: Wrench
+) -> Float[Array, " joints"]:
     """Joint torques [N m] by which the feet return `wrench`, world frame. Source: Eq. 5, signed."""
     R_wb = rotation_from_euler(state.euler)
     Jv, Jw = foot_jacobians(robot, joints)
     force, moment = wrench.force @ R_wb, wrench.moment @ R_wb
-    return -(jnp.einsum("fxj,fx->fj", Jv, force) + jnp.einsum("fxj,fx->fj", Jw, moment)).reshape(10)
+    return -(jnp.einsum("fxj,fx->fj", Jv, force) + jnp.einsum("fxj,fx->fj", Jw, moment)).reshape(-1)
 
 
 def swing_path(
@@ -108,20 +118,21 @@ def swing_path(
 def swing_joints(
     robot: Robot,
     parameters: LegParameters,
-    state: State,
+    measurement: Measurement,
     *,
     start: Feet,
     end: Feet,
     elapsed: Float[Array, "2"],
     swing: float,
-) -> tuple[Float[Array, "10"], Float[Array, "10"]]:
+) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
     """Joint angles [rad] and rates [rad/s] that carry the feet along their swing paths.
 
     `elapsed` is the time since each foot's lift-off [s]. The rates are the derivative of the angles
     along the path while the trunk moves on with its present velocity.
     """
+    state = measurement.state
 
-    def angles(time: Float[Array, ""]) -> Float[Array, "10"]:
+    def angles(time: Float[Array, ""]) -> Float[Array, " joints"]:
         s = jnp.clip((elapsed + time) / swing, 0.0, 1.0)
         R_wb = rotation_from_euler(state.euler)
         trunk = trunk_position(robot, state) + time * state.velocity
@@ -129,11 +140,8 @@ def swing_joints(
         local = (target - trunk) @ R_wb
         turn = wrap_angle(end.yaw - start.yaw)
         yaw = wrap_angle(start.yaw + s * s * (3.0 - 2.0 * s) * turn - state.euler[2])
-        turns = robot.description.yaw_joint
-        yaw = jnp.clip(yaw, robot.joint_lower[turns::5], robot.joint_upper[turns::5])
-        up = R_wb[2]  # world z in the trunk
-        in_leg = jnp.stack([up @ rot_z(yaw[0]), up @ rot_z(yaw[1])])
-        return inverse_legs(robot, local, yaw, jnp.arctan2(in_leg[:, 0], in_leg[:, 2]))
+        up = jnp.stack([R_wb[2], R_wb[2]])  # the soles are level
+        return inverse_legs(robot, local, yaw, up, measurement.joints)
 
     return jax.jvp(angles, (jnp.zeros(()),), (jnp.ones(()),))
 
@@ -145,9 +153,9 @@ def joint_torques(
     *,
     contact: Bool[Array, "2"],
     wrench: Wrench,
-    target: Float[Array, "10"],
-    target_rates: Float[Array, "10"],
-) -> Float[Array, "10"]:
+    target: Float[Array, " joints"],
+    target_rates: Float[Array, " joints"],
+) -> Float[Array, " joints"]:
     """Torque commands [N m] within the limits: stance legs push, swing legs follow their target."""
     state, joints, joint_rates = measurement
     weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
@@ -155,5 +163,5 @@ def joint_torques(
     swing = kp * (target - joints) + kd * (target_rates - joint_rates) + weight
     stance = stance_torques(robot, state, joints, wrench)
     stance = stance + parameters.gravity_compensation * weight
-    torque = jnp.where(jnp.repeat(contact, 5), stance, swing)
+    torque = jnp.where(jnp.repeat(contact, robot.description.leg_joints), stance, swing)
     return jnp.clip(torque, -robot.torque_limit, robot.torque_limit)

@@ -70,7 +70,7 @@ class MpcConfig:
     )
     qp: QpConfig = QpConfig()
     contact: str = LINE_FOOT  # a ContactModel or its name
-    constraints: tuple[str, ...] = CONSTRAINTS  # of Constraint or their names
+    constraints: tuple[str, ...] | None = None  # of Constraint or their names; else the contact's
 
     def __post_init__(self) -> None:
         rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
@@ -78,7 +78,7 @@ class MpcConfig:
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
             choose_part("MpcConfig.constraints", one, Constraint, CONSTRAINTS)
-            for one in self.constraints
+            for one in (model.constraints if self.constraints is None else self.constraints)
         ]
         object.__setattr__(self, "contact", model)
         object.__setattr__(self, "constraints", tuple(chosen))

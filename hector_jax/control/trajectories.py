@@ -16,14 +16,16 @@ is told and walked all the same.
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import Range, check, from_table, read_toml
+from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot
 
 _MOST_SECONDS = 600.0
@@ -135,28 +137,54 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
     expert weights, 6 s from standing) it says 1.55, 1.04, 1.20 m/s and 3.5 rad/s; it walked 1.6,
     1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
     """
-    names = robot.description
-    hip, knee, ankle = names.pitch_joints
-    down = robot.joint_origin[0, :, 2]
-    thigh, shin = abs(down[hip + 1 : knee + 1].sum()), abs(down[knee + 1 : ankle + 1].sum())
+    hip, knee, ankle = _knee(robot)
+    axis = robot.joint_axis[0]
+    turns = [np.argmax(np.abs(axis[:, direction])) for direction in (2, 0)]  # yaw, roll
+
+    def apart(first: int, last: int) -> float:
+        """Distance [m] of two joints in the plane of the knee, the leg straight at zero."""
+        step = robot.joint_origin[0, first + 1 : last + 1].sum(axis=0)
+        return float(np.linalg.norm(step - (step @ axis[knee]) * axis[knee]))
+
+    thigh, shin = apart(hip, knee), apart(knee, ankle)
 
     def length(bend: float) -> float:
         return np.sqrt(thigh**2 + shin**2 + 2 * thigh * shin * np.cos(bend))
 
-    def least(joint: int) -> float:
-        return np.min(np.abs([robot.joint_lower[joint], robot.joint_upper[joint]]))
+    def least(joint: Any) -> float:
+        low, high = robot.joint_lower[joint], robot.joint_upper[joint]
+        return 0.0 if low <= 0.0 <= high and joint == knee else np.min(np.abs([low, high]))
 
     stands = length(robot.standing_joints[knee])
     reach = np.sqrt(max(length(least(knee)) ** 2 - stands**2, 0.0))
-    yaw, roll = least(names.yaw_joint), least(names.roll_joint)
+    yaw, roll = map(least, turns)
     height = stands + abs(robot.foot_point[0, 2])
     stance = gait.stance * gait.tick
+    back = min(robot.heel / robot.toe, 1.0) if robot.toe > 0.0 else 1.0
     return Limits(
         ahead=float(reach / stance),
-        back=float(reach / stance * min(robot.heel / robot.toe, 1.0)),
+        back=float(reach / stance * back),
         aside=float(min(reach, height * np.tan(roll)) / stance),
         turn=float(yaw / stance),
     )
+
+
+def _knee(robot: Robot) -> tuple[int, int, int]:
+    """Hip, knee and ankle of a leg: the joint that makes it shorter, and its parallels about it."""
+    count = robot.description.leg_joints
+    standing = robot.standing_joints[:count]
+
+    def length(joints: np.ndarray) -> float:
+        both = jnp.asarray(np.concatenate([joints, robot.standing_joints[count:]]))
+        foot = foot_poses(robot, both).position[0]
+        return float(np.linalg.norm(foot - robot.joint_origin[0, 0]))
+
+    slopes = [abs(length(standing + 1e-4 * e) - length(standing - 1e-4 * e)) for e in np.eye(count)]
+    knee = int(np.argmax(slopes[1:])) + 1
+    parallel = np.abs(robot.joint_axis[0] @ robot.joint_axis[0, knee]) > 0.9
+    above, below = np.flatnonzero(parallel[:knee]), np.flatnonzero(parallel[knee + 1 :])
+    hip = int(above[-1]) if len(above) else 0
+    return hip, knee, knee + 1 + int(below[0]) if len(below) else count - 1
 
 
 def beyond(limits: Limits, command: Command) -> str | None:

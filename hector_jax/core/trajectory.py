@@ -59,13 +59,13 @@ class Trajectory(NamedTuple):
     effect: Wrench  # (T, 2, 3) each, what the ground returned
     contact: Bool[Any, "*batch T 2"]  # planned stance
     feet: Float[Any, "*batch T 2 3"]  # foot points [m]
-    joints: Float[Any, "*batch T 10"]  # [rad] hip yaw, roll, pitch, knee, ankle; left, right
+    joints: Float[Any, "*batch T joints"]  # [rad] left leg, then right, from the trunk down
     fallen: Bool[Any, "*batch T"]  # true from the sample of the fall on
     legs_touch: Bool[Any, "*batch T"]  # one leg touched the other, which is no fall
     residual: Float[Any, "*batch T"]  # worst relative KKT residual of the plan in force
 
 
-def no_samples(*batch: int) -> Trajectory:
+def no_samples(joints: int, *batch: int) -> Trajectory:
     """Walks of no samples (numpy), with leading axes `batch`: the layout of walks in a file."""
     zeros = lambda *shape: np.zeros((*batch, *shape))  # noqa: E731
     state = State(*[zeros(0, 3)] * 4)
@@ -79,7 +79,7 @@ def no_samples(*batch: int) -> Trajectory:
         effect=wrench,
         contact=zeros(0, 2),
         feet=zeros(0, 2, 3),
-        joints=zeros(0, 10),
+        joints=zeros(0, joints),
         fallen=zeros(0),
         legs_touch=zeros(0),
         residual=zeros(0),

@@ -145,7 +145,7 @@ def _read_collection(folder: Path) -> dict[str, Any]:
 
 
 def _load_file(path: Path, robot: Robot) -> Walks:
-    walks = load_tree(path, walks_like(), kind="walks", robot=robot)[0]
+    walks = load_tree(path, walks_like(robot), kind="walks", robot=robot)[0]
     count, ticks = walks.trajectory.fallen.shape
     for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
         if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
@@ -171,7 +171,8 @@ def _load_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) ->
     return walks
 
 
-def walks_like() -> Walks:
-    """Shapes in a file; axes of length 0 are walks and ticks."""
-    (job,) = draw_jobs(0, 1)
-    return Walks(jax.tree.map(lambda x: np.zeros((0, *np.shape(x))), job), no_samples(0))
+def walks_like(robot: Robot) -> Walks:
+    """Shapes in a file of a robot; axes of length 0 are walks and ticks."""
+    (job,) = draw_jobs(0, 1, robot=robot)
+    samples = no_samples(len(robot.joint_lower), 0)
+    return Walks(jax.tree.map(lambda x: np.zeros((0, *np.shape(x))), job), samples)

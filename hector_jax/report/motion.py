@@ -19,7 +19,7 @@ class Motion(NamedTuple):
     """A walk in the frame of its start; after a fall the robot stays where it was last seen."""
 
     period: float  # [s] between samples, which stand at the ends of their intervals
-    qpos: Float[np.ndarray, "T 17"]  # of MuJoCo
+    qpos: Float[np.ndarray, "T nq"]  # of MuJoCo
     path: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
     reference: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
     contact: Bool[np.ndarray, "T 2"]  # planned stance
@@ -92,8 +92,8 @@ def motions(robot: Robot, walks: Mapping[str, Trajectory]) -> dict[str, Motion]:
 
 
 def poses(
-    robot: Robot, state: State, joints: Float[np.ndarray, "T 10"]
-) -> Float[np.ndarray, "T 17"]:
+    robot: Robot, state: State, joints: Float[np.ndarray, "T joints"]
+) -> Float[np.ndarray, "T nq"]:
     """MuJoCo's qpos of a walk: trunk position, trunk quaternion, joints.
 
     Args:

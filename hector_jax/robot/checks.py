@@ -1,8 +1,7 @@
 """Check that a compiled MJCF is a biped that this package can walk.
 
-A free trunk; two mirrored legs with hip yaw, hip roll, hip pitch, knee and ankle; one motor per
-joint; line feet that touch at a toe and a heel, with contacts that the floor of each plant decides;
-a standing pose that stands.
+A free trunk; two legs of three to seven hinges; one motor per joint; feet that touch at one, two or
+four spheres, with contacts that the floor of each plant decides; a standing pose that stands.
 """
 
 from collections.abc import Sequence
@@ -10,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean
-from hector_jax.robot.description import HECTOR_AXES, Description
+from hector_jax.robot.description import Description
 
-_AXES = dict(zip("xyz", np.eye(3), strict=True))
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
 _ON_FLOOR = 1e-3  # [m]
 _MOST_FRICTION = 0.2  # of the robot's geoms; of two that touch the larger one counts
@@ -53,29 +52,13 @@ def _check_joints(description: Description, model: mujoco.MjModel) -> None:
     _expect(path, right, f"joints are {_listed(names)}; {expected}")
     for index, name in enumerate(joints):
         joint = model.joint(name)
-        which, body, this = index % 5, joint.bodyid[0], f"joint {name!r}"
+        body, this = joint.bodyid[0], f"joint {name!r}"
         _expect(path, joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE, f"{this} is not a hinge")
-        axis = _AXES[description.axes[which]]
-        right = np.allclose(joint.axis, axis, atol=_SAME)
-        _expect(path, right, f"axis of {this} is {joint.axis}, expected {axis}")
         _expect(path, joint.limited[0], f"{this} has no range, expected limits in radians")
-        parent = model.body_parentid[body]
-        above = trunk_body(model) if which == 0 else model.joint(joints[index - 1]).bodyid[0]
+        parent, first = model.body_parentid[body], index % description.leg_joints == 0
+        above = trunk_body(model) if first else model.joint(joints[index - 1]).bodyid[0]
         on, expected = model.body(parent).name, model.body(above).name
         _expect(path, parent == above, f"{this} is on body {on!r}, expected {expected!r}")
-        right = np.abs(joint.pos).max() <= _SAME and abs(model.body_quat[body][0]) >= 1 - _SAME
-        expected = "expected neither pos on the joint nor an orientation on the body"
-        _expect(path, right, f"{this} is off its body's origin or its body is turned, {expected}")
-        # Two parallel links in one plane: what the closed-form inverse kinematics solves.
-        at = model.body_pos[body]
-        closed = description.axes == HECTOR_AXES and which >= 3
-        right = not closed or (at[0] == 0.0 and at[2] < 0.0)
-        _expect(path, right, f"body of {this} is at {at}, expected x = 0 and z < 0")
-        # a stretched leg has no derivative there, and the closed form bends the knee backwards only
-        low, high = joint.range
-        right = not closed or which != 3 or -np.pi < low < high < 0.0
-        text = f"range of {this} is {joint.range}, expected -pi < lower < upper < 0"
-        _expect(path, right, f"{text}: it bends backwards only")
 
 
 def _check_motors(description: Description, model: mujoco.MjModel) -> None:
@@ -100,28 +83,52 @@ def _check_motors(description: Description, model: mujoco.MjModel) -> None:
 
 
 def _check_feet(description: Description, model: mujoco.MjModel) -> None:
-    path, toes, heels = description.model, description.toes, description.heels
-    _require(path, "keyframe", description.standing, [model.key(i).name for i in range(model.nkey)])
+    path = description.model
+    _require(
+        path, "keyframe", description.standing_key, [model.key(i).name for i in range(model.nkey)]
+    )
     sites = [model.site(i).name for i in range(model.nsite)]
     geoms = [model.geom(i).name for i in range(model.ngeom)]
-    for side, foot in enumerate(description.foot_points):
-        _require(path, "site", foot, sites)
-        body, site = model.joint(description.joints[5 * side + 4]).bodyid[0], model.site(foot)
+    lasts = description.joints[description.leg_joints - 1 :: description.leg_joints]
+    for foot, last in zip(description.named_feet, lasts, strict=True):
+        _require(path, "site", foot.point, sites)
+        body, site = model.joint(last).bodyid[0], model.site(foot.point)
         name = model.body(body).name
-        _expect(path, site.bodyid[0] == body, f"site {foot!r} is not on the foot, body {name!r}")
-        for end, ahead in ((toes[side], 1), (heels[side], -1)):
+        right = site.bodyid[0] == body
+        _expect(path, right, f"site {foot.point!r} is not on the foot, body {name!r}")
+        for end in foot.contacts:
             _require(path, "geom", end, geoms)
             geom = model.geom(end)
             right = geom.bodyid[0] == body and geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
             _expect(path, right, f"geom {end!r} is not a sphere on body {name!r}")
-            reach = geom.pos - [0, 0, geom.size[0]] - site.pos
-            expected = f"expected it {'ahead' if ahead > 0 else 'behind'} on the same sole"
-            text = f"lowest point of geom {end!r} is {reach} from site {foot!r}, {expected}"
-            _expect(path, ahead * reach[0] > 0 and np.abs(reach[1:]).max() <= 1e-3, text)
-    for names in (toes, heels):
-        left, right = (model.geom(name).pos[0] for name in names)
-        text = f"{names[0]} at x = {left}, {names[1]} at x = {right}, expected the same"
-        _expect(path, abs(left - right) <= _SAME, text)
+
+
+def check_soles(path: Path, contacts: Float[np.ndarray, "2 c 3"]) -> None:
+    """Check that the contacts of a foot are about its point, on one sole, and alike in both feet.
+
+    Args:
+        path: of the model.
+        contacts: lowest points of each foot's spheres from the foot point, in the sole's axes [m].
+
+    Raises:
+        InputError: one line saying what came and what was expected.
+    """
+    for side, of_foot in zip(("left", "right"), contacts, strict=True):
+        text = f"contacts of the {side} foot are at {of_foot.round(4).tolist()} from its point"
+        _expect(path, np.abs(of_foot[:, 2]).max() <= 1e-3, f"{text}, expected them on one sole")
+        x, y = of_foot[:, 0], of_foot[:, 1]
+        if len(of_foot) == 1:
+            right, expected = np.abs(of_foot).max() <= 1e-3, "it there"
+        elif len(of_foot) == 2:
+            right = x.min() < 0.0 < x.max() and np.abs(y).max() <= 1e-3
+            expected = "one ahead of it and one behind"
+        else:
+            corners = {(a > 0.0, b > 0.0) for a, b in zip(x, y, strict=True)}
+            right, expected = len(corners) == 4, "one at each corner around it"
+        _expect(path, right, f"{text}, expected {expected}")
+    left, right = (np.sort(of_foot[:, 0]) for of_foot in contacts)
+    text = f"contacts are at x = {left} of the left foot and {right} of the right one"
+    _expect(path, np.allclose(left, right, rtol=0, atol=_SAME), f"{text}, expected the same")
 
 
 def _check_contacts(description: Description, model: mujoco.MjModel) -> None:
@@ -129,7 +136,7 @@ def _check_contacts(description: Description, model: mujoco.MjModel) -> None:
     path, trunk = description.model, trunk_body(model)
     pyramidal = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     _expect(path, pyramidal, "option cone is elliptic, expected pyramidal")
-    for name in (*description.toes, *description.heels):
+    for name in _ends(description):
         dimensions = model.geom(name).condim[0]
         _expect(path, dimensions == 3, f"condim of geom {name!r} is {dimensions}, expected 3")
     _expect(path, model.npair == 0, f"{model.npair} contact pairs, expected none")
@@ -146,14 +153,18 @@ def _check_contacts(description: Description, model: mujoco.MjModel) -> None:
 
 def _check_standing(description: Description, model: mujoco.MjModel) -> None:
     """The standing pose is within the limits, on the floor and in balance, and can be held."""
-    path, data, this = description.model, mujoco.MjData(model), f"keyframe {description.standing!r}"
-    mujoco.mj_resetDataKeyframe(model, data, model.key(description.standing).id)
+    path, data, this = (
+        description.model,
+        mujoco.MjData(model),
+        f"keyframe {description.standing_key!r}",
+    )
+    mujoco.mj_resetDataKeyframe(model, data, model.key(description.standing_key).id)
     mujoco.mj_forward(model, data)
     for name in description.joints:
         angle, limits = data.joint(name).qpos[0], model.joint(name).range
         text = f"{this} has joint {name!r} at {angle:.4g}, expected it in its range {limits}"
         _expect(path, limits[0] <= angle <= limits[1], text)
-    ends = [(name, data.geom(name).xpos) for name in (*description.toes, *description.heels)]
+    ends = [(name, data.geom(name).xpos) for name in _ends(description)]
     for name, place in ends:
         height = place[2] - model.geom(name).size[0]
         text = f"{this} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
@@ -170,9 +181,10 @@ def _check_load(description: Description, model: mujoco.MjModel, data: mujoco.Mj
     """Each motor can hold its joint in the standing pose, the feet sharing the weight."""
     com, torques = data.subtree_com[trunk_body(model)], data.qfrc_bias.copy()
     force = -0.5 * model.opt.gravity * model.body_subtreemass[trunk_body(model)]
-    for name in description.foot_points:
-        J_v, J_w, place = np.zeros((3, model.nv)), np.zeros((3, model.nv)), data.site(name).xpos
-        mujoco.mj_jacSite(model, data, J_v, J_w, model.site(name).id)
+    for foot in description.named_feet:
+        site = data.site(foot.point)
+        J_v, J_w, place = np.zeros((3, model.nv)), np.zeros((3, model.nv)), site.xpos
+        mujoco.mj_jacSite(model, data, J_v, J_w, site.id)
         # the pressure is under the centre of mass along the foot and under the foot across it
         ahead = np.array([com[0] - place[0], 0.0, 0.0])
         torques -= J_v.T @ force + J_w.T @ np.cross(ahead, force)
@@ -190,6 +202,11 @@ def _expect(path: Path, right: Any, message: str) -> None:
 def trunk_body(model: mujoco.MjModel) -> int:
     """Body that the free joint moves."""
     return int(model.jnt_bodyid[0])
+
+
+def _ends(description: Description) -> list[str]:
+    """Spheres of both feet."""
+    return [name for foot in description.named_feet for name in foot.contacts]
 
 
 def _joints(model: mujoco.MjModel) -> list[str]:

@@ -60,6 +60,13 @@ class Foot(NamedTuple):
     body: str | None = None  # of places
 
 
+class NamedFoot(NamedTuple):
+    """A foot in the compiled model, where everything has a name."""
+
+    point: str  # site
+    contacts: tuple[str, ...]  # spheres
+
+
 def _named_foot(side: str) -> Foot:
     return Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel"))
 
@@ -111,6 +118,22 @@ class Description:
         return self.min_height, self.max_tilt
 
     @property
+    def standing_key(self) -> str:
+        """Keyframe of the standing pose in the compiled model."""
+        return self.standing if isinstance(self.standing, str) else "standing"
+
+    @property
+    def named_feet(self) -> tuple["NamedFoot", "NamedFoot"]:
+        """Site and spheres of each foot in the compiled model."""
+        left, right = (
+            NamedFoot(f"{side}_point", tuple(f"{side}_contact_{i}" for i in range(len(contacts))))
+            if body is not None
+            else NamedFoot(str(point), tuple(map(str, contacts)))
+            for side, (point, contacts, body) in zip(("left", "right"), self.feet, strict=True)
+        )
+        return left, right
+
+    @property
     def leg_joints(self) -> int:
         """Joints of a leg."""
         return len(self.joints) // 2
@@ -156,9 +179,9 @@ class _Foot:
             right = not self.contacts and all(isinstance(name, str) for name in named)
         else:
             right = len(self.contacts) in (1, 2, 4) and named[1:] == [None, None]
-            right = right and not isinstance(self.point, str)
-            places = (*self.contacts, self.point or (0.0, 0.0, 0.0))
-            right = right and all(math.isfinite(x) for place in places for x in place)
+            places = [*self.contacts, (0.0, 0.0, 0.0) if self.point is None else self.point]
+            right = right and not any(isinstance(place, str) for place in places)
+            right = right and all(math.isfinite(float(x)) for place in places for x in place)
         if not right:
             raise InputError(
                 "must be names: point (a site), toe and heel (spheres); or a body with 1, 2 or 4 "

@@ -1,20 +1,19 @@
 """Feet from joints and joints from feet, all in the trunk frame.
 
-A leg is a chain hip yaw (z), hip roll (x), hip pitch, knee, ankle (y). Behind yaw psi and roll phi
-the three pitch joints move in one plane. With the running pitches a = q_2, b = q_2 + q_3 and
-theta = q_2 + q_3 + q_4
+A leg is a chain of three to seven hinges; `Robot.joint_axis` and `Robot.joint_origin` have them in
+any order, sign and place. The way back is a damped Newton iteration from joints nearby: the rows of
+the foot's twist that the leg can place (`Structure.placed`) are met, what the leg has beyond them
+stays near the standing pose.
+
+Legs as HECTOR's have a formula (`Structure.closed_form`): hip yaw (z), hip roll (x), hip pitch,
+knee, ankle (y). Behind yaw psi and roll phi the three pitch joints move in one plane. With the
+running pitches a = q_2, b = q_2 + q_3 and theta = q_2 + q_3 + q_4
 
     foot point = o_yaw + Rz(psi) (o_roll + Rx(phi) p)
     p = o_pitch + Ry(a) o_knee + Ry(b) o_ankle + Ry(theta) sole
 
-and the way back is closed: yaw is given, roll turns the plane onto the target, the rest is a
-triangle of thigh and shin. The knee bends backwards (negative). `compile_model` has checked the
-axes and that thigh and shin point down at zero.
-
-A leg whose joints come in another order (`Description.axes`) is a product of rotations, and the way
-back is a damped Newton iteration of `NEWTON_STEPS` steps from the standing pose. There the yaw is
-the heading that the foot's y axis is square to, and the pitch is about that axis from it: in the
-order above they are psi and theta.
+Yaw is given, roll turns the plane onto the target, the rest is a triangle of thigh and shin, which
+the knee's limits say which way to bend.
 """
 
 from functools import partial
@@ -22,14 +21,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array
-from hector_jax.core.geometry import rot_x, rot_y, rot_z
-from hector_jax.robot.description import HECTOR_AXES
+from hector_jax.core.geometry import rot_x, rot_y, rot_z, skew
 from hector_jax.robot.model import Robot
 
-NEWTON_STEPS = 16
+NEWTON_STEPS = 4  # from the joints of a moment before; from far away more are needed
 _LARGEST_STEP = 0.4  # [rad] of a joint in a Newton step
 _DAMPING = 0.1  # times the squared error
 
@@ -41,15 +40,15 @@ class FootPoses(NamedTuple):
     rotation: Float[Array, "2 3 3"]  # takes foot vectors to the trunk frame
 
 
-def foot_poses(robot: Robot, joints: Float[Array, "10"]) -> FootPoses:
+def foot_poses(robot: Robot, joints: Float[Array, " joints"]) -> FootPoses:
     """Foot points and foot axes of the joint angles [rad]."""
     chain = _chain(robot, joints)
     return FootPoses(chain.foot, chain.rotation)
 
 
 def foot_jacobians(
-    robot: Robot, joints: Float[Array, "10"]
-) -> tuple[Float[Array, "2 3 5"], Float[Array, "2 3 5"]]:
+    robot: Robot, joints: Float[Array, " joints"]
+) -> tuple[Float[Array, "2 3 j"], Float[Array, "2 3 j"]]:
     """Jacobians of each foot point by its own leg's joints: velocity [m] and angular velocity [-].
 
     Trunk axes, trunk at rest: for a foot at rest on the ground, add the trunk's own motion.
@@ -60,38 +59,48 @@ def foot_jacobians(
 
 
 def inverse_legs(
-    robot: Robot, position: Float[Array, "2 3"], yaw: Float[Array, "2"], pitch: Float[Array, "2"]
-) -> Float[Array, "10"]:
-    """Joint angles [rad] that put the foot points at `position`; the inverse of `foot_poses`.
+    robot: Robot,
+    position: Float[Array, "2 3"],
+    yaw: Float[Array, "2"],
+    up: Float[Array, "2 3"],
+    start: Float[Array, " joints"],
+    steps: int = NEWTON_STEPS,
+) -> Float[Array, " joints"]:
+    """Joint angles [rad] that put the feet where they are wanted; the inverse of `foot_poses`.
 
-    Where a target is out of reach the leg points at it as far as the knee's limits let it; hip and
-    ankle angles are not limited. Of the two solutions it takes the one with the foot point below
-    the hip roll axis. Finite, with finite derivatives, everywhere.
+    Where a target is out of reach the leg points at it as far as its limits let it. Finite, with
+    finite derivatives, everywhere. By the formula the knee alone is limited, and of the two
+    solutions it is the one with the foot point below the hip roll axis.
 
     Args:
-        robot: leg lengths and knee limits.
+        robot: its legs.
         position: foot points in the trunk frame [m].
-        yaw: hip yaw angles [rad].
-        pitch: sum of the three pitch joints [rad], the foot's pitch against the leg's rolled frame.
+        yaw: headings of the feet in the trunk frame [rad].
+        up: normals of the soles in the trunk frame.
+        start: joints nearby [rad]; the formula needs none.
+        steps: of Newton (static).
     """
-    knee = robot.description.pitch_joints[1]
-    leg = _Leg(
-        jnp.asarray(robot.joint_origin),
-        jnp.asarray(robot.foot_point),
-        jnp.asarray(robot.joint_lower).reshape(2, 5)[:, knee],
-        jnp.asarray(robot.joint_upper).reshape(2, 5)[:, knee],
+    joints = robot.description.leg_joints
+    lower, upper, standing = (
+        jnp.asarray(part).reshape(2, joints)
+        for part in (robot.joint_lower, robot.joint_upper, robot.standing_joints)
     )
-    axes = robot.description.axes
-    if axes == HECTOR_AXES:
-        return jax.vmap(_inverse_leg)(leg, position, yaw, pitch).reshape(10)
-    standing = jnp.asarray(robot.standing_joints).reshape(2, 5)
-    search = jax.vmap(partial(_searched_leg, axes, knee))
-    return search(leg, standing, position, yaw, pitch).reshape(10)
+    if robot.structure.closed_form:
+        yaw = jnp.clip(yaw, lower[:, 0], upper[:, 0])
+        in_leg = jnp.stack([up[0] @ rot_z(yaw[0]), up[1] @ rot_z(yaw[1])])
+        pitch = jnp.arctan2(in_leg[:, 0], in_leg[:, 2])
+        origin, foot_point = jnp.asarray(robot.joint_origin), jnp.asarray(robot.foot_point)
+        leg = _Leg(origin, foot_point, lower[:, 3], upper[:, 3])
+        return jax.vmap(_inverse_leg)(leg, position, yaw, pitch).reshape(-1)
+    origin, axis, foot_point, sole = _constants(robot)
+    chain = _RobotLeg(origin, axis, foot_point, sole, lower, upper, standing)
+    search = jax.vmap(partial(_searched_leg, robot.structure.placed, steps))
+    return search(chain, start.reshape(2, joints), position, yaw, up).reshape(-1)
 
 
 def leg_gravity(
-    robot: Robot, joints: Float[Array, "10"], up: Float[Any, "3"]
-) -> Float[Array, "10"]:
+    robot: Robot, joints: Float[Array, " joints"], up: Float[Any, "3"]
+) -> Float[Array, " joints"]:
     """Joint torques [N m] that hold the legs' own weight, with the trunk fixed.
 
     Args:
@@ -101,11 +110,12 @@ def leg_gravity(
     """
     chain = _chain(robot, joints)
     com = chain.origin + jnp.sum(chain.frames * jnp.asarray(robot.link_com)[:, :, None, :], axis=-1)
+    link_mass, count = jnp.asarray(robot.link_mass), robot.description.leg_joints
     # a joint carries the links from its own outwards: row of the joint, column of the link
-    mass = jnp.triu(jnp.broadcast_to(jnp.asarray(robot.link_mass)[:, None, :], (2, 5, 5)))
+    mass = jnp.triu(jnp.broadcast_to(link_mass[:, None, :], (2, count, count)))
     lever = jnp.sum(mass[..., None] * (com[:, None] - chain.origin[:, :, None]), axis=2)
     moment = jnp.cross(lever, up)
-    return jnp.sum(chain.axis * moment, axis=-1).reshape(10)
+    return jnp.sum(chain.axis * moment, axis=-1).reshape(-1)
 
 
 class _Leg(NamedTuple):
@@ -122,17 +132,24 @@ class _Chain(NamedTuple):
 
     foot: Float[Array, "2 3"]
     rotation: Float[Array, "2 3 3"]
-    origin: Float[Array, "2 5 3"]
-    axis: Float[Array, "2 5 3"]
-    frames: Float[Array, "2 5 3 3"]  # links' axes; computed only where they are used
+    origin: Float[Array, "2 j 3"]
+    axis: Float[Array, "2 j 3"]
+    frames: Float[Array, "2 j 3 3"]  # links' axes; computed only where they are used
 
 
-def _chain(robot: Robot, joints: Float[Array, "10"]) -> _Chain:
-    axes = robot.description.axes
-    leg = _leg_chain if axes == HECTOR_AXES else partial(_any_chain, axes)
-    return jax.vmap(leg)(
-        jnp.asarray(robot.joint_origin), jnp.asarray(robot.foot_point), joints.reshape(2, 5)
-    )
+def _constants(robot: Robot) -> tuple[Array, Array, Array, Array]:
+    """Joint origins and axes, foot points and soles of both legs."""
+    parts = (robot.joint_origin, robot.joint_axis, robot.foot_point, robot.sole)
+    origin, axis, foot_point, sole = map(jnp.asarray, parts)
+    return origin, axis, foot_point, sole
+
+
+def _chain(robot: Robot, joints: Float[Array, " joints"]) -> _Chain:
+    origin, axis, foot_point, sole = _constants(robot)
+    legs = joints.reshape(2, robot.description.leg_joints)
+    if robot.structure.closed_form:
+        return jax.vmap(_leg_chain)(origin, foot_point, legs)
+    return jax.vmap(_any_chain)(origin, axis, foot_point, sole, legs)
 
 
 def _leg_chain(
@@ -191,58 +208,85 @@ def _inverse_leg(
     # triangle of thigh and shin
     thigh, shin = -origin[3, 2], -origin[4, 2]
     cos_knee = (x**2 + z**2 - thigh**2 - shin**2) / (2 * thigh * shin)
-    # compile_model has checked that the limits keep both ends off +-1, where arccos has no slope
-    knee = -jnp.arccos(jnp.clip(cos_knee, jnp.cos(knee_lower), jnp.cos(knee_upper)))
+    # the limits keep both ends off +-1, where arccos has no slope
+    ends = jnp.cos(knee_lower), jnp.cos(knee_upper)
+    bend = jnp.arccos(jnp.clip(cos_knee, jnp.minimum(*ends), jnp.maximum(*ends)))
+    knee = jnp.where(knee_lower < 0.0, -bend, bend)
     hip = jnp.arctan2(-x, -z) - jnp.arctan2(shin * jnp.sin(knee), thigh + shin * jnp.cos(knee))
     return jnp.stack([yaw, roll, hip, knee, pitch - hip - knee])
 
 
 def _any_chain(
-    axes: str, origin: Float[Array, "5 3"], foot_point: Float[Array, "3"], joints: Float[Array, "5"]
+    origin: Float[Array, "j 3"],
+    axis: Float[Array, "j 3"],
+    foot_point: Float[Array, "3"],
+    sole: Float[Array, "3 3"],
+    joints: Float[Array, " j"],
 ) -> _Chain:
-    turns = {"x": rot_x, "y": rot_y, "z": rot_z}
     R, point = jnp.eye(3, dtype=joints.dtype), jnp.zeros(3, joints.dtype)
-    points, axis, frames = [], [], []
-    for i, letter in enumerate(axes):
+    K = jax.vmap(skew)(axis.astype(joints.dtype))
+    sin, cos = jnp.sin(joints)[:, None, None], jnp.cos(joints)[:, None, None]
+    turns = jnp.eye(3, dtype=joints.dtype) + sin * K + (1.0 - cos) * (K @ K)  # Rodrigues
+    points, axes, frames = [], [], []
+    for i in range(len(origin)):
         point = point + R @ origin[i]
         points.append(point)
-        axis.append(R[:, "xyz".index(letter)])
-        R = R @ turns[letter](joints[i])
+        axes.append(R @ axis[i])
+        R = R @ turns[i]
         frames.append(R)
     foot = point + R @ foot_point
-    return _Chain(foot, R, *(jnp.stack(rows) for rows in (points, axis, frames)))
+    return _Chain(foot, R @ sole, *(jnp.stack(rows) for rows in (points, axes, frames)))
+
+
+class _RobotLeg(NamedTuple):
+    """Constants of a leg of any kind."""
+
+    origin: Float[Array, "*legs j 3"]
+    axis: Float[Array, "*legs j 3"]
+    foot_point: Float[Array, "*legs 3"]
+    sole: Float[Array, "*legs 3 3"]
+    lower: Float[Array, "*legs j"]
+    upper: Float[Array, "*legs j"]
+    standing: Float[Array, "*legs j"]
 
 
 def _searched_leg(
-    axes: str,
-    knee: int,
-    leg: _Leg,
-    start: Float[Array, "5"],
+    placed: tuple[int, ...],
+    steps: int,
+    leg: _RobotLeg,
+    start: Float[Array, " j"],
     position: Float[Array, "3"],
     yaw: Float[Array, ""],
-    pitch: Float[Array, ""],
-) -> Float[Array, "5"]:
-    def error(joints: Array, position: Array, yaw: Array, pitch: Array) -> Array:
-        """Of the foot point [m] and of the foot's two directions; zero where all is met."""
-        chain = _any_chain(axes, leg.origin, leg.foot_point, joints)
-        along = jnp.cos(yaw) * chain.rotation[0] + jnp.sin(yaw) * chain.rotation[1]
-        across = jnp.cos(pitch) * along[2] - jnp.sin(pitch) * along[0]
-        ahead = jnp.cos(pitch) * along[0] + jnp.sin(pitch) * along[2]
-        ahead = jnp.where(across**2 + ahead**2 < 1e-12, 1.0, ahead)
-        return jnp.append(chain.foot - position, jnp.stack([along[1], jnp.arctan2(across, ahead)]))
+    up: Float[Array, "3"],
+) -> Float[Array, " j"]:
+    rows = np.array(placed)
+
+    def error(joints: Array, target: tuple[Array, Array, Array]) -> Array:
+        """Of the foot point [m] and of the sole [rad], in the rows that the leg places."""
+        position, yaw, up = target
+        chain = _any_chain(*leg[:4], joints)
+        pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
+        wanted = (rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))).T @ rot_z(yaw)
+        off = wanted.T @ chain.rotation
+        turn = 0.5 * jnp.stack(
+            [off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]]
+        )
+        return jnp.concatenate([chain.foot - position, turn])[rows]
 
     def step(joints: Array, target: tuple[Array, Array, Array]) -> Array:
         still = jax.lax.stop_gradient(joints)
-        now, J = error(still, *target), jax.jacfwd(error)(still, *jax.lax.stop_gradient(target))
+        now, J = error(still, target), jax.jacfwd(error)(still, fixed)
         damping = _DAMPING * jax.lax.stop_gradient(now @ now) + 1e-12
-        return -jnp.linalg.solve(J.T @ J + damping * jnp.eye(5, dtype=J.dtype), J.T @ now)
+        damped = J @ J.T + damping * jnp.eye(len(rows), dtype=J.dtype)
+        rest = leg.standing - still  # of what the foot leaves free
+        return rest - J.T @ jnp.linalg.solve(damped, now + J @ rest)
 
     def improved(joints: Array, _: None) -> tuple[Array, None]:
         moved = joints + jnp.clip(step(joints, fixed), -_LARGEST_STEP, _LARGEST_STEP)
-        return moved.at[knee].set(jnp.clip(moved[knee], leg.knee_lower, leg.knee_upper)), None
+        return jnp.clip(moved, leg.lower, leg.upper), None
 
-    target = (position, yaw, pitch)
+    target = (position, yaw, up)
     fixed = jax.lax.stop_gradient(target)
-    joints, _ = jax.lax.scan(improved, jax.lax.stop_gradient(start), length=NEWTON_STEPS)
+    joints, _ = jax.lax.scan(improved, jax.lax.stop_gradient(start), length=steps)
     # one step more, the only one that is differentiated: its derivative is that of the solution
     return joints + step(joints, target)

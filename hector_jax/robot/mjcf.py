@@ -1,7 +1,7 @@
-"""The check of a robot's MJCF, from anywhere, before MuJoCo opens it.
+"""The check of a robot's file, from anywhere, before MuJoCo opens it.
 
-A description is one MJCF file of at most 1 MB that says everything itself, meshes and pictures
-apart, which lie in its folder or below. What would reach outside of it (includes, other files),
+A model is one MJCF or URDF file of at most 1 MB that says everything itself: meshes and pictures
+are named in it but never opened (`elements` drops them). What would reach outside of it (includes),
 make much of little (entities, replicated and composed bodies, huge textures and memories) or let a
 number pass that no robot has (NaN, negative masses, empty ranges) is refused by file, element,
 attribute and value. Which bodies and joints a robot has to have is no matter of this module.
@@ -17,11 +17,10 @@ from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples, whatever the robot
 _MOST_BYTES = 1_000_000
-_MOST_MESH_BYTES = 20_000_000
 _DEEPEST = 100
 _MOST_BODIES = 200
+_URDF_PARTS = ("link", "joint", "material")  # of a robot; the rest is for other programs
 _REFUSED = ("include", "attach", "model", "replicate", "composite", "flexcomp", "plugin")
-_FOLDERS = ("assetdir", "meshdir", "texturedir")
 
 _COUNT = Range(-1, 1_000_000)  # -1: as many as it takes
 _NOT_NEGATIVE = "mass density armature damping frictionloss friction margin size"
@@ -37,27 +36,33 @@ _RANGES: Mapping[str, Range] = {
     **dict.fromkeys(_PIXELS.split(), Range(0, 8192)),
     **dict.fromkeys(_COUNTS.split(), _COUNT),
 }
-_RANGES_OF = {("inertial", "mass"): POSITIVE, ("numeric", "size"): _COUNT}
+_RANGES_OF = {
+    ("inertial", "mass"): POSITIVE,
+    ("numeric", "size"): _COUNT,
+    ("mass", "value"): NOT_NEGATIVE,
+}
 _PAIRS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange")
 _MEMORY = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
 _MOST_MEMORY = 2**30
 
 
 def read_mjcf(path: Path) -> ElementTree.Element:
-    """The elements of a description that MuJoCo may open, see the module.
+    """The elements of an MJCF or URDF that MuJoCo may open, see the module.
 
     Raises:
         InputError: one line naming the file and what is wrong in it.
     """
     text = read_text(path, "the robot description", _MOST_BYTES)
     if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF")
+        raise InputError(f"{path}: {match[1].upper()} is not accepted, expected plain MJCF or URDF")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"{path}: malformed XML: {one_line(error)}") from None
-    if root.tag != "mujoco":
-        raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco>")
+    if root.tag not in ("mujoco", "robot"):
+        raise InputError(f"{path}: root element is <{root.tag[:40]}>, expected <mujoco> or <robot>")
+    if root.tag == "robot":
+        root[:] = [part for part in root if part.tag in _URDF_PARTS]
     bodies = 0
     for element, label in _labelled(path, root):
         if element.tag in _REFUSED:
@@ -65,14 +70,13 @@ def read_mjcf(path: Path) -> ElementTree.Element:
             raise InputError(
                 f"{path}: <{element.tag}>{of} is not accepted, expected one self-contained file"
             )
-        bodies += element.tag == "body"
+        bodies += element.tag in ("body", "link")
         for name, value in element.attrib.items():
             if expected := _expected(element.tag, name, value):
                 what = f"{name} is {short_repr(value)}, expected {expected}"
                 raise InputError(f"{path}: {label}: {what}")
     if bodies > _MOST_BODIES:
         raise InputError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
-    _check_files(path, root)
     return root
 
 
@@ -96,7 +100,7 @@ def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception
 def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:
     """Each element with its name in a message."""
     depth = {root: 1}
-    yield root, "<mujoco>"
+    yield root, f"<{root.tag}>"
     for parent in root.iter():
         if depth[parent] > _DEEPEST:
             raise InputError(f"{path}: elements are nested deeper than {_DEEPEST}")
@@ -116,8 +120,6 @@ def _expected(tag: str, name: str, value: str) -> str | None:
     if name == "name":
         return None
     numbers = _numbers(value)
-    if name == "timestep" and numbers != [TIME_STEP]:
-        return f"{TIME_STEP}, the step of all walks [s], or nothing"
     if name == "memory":
         size = re.fullmatch(r"(\d{1,12})([KMG]?)", value)
         fine = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)
@@ -139,41 +141,3 @@ def _numbers(text: str) -> list[float] | None:
         return [float(word) for word in text.split()]
     except ValueError:
         return None
-
-
-def _check_files(path: Path, root: ElementTree.Element) -> None:
-    """Check that meshes and pictures lie in the file's folder or below, and are there."""
-    home = path.parent.resolve()
-    places = [home]
-    for compiler in root.iter("compiler"):
-        for name in _FOLDERS:
-            if name in compiler.attrib:
-                places.append(_inside(path, home, home, name, compiler.attrib[name]))
-    for element in root.iter():
-        for name, value in element.attrib.items():
-            if not name.startswith("file"):
-                continue
-            label = f"<{element.tag}> {name}"
-            candidates = [_inside(path, home, place, label, value) for place in places]
-            there = [candidate for candidate in candidates if candidate.is_file()]
-            if not there:
-                near = [p.name for place in places if place.is_dir() for p in place.iterdir()]
-                hint = did_you_mean(Path(value).name, near)
-                raise InputError(f"{path}: {label}: no file {short_repr(value)}{hint}")
-            if (size := there[0].stat().st_size) > _MOST_MESH_BYTES:
-                raise InputError(
-                    f"{path}: {label}: {value} has {size / 1e6:.1f} MB, "
-                    f"expected at most {_MOST_MESH_BYTES / 1e6:.0f} MB"
-                )
-
-
-def _inside(path: Path, home: Path, place: Path, label: str, value: str) -> Path:
-    try:
-        resolved = (place / value).resolve()
-    except (OSError, ValueError):  # too long, or a loop of links
-        resolved = Path("/")
-    if not resolved.is_relative_to(home):
-        raise InputError(
-            f"{path}: {label} refers to {short_repr(value)}, expected a file in its own folder"
-        )
-    return resolved

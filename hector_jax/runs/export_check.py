@@ -39,7 +39,7 @@ class Record(NamedTuple):
     anchor: Anchor
     lead: int
     wrench: Wrench  # commanded, rows from t = 0 on
-    torque: Float[np.ndarray, "T 10"]  # [N m]
+    torque: Float[np.ndarray, "T joints"]  # [N m]
 
 
 def record(
@@ -72,7 +72,7 @@ def record(
     def measurements(rows: Array) -> Measurement:
         def one(yaw: Array, row: Array) -> tuple[Array, Measurement]:
             reading = sensing.unpack_reading(row)
-            measurement, yaw = sensing.measure(robot, reading, yaw, jnp.zeros(sensing.ERRORS))
+            measurement, yaw = sensing.measure(robot, reading, yaw, sensing.no_error(robot))
             return yaw, measurement
 
         return lax.scan(one, jnp.zeros(()), rows)[1]

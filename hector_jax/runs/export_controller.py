@@ -43,6 +43,7 @@ _STILL = Command(np.ones(2), np.zeros((2, 2)), np.zeros(2))
 
 def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, Plan]:
     """Memory and plan of zeros, with the shapes and dtypes of the real ones."""
+    joints = np.zeros_like(robot.standing_joints)
     shapes = jax.eval_shape(
         partial(step_plan, config),
         robot,
@@ -51,7 +52,7 @@ def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, P
         anchor=standing_anchor(robot),
         tick=np.int32(0),
         memory=Memory(Feet(np.zeros((2, 3)), np.zeros(2))),
-        measurement=Measurement(State(*np.zeros((4, 3))), np.zeros(10), np.zeros(10)),
+        measurement=Measurement(State(*np.zeros((4, 3))), joints, joints),
     )
     return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes)
 
@@ -119,7 +120,10 @@ def _standing(robot: Robot) -> tuple[dict[str, Any], ...]:
     """Measurement, command and anchor of a robot that stands."""
     position = np.append(robot.com_offset[:2], robot.standing_height)
     still = State(np.zeros(3), position, np.zeros(3), np.zeros(3))
-    measured = still._asdict() | {"joints": robot.standing_joints, "joint_rates": np.zeros(10)}
+    measured = still._asdict() | {
+        "joints": robot.standing_joints,
+        "joint_rates": np.zeros_like(robot.standing_joints),
+    }
     anchor = jax.tree.map(np.asarray, standing_anchor(robot))
     return measured, _STILL._asdict(), anchor._asdict()
 

@@ -102,9 +102,9 @@ def _score_walk(
     return ScoredWalk(metrics.score(loss, walk), upright, last, commit, text)
 
 
-def _like(loss: Loss, with_walk: bool) -> Any:
+def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
     """Layout of the artefact of one walk, with its trajectory or without."""
-    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like().trajectory)
+    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(robot).trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
     one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, *[np.array("")] * 2)  # pyright: ignore
     return one, walk if with_walk else None
@@ -183,7 +183,7 @@ def judge(
             key = content_key(*parts, code=_CODE)
             stem = f"walk-{name}" if with_walk((name, seed)) else f"score-{name}"
             paths[name, seed] = folder / f"{stem}-{seed}-{key}.npz"
-        like = lambda case: _like(config.loss, with_walk(case))  # noqa: E731
+        like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     walks = {
         case: one._replace(commit=str(one.commit), startup=str(one.startup))

@@ -9,6 +9,7 @@ All of it is linear after the limit and cheap, and the same function serves MuJo
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array
@@ -22,18 +23,18 @@ MEMORY = round(MAX_DELAY / TIME_STEP) + 1  # commands remembered, the present on
 class Motors(NamedTuple):
     """What the motors remember."""
 
-    commands: Float[Array, "*batch m 10"]  # [N m] newest first
-    torque: Float[Array, "*batch 10"]  # [N m] after the lag
+    commands: Float[Array, "*batch m joints"]  # [N m] newest first
+    torque: Float[Array, "*batch joints"]  # [N m] after the lag
 
 
-def init_actuators() -> Motors:
-    """Motors at rest."""
-    return Motors(jnp.zeros((MEMORY, 10)), jnp.zeros(10))
+def init_actuators(joints: int) -> Motors:
+    """Motors at rest, one for each joint."""
+    return Motors(jnp.zeros((MEMORY, joints)), jnp.zeros(joints))
 
 
 def step_actuators(
-    robot: Robot, imperfections: Imperfections, motors: Motors, command: Float[Array, "10"]
-) -> tuple[Motors, Float[Array, "10"]]:
+    robot: Robot, imperfections: Imperfections, motors: Motors, command: Float[Array, " joints"]
+) -> tuple[Motors, Float[Array, " joints"]]:
     """Torque at the joints [N m] over the next millisecond for what is commanded now.
 
     A delay between whole milliseconds is interpolated between two commands; a lag of zero
@@ -46,6 +47,9 @@ def step_actuators(
     arrived = jnp.maximum(1.0 - jnp.abs(age), 0.0) @ commands
     lag = jnp.maximum(imperfections.lag, 1e-9)
     torque = arrived + jnp.exp(-TIME_STEP / lag) * (motors.torque - arrived)
-    _, knee, ankle = robot.description.pitch_joints
-    leak = imperfections.linkage * torque[jnp.array([ankle, 5 + ankle])]
-    return Motors(commands, torque), torque.at[jnp.array([knee, 5 + knee])].add(leak)
+    motors = Motors(commands, torque)
+    if robot.description.linkage is None:
+        return motors, torque
+    joints = robot.description.leg_joints
+    motor, turned = (np.array([i - 1, joints + i - 1]) for i in robot.description.linkage)
+    return motors, torque.at[turned].add(imperfections.linkage * torque[motor])

@@ -74,13 +74,16 @@ class Sample(NamedTuple):
     reference: State
     effect: Wrench
     feet: Float[Array, "*batch 2 3"]
-    joints: Float[Array, "*batch 10"]
+    joints: Float[Array, "*batch joints"]
     fallen: Bool[Array, "*batch"]
     legs_touch: Bool[Array, "*batch"]
 
 
 def measure(
-    robot: Robot, reading: Float[Array, "43"], yaw: Float[Array, ""], error: Float[Array, "22"]
+    robot: Robot,
+    reading: Float[Array, " reading"],
+    yaw: Float[Array, ""],
+    error: Float[Array, " errors"],
 ) -> Measurement:
     """What the controller measures: the truth and `error`; `yaw` [rad] is that shortly before."""
     return sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)[0]
@@ -95,8 +98,8 @@ def plan_tick(
     tick: Int[Array, ""],
     memory: Memory,
     yaw: Float[Array, ""],
-    reading: Float[Array, "43"],
-    error: Float[Array, "22"],
+    reading: Float[Array, " reading"],
+    error: Float[Array, " errors"],
     *,
     max_contacts: int,
 ) -> tuple[Memory, Plan]:
@@ -136,9 +139,9 @@ def motor_torques(
     motors: Motors,
     yaw: Float[Array, ""],
     substep: Int[Array, ""],
-    reading: Float[Array, "43"],
-    error: Float[Array, "22"],
-) -> tuple[Motors, Float[Array, ""], Float[Array, "10"]]:
+    reading: Float[Array, " reading"],
+    error: Float[Array, " errors"],
+) -> tuple[Motors, Float[Array, ""], Float[Array, " joints"]]:
     """Motors, true yaw [rad] and the torque at the joints [N m] over the next millisecond.
 
     Args:
@@ -160,7 +163,7 @@ def motor_torques(
 
 def contact_wrench(
     robot: Robot,
-    before: Float[Array, "43"],
+    before: Float[Array, " reading"],
     contacts: Contacts,
     floor: Int[Array, ""],
     foot_of_geom: Int[Array, " ngeom"],
@@ -185,7 +188,7 @@ def sample(
     anchor: Anchor,
     time: Float[Array, ""],
     yaw: Float[Array, ""],
-    after: Float[Array, "43"],
+    after: Float[Array, " reading"],
     *,
     effect: Wrench,
     touches: Touches,

@@ -77,7 +77,7 @@ class _Walk(NamedTuple):
     job: WalkBatch  # of one walk
     model: mjx.Model
     data: mjx.Data  # filled in at each step
-    error: Float[Array, "22"]  # of the state estimate: none
+    error: Float[Array, " errors"]  # of the state estimate: none
 
 
 class _Physics(NamedTuple):
@@ -103,7 +103,7 @@ class _Carry(NamedTuple):
     last: Sample
 
 
-def _read(program: _Program, walk: _Walk, physics: _Physics) -> Float[Array, "43"]:
+def _read(program: _Program, walk: _Walk, physics: _Physics) -> Float[Array, " reading"]:
     """Flat reading in the precision of the controller."""
     flat = jnp.concatenate([physics.qpos, physics.qvel, jnp.zeros(1, physics.qpos.dtype)])
     return flat[np.array(program.places.coordinates)].astype(walk.error.dtype)
@@ -114,7 +114,7 @@ def _step_physics(
     walk: _Walk,
     physics: _Physics,
     *,
-    torque: Float[Array, "10"],
+    torque: Float[Array, " joints"],
     force: Float[Array, "3"],
 ) -> tuple[_Physics, mjx.Data]:
     """One millisecond of MJX under joint torques [N m] and a force [N] on the trunk."""
@@ -222,7 +222,7 @@ def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     return _Carry(
         memory=memory,
         plan=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
-        motors=init_actuators(),
+        motors=init_actuators(len(robot.joint_lower)),
         anchor=anchor,
         yaw=yaw,
         physics=mjx_model.to_single(physics) if program.single else physics,
@@ -240,7 +240,7 @@ def _walk_one(
     data = mjx.make_data(model)
     if program.single:
         model, data = mjx_model.to_single((model, data))
-    walk = _Walk(robot, job, model, data, error=jnp.zeros(sensing.ERRORS))
+    walk = _Walk(robot, job, model, data, error=jnp.asarray(sensing.no_error(robot)))
     carry = _standing(program, walk, _Physics(qpos, jnp.zeros(model.nv), jnp.zeros(model.nv)))
     begin, each = first_tick(program.config), program.substeps // program.period
     ticks = jnp.arange(begin, program.last_start + program.ticks)

@@ -23,8 +23,6 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim.world import Estimator, World
 
 CONTACTS = 16  # contacts kept of a millisecond in MuJoCo C
-READING = 43  # entries of a flat reading
-ERRORS = 22  # entries of an error: those of a State in its order, then ten joints
 DRIFT_TIME = 4.0  # [s] after which the drift has its stated size
 
 
@@ -35,9 +33,9 @@ class Reading(NamedTuple):
     velocity: Float[
         Array, "*batch 6"
     ]  # trunk: linear in the world [m/s], angular in the trunk [rad/s]
-    joints: Float[Array, "*batch 10"]  # [rad] motor side
-    joint_rates: Float[Array, "*batch 10"]  # [rad/s]
-    slack: Float[Array, "*batch 10"]  # [rad] from motor to link; zero without backlash
+    joints: Float[Array, "*batch joints"]  # [rad] motor side
+    joint_rates: Float[Array, "*batch joints"]  # [rad/s]
+    slack: Float[Array, "*batch joints"]  # [rad] from motor to link; zero without backlash
 
 
 class Touches(NamedTuple):
@@ -57,17 +55,23 @@ class Contacts(NamedTuple):
     friction: Float[Array, "*batch n 2"]  # along the tangents
 
 
-def coordinates(world: World) -> Int[np.ndarray, "43"]:
+def coordinates(world: World) -> Int[np.ndarray, " reading"]:
     """Where a flat reading's entries are in (qpos, qvel, 0); no backlash reads the zero."""
     model = world.model
-    slack = world.slack_qpos if world.slack_qpos.size else np.full(10, model.nq + model.nv)
+    slack = (
+        world.slack_qpos
+        if world.slack_qpos.size
+        else np.full(len(world.joint_qpos), model.nq + model.nv)
+    )
     trunk_rates, joint_rates = model.nq + np.arange(6), model.nq + world.joint_dof
     return np.concatenate([np.arange(7), trunk_rates, world.joint_qpos, joint_rates, slack])
 
 
-def unpack_reading(row: Float[Array, "*batch 43"]) -> Reading:
+def unpack_reading(row: Float[Array, "*batch reading"]) -> Reading:
     """Reading of a flat row, which holds its fields in their order."""
-    return Reading(row[..., :7], row[..., 7:13], row[..., 13:23], row[..., 23:33], row[..., 33:])
+    joints = (row.shape[-1] - 13) // 3
+    ends = np.cumsum([7, 6, joints, joints])
+    return Reading(*jnp.split(row, ends, axis=-1))
 
 
 def base_state(robot: Robot, reading: Reading, yaw_before: Float[Array, ""]) -> State:
@@ -160,7 +164,7 @@ def empty_contacts(rows: int) -> Contacts:
 
 
 def measure(
-    robot: Robot, reading: Reading, yaw_before: Float[Array, ""], error: Float[Array, "22"]
+    robot: Robot, reading: Reading, yaw_before: Float[Array, ""], error: Float[Array, " errors"]
 ) -> tuple[Measurement, Float[Array, ""]]:
     """What the controller is told, the truth plus `error`; and the true yaw, for the next call."""
     state = base_state(robot, reading, yaw_before)
@@ -169,13 +173,19 @@ def measure(
     return Measurement(estimate, joints, reading.joint_rates), state.euler[2]
 
 
+def no_error(robot: Robot) -> Float[np.ndarray, " errors"]:
+    """Errors of an estimate that has none: those of a State in its order, then the joints'."""
+    return np.zeros(12 + len(robot.joint_lower))
+
+
 def draw_errors(
-    estimator: Estimator, seed: int, before: int, after: int
-) -> Float[np.ndarray, "steps 22"]:
+    estimator: Estimator, joints: int, seed: int, before: int, after: int
+) -> Float[np.ndarray, "steps errors"]:
     """Errors of the estimate by millisecond: white noise, and a drift that starts at t = 0.
 
     Args:
         estimator: their sizes.
+        joints: of the robot.
         seed: which errors; the same seed gives the same bytes.
         before: steps before t = 0.
         after: steps from t = 0 on.
@@ -183,8 +193,8 @@ def draw_errors(
     rng = np.random.default_rng([0xE57, seed])
     steps = before + after
     sizes = [estimator.angle, estimator.position, estimator.ang_velocity, estimator.velocity]
-    size = np.concatenate([np.repeat(sizes, 3), np.repeat(estimator.joint, 10)])
-    errors = rng.standard_normal((steps, ERRORS)) * size
+    size = np.concatenate([np.repeat(sizes, 3), np.repeat(estimator.joint, joints)])
+    errors = rng.standard_normal((steps, len(size))) * size
     walk = rng.standard_normal((after, 3)) * np.sqrt(TIME_STEP / DRIFT_TIME)
     walk *= [estimator.drift_yaw, estimator.drift, estimator.drift]
     errors[before:, [2, 3, 4]] += np.cumsum(walk, axis=0)  # yaw, x, y

@@ -46,7 +46,7 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     count = substeps(config)
 
     def begin(robot: Robot, reading: Array) -> Memory:
-        still = jnp.zeros(()), jnp.zeros(sensing.ERRORS)
+        still = jnp.zeros(()), sensing.no_error(robot)
         return init_memory(robot, loop.measure(robot, reading, *still))
 
     def samples(robot, command, anchor, tick, yaw, readings, contacts, place) -> Sample:
@@ -80,18 +80,18 @@ class _Plant:
         world = self.world = build_world(job.imperfections, body.description)
         self.data = mujoco.MjData(world.model)
         self.data.qpos[:] = standing_qpos(world, body.standing_joints, float(body.trunk_height))
-        self.readings = np.zeros((count + 1, sensing.READING))
         self.contacts = sensing.empty_contacts(count)
         self._first, self._where = first, sensing.coordinates(world)
         self._worlds = worlds_by_step(world, job.changes, first, end)
         self._forces = np.asarray(_push_forces(job.push, np.arange(first, end)))
+        self.readings = np.zeros((count + 1, len(self._where)))
         self._read(0)
 
     def _read(self, row: int) -> None:
         flat = np.concatenate([self.data.qpos, self.data.qvel, np.zeros(1)])
         flat.take(self._where, out=self.readings[row])
 
-    def step(self, number: int, substep: int, torque: Float[Array, "10"]) -> None:
+    def step(self, number: int, substep: int, torque: Float[Array, " joints"]) -> None:
         """Millisecond `number` of the walk, which is `substep` of its tick."""
         self.world = world = self._worlds.get(self._first + number, self.world)
         self.data.ctrl[world.actuator] = torque
@@ -155,12 +155,15 @@ def _walk_ticks(
     body, weights, command, imperfections = jax.device_put((robot, *job[:3]))
     place = jax.device_put((np.array(plant.world.floor), plant.world.foot_of_geom))
     numbers = [jax.device_put(np.array(i, np.int32)) for i in range(count)]
-    errors = sensing.draw_errors(
-        job.imperfections.estimator, job.seed, steps - ticks * count, ticks * count
-    )
+    joints, lead = len(robot.joint_lower), steps - ticks * count
+    errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
     anchor = jax.device_put(standing_anchor(robot, start))
     legs = jax.device_put(config.parameters(weights).legs)
-    memory, motors, yaw = programs.begin(body, plant.readings[0]), init_actuators(), jnp.zeros(())
+    memory, motors, yaw = (
+        programs.begin(body, plant.readings[0]),
+        init_actuators(joints),
+        jnp.zeros(()),
+    )
     carry = None if retune is None else retune.init
     plan = samples = None
     for tick in range(begin, start + ticks):

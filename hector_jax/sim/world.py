@@ -25,6 +25,7 @@ from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import compile_model, quiet_mujoco
+from hector_jax.robot.source import build_spec
 
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold
@@ -179,11 +180,11 @@ class World:
     """A MuJoCo model and where the robot's parts are in it."""
 
     model: mujoco.MjModel
-    joint_qpos: np.ndarray  # (10,) motor side, left leg then right
-    joint_dof: np.ndarray  # (10,)
-    slack: np.ndarray  # (10,) backlash joints; empty where there are none
-    slack_qpos: np.ndarray  # (10,) likewise
-    actuator: np.ndarray  # (10,)
+    joint_qpos: np.ndarray  # (joints,) motor side, left leg then right
+    joint_dof: np.ndarray  # (joints,)
+    slack: np.ndarray  # (joints,) backlash joints; empty where there are none
+    slack_qpos: np.ndarray  # (joints,) likewise
+    actuator: np.ndarray  # (joints,)
     foot_of_geom: np.ndarray  # (ngeom,) 0 left, 1 right, -1 no foot
     floor: int  # geom
     trunk: int  # body
@@ -205,7 +206,7 @@ def _check(imperfections: Imperfections) -> None:
 
 def _model(description: Description, slack: bool) -> mujoco.MjModel:
     compile_model(description)  # for its checks
-    spec = mujoco.MjSpec.from_file(str(description.model))
+    spec = build_spec(description).spec
     # what is only looked at, and gives its body no mass, costs time and room in every plant
     for geom in list(spec.geoms):
         geom.material = ""
@@ -245,7 +246,7 @@ def _compile(description: Description, slack: bool) -> World:
     joints = [model.joint(name) for name in names]
     slacks = [model.joint(name + SLACK) for name in names] if slack else []
     of_joint = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
-    feet = [joint.bodyid[0] for joint in joints[4::5]]
+    feet = [joints[description.leg_joints - 1].bodyid[0], joints[-1].bodyid[0]]
     return World(
         model=model,
         joint_qpos=np.array([joint.qposadr[0] for joint in joints]),
@@ -306,7 +307,7 @@ def build_world(imperfections: Imperfections, description: Description | None = 
 
 
 def standing_qpos(
-    world: World, joints: Float[np.ndarray, "10"], height: float
+    world: World, joints: Float[np.ndarray, " joints"], height: float
 ) -> Float[np.ndarray, " nq"]:
     """Coordinates of a robot standing at the origin: trunk at `height` [m], `joints` [rad]."""
     qpos = np.zeros(world.model.nq)

@@ -1,0 +1,333 @@
+"""A robot written anew from its links: the form that all later code reads.
+
+A trunk with a free joint, one body a leg joint, left leg first; torque motors in that order; a
+floor; small spheres where a sole touches and a site where its wrench acts; a keyframe that stands.
+
+Contact bits: 1 floor, 2 left leg, 4 right leg. Soles touch the floor with their spheres only; the
+trunk and the legs touch it too, so that a fall is felt, and the legs each other. The floor alone
+decides friction and stiffness. A sphere, a cylinder or an ellipsoid that collides becomes a
+capsule of its length and radius. A link of which nothing is drawn is drawn as a stick.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.description import Description
+from hector_jax.robot.links import Link, Pose, pose_of
+from hector_jax.robot.mjcf import TIME_STEP
+
+ON_FLOOR = 1e-3  # [m] that a sole may be off the floor
+CONTACT_RADIUS = 0.01  # [m]
+SHAPES = tuple(
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
+    for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
+)
+SOLVER = {
+    "timestep": TIME_STEP,
+    "integrator": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "solver": mujoco.mjtSolver.mjSOL_NEWTON,
+    "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    "iterations": 10,
+    "ls_iterations": 10,
+}
+_SIDES = ("left", "right")
+_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
+_ROBOT_GEOM = {"friction": [0.1, 0.005, 0.0001], "solmix": 0.0, "priority": 0}
+_BITS = {None: (0, 1), 0: (2, 5), 1: (4, 3)}  # contype, conaffinity of trunk and legs
+_SOLE_BITS = ((2, 4), (4, 2))
+_FLOOR_BITS = {"contype": 0, "conaffinity": 1, "condim": 3}
+_GREY, _DARK = [0.75, 0.78, 0.82, 1.0], [0.1, 0.1, 0.1, 1.0]
+_STICK = 0.02  # [m] radius
+_SHORTEST = 1e-3  # [m] half length of a capsule
+
+
+class Feet(NamedTuple):
+    """Names of what the soles have."""
+
+    points: tuple[str, str]  # sites
+    contacts: tuple[tuple[str, ...], tuple[str, ...]]  # spheres, by foot
+
+
+class Pieces(NamedTuple):
+    """What a robot is written from."""
+
+    model: mujoco.MjModel  # as the file has it
+    links: list[Link]  # trunk, left leg, right leg
+    limits: Sequence[float]  # [N m] of the motors
+    angles: Sequence[float]  # [rad] of the legs' joints, standing
+    trunk_quat: Float[np.ndarray, "4"]  # standing
+
+
+def rebuild(description: Description, pieces: Pieces) -> tuple[mujoco.MjSpec, Feet]:
+    """The spec, with a keyframe "standing" (or as the description calls it), and the feet's names.
+
+    Raises:
+        InputError: one line: the soles are not level in the standing pose.
+    """
+    spec = _empty(description, pieces.model)
+    bodies = _add_links(spec, pieces)
+    for link, body in zip(pieces.links[1:], bodies[1:], strict=True):
+        _add_joint(pieces.model, link, body)
+    for joint, limit in zip(description.joints, pieces.limits, strict=True):
+        _add_motor(spec, joint, limit)
+    named = {str(name) for foot in description.feet if foot.body is None for name in foot.contacts}
+    for index, body in enumerate(bodies):
+        _add_geoms(pieces, index, body, named)
+    _add_sticks(pieces.links, bodies)
+    feet = Feet(*zip(*(_add_foot(spec, description, pieces, i) for i in (0, 1)), strict=True))
+    _add_standing(spec, description, pieces, feet)
+    return spec, feet
+
+
+def _empty(description: Description, model: mujoco.MjModel) -> mujoco.MjSpec:
+    spec = mujoco.MjSpec()
+    spec.modelname = description.name
+    spec.compiler.degree = False
+    for name, value in SOLVER.items():
+        setattr(spec.option, name, value)
+    spec.option.gravity = model.opt.gravity
+    vision = spec.visual
+    vision.global_.offwidth, vision.global_.offheight = 1280, 720
+    vision.headlight.ambient = [0.4, 0.4, 0.4]
+    spec.add_texture(
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=[0.86, 0.90, 0.94],
+        rgb2=[0.36, 0.47, 0.62],
+        width=256,
+        height=1536,
+    )
+    spec.worldbody.add_light(
+        pos=[-1.0, -1.4, 3.4], dir=[0.28, 0.4, -0.87], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    )
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0.0, 0.0, 0.05],
+        rgba=[0.6, 0.63, 0.67, 1.0],
+        contype=1,
+        conaffinity=0,
+        friction=[0.8, 0.005, 0.0001],
+        solref=[0.01, 1.0],
+        solmix=1.0,
+    )
+    return spec
+
+
+def _add_links(spec: mujoco.MjSpec, pieces: Pieces) -> list:
+    bodies = []
+    for link in pieces.links:
+        parent = bodies[link.parent] if bodies else spec.worldbody
+        I = link.inertia  # noqa: E741
+        body = parent.add_body(
+            name=link.name,
+            pos=link.pose.p,
+            quat=link.pose.quat,
+            mass=link.mass,
+            ipos=link.com,
+            fullinertia=[I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]],
+            explicitinertial=True,
+        )
+        if not bodies:
+            body.add_freejoint(name="base")
+        bodies.append(body)
+    return bodies
+
+
+def _add_joint(model: mujoco.MjModel, link: Link, body: mujoco.MjsBody) -> None:
+    j, dof = link.joint, model.jnt_dofadr[link.joint]
+    body.add_joint(
+        name=model.joint(j).name,
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=model.jnt_axis[j],
+        limited=True,
+        range=model.jnt_range[j],
+        solref_limit=model.jnt_solref[j],
+        solimp_limit=model.jnt_solimp[j],
+        margin=model.jnt_margin[j],
+        damping=[model.dof_damping[dof], *model.dof_dampingpoly[dof]],
+        stiffness=[model.jnt_stiffness[j], *model.jnt_stiffnesspoly[j]],
+        springref=model.qpos_spring[model.jnt_qposadr[j]],
+        armature=model.dof_armature[dof],
+        frictionloss=model.dof_frictionloss[dof],
+    )
+
+
+def _add_motor(spec: mujoco.MjSpec, joint: str, limit: float) -> None:
+    spec.add_actuator(
+        name=joint,
+        target=joint,
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        ctrllimited=True,
+        ctrlrange=[-limit, limit],
+        forcelimited=True,
+        forcerange=[-limit, limit],
+    )
+
+
+def _add_geoms(pieces: Pieces, index: int, body: mujoco.MjsBody, named: set[str]) -> None:
+    """The primitives of a link: what is looked at as it is, what collides as a box or capsule."""
+    model, link = pieces.model, pieces.links[index]
+    count = (len(pieces.links) - 1) // 2
+    leg = None if index == 0 else (index - 1) // count
+    bits = _BITS[leg] if leg is None or index % count else _SOLE_BITS[leg]
+    geoms = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in link.bodies]
+    geoms = [g for g in geoms if model.geom_type[g] in SHAPES]
+    touch = [bool(model.geom_contype[g] | model.geom_conaffinity[g]) for g in geoms]
+    for g, collides in zip(geoms, touch, strict=True):
+        own = pose_of(model.geom_pos[g], model.geom_quat[g])
+        pose = link.bodies[int(model.geom_bodyid[g])] @ own
+        shape, size = int(model.geom_type[g]), model.geom_size[g]
+        name, material = model.geom(g).name, int(model.geom_matid[g])
+        rgba = np.array(model.mat_rgba[material] if material >= 0 else model.geom_rgba[g])
+        fields: dict = {"group": int(model.geom_group[g]), "rgba": rgba}
+        if name in named:
+            fields |= {**_ROBOT_GEOM, **_FLOOR_BITS}
+        elif collides:
+            shape, size, pose = _solid(shape, size, pose)
+            fields |= {**_ROBOT_GEOM, "contype": bits[0], "conaffinity": bits[1], "condim": 1}
+            if all(touch):  # nothing else is drawn
+                fields |= {"group": 2, "rgba": [*rgba[:3], 1.0]}
+        else:
+            fields |= {"contype": 0, "conaffinity": 0}
+        body.add_geom(
+            name=name, type=shape, size=size, pos=pose.p, quat=pose.quat, mass=0.0, **fields
+        )
+
+
+def _solid(
+    shape: int, size: Float[np.ndarray, "3"], pose: Pose
+) -> tuple[int, Float[np.ndarray, "3"], Pose]:
+    """A box or a capsule in place of another primitive."""
+    if shape in (_BOX, _CAPSULE):
+        return shape, size, pose
+    radius, half = size[0], 0.0
+    if shape == _CYLINDER:
+        half = size[1] - radius
+    elif shape == _ELLIPSOID:
+        long = int(np.argmax(size))
+        radius = np.sort(size)[1]
+        half = size[long] - radius
+        # a turn of the axes that takes z to the longest one
+        pose = pose @ Pose(np.roll(np.eye(3), long + 1, axis=0))
+    return _CAPSULE, np.array([radius, max(half, _SHORTEST), 0.0]), pose
+
+
+def _add_sticks(links: Sequence[Link], bodies: Sequence) -> None:
+    """Draw a link without geoms from its joint to the next ones."""
+    empty = [not body.geoms for body in bodies]
+    for link in links[1:]:
+        if empty[link.parent] and np.linalg.norm(link.pose.p) > _STICK:
+            bodies[link.parent].add_geom(
+                type=_CAPSULE,
+                size=[_STICK, 0.0, 0.0],
+                fromto=[0.0, 0.0, 0.0, *link.pose.p],
+                contype=0,
+                conaffinity=0,
+                mass=0.0,
+                group=2,
+                rgba=_GREY,
+            )
+
+
+def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """The robot in the standing pose, its trunk's origin in that of the world."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0.0, 0.0, 0.0, *pieces.trunk_quat, *pieces.angles]
+    mujoco.mj_kinematics(model, data)
+    return model, data
+
+
+def _add_foot(
+    spec: mujoco.MjSpec, description: Description, pieces: Pieces, side: int
+) -> tuple[str, tuple[str, ...]]:
+    """Site and contact spheres of a foot; names of both."""
+    foot, path = description.feet[side], description.model
+    count, model = len(description.joints) // 2, pieces.model
+    link = pieces.links[(side + 1) * count]
+    if foot.body is None:
+        point = foot.point
+        assert isinstance(point, str)
+        own = [s for s in range(model.nsite) if model.site(s).name == point]
+        if not own or int(model.site_bodyid[own[0]]) not in link.bodies:
+            raise InputError(f"{path}: no site {point!r} on body {link.name!r}")
+        pose = link.bodies[int(model.site_bodyid[own[0]])]
+        _add_site(spec, link, point, pose.p + pose.R @ model.site_pos[own[0]])
+        return point, tuple(map(str, foot.contacts))
+    ids = [b for b in link.bodies if model.body(b).name == foot.body]
+    if not ids:
+        there = ", ".join(model.body(b).name for b in link.bodies)
+        raise InputError(
+            f"{path}: feet.{_SIDES[side]}.body is {foot.body!r}, expected one that joint "
+            f"{description.joints[(side + 1) * count - 1]!r} moves: {there}"
+        )
+    pose = link.bodies[ids[0]]
+    places = np.array([pose.p + pose.R @ np.array(place) for place in foot.contacts])
+    _, data = _standing_data(spec, pieces)
+    R = data.body(link.name).xmat.reshape(3, 3)
+    names = tuple(f"{_SIDES[side]}_contact_{i}" for i in range(len(places)))
+    for name, place in zip(names, places, strict=True):
+        if taken := spec.geom(name):
+            taken.name = ""
+        spec.body(link.name).add_geom(
+            name=name,
+            type=_SPHERE,
+            size=[CONTACT_RADIUS, 0.0, 0.0],
+            pos=place + CONTACT_RADIUS * R.T[:, 2],
+            mass=0.0,
+            group=2,
+            rgba=_DARK,
+            **_ROBOT_GEOM,
+            **_FLOOR_BITS,
+        )
+    if foot.point is None:
+        level = places @ R.T  # axes of the world, origin in the last joint
+        middle = 0.5 * (level.min(axis=0) + level.max(axis=0))
+        point = R.T @ np.array([0.0, middle[1], middle[2]])
+    else:
+        point = pose.p + pose.R @ np.array(foot.point)
+    name = f"{_SIDES[side]}_point"
+    _add_site(spec, link, name, point)
+    return name, names
+
+
+def _add_site(spec: mujoco.MjSpec, link: Link, name: str, place: Float[np.ndarray, "3"]) -> None:
+    spec.body(link.name).add_site(name=name, pos=place, size=[0.005] * 3, group=4)
+
+
+def _add_standing(
+    spec: mujoco.MjSpec, description: Description, pieces: Pieces, feet: Feet
+) -> None:
+    """The keyframe: the lowest contact on the floor, all others with it.
+
+    Raises:
+        InputError: a contact is more than ON_FLOOR above the lowest one.
+    """
+    model, data = _standing_data(spec, pieces)
+    heights = {name: lowest(model, data, name) for side in feet.contacts for name in side}
+    low = min(heights.values())
+    if max(heights.values()) - low > ON_FLOOR:
+        above = ", ".join(f"{name} {1e3 * (h - low):.1f}" for name, h in heights.items())
+        raise InputError(
+            f"{description.model}: standing, the soles are not level: contacts above the lowest "
+            f"one [mm]: {above}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
+        )
+    qpos = [0.0, 0.0, -low, *pieces.trunk_quat, *pieces.angles]
+    spec.body(pieces.links[0].name).pos = qpos[:3]
+    spec.add_key(name=standing_name(description), qpos=qpos)
+
+
+def standing_name(description: Description) -> str:
+    """Name of the keyframe."""
+    return description.standing if isinstance(description.standing, str) else "standing"
+
+
+def lowest(model: mujoco.MjModel, data: mujoco.MjData, sphere: str) -> float:
+    """Height of the lowest point of a sphere [m]."""
+    return float(data.geom(sphere).xpos[2] - model.geom(sphere).size[0])

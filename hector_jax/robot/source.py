@@ -1,0 +1,362 @@
+"""A robot's file as published, brought to the one form that all later code reads.
+
+`build_spec` takes an MJCF or a URDF as it is. A model that has that form already (`rebuild` says
+which) is left as it is, but for meshes and the like. Any other is written anew from what MuJoCo
+compiles: joints of no leg are fixed, bodies without a joint become part of their parent, motors
+become torque motors, and floor, solver and contacts are set. Each such change is a note.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError, did_you_mean, one_line
+from hector_jax.robot.description import Description
+from hector_jax.robot.elements import drop_unused
+from hector_jax.robot.links import MASSLESS, Link, links_of
+from hector_jax.robot.mjcf import read_mjcf, refusal
+from hector_jax.robot.rebuild import (
+    ON_FLOOR,
+    SHAPES,
+    SOLVER,
+    Pieces,
+    lowest,
+    rebuild,
+    standing_name,
+)
+
+_JOINT = mujoco.mjtJoint
+_MOST_FRICTION = 0.2  # of the robot's geoms; of two that touch the larger one counts
+_LEG_BITS = {None: (0, 1), 0: (2, 5), 1: (4, 3)}  # contype, conaffinity: no other ones
+
+
+class Source(NamedTuple):
+    """A robot in the form that all later code reads."""
+
+    spec: mujoco.MjSpec
+    points: tuple[str, str]  # sites, where wrenches act
+    contacts: tuple[tuple[str, ...], tuple[str, ...]]  # spheres on the soles, by foot
+    standing: str  # keyframe
+    notes: tuple[str, ...]  # what was mended, a line each
+
+
+class _File(NamedTuple):
+    description: Description
+    spec: mujoco.MjSpec
+    model: mujoco.MjModel  # without motors and keyframes, which need not fit
+    trunk: int  # body
+    joints: list[int]  # of the legs
+    free: int  # joint, or -1
+
+
+def build_spec(description: Description) -> Source:
+    """The robot of a description, see the module.
+
+    Raises:
+        InputError: one line saying what came, what was expected and how to mend it.
+    """
+    path = description.model
+    root = read_mjcf(path)
+    name = description.standing if isinstance(description.standing, str) else None
+    notes = drop_unused(path, root, description.joints, name)
+    file = _read(description, root)
+    angles, trunk_quat = _standing(file, root.tag == "robot")
+    limits = [_torque_limit(file, joint) for joint in file.joints]
+    changes = [f"a URDF: {len(limits)} motors and a floor added"] if root.tag == "robot" else []
+    changes += _changes(file, limits)
+    standing = standing_name(description)
+    if not changes:
+        points, contacts = zip(*((f.point, f.contacts) for f in description.feet), strict=True)
+        return Source(file.spec, points, contacts, standing, tuple(notes))
+    fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
+    links = links_of(file.model, file.trunk, file.joints, fixed)
+    _check_links(description, links)
+    legs = [angles[joint] for joint in file.joints]
+    pieces = Pieces(file.model, links, limits, legs, trunk_quat)
+    spec, feet = rebuild(description, pieces)
+    return Source(spec, *feet, standing, (*notes, *changes))
+
+
+def compile_spec(description: Description, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The compiled model of a spec.
+
+    Raises:
+        InputError: MuJoCo's refusal in one line.
+    """
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"{description.model}: MuJoCo refuses it: {one_line(error)}") from None
+
+
+def _read(description: Description, root: ElementTree.Element) -> _File:
+    """Compile a file without motors and keyframes, and find the robot in it."""
+    path = description.model
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        bare = spec.copy()
+        for part in (*bare.actuators, *bare.keys):
+            bare.delete(part)
+        # what is welded may have no mass; the links are checked when they are one
+        bare.compiler.boundmass = MASSLESS
+        bare.compiler.boundinertia = 1e-12
+        model = bare.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
+    names = [model.joint(j).name for j in range(model.njnt)]
+    for joint in (*description.joints, *description.weld):
+        _require(path, "joint", joint, names)
+    for motor in _motors(spec):
+        text = f"actuator {motor.name!r} drives no joint {motor.target!r}"
+        _expect(path, motor.target in names, text + did_you_mean(motor.target, names))
+    free = [j for j in range(model.njnt) if model.jnt_type[j] == _JOINT.mjJNT_FREE]
+    _expect(
+        path,
+        len(free) < 2,
+        f"{len(free)} free joints, expected exactly one, of the trunk; joints: {_listed(names)}",
+    )
+    fixed = [names[j] for j in free if names[j] in description.weld]
+    _expect(path, not fixed, f"weld names {_listed(fixed)}, the free joint, expected hinges")
+    joints = [names.index(joint) for joint in description.joints]
+    first = int(model.jnt_bodyid[joints[0]])
+    trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first])
+    file = _File(description, spec, model, trunk, joints, free[0] if free else -1)
+    _check_joints(file)
+    _check_world(file)
+    return file
+
+
+def _check_joints(file: _File) -> None:
+    """Leg joints are hinges with a range, one a body; all others are welded."""
+    path, model, weld = file.description.model, file.model, file.description.weld
+    extra = [
+        model.joint(j).name or f"of body {model.body(model.jnt_bodyid[j]).name!r}"
+        for j in range(model.njnt)
+        if j not in (*file.joints, file.free) and model.joint(j).name not in weld
+    ]
+    text = f"joints {_listed(extra)} are of no leg: add them to weld or remove them"
+    _expect(path, not extra, text)
+    for j in file.joints:
+        body, this = int(model.jnt_bodyid[j]), f"joint {model.joint(j).name!r}"
+        _expect(path, model.jnt_type[j] == _JOINT.mjJNT_HINGE, f"{this} is not a hinge")
+        on = model.body(body).name
+        text = f"{this} is not below the trunk, body {model.body(file.trunk).name!r}"
+        _expect(path, model.body_rootid[body] == file.trunk and body != file.trunk, text)
+        text = f"{this} shares body {on!r} with another joint, expected a body for each"
+        _expect(path, model.body_jntnum[body] == 1, text)
+        text = f"{this} has no range, expected its limits (in a URDF: revolute, lower and upper)"
+        _expect(path, model.jnt_limited[j], text)
+
+
+def _check_world(file: _File) -> None:
+    """The floor is level or not there, and gravity points downwards."""
+    path, model = file.description.model, file.model
+    gravity = model.opt.gravity
+    right = np.all(gravity[:2] == 0.0) and gravity[2] < 0.0
+    _expect(path, right, f"gravity is {gravity}, expected 0 0 and a negative number")
+    for g in _world_geoms(file):
+        plane = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE
+        text = (
+            f"geom {model.geom(g).name or g!r} of the world is terrain, expected a plane at z = 0"
+        )
+        _expect(path, plane, text)
+        level = abs(model.geom_pos[g][2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
+        text = (
+            f"floor {model.geom(g).name or g!r} is at {model.geom_pos[g]}, expected level at z = 0"
+        )
+        _expect(path, level, text)
+
+
+def _world_geoms(file: _File) -> list[int]:
+    """Geoms that collide and are no part of the robot."""
+    model = file.model
+    collide = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    return [int(g) for g in collide if model.body_rootid[model.geom_bodyid[g]] != file.trunk]
+
+
+def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarray, "4"]]:
+    """Angle [rad] of each hinge and slide when the robot stands, and how its trunk is turned."""
+    description, model = file.description, file.model
+    path, pose, upright = description.model, description.standing, np.array([1.0, 0.0, 0.0, 0.0])
+    names = {model.joint(j).name: j for j in range(model.njnt)}
+    known = (*description.joints, *description.weld)
+    if not isinstance(pose, str):
+        for name, _ in pose:
+            _require(path, "joint", name, known)
+        angles = dict.fromkeys((names[name] for name in known), 0.0)
+        return angles | {names[name]: angle for name, angle in pose}, upright
+    keys = [key for key in file.spec.keys if key.name == pose]
+    hint = "; a URDF has none: give standing = { joint = angle }" if urdf else ""
+    _expect(
+        path, keys, f"no keyframe {pose!r}; expected one, or standing = {{ joint = angle }}{hint}"
+    )
+    qpos = np.array(keys[0].qpos)
+    text = f"keyframe {pose!r} has {len(qpos)} numbers, expected {model.nq}"
+    _expect(path, len(qpos) == model.nq, text)
+    angles = {names[name]: float(qpos[model.jnt_qposadr[names[name]]]) for name in known}
+    if file.free >= 0:
+        start = model.jnt_qposadr[file.free]
+        upright = qpos[start + 3 : start + 7]
+    return angles, upright
+
+
+def _torque_limit(file: _File, joint: int) -> float:
+    """The smallest limit of a joint's torque [N m] that the file states.
+
+    Of its actuators' forces, of the control of a motor, and of the joint itself (effort in a URDF).
+    """
+    name, model, found = file.model.joint(joint).name, file.model, []
+    for motor in _motors(file.spec):
+        if motor.target == name:
+            gear = abs(motor.gear[0])
+            if _limited(motor.forcelimited, motor.forcerange):
+                found.append(gear * np.abs(motor.forcerange).min())
+            if _is_motor(motor) and _limited(motor.ctrllimited, motor.ctrlrange):
+                found.append(gear * abs(motor.gainprm[0]) * np.abs(motor.ctrlrange).min())
+    if model.jnt_actfrclimited[joint]:
+        found.append(np.abs(model.jnt_actfrcrange[joint]).min())
+    text = f"joint {name!r} has no torque limit, expected forcerange or ctrlrange of its motor, "
+    text += "actuatorfrcrange of the joint, or effort in a URDF"
+    _expect(file.description.model, found and min(found) > 0.0, text)
+    return float(min(found))
+
+
+def _motors(spec: mujoco.MjSpec) -> list:
+    joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    return [motor for motor in spec.actuators if motor.trntype in joint]
+
+
+def _limited(flag: mujoco.mjtLimited, span: Float[np.ndarray, "2"]) -> bool:
+    automatic = flag == mujoco.mjtLimited.mjLIMITED_AUTO
+    return bool(span[0] < span[1]) if automatic else bool(flag)
+
+
+def _is_motor(motor: mujoco.MjsActuator) -> bool:
+    """Whether its control is a force."""
+    kinds = (motor.gaintype, motor.biastype, motor.dyntype)
+    plain = (
+        mujoco.mjtGain.mjGAIN_FIXED,
+        mujoco.mjtBias.mjBIAS_NONE,
+        mujoco.mjtDyn.mjDYN_NONE,
+    )
+    return kinds == plain
+
+
+def _changes(file: _File, limits: Sequence[float]) -> list[str]:
+    """What has to be changed in a file, in a line each; nothing where it has the form already."""
+    description, model = file.description, file.model
+    inside = [b for b in range(1, model.nbody) if model.body_rootid[b] == file.trunk]
+    static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
+    order = [file.free, *file.joints] == list(range(model.njnt))
+    at_origin = not np.any(model.jnt_pos) and not np.any(model.qpos0[7:])
+    numbers = [name for name, value in SOLVER.items() if getattr(model.opt, name) != value]
+    floor = _world_geoms(file)
+    lines = (
+        ("free joint added to the trunk", file.free < 0),
+        (f"fixed: {_listed(description.weld)}", description.weld),
+        (f"made one with their parents: {_listed(static)}", static),
+        (
+            "joints put in order, left leg first",
+            file.free >= 0 and not order and not description.weld,
+        ),
+        ("frames of the joints put into their anchors", not at_origin and order),
+        ("motors replaced by torque motors", not _motors_right(file, limits)),
+        (f"option {_listed(numbers)} set", numbers),
+        ("floor added" if not floor else "floor replaced", not _floor_right(file)),
+        ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
+        ("contact bits, friction and shapes set", not _contacts_right(file)),
+        ("standing pose by angles", not isinstance(description.standing, str)),
+    )
+    changes = [line for line, there in lines if there]
+    return changes or _height(file)
+
+
+def _motors_right(file: _File, limits: Sequence[float]) -> bool:
+    motors, names = list(file.spec.actuators), file.description.joints
+    if [motor.target for motor in motors] != list(names):
+        return False
+    span = lambda motor: {*map(float, motor.ctrlrange), *map(float, motor.forcerange)}  # noqa: E731
+    return all(
+        _is_motor(motor)
+        and motor.gainprm[0] == motor.gear[0] == 1.0
+        and motor.ctrlrange[1] == limit
+        and span(motor) <= {-limit, limit, 0.0}
+        for motor, limit in zip(motors, limits, strict=True)
+    )
+
+
+def _floor_right(file: _File) -> bool:
+    model, floor = file.model, _world_geoms(file)
+    bits = [(model.geom_contype[g], model.geom_conaffinity[g]) for g in floor]
+    return bits == [(1, 0)]
+
+
+def _contacts_right(file: _File) -> bool:
+    """Whether the geoms of the robot touch the floor and the other leg as they should."""
+    model, count = file.model, len(file.joints) // 2
+    roots = [int(model.jnt_bodyid[file.joints[side * count]]) for side in (0, 1)]
+    ends = {name for foot in file.description.feet for name in foot.contacts}
+    for g in map(int, np.flatnonzero(model.geom_contype | model.geom_conaffinity)):
+        body = above = int(model.geom_bodyid[g])
+        if model.body_rootid[body] != file.trunk:
+            continue
+        while above and above not in roots:
+            above = int(model.body_parentid[above])
+        contype, conaffinity = _LEG_BITS[roots.index(above) if above else None]
+        end = model.geom(g).name in ends
+        right = (
+            not model.geom_contype[g] & ~contype and not model.geom_conaffinity[g] & ~conaffinity
+        )
+        right &= model.geom_condim[g] == (3 if end else 1) and model.geom_type[g] in SHAPES
+        right &= model.geom_friction[g, 0] <= _MOST_FRICTION
+        if not right or model.geom_solmix[g] or model.geom_priority[g]:
+            return False
+    return True
+
+
+def _height(file: _File) -> list[str]:
+    """Whether a keyframe has a sole off the floor."""
+    model, data = file.model, mujoco.MjData(file.model)
+    key = next(key for key in file.spec.keys if key.name == file.description.standing)
+    data.qpos[:] = key.qpos
+    mujoco.mj_kinematics(model, data)
+    names = {model.geom(g).name for g in range(model.ngeom)}
+    ends = [name for foot in file.description.feet for name in foot.contacts]
+    for name in map(str, ends):
+        _require(file.description.model, "geom", name, sorted(names))
+    low = min(lowest(model, data, str(name)) for name in ends)
+    if abs(low) <= ON_FLOOR:
+        return []
+    return [f"keyframe {key.name!r} lowered by {low:.4g} m to stand on the floor"]
+
+
+def _check_links(description: Description, links: Sequence[Link]) -> None:
+    """Legs hang together from the trunk down, and each link has a mass."""
+    path, count = description.model, len(description.joints) // 2
+    for index, link in enumerate(links):
+        text = f"body {link.name!r} moves and has no mass: give it an <inertial>"
+        _expect(path, link.mass > 0.0, text)
+        if index:
+            above = 0 if index % count == 1 else index - 1
+            text = f"joint {description.joints[index - 1]!r} is on body {links[link.parent].name!r}"
+            text += f", expected {links[above].name!r}: name each leg from the trunk down"
+            _expect(path, link.parent == above, text)
+
+
+def _expect(path: Path, right: Any, message: str) -> None:
+    if not right:
+        raise InputError(f"{path}: {one_line(message) if len(message) < 300 else message}")
+
+
+def _require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
+    text = f"no {kind} {name!r}{did_you_mean(name, names)}; {kind}s: {_listed(names)}"
+    _expect(path, name in names, text)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(name for name in names if name) or "none"
