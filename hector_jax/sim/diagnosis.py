@@ -25,6 +25,7 @@ MOST_AT_LIMIT = 0.05  # share of a walk for which a motor may be at its limit
 MOST_BEFORE_FALL = 0.1  # the same before a fall, where something has to be to blame
 # [m] of a height that is off all along; [s] after t = 0. HECTOR is off by 1.7 cm on its curves.
 STEADY, SETTLED = 0.02, 1.0
+FALLING = 0.5  # [s] before a fall of which nothing is told
 SUNK = 0.03  # [m] of a height that is lost while the robot is upright
 
 
@@ -175,13 +176,12 @@ def _grows(error: Float[np.ndarray, " n"]) -> bool:
     return bool(early < middle < late)
 
 
-def _steady_height(walked: Trajectory) -> list[str]:
-    time = float(walked.period) * np.arange(1, len(walked.fallen) + 1)
-    rows: Bool[np.ndarray, " T"] = (time > SETTLED) & ~np.asarray(walked.fallen)
-    if not rows.any():
+def _steady_height(walked: Trajectory, rows: Bool[np.ndarray, " T"]) -> list[str]:
+    errors = (walked.state.position - walked.reference.position)[rows, 2]
+    if len(errors) < 3:
         return []
-    error = (walked.state.position - walked.reference.position)[rows, 2].mean()
-    if abs(error) <= STEADY:
+    error, parts = errors.mean(), [part.mean() for part in np.array_split(errors, 3)]
+    if abs(error) <= STEADY or min(part / error for part in parts) < 0.5:
         return []
     way = "above" if error > 0.0 else "below"
     return [
@@ -201,4 +201,8 @@ def not_the_weights(config: WalkConfig, robot: Robot, job: Job) -> list[str]:
     found = record(config, robot, job)
     if np.asarray(found.walked.fallen)[0]:
         return [str(startup_fall(config, robot, job))]
-    return [*_steady_height(found.walked), *at_limit(robot, found.torque, MOST_AT_LIMIT)]
+    end = found.time[-1] - FALLING * found.fallen
+    time = float(found.walked.period) * np.arange(1, len(found.walked.fallen) + 1)
+    upright = (time > SETTLED) & (time <= end)
+    torque = found.torque[found.time <= end]
+    return [*_steady_height(found.walked, upright), *at_limit(robot, torque, MOST_AT_LIMIT)]
