@@ -154,7 +154,7 @@ def likeliest_cause(robot: Robot, found: Record) -> str:
     if lines := at_limit(robot, found.torque[:count], MOST_BEFORE_FALL):
         return lines[0]
     error = found.height[:count] - standing
-    if _grows(error):
+    if _grows(error, found.tilt[:count] / tilted):
         way = "sinks" if error[-1] < 0.0 else "rises"
         return (
             f"the centre of mass {way} steadily, by {100 * abs(error[-1]):.0f} cm while still "
@@ -163,14 +163,21 @@ def likeliest_cause(robot: Robot, found: Record) -> str:
     if found.touching and found.tilt[-1] <= tilted and found.height[-1] >= low:
         return f"{found.touching} touches the floor"
     roll, pitch = found.angles[-1]
-    ways = ("to the right", "to the left") if abs(roll) > abs(pitch) else ("forwards", "backwards")
-    way = ways[(roll if abs(roll) > abs(pitch) else pitch) < 0.0]
+    if abs(roll) > abs(pitch):
+        way = "to the right" if roll > 0.0 else "to the left"
+    else:
+        way = "forwards" if pitch > 0.0 else "backwards"
     return f"it tips over {way} (standing pose, joint gains, gait)"
 
 
-def _grows(error: Float[np.ndarray, " n"]) -> bool:
-    """Whether an error of the height grows all along, to a size that tells."""
-    if len(error) < 3 or abs(error[-1]) < SUNK:
+def _grows(error: Float[np.ndarray, " n"], tilt: Float[np.ndarray, " n"]) -> bool:
+    """Whether an error of the height grows all along, and tells before the tilt does.
+
+    Args:
+        error: [m].
+        tilt: as a share of that of a fall.
+    """
+    if len(error) < 3 or abs(error[-1]) < SUNK or tilt[np.argmax(np.abs(error) >= SUNK)] > 0.25:
         return False
     early, middle, late = (abs(part.mean()) for part in np.array_split(error, 3))
     return bool(early < middle < late)
