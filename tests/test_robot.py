@@ -14,24 +14,12 @@ from hector_jax.robot.description import MODEL_PATH, Description
 from hector_jax.robot.model import compile_model, describe, load_robot
 
 TEXT = MODEL_PATH.read_text()
-PAIR = '<contact><pair geom1="left_toe" geom2="floor"/></contact>'
 POSE = "0 0 0.785398163397 -1.570796326795 0.785398163397"
-FLOOR = "the floor of a plant decides"
-GEOM = '<geom friction="0.1 '
 BALANCED = 'pos="0 0 0" mass="5.512"'
 WRONG = (  # what is wrong, the text and what stands in its place, words of the message
     ("knee stretches", ('range="-2.38 -0.10"', 'range="-2.38 0"'), ["'left_knee'", "upper < 0"]),
     ("knee forwards", ('range="-2.38 -0.10"', 'range="0.10 2.38"'), ["bends backwards only"]),
-    ("lopsided", ('<motor ctrlrange="-33.5', '<motor ctrlrange="-10'), ["[-10.", "about 0"]),
-    ("servo", ('<motor name="left_knee"', '<position kp="9" name="left_knee"'), ["is no motor"]),
     ("weak motor", ('ctrlrange="-67 67"', 'ctrlrange="-2 2"'), ["'left_knee', which has 2"]),
-    ("contact pair", ("</actuator>", f"</actuator>{PAIR}"), ["1 contact pairs, expected none"]),
-    ("elliptic cone", ('cone="pyramidal"', 'cone="elliptic"'), ["expected pyramidal"]),
-    ("condim of a foot", ('"1" condim="3"', '"1" condim="6"'), ["'left_toe' is 6, expected 3"]),
-    ("friction", (GEOM, GEOM.replace("0.1", "0.9")), ["has friction 0.9", FLOOR]),
-    ("stiffness", ('solmix="0"', 'solmix="1"'), ["solmix 1.0", FLOOR]),
-    ("priority", (GEOM, GEOM.replace("<geom", '<geom priority="1"')), ["priority 1", FLOOR]),
-    ("pose in the air", ("0 0 0.548127 1", "0 0 0.60 1"), ["left_toe' 0.05187 m above the floor"]),
     ("pose out of range", (POSE, POSE.replace("-1.57", "-2.57")), ["left_knee' at -2.571"]),
     ("out of balance", (BALANCED, BALANCED.replace("0 0 0", "0.5 0 0")), ["over the feet"]),
 )

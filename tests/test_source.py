@@ -5,6 +5,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from published import JOINTS, MOTOR, SHIN, small, urdf_of
 
 from hector_jax.robot.description import MODEL_PATH, Description, Foot, read_description
 from hector_jax.robot.source import build_spec
@@ -50,48 +51,44 @@ def test_a_model_that_has_the_form_is_left_bit_for_bit(path):
         np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), name)
 
 
+def edited(folder, *changes):
+    text = MODEL_PATH.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "robot.xml").write_text(text)
+    return Description(model=folder / "robot.xml")
+
+
+def test_solver_and_height_are_mended_in_place(tmp_path):
+    changes = (('cone="pyramidal"', 'cone="elliptic"'), ('qpos="0 0 0.548', 'qpos="0 0 0.648'))
+    source = build_spec(edited(tmp_path, *changes))
+    got, expected = source.spec.compile(), compiled(Description())
+    assert source.notes == (
+        "option cone set",
+        "keyframe 'standing' lowered by 0.1 m to stand on the floor",
+    )
+    np.testing.assert_allclose(got.key_qpos, expected.key_qpos, atol=1e-6)
+    assert (got.opt.cone, got.ngeom) == (expected.opt.cone, expected.ngeom)
+
+
+def test_named_feet_stay_when_the_robot_is_written_anew(tmp_path):
+    source = build_spec(edited(tmp_path, ('friction="0.1 ', 'friction="0.9 ')))
+    assert source.notes == ("contact bits, friction and shapes set",)
+    got, expected = source.spec.compile(), compiled(Description())
+    names = [name for foot in source.contacts for name in foot]
+    assert names == ["left_toe", "left_heel", "right_toe", "right_heel"]
+    for name in (*names, "trunk", "left_sole"):
+        for field in ("pos", "size", "contype", "conaffinity", "condim", "friction"):
+            ours, theirs = (getattr(model.geom(name), field) for model in (got, expected))
+            np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    np.testing.assert_allclose(got.site_pos, expected.site_pos, atol=1e-12)
+    np.testing.assert_allclose(got.key_qpos, expected.key_qpos, atol=1e-6)
+    ours, theirs = (mass_matrix(model, standing(model)) for model in (got, expected))
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+
+
 # HECTOR written as a URDF
-
-
-def place(pos, quat):
-    """A URDF's origin, of a place and a quaternion."""
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, quat)
-    R = R.reshape(3, 3)
-    rpy = np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(R[2, 0]), np.arctan2(R[1, 0], R[0, 0])
-    write = lambda numbers: " ".join(f"{x:.17g}" for x in numbers)  # noqa: E731
-    return f'<origin xyz="{write(pos)}" rpy="{write(rpy)}"/>'
-
-
-def urdf_of(model, world=False, effort=True, turn=None):
-    """The bodies of a compiled model as a URDF."""
-    text = ['<robot name="r">']
-    if world:
-        text.append('<link name="world"/><joint name="fix" type="fixed"><parent link="world"/>')
-        text.append(f'<child link="{model.body(1).name}"/></joint>')
-    for b in range(1, model.nbody):
-        body, parent = model.body(b), model.body(model.body_parentid[b])
-        xx, yy, zz = (f"{x:.17g}" for x in body.inertia)
-        text.append(
-            f'<link name="{body.name}"><inertial>{place(body.ipos, body.iquat)}'
-            f'<mass value="{body.mass[0]:.17g}"/><inertia ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="0" '
-            'ixz="0" iyz="0"/></inertial><visual><geometry><mesh filename="package://a/b.stl"/>'
-            "</geometry></visual></link>"
-        )
-        if b == 1:
-            continue
-        joint = model.joint(body.jntadr[0])
-        dof = joint.dofadr[0]
-        limit = model.actuator(joint.name).ctrlrange[1]
-        text.append(
-            f'<joint name="{joint.name}" type="revolute"><parent link="{parent.name}"/>'
-            f'<child link="{body.name}"/>{place(body.pos, body.quat)}'
-            f'<axis xyz="{joint.axis[0]} {joint.axis[1]} {joint.axis[2]}"/>'
-            f'<limit lower="{joint.range[0]}" upper="{joint.range[1]}" velocity="9" '
-            f'effort="{limit if effort else 0}"/>'
-            f'<dynamics damping="{model.dof_damping[dof]}" friction="0"/></joint>'
-        )
-    return "\n".join([*text, "<gazebo><plugin/></gazebo></robot>"])
 
 
 def by_numbers(folder, text, **changes):
@@ -147,104 +144,22 @@ def refused(description):
 # A small biped with what published files have
 
 
-LEG = """
-<body name="{s}_hip" pos="0 {y} -0.1">
-  <inertial pos="0 0 -0.02" mass="0.5" diaginertia="0.001 0.001 0.001"/>
-  <joint name="{s}_roll" axis="1 0 0" range="-0.5 0.5"/>
-  <body name="{s}_thigh" {thigh}>
-    <inertial pos="0 0 -0.1" mass="1" diaginertia="0.01 0.01 0.002"/>
-    <joint name="{s}_pitch" axis="0 1 0" range="-1 1"/>
-    <geom type="cylinder" size="0.03 0.08" pos="0 0 -0.1"/>
-    <geom class="visual" mesh="thigh"/>
-    <body name="{s}_shin" pos="0 0 -0.2">
-      {shin}
-      <joint name="{s}_knee" axis="0 1 0" {range}/>
-      <body name="{s}_foot" pos="0 0 -0.2">
-        <inertial pos="0.01 0 -0.02" mass="0.2" diaginertia="0.0002 0.0003 0.0002"/>
-        <joint name="{s}_ankle" axis="0 1 0" range="-1 1" pos="0 0 0.01"/>
-        <geom type="box" size="0.06 0.03 0.01" pos="0.01 0 -0.03"/>
-        <body name="{s}_cap" pos="0.05 0 -0.03">
-          <geom type="sphere" size="0.005" mass="0.01"/>
-        </body>
-      </body>
-    </body>
-  </body>
-</body>
-"""
-SHIN = '<inertial pos="0 0 -0.1" mass="0.5" diaginertia="0.004 0.004 0.001"/>'
-MOTOR = '<position joint="{0}" kp="100" forcerange="-30 30"/>'
-BIPED = """<mujoco model="small">
-<compiler angle="radian" autolimits="true" meshdir="../meshes"/>
-<option cone="elliptic" timestep="0.002"/>
-<asset><mesh name="thigh" file="thigh.stl"/><mesh name="arm" file="/etc/passwd"/></asset>
-<default><geom density="0"/>
-  <default class="visual"><geom type="mesh" contype="0" conaffinity="0" mass="0"/></default>
-</default>
-<worldbody>
-  <body name="base" pos="0 0 1">{free}
-    <inertial pos="0.01 0 0.05" mass="4" diaginertia="0.03 0.02 0.02"/>
-    <geom type="box" size="0.05 0.08 0.1"/>
-    {left}
-    <body name="torso" pos="0 0 0.2" euler="0 0 0.1">
-      <inertial pos="0 0 0.1" mass="3" diaginertia="0.03 0.02 0.01"/>
-      <joint name="waist" axis="0 0 1" range="-1 1" pos="0.02 0 0"/>
-      <body name="arm" pos="0 0.1 0.2">
-        <inertial pos="0 0 -0.1" mass="0.7" diaginertia="0.003 0.003 0.001"/>
-        <joint name="shoulder" axis="0 1 0" range="-3 3"/>
-        {arm}
-      </body>
-    </body>
-    {right}
-  </body>
-</worldbody>
-{more}
-<actuator>{motors}</actuator>
-</mujoco>"""
-JOINTS = [f"{s}_{j}" for s in ("left", "right") for j in ("roll", "pitch", "knee", "ankle")]
-MOTORS = "".join(MOTOR.format(joint) for joint in JOINTS)
-ANGLES = {"pitch": -0.3, "knee": 0.6, "ankle": -0.3}
-
-
-def small(
-    folder,
-    free="<freejoint/>",
-    more="",
-    arm="",
-    shin=SHIN,
-    knee='range="-0.1 2"',
-    thigh='pos="0.01 0 -0.02"',
-    motors=MOTORS,
-    contacts=((0.07, 0.0, -0.04), (-0.05, 0.0, -0.04)),
-    **changes,
-):
-    """The small biped and its description."""
-    legs = {
-        s: LEG.format(s=s, y=y, shin=shin, range=knee, thigh=thigh)
-        for s, y in (("left", 0.1), ("right", -0.1))
-    }
-    path = folder / "robot.xml"
-    path.write_text(BIPED.format(free=free, more=more, arm=arm, motors=motors, **legs))
-    angles = {f"{s}_{j}": a for s in ("left", "right") for j, a in ANGLES.items()}
-    angles |= {"waist": 0.4, "shoulder": 1.0}
-    fields = {
-        "model": path,
-        "joints": tuple(JOINTS),
-        "linkage": None,
-        "weld": ("waist", "shoulder"),
-        "standing": tuple(angles.items()),
-        "feet": tuple(Foot(None, contacts, f"{s}_foot") for s in ("left", "right")),
-    }
-    return Description(**{**fields, **changes})
-
-
 def test_meshes_that_are_missing_are_not_missed_and_no_file_is_opened(tmp_path):
     source = build_spec(small(tmp_path))
     assert "4 meshes and pictures are not read" in source.notes
     assert source.spec.compile().nmesh == 0
 
 
-def test_welded_and_jointless_bodies_are_part_of_the_trunk_and_the_feet(tmp_path):
-    description = small(tmp_path)
+TURNED = {  # a body, and a joint that is not zero where the file draws it
+    "thigh": 'pos="0.01 0 -0.02" euler="0 0.2 0"',
+    "knee": 'range="-0.1 2" ref="0.1"',
+    "ankle": -0.4,
+}
+
+
+@pytest.mark.parametrize("legs", [{}, TURNED])
+def test_welded_and_jointless_bodies_are_part_of_the_trunk_and_the_feet(tmp_path, legs):
+    description = small(tmp_path, **legs)
     model = compiled(description)
     names = [model.body(b).name for b in range(1, model.nbody)]
     assert names == ["base"] + [
@@ -296,7 +211,7 @@ def test_solver_motors_and_floor_are_set(tmp_path):
     model = source.spec.compile()
     assert model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     assert (model.opt.timestep, model.opt.iterations) == (0.001, 10)
-    for note in ("motors replaced by torque motors", "floor added"):
+    for note in ("torque motors replace the actuators", "floor added"):
         assert note in source.notes
     assert [model.joint(j).name for j in range(1, 9)] == JOINTS
     np.testing.assert_array_equal(model.actuator_trnid[:, 0], range(1, 9))
@@ -404,3 +319,14 @@ def test_a_wrong_body_of_a_foot_or_order_of_joints_is_refused(tmp_path):
     assert "feet.left.body is 'left_shin'" in refused(small(tmp_path, feet=feet))
     turned = tuple(JOINTS[i] for i in (1, 0, 2, 3, 4, 5, 6, 7))
     assert "name each leg from the trunk down" in refused(small(tmp_path, joints=turned))
+
+
+@pytest.mark.parametrize(("name", "joints", "contacts"), [("h1", 10, 2), ("g1", 12, 4)])
+def test_the_examples_of_published_robots_are_descriptions(name, joints, contacts):
+    """And stand, where the user has put the model beside them."""
+    path = STRIDER.parents[1] / "menagerie" / f"{name}.toml"
+    description = read_description(path)
+    assert len(description.joints) == joints
+    assert [len(foot.contacts) for foot in description.feet] == [contacts] * 2
+    if description.model.exists():
+        assert compiled(description).nu == joints

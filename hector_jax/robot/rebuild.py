@@ -6,7 +6,7 @@ floor; small spheres where a sole touches and a site where its wrench acts; a ke
 Contact bits: 1 floor, 2 left leg, 4 right leg. Soles touch the floor with their spheres only; the
 trunk and the legs touch it too, so that a fall is felt, and the legs each other. The floor alone
 decides friction and stiffness. A sphere, a cylinder or an ellipsoid that collides becomes a
-capsule of its length and radius. A link of which nothing is drawn is drawn as a stick.
+capsule of its length and radius. A body of which nothing is drawn is drawn as a stick.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.description import Description
+from hector_jax.robot.description import Description, Foot
 from hector_jax.robot.links import Link, Pose, pose_of
 from hector_jax.robot.mjcf import TIME_STEP
 
@@ -78,7 +78,7 @@ def rebuild(description: Description, pieces: Pieces) -> tuple[mujoco.MjSpec, Fe
     named = {str(name) for foot in description.feet if foot.body is None for name in foot.contacts}
     for index, body in enumerate(bodies):
         _add_geoms(pieces, index, body, named)
-    _add_sticks(pieces.links, bodies)
+    _add_sticks(pieces, bodies)
     feet = Feet(*zip(*(_add_foot(spec, description, pieces, i) for i in (0, 1)), strict=True))
     _add_standing(spec, description, pieces, feet)
     return spec, feet
@@ -218,21 +218,27 @@ def _solid(
     return _CAPSULE, np.array([radius, max(half, _SHORTEST), 0.0]), pose
 
 
-def _add_sticks(links: Sequence[Link], bodies: Sequence) -> None:
-    """Draw a link without geoms from its joint to the next ones."""
-    empty = [not body.geoms for body in bodies]
-    for link in links[1:]:
-        if empty[link.parent] and np.linalg.norm(link.pose.p) > _STICK:
-            bodies[link.parent].add_geom(
-                type=_CAPSULE,
-                size=[_STICK, 0.0, 0.0],
-                fromto=[0.0, 0.0, 0.0, *link.pose.p],
-                contype=0,
-                conaffinity=0,
-                mass=0.0,
-                group=2,
-                rgba=_GREY,
-            )
+def _add_sticks(pieces: Pieces, bodies: Sequence) -> None:
+    """Draw each body of the file that has no geoms, from its origin to those of its children."""
+    model, links = pieces.model, pieces.links
+    shown = [int(b) for b, g in zip(model.geom_bodyid, model.geom_type, strict=True) if g in SHAPES]
+    for index, link in enumerate(links):
+        ends = [(int(model.body_parentid[b]), pose.p) for b, pose in link.bodies.items()]
+        for child in links[1:]:
+            if child.parent == index:
+                parent = int(model.body_parentid[model.jnt_bodyid[child.joint]])
+                ends.append((parent, child.pose.p))
+        for parent, end in ends:
+            if parent in link.bodies and parent not in shown:
+                _add_stick(bodies[index], link.bodies[parent].p, end, _STICK)
+
+
+def _add_stick(
+    body: mujoco.MjsBody, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
+) -> None:
+    if np.linalg.norm(end - start) > radius:
+        looks = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": 2, "rgba": _GREY}
+        body.add_geom(type=_CAPSULE, size=[radius, 0.0, 0.0], fromto=[*start, *end], **looks)
 
 
 def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -248,53 +254,55 @@ def _add_foot(
     spec: mujoco.MjSpec, description: Description, pieces: Pieces, side: int
 ) -> tuple[str, tuple[str, ...]]:
     """Site and contact spheres of a foot; names of both."""
-    foot, path = description.feet[side], description.model
-    count, model = len(description.joints) // 2, pieces.model
-    link = pieces.links[(side + 1) * count]
-    if foot.body is None:
-        point = foot.point
-        assert isinstance(point, str)
-        own = [s for s in range(model.nsite) if model.site(s).name == point]
-        if not own or int(model.site_bodyid[own[0]]) not in link.bodies:
-            raise InputError(f"{path}: no site {point!r} on body {link.name!r}")
-        pose = link.bodies[int(model.site_bodyid[own[0]])]
-        _add_site(spec, link, point, pose.p + pose.R @ model.site_pos[own[0]])
-        return point, tuple(map(str, foot.contacts))
-    ids = [b for b in link.bodies if model.body(b).name == foot.body]
-    if not ids:
-        there = ", ".join(model.body(b).name for b in link.bodies)
-        raise InputError(
-            f"{path}: feet.{_SIDES[side]}.body is {foot.body!r}, expected one that joint "
-            f"{description.joints[(side + 1) * count - 1]!r} moves: {there}"
-        )
-    pose = link.bodies[ids[0]]
+    foot, path, model = description.feet[side], description.model, pieces.model
+    last = (side + 1) * len(description.joints) // 2
+    link = pieces.links[last]
+    if foot.body is not None:
+        named = {model.body(b).name: pose for b, pose in link.bodies.items()}
+        if foot.body not in named:
+            raise InputError(
+                f"{path}: feet.{_SIDES[side]}.body is {foot.body!r}, expected one that joint "
+                f"{description.joints[last - 1]!r} moves: {', '.join(named)}"
+            )
+        return _place_foot(spec, foot, pieces, link, named[foot.body], _SIDES[side])
+    point, names = str(foot.point), tuple(map(str, foot.contacts))
+    for name in names:
+        there = spec.geom(name)
+        if there is None or there.parent.name != link.name or there.type != _SPHERE:
+            raise InputError(f"{path}: no sphere {name!r} on body {link.name!r}")
+    own = [s for s in range(model.nsite) if model.site(s).name == point]
+    if not own or int(model.site_bodyid[own[0]]) not in link.bodies:
+        raise InputError(f"{path}: no site {point!r} on body {link.name!r}")
+    pose = link.bodies[int(model.site_bodyid[own[0]])]
+    _add_site(spec, link, point, pose.p + pose.R @ model.site_pos[own[0]])
+    return point, names
+
+
+def _place_foot(
+    spec: mujoco.MjSpec, foot: Foot, pieces: Pieces, link: Link, pose: Pose, side: str
+) -> tuple[str, tuple[str, ...]]:
+    """Spheres whose lowest points, standing, are the contacts, and the site."""
     places = np.array([pose.p + pose.R @ np.array(place) for place in foot.contacts])
     _, data = _standing_data(spec, pieces)
-    R = data.body(link.name).xmat.reshape(3, 3)
-    names = tuple(f"{_SIDES[side]}_contact_{i}" for i in range(len(places)))
+    R, body = data.body(link.name).xmat.reshape(3, 3), spec.body(link.name)
+    up = CONTACT_RADIUS * R.T[:, 2]
+    for place in places:
+        _add_stick(body, places.mean(axis=0) + up, place + up, CONTACT_RADIUS)
+    names = tuple(f"{side}_contact_{i}" for i in range(len(places)))
     for name, place in zip(names, places, strict=True):
         if taken := spec.geom(name):
             taken.name = ""
-        spec.body(link.name).add_geom(
-            name=name,
-            type=_SPHERE,
-            size=[CONTACT_RADIUS, 0.0, 0.0],
-            pos=place + CONTACT_RADIUS * R.T[:, 2],
-            mass=0.0,
-            group=2,
-            rgba=_DARK,
-            **_ROBOT_GEOM,
-            **_FLOOR_BITS,
-        )
+        looks = {"mass": 0.0, "group": 2, "rgba": _DARK, **_ROBOT_GEOM, **_FLOOR_BITS}
+        size = [CONTACT_RADIUS, 0.0, 0.0]
+        body.add_geom(name=name, type=_SPHERE, size=size, pos=place + up, **looks)
     if foot.point is None:
         level = places @ R.T  # axes of the world, origin in the last joint
         middle = 0.5 * (level.min(axis=0) + level.max(axis=0))
         point = R.T @ np.array([0.0, middle[1], middle[2]])
     else:
         point = pose.p + pose.R @ np.array(foot.point)
-    name = f"{_SIDES[side]}_point"
-    _add_site(spec, link, name, point)
-    return name, names
+    _add_site(spec, link, f"{side}_point", point)
+    return f"{side}_point", names
 
 
 def _add_site(spec: mujoco.MjSpec, link: Link, name: str, place: Float[np.ndarray, "3"]) -> None:

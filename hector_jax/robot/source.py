@@ -67,12 +67,14 @@ def build_spec(description: Description) -> Source:
     file = _read(description, root)
     angles, trunk_quat = _standing(file, root.tag == "robot")
     limits = [_torque_limit(file, joint) for joint in file.joints]
-    changes = [f"a URDF: {len(limits)} motors and a floor added"] if root.tag == "robot" else []
+    changes = ["a URDF, with neither motors nor a floor"] if root.tag == "robot" else []
     changes += _changes(file, limits)
     standing = standing_name(description)
     if not changes:
+        notes += _set_options(file) + _lower(file)
         points, contacts = zip(*((f.point, f.contacts) for f in description.feet), strict=True)
         return Source(file.spec, points, contacts, standing, tuple(notes))
+    notes += _set_options(file)
     fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
     links = links_of(file.model, file.trunk, file.joints, fixed)
     _check_links(description, links)
@@ -248,14 +250,13 @@ def _is_motor(motor: mujoco.MjsActuator) -> bool:
 
 
 def _changes(file: _File, limits: Sequence[float]) -> list[str]:
-    """What has to be changed in a file, in a line each; nothing where it has the form already."""
+    """Why a robot has to be written anew, in a line each; nothing where it has the form already."""
     description, model = file.description, file.model
     inside = [b for b in range(1, model.nbody) if model.body_rootid[b] == file.trunk]
     static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
     order = [file.free, *file.joints] == list(range(model.njnt))
     at_origin = not np.any(model.jnt_pos) and not np.any(model.qpos0[7:])
-    numbers = [name for name, value in SOLVER.items() if getattr(model.opt, name) != value]
-    floor = _world_geoms(file)
+    floor, motors = _world_geoms(file), "replace the actuators" if file.spec.actuators else "added"
     lines = (
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {_listed(description.weld)}", description.weld),
@@ -265,15 +266,22 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
             file.free >= 0 and not order and not description.weld,
         ),
         ("frames of the joints put into their anchors", not at_origin and order),
-        ("motors replaced by torque motors", not _motors_right(file, limits)),
-        (f"option {_listed(numbers)} set", numbers),
+        (f"torque motors {motors}", not _motors_right(file, limits)),
         ("floor added" if not floor else "floor replaced", not _floor_right(file)),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
         ("contact bits, friction and shapes set", not _contacts_right(file)),
         ("standing pose by angles", not isinstance(description.standing, str)),
     )
-    changes = [line for line, there in lines if there]
-    return changes or _height(file)
+    return [line for line, there in lines if there]
+
+
+def _set_options(file: _File) -> list[str]:
+    """Set step and solver, in place."""
+    option = file.spec.option
+    wrong = [name for name, value in SOLVER.items() if getattr(option, name) != value]
+    for name in wrong:
+        setattr(option, name, SOLVER[name])
+    return [f"option {_listed(wrong)} set"] if wrong else []
 
 
 def _motors_right(file: _File, limits: Sequence[float]) -> bool:
@@ -319,19 +327,22 @@ def _contacts_right(file: _File) -> bool:
     return True
 
 
-def _height(file: _File) -> list[str]:
-    """Whether a keyframe has a sole off the floor."""
+def _lower(file: _File) -> list[str]:
+    """Put level soles of the file's keyframe on the floor, in place."""
     model, data = file.model, mujoco.MjData(file.model)
     key = next(key for key in file.spec.keys if key.name == file.description.standing)
     data.qpos[:] = key.qpos
     mujoco.mj_kinematics(model, data)
     names = {model.geom(g).name for g in range(model.ngeom)}
-    ends = [name for foot in file.description.feet for name in foot.contacts]
-    for name in map(str, ends):
-        _require(file.description.model, "geom", name, sorted(names))
-    low = min(lowest(model, data, str(name)) for name in ends)
-    if abs(low) <= ON_FLOOR:
+    ends = [str(name) for foot in file.description.feet for name in foot.contacts]
+    if not names.issuperset(ends):  # as `checks` will say
         return []
+    heights = [lowest(model, data, name) for name in ends]
+    low = min(heights)
+    if abs(low) <= ON_FLOOR or max(heights) - low > ON_FLOOR:
+        return []
+    data.qpos[2] -= low
+    key.qpos = data.qpos
     return [f"keyframe {key.name!r} lowered by {low:.4g} m to stand on the floor"]
 
 
