@@ -24,6 +24,7 @@ import plots
 import tyro
 from lib import walk_groups, write_report
 from scenes import (
+    PAYLOAD,
     Cell,
     Level,
     SceneConfig,
@@ -34,7 +35,7 @@ from scenes import (
     table,
 )
 
-from hector_jax.control.controller import WalkConfig
+from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import exit_code
@@ -45,14 +46,15 @@ from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report.report import WORLDS
-from hector_jax.robot.model import load_robot
+from hector_jax.robot.description import HECTOR, Description
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import named_world
-from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.tuning.loss import loss_of_robot
 
 BASELINE = "nominal"
 
@@ -67,6 +69,7 @@ class Flags:
     first_seed: int = 0
     scenes: Annotated[SceneConfig, tyro.conf.arg(name="")] = SceneConfig()
     quick: bool = False  # two forces, two floors, one gait phase
+    robot: Path | None = None  # TOML file of another biped; HECTOR by default
     out: Path = Path("runs/robustness")  # folder of the report
     processes: int = 2  # one core each
 
@@ -85,13 +88,13 @@ class Result(NamedTuple):
     residual: float  # largest of a plan
 
 
-def weight_sets(named: Sequence[str]) -> dict[str, Weights]:
+def weight_sets(named: Sequence[str], robot: Robot | None = None) -> dict[str, Weights]:
     """Nominal, expert and the files of NAME=FILE.
 
     Raises:
         InputError: no NAME=FILE, a name that is taken, or a file that holds no weights.
     """
-    sets = {BASELINE: nominal(), "expert": expert()}
+    sets = {BASELINE: nominal(robot), "expert": expert(robot)}
     for text in named:
         name, _, file = text.partition("=")
         # names are parts of files' names, where other characters might make two of them one
@@ -133,10 +136,12 @@ def main() -> None:
     if flags.quick:
         short = replace(flags.scenes, forces=(50.0, 100.0), frictions=(0.4, 0.25), phases=1)
         flags = replace(flags, scenes=short)
-    robot, sets = jax.tree.map(np.asarray, load_robot()), weight_sets(flags.set)
+    robot = jax.tree.map(np.asarray, load_robot(flags.robot))
+    sets, body, config = weight_sets(flags.set, robot), robot.description, walk_config(robot)
     seeds = range(flags.first_seed, flags.first_seed + flags.seeds)
     plant = standin if flags.world == "standin" else partial(named_world, flags.world)
-    scenes, plants = make_scenes(flags.scenes), {seed: plant(seed) for seed in seeds}
+    plants = {seed: plant(seed, body) for seed in seeds}
+    scenes = make_scenes(flags.scenes, config.gait, body.plants)
 
     def group(level: Level, name: str, seed: int) -> str:
         return f"{level.name}-{name}-{seed}".replace(" ", "-").replace("/", "-")
@@ -150,7 +155,7 @@ def main() -> None:
         for level, at_level in scenes.items()
         for name in sets
     }
-    config, loss = WalkConfig(), PAPER_LOSS
+    loss = loss_of_robot(body)
     with workers(flags.processes) as pool:
         walked = walk_groups(
             groups,
@@ -167,23 +172,31 @@ def main() -> None:
         for level in scenes
         for name in sets
     }
-    print(report(flags, sets, compare(list(scenes), list(sets), scores), flags.out))
+    result = compare(list(scenes), list(sets), scores)
+    print(report(flags, sets, result, flags.out, body))
 
 
-def report(flags: Flags, sets: Mapping[str, Weights], result: Result, folder: Path) -> Path:
+def report(
+    flags: Flags,
+    sets: Mapping[str, Weights],
+    result: Result,
+    folder: Path,
+    body: Description = HECTOR,
+) -> Path:
     """Write the report with its pictures and its numbers as JSON; returns its path."""
     make_folder(folder)
     world, count = WORLDS.get(flags.world, flags.world), flags.scenes.phases
     rows = {level.name: row for level, row in result.cells.items()}
     last = flags.first_seed + flags.seeds - 1
     phases = "one phase of the gait" if count == 1 else f"{count} phases of the gait"
+    payload = PAYLOAD * body.plants.payload
     solved = "." if result.residual <= SOLVED else ": **not solved**."
     paragraphs = [
         f"Trajectory {flags.scenes.traj}, world {world}, plants {flags.first_seed} to {last}. "
         f"Pushes of 0.1 s on the trunk from eight sides, floors that turn slippery for 2 s, both "
-        f"begun at {phases}; slopes of 3 degrees that rise towards the named side; 2 kg on top of "
-        "the trunk; commands that no tuning saw. The controller is told of none of it. Largest "
-        f"relative KKT residual of a plan {result.residual:.0e}{solved}",
+        f"begun at {phases}; slopes of 3 degrees that rise towards the named side; {payload:g} kg "
+        "on top of the trunk; commands that no tuning saw. The controller is told of none of it. "
+        f"Largest relative KKT residual of a plan {result.residual:.0e}{solved}",
         table(result.cells, result.losses),
         f"L / {BASELINE} is the median of the ratio in the same scene on the same plant, falls "
         "charged as the loss charges them; in brackets its 95 % interval from redrawing the "

@@ -19,8 +19,9 @@ from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_comman
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.report.report import markdown_table
+from hector_jax.robot.description import HECTOR, PlantSizes
 from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
-from hector_jax.sim.changes import Change
+from hector_jax.sim.changes import TRUNK_TOP, Change
 from hector_jax.sim.world import NO_PUSH, Push
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
@@ -28,6 +29,7 @@ PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk goes on until t
 SLIPPERY = 1.0, 3.0  # [s] from when to when a floor is slippery
 PAYLOAD, PAYLOAD_LATE = 2.0, 2.0  # [kg], [s] when it is put on during a walk
 SLOPE = np.deg2rad(3.0)
+_GAIT = GaitConfig()
 SLOPES = {"up": (SLOPE, 0.0), "down": (-SLOPE, 0.0), "left": (0.0, SLOPE), "right": (0.0, -SLOPE)}
 """Where the floor rises, seen from the walk's start."""
 
@@ -69,7 +71,8 @@ class SceneConfig:
     """Which scenes."""
 
     traj: str = "straight"  # walked in all scenes but those of kind command
-    forces: tuple[float, ...] = (25.0, 50.0, 75.0, 100.0, 125.0, 150.0)  # [N] of the pushes
+    # of the pushes [N], of another robot times its size
+    forces: tuple[float, ...] = (25.0, 50.0, 75.0, 100.0, 125.0, 150.0)
     frictions: tuple[float, ...] = (0.5, 0.4, 0.3, 0.25, 0.2)  # that the floor steps to
     phases: int = 3  # of the gait, at which a push or a slippery floor begins
 
@@ -84,9 +87,17 @@ class SceneConfig:
                 )
 
 
-def make_scenes(config: SceneConfig) -> dict[Level, list[Scene]]:
-    """All scenes by level; those of a push are ordered by direction, then by phase."""
-    command, gait = named_command(config.traj), GaitConfig()
+def make_scenes(
+    config: SceneConfig, gait: GaitConfig = _GAIT, sizes: PlantSizes = HECTOR.plants
+) -> dict[Level, list[Scene]]:
+    """All scenes by level; those of a push are ordered by direction, then by phase.
+
+    Args:
+        config: which.
+        gait: of the robot.
+        sizes: of its pushes, payloads and lengths.
+    """
+    command = named_command(config.traj)
     # t = 0 begins a cycle
     later = gait.tick * gait.cycle * np.arange(config.phases) / config.phases
     angles = np.deg2rad(DIRECTIONS)
@@ -101,17 +112,21 @@ def make_scenes(config: SceneConfig) -> dict[Level, list[Scene]]:
         return Scene(command, changes=(change,))
 
     scenes = {Level("calm", config.traj): [Scene(command)]}
-    for force in config.forces:
-        scenes[Level("push", force)] = [pushed(force * way, t) for way in ways for t in later]
+    for force in sizes.push * np.array(config.forces):
+        scenes[Level("push", float(force))] = [
+            pushed(force * way, t) for way in ways for t in later
+        ]
     for friction in config.frictions:
         scenes[Level("friction", friction)] = [
             changed(Change(start + t, end + t, floor_friction=friction)) for t in later
         ]
     for side, rise in SLOPES.items():
         scenes[Level("slope", side)] = [changed(Change(slope=rise))]
-    early, late = Change(payload=PAYLOAD), Change(start=PAYLOAD_LATE, payload=PAYLOAD)
-    scenes[Level("payload", "2 kg from the start")] = [changed(early)]
-    scenes[Level("payload", "2 kg put on at 2 s")] = [changed(late)]
+    payload, (x, y, z) = sizes.payload * PAYLOAD, sizes.trunk_com * np.array(TRUNK_TOP)
+    early = Change(payload=payload, payload_at=(float(x), float(y), float(z)))
+    late = early._replace(start=PAYLOAD_LATE)
+    scenes[Level("payload", f"{payload:g} kg from the start")] = [changed(early)]
+    scenes[Level("payload", f"{payload:g} kg put on at 2 s")] = [changed(late)]
     for name in UNSEEN:
         unseen = named_command(name)
         scenes[Level("command", name)] = [Scene(unseen, max(4.0, float(unseen.duration.sum())))]

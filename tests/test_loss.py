@@ -194,7 +194,7 @@ def test_a_fourth_term_is_tuned_told_and_written_from_one_place():
     assert "L_sway" in text.splitlines()[0]
     assert "L_sway [m^2/s^2]" in text
     assert TuneConfig.from_table("here", config.as_table(), loss) == config
-    with pytest.raises(InputError, match="no term 'L_sway'"):
+    with pytest.raises(InputError, match="unknown term 'L_sway'"):
         TuneConfig.from_table("here", config.as_table())
 
 

@@ -13,11 +13,12 @@ from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
+from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import RunRequest
-from hector_jax.sim.loop import Job
+from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
@@ -75,11 +76,24 @@ def default_of(flag: Path, usual: Path, path: Path | None, robot: Robot) -> Path
     return folder_of(Path(usual.parts[0]), path, robot).joinpath(*usual.parts[1:])
 
 
-def plants(world: str, seeds: range) -> list[Imperfections]:
-    """One plant of a world for each seed."""
+def plants(world: str, seeds: range, description: Description) -> list[Imperfections]:
+    """One plant of a world for each seed, sized for the robot of a description."""
     if world == "standin":
-        return [standin(seed) for seed in seeds]
-    return [named_world(world, seed) for seed in seeds]
+        return [standin(seed, description) for seed in seeds]
+    return [named_world(world, seed, description) for seed in seeds]
+
+
+def plant_of(path: Path | None, robot: Robot) -> Robot | None:
+    """The model of the robot that is walked on, where it is another.
+
+    Raises:
+        InputError: its file is wrong, or its joints are not the robot's.
+    """
+    if path is None:
+        return None
+    plant = load_robot(path)
+    check_plant(robot.description, plant.description)
+    return plant
 
 
 def course(text: str, robot: Robot) -> NamedCommand:
@@ -122,12 +136,27 @@ def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
 
 
 def walk_once(
-    args: Walk | View, robot: Robot, trajectory: NamedCommand, weights: Weights
+    args: Walk | View,
+    robot: Robot,
+    trajectory: NamedCommand,
+    weights: Weights,
+    plant: Robot | None = None,
 ) -> Trajectory:
     """One walk in the world of the flags."""
-    lasts = seconds(args.seconds, trajectory)
     if args.world == "srbm":
+        lasts = seconds(args.seconds, trajectory)
         return verdicts.walk_rigid_body(robot, weights, trajectory.command, lasts)
-    plant = plants(args.world, range(args.seed, args.seed + 1))[0]
-    job = Job(weights, trajectory.command, plant, lasts, args.seed)
-    return walk(walk_config(robot), robot, job)
+    return walk(walk_config(robot), robot, job_of(args, robot, trajectory, weights, plant))
+
+
+def job_of(
+    args: Walk | View,
+    robot: Robot,
+    trajectory: NamedCommand,
+    weights: Weights,
+    plant: Robot | None = None,
+) -> Job:
+    """The walk of the flags in a world of MuJoCo; `plant` is another model of the robot."""
+    lasts, body = seconds(args.seconds, trajectory), robot if plant is None else plant
+    (imperfections,) = plants(args.world, range(args.seed, args.seed + 1), body.description)
+    return Job(weights, trajectory.command, imperfections, lasts, args.seed, plant=plant)

@@ -105,9 +105,9 @@ def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -
     """Walks of the three trajectories with nominal and expert weights, for information only."""
     jobs = [
         Job(weights, named_command(name), plant, seed=seed)
-        for weights in (nominal(), expert())
+        for weights in (nominal(robot), expert(robot))
         for name in COMMANDS
-        for seed, plant in enumerate(arguments.plants("standin", range(count)))
+        for seed, plant in enumerate(arguments.plants("standin", range(count), robot.description))
     ]
     return verdicts.walk_all(
         pool, config, robot, jobs, f"walking on {plural(count, 'stand-in plant')}, for information"

@@ -11,7 +11,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, say
 from hector_jax.core.files import as_json, write_json
-from hector_jax.core.inputs import plural, printable
+from hector_jax.core.inputs import InputError, plural, printable
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm.dataset import SOLVED
@@ -22,27 +22,30 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.folder import RESULT, load_run
-from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.sim.diagnosis import startup_fall
+from hector_jax.tuning.loss import loss_of_robot
 
 
 def evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
     robot = load_robot(args.robot)
-    course = arguments.course(args.traj, robot)
+    plant, course = arguments.plant_of(args.plant, robot), arguments.course(args.traj, robot)
     seconds = arguments.seconds(args.seconds, course)
     # ideal and hfs are one plant each, without chance
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights(text, robot) for text in args.weights}
-    plants = arguments.plants(args.world, seeds)
+    body = robot if plant is None else plant
+    plants = arguments.plants(args.world, seeds, body.description)
+    config = tunings.tune_config(robot)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        config = tunings.tune_config(robot)
-        walks = verdicts.judge(
-            pool, config, robot, sets, course.command, plants, seeds, title=title, seconds=seconds
-        )
+        known = pool, config, robot, sets, course.command, plants, seeds
+        walks = verdicts.judge(*known, title=title, seconds=seconds, plant=plant)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
     result = metrics.as_result(verdict, args.world)
+    if plant is not None:
+        result["plant"] = plant.description.name
     if args.out is not None:
         write_json(args.out, result)
     if args.json:
@@ -50,7 +53,8 @@ def evaluate(args: Evaluate) -> None:
     else:
         names = arguments.short_names(args.weights)
         named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
-        print_table(named, f"{course.name}, {plural(count, 'plant')}", args.world)
+        of = "" if plant is None else f" of {plant.description.name}"
+        print_table(named, f"{course.name}, {plural(count, 'plant')}{of}", args.world)
 
 
 def walk(args: Walk) -> None:
@@ -62,33 +66,45 @@ def walk(args: Walk) -> None:
     if args.video is not None:
         check_film(args.video)
     robot = load_robot(args.robot)
+    plant = arguments.plant_of(args.plant, robot)
+    if args.world == "srbm" and plant is not None:
+        raise InputError("--plant needs a world of MuJoCo, got --world srbm")
     weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
+    loss, config = loss_of_robot(robot.description), walk_config(robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = arguments.walk_once(args, robot, course, weights)
-    score = metrics.score(PAPER_LOSS, trajectory)
-    upright = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen)))
-    samples = round(walk_config(robot).gait.tick / float(trajectory.period))  # of each plan
+    trajectory = arguments.walk_once(args, robot, course, weights, plant)
+    score = metrics.score(loss, trajectory)
+    upright, startup = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen))), None
+    if upright == 0.0 and args.world != "srbm":
+        startup = startup_fall(config, robot, arguments.job_of(args, robot, course, weights, plant))
+    samples = round(config.gait.tick / float(trajectory.period))  # of each plan
     plans = np.asarray(trajectory.residual)[::samples]
     unsolved = int(np.sum(~(plans <= SOLVED)))
     fell = bool(score.fallen) and not unsolved  # without a plan it is no fall of these weights
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
     if args.json:
-        losses = {part: float(loss) for part, loss in score.losses.items()}
+        losses = {part: float(value) for part, value in score.losses.items()}
         errors = {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
         solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
+        told = {"seconds": upright if startup is None else startup.time, "fell": fell}
+        told |= {} if startup is None else {"startup": startup._asdict()}
+        told |= {} if plant is None else {"plant": plant.description.name}
         # a walk that falls at once has no errors
-        print(as_json({"seconds": upright, "fell": fell, **losses, **errors, **solved}))
+        print(as_json({**told, **losses, **errors, **solved}))
     else:
-        terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in PAPER_LOSS)
         end = "fell after" if fell else "ended after" if score.fallen else "walked"
+        end = f"{end} {upright:.2f} s" if startup is None else str(startup)
+        on = "" if plant is None else f" on {plant.description.name}"
         print(
-            f"{course.name} in {args.world}, {printable(args.weights)} weights: {end} "
-            f"{upright:.2f} s; L {score.L / 1e6:.3f}e6 ({terms})"
+            f"{course.name} in {args.world}{on}, {printable(args.weights)} weights: {end}; ", end=""
         )
+        terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in loss)
+        print(f"L {score.L / 1e6:.3f}e6 ({terms})")
         cm, degrees = 100 * score.rms_position, np.degrees(score.rms_euler)
-        print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
-        print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
+        if upright > 0.0:
+            print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
+            print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
@@ -99,7 +115,7 @@ def walk(args: Walk) -> None:
         beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
         say(f"walking with {beside} weights for the other half of the film")
         walks = {
-            beside: arguments.walk_once(args, robot, course, other(robot)),
+            beside: arguments.walk_once(args, robot, course, other(robot), plant),
             name: trajectory,
         }
         pictures.film(args.video, robot, walks)

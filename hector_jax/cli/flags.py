@@ -159,6 +159,7 @@ class Evaluate(Configured):
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table
     robot: Robot = None  # TOML file of another biped; HECTOR by default
+    plant: Robot = None  # TOML file of another model of the robot, of which the plants are
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,7 @@ class Walk(Configured):
     video: Path | None = None  # file for a film beside nominal weights (.mp4; .webp for a page)
     json: bool = False  # print JSON instead of text
     robot: Robot = None  # TOML file of another biped; HECTOR by default
+    plant: Robot = None  # TOML file of another model of the robot, which is walked on
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,8 @@ from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
 from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.runs.verdicts import ScoredWalks
+from hector_jax.sim.diagnosis import not_the_weights
+from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import aligned
@@ -161,6 +163,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config = tunings.tune_config(robot, iterations=args.iterations, others=args.also)
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
+        _say_what_no_weights_mend(pool, config, robot, trajectories[0])
         run = _Run(
             folder,
             args,
@@ -202,6 +205,17 @@ def _tune_in(folder: Path, args: Tune) -> None:
         for name, one in by_name.items():
             print_table(one, f"{name}, {plural(args.seeds, 'plant')}")
     say(f"the report is {report}")
+
+
+def _say_what_no_weights_mend(
+    pool: Executor, config: TuneConfig, robot: Robot, course: NamedCommand
+) -> None:
+    """Walk once with nominal weights on the simulator; a line for what is not the weights."""
+    seconds = course.seconds or Walk.seconds
+    job = Job(nominal(robot), course.command, hfs(robot.description), seconds)
+    known = jax.tree.map(np.asarray, (robot, job))
+    for line in pool.submit(not_the_weights, config.rollout.walk, *known).result():
+        say(f"before any tuning, {course.name} on hfs with nominal weights: {line}")
 
 
 def _net(pool: Executor, args: Tune, robot: Robot) -> TrainedNet:
@@ -293,16 +307,16 @@ def _walk_sets(
 ) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
     """Walks of all sets on the stand-in plants and on the hfs, by trajectory."""
     seeds = range(run.args.seeds)
-    plants = arguments.plants("standin", seeds)
+    plants = arguments.plants("standin", seeds, run.robot.description)
     notes: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
     judge = partial(verdicts.judge, pool, run.config, run.robot, sets, **notes)
-    walks = {}
+    simulator, walks = hfs(run.robot.description), {}
     for name, command, _ in run.trajectories:
         where = f" {name}" if len(run.trajectories) > 1 else ""
         title = f"evaluating{where} on {plural(len(seeds), 'stand-in plant')}"
         standin = judge(command, plants, seeds, title=title, folder=run.artefacts / "standin")
         title = f"walking{where} on the high-fidelity simulator"
-        on_hfs = judge(command, [hfs()], [0], title=title, folder=run.artefacts / "hfs")
+        on_hfs = judge(command, [simulator], [0], title=title, folder=run.artefacts / "hfs")
         walks[name] = standin, on_hfs
     return walks
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Push, hfs_drawn
@@ -32,15 +33,15 @@ def draw_jobs(
     Trajectories take turns: straight, c, s, random velocities. Weights take turns too: each of the
     24 log-uniform around nominal, around expert and, where tuning paths are given, a point of one.
     Each walk has a plant of its own, drawn around the hfs. A third of the walks, drawn too, is
-    pushed once or twice: 10 to 30 N for 0.1 s, from any side. Job i depends on the seed and on i
-    alone, so a longer list begins with the shorter one.
+    pushed once or twice: 10 to 30 N (times the robot's size) for 0.1 s, from any side. Job i
+    depends on the seed and on i alone, so a longer list begins with the shorter one.
 
     Args:
         seed: of everything drawn.
         count: number of walks.
         paths: weights that tunings went through, stacked along a first axis each.
         seconds: length of each walk.
-        robot: whose nominal and expert weights they are; HECTOR by default.
+        robot: whose weights and plants they are; HECTOR by default.
 
     Raises:
         ValueError: fewer than one walk.
@@ -59,13 +60,19 @@ def draw_jobs(
             weights = _point(path, int(rng.integers(len(path.Q.euler))))
         else:
             weights = _draw_weights(rng, centres[centre], SPREAD)
-        return _draw_plant(rng, i, command, weights, seconds=seconds)
+        return _draw_plant(rng, i, command, weights, seconds=seconds, robot=robot)
 
     return [draw(i) for i in range(count)]
 
 
 def draw_jobs_near(
-    seed: int, count: int, command: Command, *, path: Weights, seconds: float = 4.0
+    seed: int,
+    count: int,
+    command: Command,
+    *,
+    path: Weights,
+    seconds: float = 4.0,
+    robot: Robot | None = None,
 ) -> list[Job]:
     """Draw walks around where one tuning went.
 
@@ -79,6 +86,7 @@ def draw_jobs_near(
         command: what was tuned for.
         path: weights that the tuning went through, stacked along a first axis.
         seconds: length of each walk.
+        robot: whose plants they are; HECTOR by default.
     """
 
     def draw(i: int) -> Job:
@@ -86,7 +94,7 @@ def draw_jobs_near(
         mine = _random_command(rng) if i % 2 else _split_last(command)
         point = -1 if i // 2 % 2 else int(rng.integers(len(path.Q.euler)))
         weights = _draw_weights(rng, _point(path, point), NEAR)
-        return _draw_plant(rng, i, mine, weights, seconds=seconds)
+        return _draw_plant(rng, i, mine, weights, seconds=seconds, robot=robot)
 
     return [draw(i) for i in range(count)]
 
@@ -96,19 +104,27 @@ def _point(path: Weights, index: int) -> Weights:
 
 
 def _draw_plant(
-    rng: np.random.Generator, i: int, command: Command, weights: Weights, *, seconds: float
+    rng: np.random.Generator,
+    i: int,
+    command: Command,
+    weights: Weights,
+    *,
+    seconds: float,
+    robot: Robot | None,
 ) -> Job:
-    plant = hfs_drawn(int(rng.integers(2**31)))
-    return Job(weights, command, plant, seconds, seed=i, push=_draw_push(rng, seconds))
+    description = HECTOR if robot is None else robot.description
+    plant = hfs_drawn(int(rng.integers(2**31)), description=description)
+    push = _draw_push(rng, seconds, description.plants.push)
+    return Job(weights, command, plant, seconds, seed=i, push=push)
 
 
 def _draw_weights(rng: np.random.Generator, centre: Weights, spread: float) -> Weights:
     return jax.tree.map(lambda w: w * spread ** rng.uniform(-1.0, 1.0, w.shape), centre)
 
 
-def _draw_push(rng: np.random.Generator, seconds: float) -> Push:
+def _draw_push(rng: np.random.Generator, seconds: float, scale: float) -> Push:
     number = rng.integers(1, PUSHES + 1) if rng.random() < 1.0 / 3.0 else 0
-    size = rng.uniform(10.0, 30.0, PUSHES) * (np.arange(PUSHES) < number)
+    size = scale * rng.uniform(10.0, 30.0, PUSHES) * (np.arange(PUSHES) < number)
     side = rng.uniform(-np.pi, np.pi, PUSHES)
     force = size[:, None] * np.stack([np.cos(side), np.sin(side), np.zeros(PUSHES)], axis=1)
     start = rng.uniform(0.0, max(seconds - PUSH_TIME, 0.0), PUSHES)

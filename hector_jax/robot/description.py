@@ -15,6 +15,8 @@
     [gait] [mpc] [footstep] [legs]     # fields of GaitConfig, MpcConfig, FootstepConfig, LegConfig
     [weights]
     nominal, expert = { euler, position, ang_velocity, velocity, force, moment }   # x, y, z or one
+    [loss]                             # weights of the terms of the loss: L_Eul, L_pos, L_ctrl
+    [plants]                           # fields of PlantSizes
 
 What is left out is as in assets/hector.toml. Masses, lengths, joint and torque limits are the
 model's; a description rides on its `Robot` and is static under jit.
@@ -28,7 +30,7 @@ from typing import Annotated, Any, NamedTuple
 import jax
 
 from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.core.settings import POSITIVE, from_table, read_toml
+from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, check, from_table, read_toml
 from hector_jax.core.trajectory import MAX_TILT, MIN_HEIGHT
 
 _PACKAGE = Path(__file__).parents[1]
@@ -54,7 +56,7 @@ class Foot(NamedTuple):
     """A foot in the model: names in it, or places in the frame of a body."""
 
     point: str | Triple | None  # site; or where wrenches act [m]: below the last joint by default
-    contacts: tuple[str, ...] | tuple[Triple, ...]  # spheres; or where the sole touches [m]
+    contacts: tuple[str | Triple, ...]  # spheres; or where the sole touches [m]
     body: str | None = None  # of places
 
 
@@ -67,6 +69,23 @@ class NamedFoot(NamedTuple):
 
 def _named_foot(side: str) -> Foot:
     return Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel"))
+
+
+_Factor = Annotated[float, NOT_NEGATIVE]
+
+
+@dataclass(frozen=True)
+class PlantSizes:
+    """How large the imperfections of this robot's plants are, each times that of HECTOR's."""
+
+    joint_friction: _Factor = 1.0
+    joint_damping: _Factor = 1.0
+    push: _Factor = 1.0  # forces from outside
+    trunk_com: _Factor = 1.0  # lengths: shift of the trunk's centre of mass, place of a payload
+    payload: _Factor = 1.0  # masses
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @jax.tree_util.register_static
@@ -87,6 +106,8 @@ class Description:
     control: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()  # sections as they came
     nominal: tuple[Triple, ...] | None = None  # in the order of _Diagonals; None: as HECTOR's
     expert: tuple[Triple, ...] | None = None  # likewise
+    loss: tuple[tuple[str, float], ...] = ()  # alphas by term; of the others those of the paper
+    plants: PlantSizes = PlantSizes()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "control", _frozen(self.control))
@@ -228,6 +249,8 @@ class _File:
     footstep: dict | None = None
     legs: dict | None = None
     weights: _Weights = _Weights()
+    loss: dict[str, float] | None = None
+    plants: PlantSizes = PlantSizes()
 
     def __post_init__(self) -> None:
         angles = self.standing.values() if isinstance(self.standing, dict) else ()
@@ -242,7 +265,8 @@ class _File:
 def read_description(path: Path) -> Description:
     """The description in a TOML file, see the module.
 
-    The fields of the controller's sections are checked by `walking.walk_config`.
+    The fields of the controller's sections are checked by `controller.walk_config`, the terms of
+    the loss by `loss.loss_of_robot`.
 
     Raises:
         InputError: one line naming file, key, what came and what was expected.
@@ -276,6 +300,8 @@ def read_description(path: Path) -> Description:
         ),
         nominal=weights.nominal and weights.nominal.rows(),
         expert=weights.expert and weights.expert.rows(),
+        loss=tuple((file.loss or {}).items()),
+        plants=file.plants,
     )
 
 
@@ -284,3 +310,7 @@ def _frozen(value: Any) -> Any:
     if isinstance(value, dict):
         value = list(value.items())
     return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+
+
+HECTOR = Description()
+"""Whose plants are drawn where no description is given."""

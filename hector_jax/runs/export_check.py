@@ -50,7 +50,7 @@ def record(
     Raises:
         InputError: the robot falls.
     """
-    plant = ideal()
+    plant = ideal(robot.description)
     world = build_world(plant, robot.description)
     standing = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
     rows = [np.concatenate([standing, np.zeros(world.model.nv + 1)])[sensing.coordinates(world)]]

@@ -314,7 +314,9 @@ def refresh(
     walks = folder / "walks"
     late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
     path = stack([tuning.ten, *late])
-    jobs = draw_jobs_near(config.seed, config.walks, command, path=path, seconds=config.seconds)
+    jobs = draw_jobs_near(
+        config.seed, config.walks, command, path=path, seconds=config.seconds, robot=robot
+    )
     with locked(walks):
         # the jobs say the rest
         settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}

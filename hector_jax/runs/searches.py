@@ -47,9 +47,9 @@ def losses_on_hfs(
         at_once: walks that a program is compiled for; fewer are filled up to it.
     """
     walk = config.rollout.walk
-    seconds = config.rollout.ticks * walk.gait.tick
+    seconds, plant = config.rollout.ticks * walk.gait.tick, hfs(robot.description)
     jobs = [
-        Job(weights, commands[name], hfs(), seconds)
+        Job(weights, commands[name], plant, seconds)
         for name, each in sets.items()
         for weights in each
     ]
@@ -97,7 +97,7 @@ def search(
         "controller": repr(tune.rollout.walk),
         "loss": repr(tune.loss),
         "robot": robot_hash(robot),
-        "plant": tree_hash(hfs()),
+        "plant": tree_hash(hfs(robot.description)),
         "commands": {name: tree_hash(command) for name, command in every.items()},
     }
 

@@ -31,6 +31,7 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import RolloutConfig
 
 # modules that decide the numbers, for `content_key`
@@ -235,8 +236,13 @@ def gradient_norms(
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
-    """Settings of a tuning, with the controller that the robot's description asks for."""
-    return TuneConfig(rollout=RolloutConfig(walk=walk_config(robot)), **settings)
+    """Settings of a tuning, with the controller and the loss that the robot's TOML asks for.
+
+    Raises:
+        InputError: one line naming the file and what is wrong in it.
+    """
+    rollout = RolloutConfig(walk=walk_config(robot))
+    return TuneConfig(rollout=rollout, loss=loss_of_robot(robot.description), **settings)
 
 
 def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
@@ -262,7 +268,7 @@ def compile_programs(pool: Executor, robot: Robot) -> None:
     """Compile what tunings and walks run, each program in one process; the others load it."""
     config = tune_config(robot)
     controller, straight = config.rollout.walk, named_command("straight")
-    tick = Job(nominal(robot), straight, hfs(), controller.gait.tick)
+    tick = Job(nominal(robot), straight, hfs(robot.description), controller.gait.tick)
     with bar("compiling, once on a machine") as tell:
         jobs = [
             pool.submit(_compile_tuning, config, robot, straight),

@@ -23,6 +23,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.metrics import Score
+from hector_jax.sim.diagnosis import StartupFall, startup_fall
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Imperfections
@@ -30,7 +31,11 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-_CODE = ("sim.walk", "runs.metrics")  # modules that decide the numbers, for `content_key`
+_CODE = (
+    "sim.walk",
+    "sim.diagnosis",
+    "runs.metrics",
+)  # modules that decide the numbers, for `content_key`
 
 Case = tuple[str, int]
 """A set and a seed."""
@@ -40,9 +45,10 @@ class ScoredWalk(NamedTuple):
     """What is kept of one walk."""
 
     score: Score
-    upright: Float[np.ndarray, ""]  # [s] until a fall, or the whole walk
+    upright: Float[np.ndarray, ""]  # [s] until a fall, below zero in the start-up; or all of it
     last: State  # the last one upright, or of the walk
     commit: str  # at which it was walked; empty where that is not known
+    startup: str  # what is to be said of a fall in the start-up; empty where there is none
 
 
 class ScoredWalks(NamedTuple):
@@ -86,18 +92,21 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
 
 
-def _score_walk(config: Loss, walk: Trajectory, commit: str) -> ScoredWalk:
+def _score_walk(
+    loss: Loss, walk: Trajectory, commit: str, startup: StartupFall | None
+) -> ScoredWalk:
     up = int(np.sum(~np.asarray(walk.fallen)))
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
-    upright = np.asarray(up * float(walk.period))
-    return ScoredWalk(metrics.score(config, walk), upright, last, commit)
+    upright = np.asarray(up * float(walk.period) if startup is None else startup.time)
+    text = "" if startup is None else str(startup)
+    return ScoredWalk(metrics.score(loss, walk), upright, last, commit, text)
 
 
 def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
     """Layout of the artefact of one walk, with its trajectory or without."""
     walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(robot).trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
-    one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, np.array(""))  # pyright: ignore
+    one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, *[np.array("")] * 2)  # pyright: ignore
     return one, walk if with_walk else None
 
 
@@ -106,6 +115,12 @@ def _say_unsolved(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
         worst = np.max([walk.score.residual for walk in each])
         if not worst <= SOLVED:
             say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
+
+
+def _say_startup_falls(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
+    for name, each in walks.items():
+        if falls := [walk.startup for walk in each if walk.startup]:
+            say(f"{name}: {len(falls)} of {plural(len(each), 'walk')} {falls[0]}")
 
 
 def judge(
@@ -121,6 +136,7 @@ def judge(
     seconds: float = 4.0,
     folder: Path | None = None,
     commit: str = "",
+    plant: Robot | None = None,
 ) -> ScoredWalks:
     """Walk every weight set on every plant and score the walks.
 
@@ -133,17 +149,19 @@ def judge(
         title: for the person who waits.
         folder: of the scores, where walks that are there are not walked again; None: keep none.
         commit: to note with what is walked now.
+        plant: another model of the robot, of which the plants are.
 
     Raises:
         InputError: the folder cannot be written.
     """
     walk_config = config.rollout.walk
     jobs = {
-        (name, seed): Job(weights, command, plant, seconds, seed)
-        for plant, seed in zip(plants, seeds, strict=True)
+        (name, seed): Job(weights, command, imperfections, seconds, seed, plant=plant)
+        for imperfections, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
 
+    host = jax.tree.map(np.asarray, robot)  # for another process
     with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
 
     def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
@@ -151,20 +169,28 @@ def judge(
         walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
         for case, walk in zip(missing, walks, strict=True):
             samples = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
-            yield case, (_score_walk(config.loss, walk, commit), samples)
+            startup = None
+            if np.asarray(walk.fallen)[0]:
+                startup = pool.submit(startup_fall, walk_config, host, jobs[case]).result()
+            yield case, (_score_walk(config.loss, walk, commit, startup), samples)
 
     if folder is None:
         results = dict(make(list(jobs), {}))
     else:
         paths = {}
         for (name, seed), job in jobs.items():
-            key = content_key(walk_config, repr(config.loss), robot, job, code=_CODE)
+            parts = walk_config, repr(config.loss), robot, job, *([plant] if plant else [])
+            key = content_key(*parts, code=_CODE)
             stem = f"walk-{name}" if with_walk((name, seed)) else f"score-{name}"
             paths[name, seed] = folder / f"{stem}-{seed}-{key}.npz"
         like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
-    walks = {case: one._replace(commit=str(one.commit)) for case, (one, _) in results.items()}
+    walks = {
+        case: one._replace(commit=str(one.commit), startup=str(one.startup))
+        for case, (one, _) in results.items()
+    }
     by_set = {name: [walks[name, seed] for seed in seeds] for name in sets}
     _say_unsolved(by_set)
+    _say_startup_falls(by_set)
     first = {name: results[name, seeds[0]][1] for name in sets if folder is not None}
     return ScoredWalks(by_set, first)

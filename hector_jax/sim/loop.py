@@ -19,6 +19,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
@@ -39,6 +40,31 @@ class Job(NamedTuple):
     start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
     push: Push = NO_PUSH
     changes: tuple[Change, ...] = ()  # of the plant
+    plant: Robot | None = None  # another model, which is walked on in place of the controller's own
+
+    def body(self, robot: Robot) -> Robot:
+        """The robot whose file and standing pose the plant has; that of the controller by default.
+
+        Raises:
+            InputError: its joints are not those of the controller's.
+        """
+        if self.plant is None:
+            return robot
+        check_plant(robot.description, self.plant.description)
+        return self.plant
+
+
+def check_plant(ours: Description, theirs: Description) -> None:
+    """Check that one robot can be the plant of the controller of another.
+
+    Raises:
+        InputError: its joints are others, or in another order.
+    """
+    if ours.joints != theirs.joints:
+        raise InputError(
+            f"{theirs.path}: joints are {', '.join(theirs.joints)}; as a plant of {ours.path} "
+            f"expected {', '.join(ours.joints)}"
+        )
 
 
 class Sample(NamedTuple):

@@ -269,6 +269,8 @@ def _check_batch(jobs: Sequence[Job]) -> None:
     ):
         if len(values) > 1:
             raise ValueError(f"walks of one batch must agree in {name}, got {sorted(values)}")
+    if len({job.plant and job.plant.description for job in jobs}) > 1:
+        raise ValueError("walks of one batch must be on plants of one model")
     if any(np.any(np.asarray(x)) for job in jobs for x in job.imperfections.estimator):
         raise ValueError("a batch in MJX knows its state exactly: estimator errors must be zero")
     changing = [i for i, job in enumerate(jobs) if job.changes]
@@ -300,7 +302,7 @@ def walk_batch(
 
     Args:
         config: the controller.
-        robot: its nominal body; the plants are its MJCF.
+        robot: its nominal body; the plants are its MJCF, or that of the jobs.
         jobs: what to walk, all of one length; plants that do not change, without errors of the
             estimator.
         chunk: walks at once, at most; by default 32 on a CPU and 4096 elsewhere.
@@ -311,9 +313,11 @@ def walk_batch(
         The walks (numpy) in the order of their jobs, as their chunks are done.
 
     Raises:
-        ValueError: the jobs differ in length, in the pieces of their commands, in the number of
-            their pushes or in their joints, have errors of the estimator or changes, or a number
-            of one is out of its range; or a geom that may touch the floor has a shape unknown here.
+        InputError: the joints of the jobs' plant are not those of the robot.
+        ValueError: the jobs differ in their plant's model, in length, in the pieces of their
+            commands, in the number of their pushes or in their joints, have errors of the estimator
+            or changes, or a number of one is out of its range; or a geom that may touch the floor
+            has a shape unknown here.
     """
     if chunk is None:
         chunk = CPU_CHUNK if jax.default_backend() == "cpu" else DEVICE_CHUNK
@@ -323,9 +327,10 @@ def walk_batch(
         return iter(())
     _check_batch(jobs)
     ticks = [loop.walk_ticks(config, job.seconds, int(job.start_tick)) for job in jobs][0]
-    worlds = build_worlds([job.imperfections for job in jobs], robot.description)
+    body = jobs[0].body(robot)
+    worlds = build_worlds([job.imperfections for job in jobs], body.description)
     model, varied = mjx_model.batched_model(worlds, single)
-    qpos = jnp.asarray(standing_qpos(worlds[0], robot.standing_joints, float(robot.trunk_height)))
+    qpos = jnp.asarray(standing_qpos(worlds[0], body.standing_joints, float(body.trunk_height)))
     starts = np.array([job.start_tick for job in jobs], np.int32)
     others = {name for job in jobs for name in job.weights.others}
     batch = WalkBatch(

@@ -8,26 +8,33 @@ that errs and drifts), so that a map learned on the hfs is not tested on its own
 
 import numpy as np
 
+from hector_jax.robot.description import HECTOR, Description
 from hector_jax.sim.world import Estimator, Imperfections
 
 
-def standin(seed: int) -> Imperfections:
-    """The plant of a seed; every number is drawn uniformly from its range, each on its own."""
-    rng = np.random.default_rng([0x57A, seed])
+def standin(seed: int, description: Description = HECTOR) -> Imperfections:
+    """The plant of a seed; every number is drawn uniformly from its range, each on its own.
+
+    Args:
+        seed: which plant.
+        description: of the robot, HECTOR by default; joint friction and damping and the shift of
+            the trunk's centre of mass are times its sizes.
+    """
+    sizes, rng = description.plants, np.random.default_rng([0x57A, seed])
     draw = lambda low, high, size=(): np.asarray(rng.uniform(low, high, size))  # noqa: E731
     return Imperfections(
-        joint_friction=draw(0.3, 0.7),
-        joint_damping=draw(0.1, 0.4),
+        joint_friction=draw(0.3, 0.7) * sizes.joint_friction,
+        joint_damping=draw(0.1, 0.4) * sizes.joint_damping,
         armature=draw(0.9, 1.4),
         backlash=draw(0.005, 0.015),
         delay=draw(0.001, 0.005),
         lag=draw(0.002, 0.006),
-        torque_gain=draw(0.9, 1.0, 10),
-        linkage=draw(0.3, 1.0),
+        torque_gain=draw(0.9, 1.0, len(description.joints)),
+        linkage=draw(0.3, 1.0) * (description.linkage is not None),
         contact_time=draw(0.006, 0.02),
         floor_friction=draw(0.65, 1.0),
         mass=draw(0.95, 1.08),
-        trunk_com=draw(-0.015, 0.015, 3),
+        trunk_com=draw(-0.015, 0.015, 3) * sizes.trunk_com,
         estimator=Estimator(
             position=np.asarray(0.003),
             velocity=np.asarray(0.03),

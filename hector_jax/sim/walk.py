@@ -46,7 +46,7 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     count = substeps(config)
 
     def begin(robot: Robot, reading: Array) -> Memory:
-        still = jnp.zeros(()), sensing.no_error(robot)
+        still = jnp.zeros(()), jnp.asarray(sensing.no_error(robot))
         return init_memory(robot, loop.measure(robot, reading, *still))
 
     def samples(robot, command, anchor, tick, yaw, readings, contacts, place) -> Sample:
@@ -76,9 +76,10 @@ class _Plant:
     def __init__(self, config: WalkConfig, robot: Robot, job: Job, first: int, end: int) -> None:
         """Stand at the origin; `first` and `end` are milliseconds after t = 0."""
         count = substeps(config)
-        world = self.world = build_world(job.imperfections, robot.description)
+        body = job.body(robot)
+        world = self.world = build_world(job.imperfections, body.description)
         self.data = mujoco.MjData(world.model)
-        self.data.qpos[:] = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
+        self.data.qpos[:] = standing_qpos(world, body.standing_joints, float(body.trunk_height))
         self.contacts = sensing.empty_contacts(count)
         self._first, self._where = first, sensing.coordinates(world)
         self._worlds = worlds_by_step(world, job.changes, first, end)
@@ -118,7 +119,7 @@ def walk(
 
     Args:
         config: the controller.
-        robot: its nominal body; the plant is its MJCF.
+        robot: its nominal body; the plant is its MJCF, or that of the job.
         job: what to walk.
         on_sample: called after each millisecond, start-up included, with the world of that moment.
         retune: gives the weights to plan with at each tick from t = 0 on, instead of the job's.

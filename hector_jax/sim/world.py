@@ -1,16 +1,18 @@
 """The MuJoCo worlds: a robot's MJCF and what is wrong with a plant's joints, ground and masses.
 
 Imperfections are numbers, so that a world is data: `ideal`, `hfs` (the high-fidelity simulator) and
-plants drawn around the hfs. What a number means is stated here; the motors' part of it (delay, lag,
-gain, linkage) lives in sim.actuators, the estimator's in sim.sensing, the rest becomes a field of
-the MuJoCo model. Backlash is a second hinge on the axis of each joint, free within +-b between
-motor and link; the encoder sits on the motor's side. Everything is looked up by name, so that
-nothing depends on how many joints there are.
+plants drawn around the hfs. They are those of HECTOR; a robot's description says how much larger
+its own are (`PlantSizes`), and one without a linkage has none. What a number means is stated here;
+the motors' part of it (delay, lag, gain, linkage) lives in sim.actuators, the estimator's in
+sim.sensing, the rest becomes a field of the MuJoCo model. Backlash is a second hinge on the axis of
+each joint, free within +-b between motor and link; the encoder sits on the motor's side. Everything
+is looked up by name, so that nothing depends on how many joints there are.
 """
 
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -20,7 +22,7 @@ from jaxtyping import Float, Int
 from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, unknown
-from hector_jax.robot.description import Description
+from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import compile_model, quiet_mujoco
 from hector_jax.robot.source import build_spec
@@ -64,7 +66,7 @@ class Imperfections(NamedTuple):
     backlash: Float[Array, "*batch"]  # [rad] half width b
     delay: Float[Array, "*batch"]  # [s] of the torque command
     lag: Float[Array, "*batch"]  # [s] first order, of the torque
-    torque_gain: Float[Array, "*batch 10"]
+    torque_gain: Float[Array, "*batch joints"]
     linkage: Float[Array, "*batch"]  # share of the ankle torque that is added at the knee
     contact_time: Float[Array, "*batch"]  # [s] solref of the floor
     floor_friction: Float[Array, "*batch"]
@@ -85,16 +87,20 @@ def truth() -> Estimator:
     return Estimator(*(np.zeros(()) for _ in Estimator._fields))
 
 
-def ideal() -> Imperfections:
-    """For checking the controller: firm ground, joint damping 0.1, nothing else."""
+def ideal(description: Description = HECTOR) -> Imperfections:
+    """For checking the controller: firm ground, joint damping 0.1, nothing else.
+
+    Args:
+        description: of the robot, HECTOR by default.
+    """
     values = dict(
         joint_friction=0.0,
-        joint_damping=0.1,
+        joint_damping=0.1 * description.plants.joint_damping,
         armature=1.0,
         backlash=0.0,
         delay=0.0,
         lag=0.0,
-        torque_gain=np.ones(10),
+        torque_gain=np.ones(len(description.joints)),
         linkage=0.0,
         contact_time=0.01,
         floor_friction=0.8,
@@ -105,60 +111,68 @@ def ideal() -> Imperfections:
     return Imperfections(**arrays, estimator=truth())
 
 
-def hfs() -> Imperfections:
+def hfs(description: Description = HECTOR) -> Imperfections:
     """The high-fidelity simulator: friction, backlash, delay, lag and linkage as in the paper's."""
-    return ideal()._replace(
-        joint_friction=np.asarray(0.3),
-        joint_damping=np.asarray(0.3),
+    sizes = description.plants
+    return ideal(description)._replace(
+        joint_friction=np.asarray(0.3 * sizes.joint_friction),
+        joint_damping=np.asarray(0.3 * sizes.joint_damping),
         backlash=np.asarray(0.005),
         delay=np.asarray(0.002),
         lag=np.asarray(0.004),
-        linkage=np.asarray(0.5),
+        linkage=np.asarray(0.5 if description.linkage else 0.0),
     )
 
 
-def hfs_drawn(seed: int, share: float = 0.2) -> Imperfections:
+def hfs_drawn(seed: int, share: float = 0.2, description: Description = HECTOR) -> Imperfections:
     """A plant around the hfs: each number drawn uniformly within +-`share` of its own.
 
-    Of mass, whose number is known better, a tenth of the share; the trunk's centre of mass
-    moves by up to 2.5 cm times the share. The floor keeps a friction of at least 0.6 (that
-    with which the MPC plans), and no motor gives
-    more than it is told to: a gain falls short of 1 by up to a quarter of the share.
+    Of mass, whose number is known better, a tenth of the share; the trunk's centre of mass moves
+    by up to 2.5 cm times the share, of another robot times its size. The floor keeps a friction of
+    at least 0.6 (that with which the MPC plans), and no motor gives more than it is told to: a gain
+    falls short of 1 by up to a quarter of the share.
 
     Args:
         seed: which plant.
         share: 0.2 for collection, 0.4 for `hfs-varied`.
+        description: of the robot, HECTOR by default.
     """
-    base, rng = hfs(), np.random.default_rng([0x4F5, round(1000 * share), seed])
+    base, rng = hfs(description), np.random.default_rng([0x4F5, round(1000 * share), seed])
     within = lambda value, part: np.asarray(value * rng.uniform(1 - part, 1 + part))  # noqa: E731
     apart = ("torque_gain", "mass", "trunk_com", "estimator")  # drawn after the others
     names = [name for name in base._fields if name not in apart]
     drawn = base._replace(**{name: within(getattr(base, name), share) for name in names})
     return drawn._replace(
         floor_friction=np.maximum(drawn.floor_friction, 0.6),
-        torque_gain=rng.uniform(1 - share / 4, 1.0, 10),
+        torque_gain=rng.uniform(1 - share / 4, 1.0, len(description.joints)),
         mass=within(base.mass, share / 10),
-        trunk_com=rng.uniform(-1.0, 1.0, 3) * share * 0.025,
+        trunk_com=rng.uniform(-1.0, 1.0, 3) * share * 0.025 * description.plants.trunk_com,
     )
 
 
-def hfs_varied(seed: int) -> Imperfections:
+def hfs_varied(seed: int, description: Description = HECTOR) -> Imperfections:
     """One of the 20 plants around the hfs by which we choose between variants of ours."""
-    return hfs_drawn(seed, 0.4)
+    return hfs_drawn(seed, 0.4, description)
 
 
 WORLDS = ("ideal", "hfs", "hfs-varied")
 
 
-def named_world(name: str, seed: int = 0) -> Imperfections:
-    """Imperfections of a world with a name; the seed chooses the plant where there are several.
+def named_world(name: str, seed: int = 0, description: Description = HECTOR) -> Imperfections:
+    """Imperfections of a world with a name.
+
+    Args:
+        name: of WORLDS.
+        seed: which plant, where there are several.
+        description: of the robot, HECTOR by default.
 
     Raises:
         InputError: the name is none of WORLDS.
     """
     if name not in WORLDS:
         raise InputError(unknown("world", name, WORLDS))
-    return {"ideal": ideal, "hfs": hfs, "hfs-varied": lambda: hfs_varied(seed)}[name]()
+    worlds = {"ideal": ideal, "hfs": hfs, "hfs-varied": partial(hfs_varied, seed)}
+    return worlds[name](description=description)
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +297,7 @@ def build_worlds(
     for plant in imperfections:
         _check(plant)
     slack = [bool(plant.backlash > 0.0) for plant in imperfections]
-    blank = {kind: _compile(description or Description(), kind) for kind in set(slack)}
+    blank = {kind: _compile(description or HECTOR, kind) for kind in set(slack)}
     return [_with_numbers(blank[s], p) for s, p in zip(slack, imperfections, strict=True)]
 
 

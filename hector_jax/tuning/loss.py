@@ -10,7 +10,11 @@ measured walks, follows a term through the states and commands of a walk only.
 
 A world that ticks slower weighs its tracking sums by the milliseconds a tick stands for; the
 smoothness counts the changes of the held command. A fall is a fall: every missing sample is charged
-the larger of the last error and a fixed one, and smoothness stops.
+the larger of the last error and a least one, and smoothness stops. The least error in position is
+the height of the reference, so that a tall robot has farther to fall.
+
+The terms grow with the robot: L_pos with the square of its height, L_ctrl with that of its weight.
+A robot's description may weigh them otherwise (`loss_of_robot`).
 """
 
 from collections.abc import Callable, Mapping
@@ -23,12 +27,13 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError, did_you_mean, short_repr
+from hector_jax.core.inputs import InputError, short_repr, unknown
 from hector_jax.core.settings import NOT_NEGATIVE
 from hector_jax.core.trajectory import Trajectory, Wrench
+from hector_jax.robot.description import Description
 
 SAMPLE = 1e-3  # [s] the rate at which the paper sums
-FALL_POSITION = 0.5  # [m] least error charged after a fall
+FALL_POSITION = 0.5  # [m] least error charged after a fall from less than this height
 FALL_EULER = 0.8  # [rad]
 
 
@@ -63,7 +68,7 @@ Terms = Mapping[str, Float[Array, "*batch"]]
 
 
 def _charged(
-    error: Float[Array, " T"], fallen: Bool[Array, " T"], least: float
+    error: Float[Array, " T"], fallen: Bool[Array, " T"], least: float | Float[Array, " T"]
 ) -> Float[Array, " T"]:
     """Squared errors with those after the fall replaced by what a fall is charged."""
     before = jnp.where(fallen, 0.0, error)
@@ -88,7 +93,8 @@ def position_loss(trajectory: Trajectory) -> Float[Array, ""]:
     """Squared error of the centre of mass [m^2], summed over 1 kHz samples."""
     error = jnp.sum((trajectory.state.position - trajectory.reference.position) ** 2, axis=-1)
     samples = trajectory.period / SAMPLE
-    return samples * jnp.sum(_charged(error, trajectory.fallen, FALL_POSITION))
+    least = jnp.maximum(trajectory.reference.position[..., 2], FALL_POSITION)
+    return samples * jnp.sum(_charged(error, trajectory.fallen, least))
 
 
 def control_loss(trajectory: Trajectory) -> Float[Array, ""]:
@@ -175,8 +181,20 @@ def with_alphas(weights: Mapping[str, float], loss: Loss = PAPER_LOSS) -> Loss:
     names = {key: term.name for term in loss for key in (term.name, _KEYS.get(term.name, ""))}
     for key in weights:
         if key not in names:
-            raise InputError(f"no term {key!r} in the loss{did_you_mean(key, names)}")
+            raise InputError(unknown("term", key, (term.name for term in loss)))
     given = {names[key]: weight for key, weight in weights.items()}
     weighted = tuple(t._replace(weight=given.get(t.name, t.weight)) for t in loss)
     check_loss(weighted)
     return weighted
+
+
+def loss_of_robot(description: Description) -> Loss:
+    """The paper's loss with the weights that a robot's description gives.
+
+    Raises:
+        InputError: one line naming the file, for a term that there is not or a wrong weight.
+    """
+    try:
+        return with_alphas(dict(description.loss))
+    except InputError as error:
+        raise InputError(f"{description.path}: loss: {error}") from None

@@ -74,7 +74,8 @@ def distances(
             upright = motion.times <= motion.fall_time
             away = np.where(upright, 100 * motion.distance, np.nan)
             mean = np.sqrt(np.mean(away[upright] ** 2)) if upright.any() else np.nan
-            label = f"{label_of(name)}: {mean:.1f} cm RMS"
+            rms = f"{mean:.1f} cm RMS" if upright.any() else "fell at once"
+            label = f"{label_of(name)}: {rms}"
             axes.plot(motion.times, away, color=np.divide(colour, 255), ls=style, label=label)
         axes.set_title("distance from the reference [cm]", loc="left")
         axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))

@@ -1,0 +1,205 @@
+"""What is told of a walk that goes wrong and not by its weights: falls before t = 0, motors."""
+
+import json
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from pretend import pretend_walk
+
+from hector_jax.cli import arguments, evaluate
+from hector_jax.cli import tune as tuning
+from hector_jax.cli.main import main
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.reference import named_command
+from hector_jax.control.trajectories import command_of
+from hector_jax.control.weights import nominal
+from hector_jax.report.report import render
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import metrics, verdicts
+from hector_jax.sim import diagnosis
+from hector_jax.sim.diagnosis import Record, StartupFall, likeliest_cause, not_the_weights
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import hfs
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.loss import PAPER_LOSS
+
+ROBOT, STRAIGHT = load_robot(), named_command("straight")
+JOB = Job(nominal(), STRAIGHT, hfs(), 1.0)
+STANDING = float(ROBOT.standing_height)
+FALL = StartupFall(-0.42, 0.21, 0.93, "it tips over forwards (standing pose, joint gains, gait)")
+TEXT = (
+    "fell at -0.42 s, in the start-up: centre of mass 0.21 m high, tilt 0.93 rad; likeliest cause: "
+    "it tips over forwards (standing pose, joint gains, gait)"
+)
+
+
+def fallen_at_once(seed=0, seconds=1.0):
+    walked = pretend_walk(seed, seconds=seconds)
+    return walked._replace(fallen=np.ones_like(walked.fallen))
+
+
+def recorded(height=0.0, angles=(0.0, 0.0), knee=0.0, *, fallen=True, touching="", walked=None):
+    """A second that ends with these, and began standing; the left knee's torque all along."""
+    rise = np.linspace(0.0, 1.0, 1000)
+    torque = np.zeros((1000, 10))
+    torque[:, 3] = knee
+    return Record(
+        time=0.001 * (1 + np.arange(1000)) - 1.0,
+        height=STANDING + height * rise,
+        angles=np.outer(rise, angles),
+        torque=torque,
+        touching=touching,
+        fallen=fallen,
+        walked=fallen_at_once() if walked is None else walked,
+    )
+
+
+def unsolved():
+    walked = fallen_at_once()
+    return walked._replace(residual=np.full_like(walked.residual, np.inf))
+
+
+@pytest.mark.parametrize(
+    ("record", "cause"),
+    [
+        (recorded(height=np.nan), "the physics diverges"),
+        (recorded(fallen=False), "the physics diverges"),
+        (recorded(-0.2, walked=unsolved()), "a QP of the MPC is not solved"),
+        (recorded(-0.2, knee=1.0), "the torque of left_knee is at its limit of 67 N m for 100 %"),
+        (recorded(-0.2), "the centre of mass sinks steadily, by 9 cm while still upright"),
+        (recorded(0.2, (0.0, 0.3)), "the centre of mass rises steadily, by 20 cm"),
+        (recorded(0.06, (0.0, 0.9)), "it tips over forwards"),
+        (recorded(0.0, (0.0, -0.9)), "it tips over backwards"),
+        (recorded(0.0, (0.9, 0.1)), "it tips over to the right"),
+        (recorded(0.0, (-0.9, 0.1)), "it tips over to the left"),
+        (recorded(0.0, (0.0, 0.3), touching="left_shin"), "left_shin touches the floor"),
+    ],
+)
+def test_the_likeliest_cause_follows_from_what_came_before_the_fall(record, cause):
+    assert likeliest_cause(ROBOT, record).startswith(cause)
+
+
+def test_torques_of_a_robot_that_is_half_over_are_nobodys_fault():
+    record = recorded(0.0, (0.0, 0.9))
+    record.torque[record.tilt > 0.5] = 1.0
+    assert "tips over" in likeliest_cause(ROBOT, record)
+
+
+def test_a_fall_in_the_start_up_is_that_of_the_walk():
+    heavy = JOB._replace(imperfections=hfs()._replace(mass=np.array(6.0)), seconds=0.05)
+    config, rows = WalkConfig(), []
+    walked = walk(config, ROBOT, heavy, on_sample=lambda world, data: rows.append(data.qpos[2]))
+    assert walked.fallen.all()
+    fall = diagnosis.startup_fall(config, ROBOT, heavy)
+    assert fall is not None
+    assert -1.1 < fall.time < -0.5
+    # the walk goes on to the end of the tick in which it falls
+    assert 0.0 <= len(rows) - 1000 * (fall.time + 1.1) < 10
+    assert fall.height == pytest.approx(float(walked.initial.position[2]), abs=5e-3)
+    assert fall.height < ROBOT.description.min_height
+    assert "sinks steadily" in fall.cause
+    assert diagnosis.startup_fall(config, ROBOT, JOB._replace(seconds=0.05)) is None
+
+
+# What no weights mend
+
+
+def settled(height):
+    """Two seconds upright, this far above the reference [m]."""
+    walked = pretend_walk(error=0.0, seconds=2.0)
+    position = walked.reference.position + [0.0, 0.0, height]
+    return walked._replace(state=walked.state._replace(position=position))
+
+
+def lines(monkeypatch, record):
+    monkeypatch.setattr(diagnosis, "record", lambda *args: record._replace(time=record.time + 2.0))
+    return not_the_weights(WalkConfig(), ROBOT, JOB)
+
+
+def test_a_sound_walk_has_nothing_to_be_told(monkeypatch):
+    assert lines(monkeypatch, recorded(fallen=False, walked=settled(0.015))) == []
+
+
+def test_a_height_that_is_off_and_motors_at_their_limits_are_told(monkeypatch):
+    record = recorded(fallen=False, walked=settled(-0.04))
+    record.torque[:100, 2], record.torque[:30, 5] = -0.99, 1.0
+    height, torque = lines(monkeypatch, record)
+    assert height.startswith("the centre of mass is 4.0 cm below its reference all along")
+    assert torque == "the torque of left_hip_pitch is at its limit of 33.5 N m for 10 % of the time"
+
+
+def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
+    walked = settled(0.0)
+    walked.state.position[150:, 2] -= 0.3
+    record = recorded(walked=walked)
+    record.torque[500:] = 1.0
+    assert lines(monkeypatch, record) == []
+
+
+def test_a_fall_in_the_start_up_is_told_before_any_tuning(monkeypatch, capsys):
+    monkeypatch.setattr(diagnosis, "record", lambda *args: recorded())
+    monkeypatch.setattr(diagnosis, "startup_fall", lambda *args: FALL)
+    with ThreadPoolExecutor(1) as pool:
+        tuning._say_what_no_weights_mend(pool, TuneConfig(), ROBOT, command_of("straight"))
+    said = capsys.readouterr().err
+    assert f"before any tuning, straight on hfs with nominal weights: {TEXT}\n" in said
+
+
+# How a fall in the start-up is told
+
+
+def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
+    monkeypatch.setattr(arguments, "walk_once", lambda *args: fallen_at_once())
+    monkeypatch.setattr(evaluate, "startup_fall", lambda *args: FALL)
+    monkeypatch.setattr(sys, "argv", ["hector", "walk"])
+    assert main() == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"straight in hfs, nominal weights: {TEXT}; L ")
+    assert "nan" not in out
+    monkeypatch.setattr(sys, "argv", ["hector", "walk", "--json"])
+    assert main() == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["seconds"], told["fell"]) == (-0.42, True)
+    assert told["startup"] == FALL._asdict()
+    assert told["rms_position"] == [None] * 3
+
+
+def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
+    monkeypatch, tmp_path, capsys
+):
+    made = []
+
+    def walks_of(pool, config, robot, jobs, title):
+        for job in jobs:
+            made.append(job.seed)
+            yield pretend_walk(1, seconds=1.0) if job.seed == 1 else fallen_at_once(job.seed)
+
+    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(verdicts, "startup_fall", lambda *args: FALL)
+    for _ in range(2):  # as walked, and from the folder
+        with ThreadPoolExecutor(1) as pool:
+            found = verdicts.judge(
+                pool,
+                TuneConfig(),
+                ROBOT,
+                {"mine": nominal()},
+                STRAIGHT,
+                [hfs()] * 3,
+                range(3),
+                title="",
+                folder=tmp_path,
+            )
+        assert [float(one.upright) for one in found.walks["mine"]] == [-0.42, 1.0, -0.42]
+        assert f"mine: 2 of 3 walks {TEXT}\n" in capsys.readouterr().err
+    assert made == [0, 1, 2]
+
+
+def test_the_table_of_a_set_that_always_falls_at_once_has_no_nan():
+    scores = [metrics.score(PAPER_LOSS, fallen_at_once())] * 2
+    verdict = metrics.make_verdict(PAPER_LOSS, [0, 1], {"nominal": scores})
+    text = render("verdict.md.j2", verdict=verdict)
+    assert "nan" not in text
+    assert "| nominal | - | - | - | - | - | - |" in text

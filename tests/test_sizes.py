@@ -1,0 +1,177 @@
+"""What depends on the size of a robot: its plants, the weights of its loss, what a fall costs."""
+
+import hashlib
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pretend import pretend_walk
+from scenes import Level, SceneConfig, make_scenes
+
+from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import from_table, to_table
+from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
+from hector_jax.robot.description import Description, PlantSizes, read_description
+from hector_jax.robot.model import load_robot
+from hector_jax.runs.tunings import tune_config
+from hector_jax.sim.standin import standin
+from hector_jax.sim.world import WORLDS, hfs, hfs_drawn, hfs_varied, ideal, named_world
+from hector_jax.tuning.loss import PAPER_LOSS, losses
+
+SIZES = PlantSizes(joint_friction=3.0, joint_damping=2.0, push=5.0, trunk_com=1.5, payload=4.0)
+LARGE = Description(plants=SIZES)
+# seven joints a leg, and none that another's motor turns
+LONG = Description(joints=tuple(f"joint_{i}" for i in range(14)), linkage=None)
+
+
+def described(folder, text):
+    path = folder / "robot.toml"
+    path.write_text(text)
+    return path
+
+
+def exactly(plant):
+    """Each number to the last bit."""
+    flat = plant._asdict() | {f"estimator.{k}": v for k, v in plant.estimator._asdict().items()}
+    del flat["estimator"]
+    return {name: [float(x).hex() for x in np.ravel(value)] for name, value in flat.items()}
+
+
+# Plants
+
+
+def test_the_plants_of_hector_are_those_that_they_always_were():
+    plants = {"ideal": ideal(), "hfs": hfs()}
+    for seed in range(4):
+        plants[f"hfs_drawn {seed}"] = hfs_drawn(seed)
+        plants[f"hfs_varied {seed}"] = hfs_varied(seed)
+        plants[f"standin {seed}"] = standin(seed)
+    text = json.dumps({name: exactly(plant) for name, plant in plants.items()}, sort_keys=True)
+    # of b1e541f, before other robots had sizes
+    expected = "68134952a35e59ed74a37ca45b5aa5b66a061dd66336dddb936d51dc387b7c48"
+    assert hashlib.sha256(text.encode()).hexdigest() == expected
+
+
+def factories(description):
+    yield from (named_world(name, 2, description) for name in WORLDS)
+    yield hfs_drawn(3, description=description)
+    yield standin(1, description)
+
+
+def test_a_plant_has_the_sizes_of_its_robot():
+    for ours, theirs in zip(factories(LARGE), factories(Description()), strict=True):
+        np.testing.assert_allclose(ours.joint_friction, 3.0 * theirs.joint_friction)
+        np.testing.assert_allclose(ours.joint_damping, 2.0 * theirs.joint_damping)
+        np.testing.assert_allclose(ours.trunk_com, 1.5 * theirs.trunk_com)
+        named = {"joint_friction": 0, "joint_damping": 0, "trunk_com": 0}
+        assert exactly(ours) | named == exactly(theirs) | named  # and nothing else
+
+
+def test_a_plant_has_a_motor_for_each_joint_and_no_linkage_where_there_is_none():
+    for plant, usual in zip(factories(LONG), factories(Description()), strict=True):
+        assert plant.torque_gain.shape == (14,)
+        assert usual.torque_gain.shape == (10,)
+        assert plant.linkage == 0.0
+        assert np.all((plant.torque_gain > 0.8) & (plant.torque_gain <= 1.0))
+
+
+def test_pushes_of_the_data_have_the_size_of_the_robot():
+    robot = load_robot()
+    large = robot._replace(description=replace(robot.description, plants=SIZES))
+    weights = draw_jobs(0, 1)[0].weights
+    path = type(weights)(*(part if part is weights.others else _row(part) for part in weights))
+    near = (0, 12, draw_jobs(0, 1)[0].command)
+    pairs = [
+        (draw_jobs(0, 12, robot=large), draw_jobs(0, 12)),
+        (draw_jobs_near(*near, path=path, robot=large), draw_jobs_near(*near, path=path)),
+    ]
+    for ours, theirs in pairs:
+        assert any(np.any(job.push.force) for job in theirs)
+        for one, other in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(one.push.force, 5.0 * other.push.force)
+            friction = other.imperfections.joint_friction
+            np.testing.assert_allclose(one.imperfections.joint_friction, 3.0 * friction)
+
+
+def _row(part):
+    return type(part)(*(np.asarray(x)[None] for x in part))
+
+
+def test_scenes_push_and_load_as_much_as_the_robot_is_large():
+    config = SceneConfig(forces=(50.0,), frictions=(0.4,), phases=1)
+    scenes = make_scenes(config, sizes=SIZES)
+    force = scenes[Level("push", 250.0)][0].push.force
+    np.testing.assert_allclose(np.linalg.norm(force), 250.0)
+    (loaded,) = scenes[Level("payload", "8 kg from the start")]
+    assert loaded.changes[0].payload == 8.0
+    np.testing.assert_allclose(loaded.changes[0].payload_at, (0.0, 0.0, 1.5 * 0.124))
+
+
+# What the TOML says
+
+
+def test_sizes_and_loss_are_sections_of_the_robots_file(tmp_path):
+    path = described(tmp_path, "[plants]\npush = 4\njoint_friction = 2.5\n[loss]\nL_ctrl = 0.05")
+    description = read_description(path)
+    assert description.plants == PlantSizes(push=4.0, joint_friction=2.5)
+    assert description.loss == (("L_ctrl", 0.05),)
+    assert hash(description) != hash(Description())  # static under jit
+    assert from_table("here", Description, to_table(description)) == description  # as in a dump
+    plain = read_description(described(tmp_path, ""))
+    assert (plain.plants, plain.loss) == (PlantSizes(), ())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[plants]\npusch = 2", "plants: unknown field 'pusch'; did you mean 'push'"),
+        ("[plants]\npush = -1", "plants: push must be a number of at least 0, got -1"),
+        ("[plants]\npush = inf", "plants: push must be a number of at least 0, got inf"),
+        ("loss = 3", "loss must be"),
+        ("[loss]\nL_ctrl = 'much'", "loss must be"),
+    ],
+)
+def test_a_wrong_section_is_one_line(tmp_path, text, message):
+    with pytest.raises(InputError, match=message) as error:
+        read_description(described(tmp_path, text))
+    assert "\n" not in str(error.value)
+
+
+# The loss
+
+
+def weighed(**alphas):
+    robot = load_robot()
+    return robot._replace(description=replace(robot.description, loss=tuple(alphas.items())))
+
+
+def test_a_robots_loss_has_the_weights_of_its_file():
+    assert tune_config(load_robot()).loss == PAPER_LOSS
+    loss = tune_config(weighed(L_ctrl=0.1, position=3e4)).loss
+    assert [term.weight for term in loss] == [1e5, 3e4, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("alphas", "message"),
+    [
+        ({"L_ctl": 0.1}, r"hector.toml: loss: unknown term 'L_ctl'; did you mean 'L_ctrl'\?"),
+        ({"L_ctrl": -0.1}, "hector.toml: loss: .*L_ctrl must be a number of at least 0, got -0.1"),
+    ],
+)
+def test_a_term_that_there_is_not_is_one_line_that_names_the_file(alphas, message):
+    with pytest.raises(InputError, match=message) as error:
+        tune_config(weighed(**alphas))
+    assert "\n" not in str(error.value)
+
+
+def test_a_fall_from_higher_up_costs_more():
+    walk = pretend_walk(error=0.0, seconds=1.0)
+    fallen = walk._replace(fallen=np.ones_like(walk.fallen))
+    taller = fallen.reference._replace(position=fallen.reference.position * [1, 1, 2.0])
+    low, high = (
+        float(losses(PAPER_LOSS, one)["L_pos"])
+        for one in (fallen, fallen._replace(reference=taller))
+    )
+    assert low == pytest.approx(1000 * 0.5**2)
+    assert high == pytest.approx(1000 * 1.0**2)
