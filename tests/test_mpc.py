@@ -319,7 +319,7 @@ def test_constraints_are_chosen_by_name_in_files():
     assert former == MpcConfig(effort_reference="gravity")
     assert [str(one) for one in MpcConfig(line_friction=False).on("inputs")] == names[:3]
     assert replace(MpcConfig(line_friction=False), line_friction=True) == MpcConfig()
-    for wrong in ({"constraints": ["frictoin"]}, {"contact": "point"}, {"constraints": []}):
+    for wrong in ({"constraints": ["frictoin"]}, {"contact": "round"}, {"constraints": []}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             from_table("robot.toml", MpcConfig, wrong)
 

@@ -74,8 +74,14 @@ class MpcConfig:
     constraints: tuple[str, ...] | None = None  # of Constraint or their names; else the contact's
 
     def __post_init__(self) -> None:
-        rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE, "sole": SHARE}
-        check(self, **rules, step_ticks=AT_LEAST_ONE, effort_reference=("zero", "gravity"))
+        rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
+        check(
+            self,
+            **rules,
+            sole=SHARE,
+            step_ticks=AT_LEAST_ONE,
+            effort_reference=("zero", "gravity"),
+        )
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
             choose_part("MpcConfig.constraints", one, Constraint, CONSTRAINTS)

@@ -169,6 +169,9 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
         height = place[2] - model.geom(name).size[0]
         text = f"{this} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
         _expect(path, abs(height) <= _ON_FLOOR, text)
+    left, right = (data.site(foot.point).xpos[1] for foot in description.named_feet)
+    text = f"{this} has the left foot at y = {left:.4g}, expected it left of the right one, at"
+    _expect(path, left > right, f"{text} {right:.4g}")
     com = data.subtree_com[trunk_body(model)]
     low, high = (side([place[:2] for _, place in ends], axis=0) for side in (np.min, np.max))
     right = np.all(low <= com[:2]) and np.all(com[:2] <= high)

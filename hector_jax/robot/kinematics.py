@@ -267,10 +267,7 @@ def _searched_leg(
         chain = _any_chain(*leg[:4], joints)
         pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
         wanted = (rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))).T @ rot_z(yaw)
-        off = wanted.T @ chain.rotation
-        turn = 0.5 * jnp.stack(
-            [off[2, 1] - off[1, 2], off[0, 2] - off[2, 0], off[1, 0] - off[0, 1]]
-        )
+        turn = _rotation_vector(wanted.T @ chain.rotation)
         return jnp.concatenate([chain.foot - position, turn])[rows]
 
     def step(joints: Array, target: tuple[Array, Array, Array]) -> Array:
@@ -290,3 +287,13 @@ def _searched_leg(
     joints, _ = jax.lax.scan(improved, jax.lax.stop_gradient(start), length=steps)
     # one step more, the only one that is differentiated: its derivative is that of the solution
     return joints + step(joints, target)
+
+
+def _rotation_vector(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Axis times angle [rad] of a rotation by less than half a turn."""
+    vector = 0.5 * jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    square = vector @ vector
+    small = square < 1e-16
+    sine = jnp.sqrt(jnp.where(small, 1.0, square))
+    angle = jnp.arctan2(sine, 0.5 * (jnp.trace(R) - 1.0))
+    return jnp.where(small, 1.0, angle / sine) * vector

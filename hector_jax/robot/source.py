@@ -193,10 +193,9 @@ def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarr
         angles = dict.fromkeys((names[name] for name in known), 0.0)
         return angles | {names[name]: angle for name, angle in pose}, upright
     keys = [key for key in file.spec.keys if key.name == pose]
-    hint = "; a URDF has none: give standing = { joint = angle }" if urdf else ""
-    _expect(
-        path, keys, f"no keyframe {pose!r}; expected one, or standing = {{ joint = angle }}{hint}"
-    )
+    hint = "; a URDF has none" if urdf else ""
+    text = f"no keyframe {pose!r}{hint}; expected one, or standing = {{ joint = angle }}"
+    _expect(path, keys, text)
     qpos = np.array(keys[0].qpos)
     text = f"keyframe {pose!r} has {len(qpos)} numbers, expected {model.nq}"
     _expect(path, len(qpos) == model.nq, text)

@@ -1,0 +1,175 @@
+"""Legs of any number, order and sign of joints, with turned bodies, against MuJoCo."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hector_jax.core.geometry import rot_x, rot_y, rot_z
+from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs, leg_gravity
+from hector_jax.robot.model import compile_model, describe, load_robot
+
+LEGS = {  # axes in the trunk frame, from the trunk down
+    4: ["x", "y", "y", "-y"],
+    6: ["-y", "x", "-z", "y", "y", "-x"],
+    7: ["z", "x", "y", "-y", "z", "y", "x"],
+}
+BEND = 0.5  # [rad] of hip and ankle; the knee bends twice as much
+
+
+def joint_axis(name):
+    return (-1.0 if name[0] == "-" else 1.0) * np.eye(3)["xyz".index(name[-1])]
+
+
+def leg_xml(side, axes, name, turns):
+    """One leg; each body is turned by a rotation of its own, which changes nothing."""
+    pitches = [i for i, axis in enumerate(axes) if axis[-1] == "y"]
+    knee, ankle = pitches[1], pitches[2]
+    before, text = np.eye(3), ""
+    for i, axis in enumerate(axes):
+        step = np.array([0.01, 0.01 * side, -0.01])
+        if i == 0:
+            step = np.array([0.0, 0.08 * side, -0.06])
+        elif i in (knee, ankle):
+            step = np.array([0.0, 0.0, -0.25])
+        R = turns[i]
+        quat = Rotation.from_matrix(before.T @ R).as_quat(scalar_first=True)
+        local = R.T @ joint_axis(axis)
+        com = R.T @ np.array([0.01, 0.0, -0.05])
+        text += (
+            f'<body name="{name}{i}" pos="{" ".join(map(str, before.T @ step))}" '
+            f'quat="{" ".join(map(str, quat))}">'
+            f'<inertial pos="{" ".join(map(str, com))}" mass="{1.0 - 0.1 * i}" '
+            'diaginertia="0.004 0.005 0.003"/>'
+            f'<joint name="{name}{i}" axis="{" ".join(map(str, local))}" range="-2.5 2.5" '
+            'actuatorfrcrange="-90 90"/>'
+        )
+        before = R
+    return text + "</body>" * len(axes), before
+
+
+def written(folder, count):
+    """A biped with legs of `count` joints, and its TOML."""
+    rng, axes = np.random.default_rng(count), LEGS[count]
+    legs, soles = "", []
+    for side, name in ((1, "left"), (-1, "right")):
+        turns = Rotation.random(count, random_state=rng.integers(1000)).as_matrix()
+        text, last = leg_xml(side, axes, name, turns)
+        legs += text
+        soles.append(last)
+    (folder / "made.xml").write_text(
+        '<mujoco><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 1"><freejoint/>'
+        '<inertial pos="0 0 0.1" mass="10" diaginertia="0.2 0.2 0.1"/>'
+        f"{legs}</body></worldbody></mujoco>"
+    )
+    pitches = [i for i, axis in enumerate(axes) if axis[-1] == "y"]
+    bends = dict(zip(pitches, (-BEND, 2 * BEND, -BEND), strict=True))
+    signs = {i: -1.0 if axes[i][0] == "-" else 1.0 for i in range(count)}
+    lines = ['name = "made"', 'model = "made.xml"', "[standing]"]
+    lines += [f"{s}{i} = {b * signs[i]}" for s in ("left", "right") for i, b in bends.items()]
+    names = {s: [f"{s}{i}" for i in range(count)] for s in ("left", "right")}
+    lines += ["[joints]", *(f"{side} = {joints!r}" for side, joints in names.items())]
+    for side, R in zip(("left", "right"), soles, strict=True):
+        corners = [
+            (R.T @ np.array([x, y, -0.05])).tolist() for x in (-0.06, 0.1) for y in (-0.03, 0.03)
+        ]
+        point = (R.T @ np.array([0.0, 0.0, -0.05])).tolist()
+        lines += [f"[feet.{side}]", f'body = "{side}{count - 1}"']
+        lines += [f"contacts = {corners}", f"point = {point}"]
+    path = folder / "made.toml"
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.fixture(scope="module", params=LEGS)
+def made(request, tmp_path_factory):
+    path = written(tmp_path_factory.mktemp("made"), request.param)
+    return load_robot(path), compile_model(describe(path))
+
+
+def posed(robot, model, joints):
+    data = mujoco.MjData(model)
+    data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0
+    for name, angle in zip(robot.description.joints, joints, strict=True):
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def random_joints(robot, spread=0.4):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        yield robot.standing_joints + rng.uniform(-spread, spread, len(robot.standing_joints))
+
+
+def test_feet_and_jacobians_are_those_of_mujoco(made):
+    robot, model = made
+    poses, jacobians = jax.jit(foot_poses), jax.jit(foot_jacobians)
+    standing = posed(robot, model, robot.standing_joints)
+    names = [foot.point for foot in robot.description.named_feet]
+    bodies = [model.site(name).bodyid[0] for name in names]
+    soles = [standing.xmat[b].reshape(3, 3).T for b in bodies]  # level when it stands
+    for joints in random_joints(robot):
+        data, feet = posed(robot, model, joints), poses(robot, jnp.asarray(joints))
+        J_v, J_w = jacobians(robot, jnp.asarray(joints))
+        count = len(joints) // 2
+        for side, (name, body) in enumerate(zip(names, bodies, strict=True)):
+            np.testing.assert_allclose(feet.position[side], data.site(name).xpos, atol=1e-12)
+            R = data.xmat[body].reshape(3, 3) @ soles[side]
+            np.testing.assert_allclose(feet.rotation[side], R, atol=1e-12)
+            full_v, full_w = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+            mujoco.mj_jacSite(model, data, full_v, full_w, model.site(name).id)
+            joints_ = robot.description.joints[side * count :][:count]
+            own = [model.joint(joint).dofadr[0] for joint in joints_]
+            np.testing.assert_allclose(J_v[side], full_v[:, own], atol=1e-12)
+            np.testing.assert_allclose(J_w[side], full_w[:, own], atol=1e-12)
+
+
+def test_the_weight_of_the_legs_is_that_of_mujoco(made):
+    robot, model = made
+    for joints in random_joints(robot):
+        data = posed(robot, model, joints)
+        own = [model.joint(name).dofadr[0] for name in robot.description.joints]
+        found = leg_gravity(robot, jnp.asarray(joints), jnp.asarray(robot.gravity))
+        np.testing.assert_allclose(found, data.qfrc_bias[own], atol=1e-10)
+
+
+def test_joints_are_found_from_feet(made):
+    """In the rows that a leg places; the position always, all of the sole from six joints on."""
+    robot, _ = made
+    count = robot.description.leg_joints
+    assert robot.structure.placed == ((0, 1, 2, 4) if count == 4 else (0, 1, 2, 3, 4, 5))
+    inverse = jax.jit(partial(inverse_legs, steps=20))
+    start = jnp.asarray(robot.standing_joints)
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        feet = foot_poses(robot, start)
+        position = feet.position + rng.uniform(-0.04, 0.04, (2, 3))
+        roll, pitch, yaw = jnp.asarray(rng.uniform(-0.2, 0.2, (3, 2)))
+        level = [rot_y(p) @ rot_x(r) for r, p in zip(roll, pitch, strict=True)]
+        up = jnp.stack([R.T[:, 2] for R in level])
+        found = foot_poses(robot, inverse(robot, position, yaw, up, start))
+        np.testing.assert_allclose(found.position, position, atol=1e-9)
+        if count >= 6:
+            wanted = jnp.stack([R.T @ rot_z(y) for R, y in zip(level, yaw, strict=True)])
+            np.testing.assert_allclose(found.rotation, wanted, atol=1e-9)
+
+
+def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
+    robot, _ = made
+    start, up = jnp.asarray(robot.standing_joints), jnp.tile(jnp.array([0.0, 0.0, 1.0]), (2, 1))
+    position = foot_poses(robot, start).position
+    moved = jnp.array([[0.3, 0.1, 0.2], [-0.2, 0.1, 0.3]])
+    at = jax.jit(lambda t: inverse_legs(robot, position + t * moved, jnp.zeros(2), up, start, 12))
+    rates = jax.jvp(at, (jnp.asarray(0.05),), (jnp.asarray(1.0),))[1]
+    difference = (at(jnp.asarray(0.05 + 1e-5)) - at(jnp.asarray(0.05 - 1e-5))) / 2e-5
+    if robot.description.leg_joints <= 6:  # of a seventh joint the part that moves no foot is left
+        np.testing.assert_allclose(rates, difference, atol=2e-4)
+    feet = lambda q: foot_poses(robot, q).position  # noqa: E731
+    np.testing.assert_allclose(
+        jax.jvp(feet, (at(jnp.asarray(0.05)),), (rates,))[1], moved, atol=1e-6
+    )
