@@ -41,6 +41,7 @@ from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import aligned
@@ -213,8 +214,8 @@ def _say_what_no_weights_mend(
     """Walk once with nominal weights on the simulator; a line for what is not the weights."""
     seconds = course.seconds or Walk.seconds
     job = Job(nominal(robot), course.command, hfs(robot.description), seconds)
-    known = jax.tree.map(np.asarray, (robot, job))
-    for line in pool.submit(not_the_weights, config.rollout.walk, *known).result():
+    known = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
+    for line in pool.submit(not_the_weights, *known).result():
         say(f"before any tuning, {course.name} on hfs with nominal weights: {line}")
 
 

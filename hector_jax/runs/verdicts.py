@@ -26,6 +26,7 @@ from hector_jax.runs.metrics import Score
 from hector_jax.sim.diagnosis import StartupFall, startup_fall
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss
@@ -171,7 +172,8 @@ def judge(
             samples = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
             startup = None
             if np.asarray(walk.fallen)[0]:
-                startup = pool.submit(startup_fall, walk_config, host, jobs[case]).result()
+                job = on_host(jobs[case])
+                startup = pool.submit(startup_fall, walk_config, host, job).result()
             yield case, (_score_walk(config.loss, walk, commit, startup), samples)
 
     if folder is None:

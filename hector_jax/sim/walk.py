@@ -219,6 +219,17 @@ def _trajectory(
     return loop.as_trajectory(np.array(TIME_STEP), initial, plan, held)
 
 
+def on_host(job: Job) -> Job:
+    """The job with arrays of the host: what a process is sent must not sit on a device."""
+    host = partial(jax.tree.map, np.asarray)
+    return job._replace(
+        weights=host(job.weights),
+        command=host(job.command),
+        imperfections=host(job.imperfections),
+        plant=host(job.plant),
+    )
+
+
 def walk_many(
     pool: Executor,
     config: WalkConfig,
@@ -232,13 +243,5 @@ def walk_many(
 
     `exact` and `batch` are those of an `Engine`: this one is always exact and compiles no batch.
     """
-    host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
-    sent = [
-        job._replace(
-            weights=host(job.weights),
-            command=host(job.command),
-            imperfections=host(job.imperfections),
-        )
-        for job in jobs
-    ]
-    yield from pool.map(walk, repeat(config), repeat(host(robot)), sent)
+    sent = map(on_host, jobs)
+    yield from pool.map(walk, repeat(config), repeat(jax.tree.map(np.asarray, robot)), sent)
