@@ -72,7 +72,7 @@ def inertia_about(model, data, bodies, place):
 
 @pytest.mark.parametrize(
     ("path", "mass", "com_height"),
-    [(HUMANOID, 35.0, 0.688), (V2, 11.468, 0.417), (V2_ARMS, 14.848, 0.478)],
+    [(HUMANOID, 35.0, 0.647), (V2, 11.468, 0.417), (V2_ARMS, 14.848, 0.478)],
     ids=NAMES,
 )
 def test_a_model_weighs_what_its_source_says(path, mass, com_height):
@@ -90,7 +90,7 @@ def test_the_soles_lie_on_the_floor_below_the_centre_of_mass(path):
     assert np.all(low[:2] < com[:2])
     assert np.all(com[:2] < high[:2])
     ankle = data.body(table(path)["feet"]["left"]["body"]).xpos[0]
-    assert 0.0 < com[0] - ankle < 0.02  # a little ahead of the ankle
+    assert 0.0 < com[0] - ankle < 0.025  # a little ahead of the ankle
     assert abs(com[1]) < 1e-9
     touching = {data.contact[i].geom2 for i in range(data.ncon)}
     assert touching <= set(foot_spheres(model))  # neither trunk, legs nor arms
@@ -193,12 +193,13 @@ def test_the_humanoid_bends_its_knees_forwards_and_fits_its_gains():
         for i in range(model.ngeom)
         if model.geom(i).name == "head"
     )
-    assert 1.25 < top < 1.32  # stretched 1.32 m
+    assert 1.2 < top < 1.32  # stretched 1.32 m
     file = table(HUMANOID)
     weight = 9.81 * model.body_mass.sum()
     assert 2.4 < file["mpc"]["max_force"] / weight < 2.6
     assert file["limits"]["min_height"] == pytest.approx(0.55 * data.subtree_com[1][2], abs=0.01)
-    assert file["footstep"]["width"] == pytest.approx(data.body("left_foot").xpos[1], abs=1e-3)
+    width = 0.85 * data.body("left_foot").xpos[1]
+    assert file["footstep"]["width"] == pytest.approx(width, abs=1e-3)
     # the ankle can put nearly the whole weight on the toes
     ahead = np.array(file["feet"]["left"]["contacts"])[:, 0].max()
     assert weight * ahead < model.actuator("left_ankle_pitch").ctrlrange[1]

@@ -45,7 +45,7 @@ def main() -> None:
 
 def _views(scene: Scene, width: int, height: int) -> Iterator[list[UInt8[np.ndarray, "h w 3"]]]:
     """Render both walks at each time of the scene."""
-    model = mujoco.MjModel.from_xml_path(scene.model)
+    model = scene.model
     data = mujoco.MjData(model)
     model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
     model.vis.global_.offheight = max(model.vis.global_.offheight, height)

@@ -23,11 +23,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.console import Broken
+from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.settings import AT_LEAST_ONE, Range, check, choose
 from hector_jax.report.motion import Motion
 from hector_jax.report.plots.style import label_of
-from hector_jax.robot.model import Robot
+from hector_jax.robot.model import Robot, compile_model
 
 BACK_ENDS = ("egl", "osmesa", "glfw")
 ENDINGS = (".mp4", ".webp", ".gif", ".png")  # all but the first are animated pictures
@@ -65,7 +66,7 @@ class Scene(NamedTuple):
     file: str  # name of the film or strip
     strip: bool
     config: VideoConfig
-    model: str  # path of the body's MJCF
+    model: mujoco.MjModel  # of the robot
     top: float  # of the robot above the floor [m]
     motions: dict[str, Motion]  # before and after, by the words above them
     times: Float[np.ndarray, " K"]  # of the frames [s]
@@ -137,7 +138,7 @@ def make_scene(
         file=f"drawn{path.suffix.lower()}",
         strip=strip,
         config=config,
-        model=str(robot.description.model.resolve()),
+        model=compile_model(robot.description),
         top=_TOP * float(robot.standing_height),
         motions={label_of(name): motion for name, motion in motions.items()},
         times=_snapshot_times(next(iter(motions.values())), seconds, config.tiles)
