@@ -172,7 +172,7 @@ def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray,
 
 def _box_of_inertia(
     found: Survey, data: mujoco.MjData, leg: Sequence[int]
-) -> Float[np.ndarray, "8 3"]:
+) -> Float[np.ndarray, "4 3"]:
     """Lower corners of the box that has the mass and inertia of the foot's last body."""
     model, body = found.model, int(found.model.jnt_bodyid[leg[-1]])
     mass, spread = model.body_mass[body], model.body_inertia[body]

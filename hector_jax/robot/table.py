@@ -1,5 +1,6 @@
 """What is known of a robot, as a short table in plain words."""
 
+import textwrap
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -39,7 +40,7 @@ def table_of(robot: Robot) -> list[str]:
         f"{_way(_forwards(robot))}; axes and numbers of the left leg:",
         *_columns([_HEADER, *rows]),
         f"feet     {robot.structure.contact}: {_sole(robot)}",
-        f"fixed    {', '.join(description.weld) or 'no joint'}",
+        *_words("fixed", description.weld),
     ]
 
 
@@ -60,13 +61,14 @@ def table_of_survey(found: Survey) -> list[str]:
         f"legs     {len(rows)} joints each; knees bend {_way(found.forwards)}; axes and numbers of "
         "the left leg:",
         *_columns([_HEADER[:3], *rows]),
-        f"fixed    {', '.join(found.weld) or 'no joint'}",
+        *_words("fixed", found.weld),
     ]
 
 
 def mended(robot: Robot) -> list[str]:
     """What of the model's file is read otherwise than it stands there, a line each."""
-    return list(build_spec(robot.description).notes)
+    notes = build_spec(robot.description).notes
+    return [note for note in notes if not note.startswith("fixed: ")]  # as the table has them
 
 
 def remarks(robot: Robot) -> list[str]:
@@ -122,6 +124,12 @@ def _sole(robot: Robot) -> str:
 def _both(left: str, right: str) -> str:
     """Two names in one cell."""
     return f"{left}, {right}"
+
+
+def _words(title: str, words: Sequence[str]) -> list[str]:
+    """Names under a title."""
+    lines = textwrap.wrap(", ".join(words) or "no joint", 91, break_on_hyphens=False)
+    return [f"{title if i == 0 else '':8s} {line}" for i, line in enumerate(lines)]
 
 
 def _columns(rows: Sequence[Iterable[str]]) -> list[str]:
