@@ -74,7 +74,9 @@ def test_a_proposal_loads_and_names_joints_and_feet_as_the_robots_own_toml(path)
 def test_legs_are_told_from_arms_and_what_is_of_no_leg_is_welded(tmp_path):
     found = survey(small(tmp_path).model)
     legs = [[found.model.joint(j).name for j in leg] for leg in found.legs]
-    assert legs == [[f"{s}_{j}" for j in ("roll", "pitch", "knee", "ankle")] for s in ("left", "right")]
+    assert legs == [
+        [f"{s}_{j}" for j in ("roll", "pitch", "knee", "ankle")] for s in ("left", "right")
+    ]
     assert set(found.weld) == {"waist", "shoulder"}
     assert found.model.body(found.trunk).name == "base"
     assert (found.knee, found.forwards) == (2, True)
@@ -256,4 +258,6 @@ def test_what_is_likely_trouble_is_told():
     weak = robot._replace(torque_limit=0.1 * robot.torque_limit)
     assert any("set mpc.sole = 0.3" in line for line in remarks(weak))
     described = replace(robot.description, control=(("mpc", (("max_force", 300.0),)),))
-    assert any("mpc.max_force is 300 N" in line for line in remarks(robot._replace(description=described)))
+    assert any(
+        "mpc.max_force is 300 N" in line for line in remarks(robot._replace(description=described))
+    )

@@ -78,7 +78,9 @@ def _foot_geoms(found: Survey, leg: Sequence[int]) -> list[int]:
     """Primitives of a foot that collide, with the floor where there is one."""
     model = found.model
     bodies = below(model, int(model.jnt_bodyid[leg[-1]]))
-    bits = [(int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in range(model.ngeom)]
+    bits = [
+        (int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in range(model.ngeom)
+    ]
     floor = [
         bits[g]
         for g in range(model.ngeom)
@@ -89,9 +91,7 @@ def _foot_geoms(found: Survey, leg: Sequence[int]) -> list[int]:
         for g in range(model.ngeom)
         if model.geom_bodyid[g] in bodies and model.geom_type[g] in SHAPES and any(bits[g])
     ]
-    on_floor = [
-        g for g in inside if any(bits[g][0] & a or bits[g][1] & c for c, a in floor)
-    ]
+    on_floor = [g for g in inside if any(bits[g][0] & a or bits[g][1] & c for c, a in floor)]
     return on_floor if floor else inside
 
 

@@ -51,7 +51,9 @@ def _solve(
     bodies = [int(model.jnt_bodyid[leg[-1]]) for leg in found.legs]
     zero = [data.xmat[b].reshape(3, 3).copy() for b in bodies]
     local = [R.T @ sole.axes for R, sole in zip(zero, soles, strict=True)]  # sole in the body
-    anchors = [data.xanchor[leg[-1]] - data.xpos[b] for leg, b in zip(found.legs, bodies, strict=True)]
+    anchors = [
+        data.xanchor[leg[-1]] - data.xpos[b] for leg, b in zip(found.legs, bodies, strict=True)
+    ]
     points = [
         R.T @ (anchor + sole.axes @ sole.point)
         for R, anchor, sole in zip(zero, anchors, soles, strict=True)

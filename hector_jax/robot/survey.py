@@ -160,7 +160,8 @@ def _legs(
         ends = (f"{model.joint(way[-1]).name} ({len(way)})" for way in _chains(model, free))
         raise InputError(
             f"{path}: no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} "
-            f"hinges that mirror each other; chains by their last joint: {', '.join(ends) or 'none'}"
+            "hinges that mirror each other; chains by their last joint: "
+            f"{', '.join(ends) or 'none'}"
         )
     *_, one, other = min(found)
     if _is_right(model, data, one, other):
@@ -188,16 +189,12 @@ def _is_right(
     return re.search(r"right|(^|_)r(_|$)", name) is not None
 
 
-def _knee(
-    path: Path, model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int]
-) -> int:
+def _knee(path: Path, model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int]) -> int:
     """Which joint of a leg is the knee."""
     axes, anchors = data.xaxis[list(leg)], data.xanchor[list(leg)]
     bend = [i for i in range(len(leg)) if abs(axes[i][1]) >= _BENDS]
     if len(bend) < 2:
-        words = ", ".join(
-            f"{model.joint(j).name} {axis_words(data.xaxis[j])}" for j in leg
-        )
+        words = ", ".join(f"{model.joint(j).name} {axis_words(data.xaxis[j])}" for j in leg)
         raise InputError(
             f"{path}: {len(bend)} joints of the left leg turn about y, expected hip and knee at "
             f"least: turn the model so that x is ahead; joints: {words}"
@@ -206,6 +203,6 @@ def _knee(
     hip = anchors[bend[0]]
 
     def apart(i: int) -> float:
-        return min(np.linalg.norm(anchors[i] - hip), np.linalg.norm(anchors[i] - end))
+        return float(min(np.linalg.norm(anchors[i] - place) for place in (hip, end)))
 
     return max(bend[1:], key=apart)

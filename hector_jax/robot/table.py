@@ -51,7 +51,9 @@ def table_of_survey(found: Survey) -> list[str]:
         (
             _both(model.joint(left).name, model.joint(right).name),
             axis_words(data.xaxis[left]),
-            "{:+.2f} to {:+.2f}".format(*model.jnt_range[left]) if model.jnt_limited[left] else "none",
+            "{:+.2f} to {:+.2f}".format(*model.jnt_range[left])
+            if model.jnt_limited[left]
+            else "none",
         )
         for left, right in zip(*found.legs, strict=True)
     ]
@@ -77,7 +79,7 @@ def remarks(robot: Robot) -> list[str]:
     control = {name: dict(section) for name, section in robot.description.control}
     if share > _HEAVY and not control.get("legs", {}).get("gravity_compensation"):
         lines.append(
-            f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they straighten: "
+            f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they stretch: "
             "set legs.gravity_compensation = true and bend the knees"
         )
     reach, used = ankle_reach(robot), control.get("mpc", {}).get("sole", 1.0)
