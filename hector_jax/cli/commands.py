@@ -3,7 +3,7 @@
 from functools import singledispatch
 from typing import Any
 
-from hector_jax.cli import data, doctor, evaluate, export, search, tune, view
+from hector_jax.cli import data, doctor, evaluate, export, robot, search, tune, view
 
 
 @singledispatch
@@ -25,6 +25,7 @@ for _command in (
     evaluate.evaluate,
     evaluate.walk,
     evaluate.compare,
+    robot.examine_robot,
     view.view_run,
     view.replay_dump,
     view.tensorboard,

@@ -31,7 +31,7 @@ Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Number = Literal["footstep_feedback", "footstep_width", "turn_lead", "effort_reference", "friction"]
 Variant = Literal["residual", "paper"]
 Engine = Literal["auto", "c", "mjx"]
-Robot = Annotated[Path | None, Source.ROBOT]
+RobotFile = Annotated[Path | None, Source.ROBOT]
 Weights = Annotated[str, Source.WEIGHTS]
 Trajectory = Annotated[str, Source.TRAJECTORY]
 Trajectories = tuple[Trajectory, ...]
@@ -59,7 +59,7 @@ class Collect(Configured):
     seed: Seed = 0  # seed of all random numbers: commands, weights, plants, pushes
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     processes: Processes = 2  # worker processes, one core each
-    robot: Robot = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Train(Configured):
     epochs: Annotated[int, Range(1, 100_000)] = 200  # passes over the samples
     seed: Seed = 0  # seed of the initial parameters and of the order of the samples
     json: bool = False  # print JSON instead of text
-    robot: Robot = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Tune(Configured):
     video: bool = True  # make a film of the nominal and the tuned weights
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
-    robot: Robot = None  # TOML file of another biped, with its data in DATA/NAME; or HECTOR
+    robot: RobotFile = None  # TOML file of another biped, with its data in DATA/NAME; or HECTOR
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class Search(Configured):
     record: Path | None = None  # folder of the record that a search resumes from; by default OUT
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of text
-    robot: Robot = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
 
 
 @dataclass(frozen=True)
@@ -158,8 +158,8 @@ class Evaluate(Configured):
     out: Path | None = None  # file for the result as JSON
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table
-    robot: Robot = None  # TOML file of another biped; HECTOR by default
-    plant: Robot = None  # TOML file of another model of the robot, of which the plants are
+    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
+    plant: RobotFile = None  # TOML file of another model of the robot, of which the plants are
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,19 @@ class Walk(Configured):
     out: Path | None = None  # file for the trajectory (.npz)
     video: Path | None = None  # file for a film beside nominal weights (.mp4; .webp for a page)
     json: bool = False  # print JSON instead of text
-    robot: Robot = None  # TOML file of another biped; HECTOR by default
-    plant: Robot = None  # TOML file of another model of the robot, which is walked on
+    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
+    plant: RobotFile = None  # TOML file of another model of the robot, which is walked on
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
+
+    Of a TOML file: check it. Example: hector robot h1.xml --out h1.toml
+    """
+
+    file: Annotated[Path, Source.FILE]  # MJCF, URDF, or the TOML file of a robot
+    out: Path | None = None  # file for the proposal, new and beside the model; else it is printed
 
 
 @dataclass(frozen=True)
@@ -204,7 +215,7 @@ class Export:
     # trajectory to check on; by default that of the run, or straight
     traj: Annotated[str | None, Source.TRAJECTORY] = None
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
-    robot: Robot = None  # TOML file of the biped of a weights file; HECTOR by default
+    robot: RobotFile = None  # TOML file of the biped of a weights file; HECTOR by default
     json: bool = False  # print JSON instead of text
 
 
@@ -279,6 +290,7 @@ Command = (
     | Search
     | Evaluate
     | Walk
+    | Robot
     | Doctor
     | Export
     | View

@@ -272,7 +272,16 @@ def read_description(path: Path) -> Description:
         InputError: one line naming file, key, what came and what was expected.
     """
     path = Path(path)
-    file = from_table(str(path), _File, read_toml(path, "the robot description", _MAX_BYTES))
+    return description_of(path, read_toml(path, "the robot description", _MAX_BYTES))
+
+
+def description_of(path: Path, table: dict[str, Any]) -> Description:
+    """The description that a TOML file at a path would give with this content.
+
+    Raises:
+        InputError: as `read_description`.
+    """
+    file = from_table(str(path), _File, table)
     name = path.stem if file.name is None else file.name
     if not name.replace("-", "").replace("_", "").isalnum():
         raise InputError(

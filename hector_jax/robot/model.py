@@ -101,14 +101,22 @@ def describe(path: Path | None = None) -> Description:
     return replace(read_description(DESCRIPTION_PATH), model=path)
 
 
-@quiet_mujoco()
 def load_robot(path: Path | None = None) -> Robot:
     """The robot of a file, see `describe`.
 
     Raises:
         InputError: as `describe` and `compile_model`.
     """
-    description = describe(path)
+    return robot_of(describe(path))
+
+
+@quiet_mujoco()
+def robot_of(description: Description) -> Robot:
+    """The robot of a description.
+
+    Raises:
+        InputError: as `compile_model`.
+    """
     model = compile_model(description)
     data = mujoco.MjData(model)
     key = model.key(description.standing_key)

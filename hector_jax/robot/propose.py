@@ -1,0 +1,278 @@
+"""The TOML that a model's file asks for: what `survey` finds, and sizes by rules.
+
+Rules scale HECTOR (m0 = 12 kg; h0 = 0.423 m, the height of its centre of mass standing) to a robot
+of mass m and height h:
+
+    stance, swing [ticks]    20 sqrt(h / h0): a pendulum's time
+    step_ticks               0.15 swing, rounded up, at least 3: ten steps see past the next step
+    max_force                2.5 m g
+    effort_reference         "gravity": else the plan jumps before single stance
+    sole                     0.6 of a flat foot, or it rolls over its edge; of any foot not more
+                             than its ankle can hold with the weight on it
+    width                    0.85 of half the distance of the foot points, standing
+    feedback                 0.12 s sqrt(h / h0)
+    height                   0.06 m h / 0.69 m of a swinging foot; landing -0.005 m
+    kp                       I w^2, w = 30 rad/s and I what hangs at the joint, its motor included;
+                             at most 2 / rad times the torque limit
+    kd                       sqrt(kp I)
+    Q                        HECTOR's
+    R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; of nominal 0.3 of that
+    L_ctrl                   times (m0 / m)^2
+    joint_friction, _damping times m h / (m0 h0); push, payload: m / m0; trunk_com: h / h0
+    min_height               0.55 h
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.description import Description, description_of
+from hector_jax.robot.model import Robot, compile_model, robot_of
+from hector_jax.robot.soles import SIDES, Sole, find_soles
+from hector_jax.robot.stand import standing_pose
+from hector_jax.robot.survey import Survey, survey
+
+MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
+_W = 30.0  # [rad/s] of the swing leg's joints
+_KP_PER_LIMIT = 2.0  # [1/rad]
+_COLUMNS = 100
+
+
+class Proposal(NamedTuple):
+    """A TOML for a file."""
+
+    found: Survey
+    soles: tuple[Sole, Sole]
+    table: dict[str, Any]
+    wrong: tuple[str, ...]  # what is to be mended by hand, a line each
+
+
+class Size(NamedTuple):
+    """What the rules read."""
+
+    mass: float  # against HECTOR's
+    height: float  # against HECTOR's
+    robot: Robot
+    inertia: Float[np.ndarray, " joints"]  # at each joint, standing [kg m^2]
+
+
+def propose(path: Path) -> Proposal:
+    """The TOML that a file asks for.
+
+    Raises:
+        InputError: one line saying what is missing in the file and how to mend it.
+    """
+    found = survey(path)
+    soles = find_soles(found)
+    angles, balanced = standing_pose(found, soles)
+    table = names(found, soles, angles)
+    wrong = []
+    if soles[0].guessed:
+        wrong.append(
+            f"no box, sphere, capsule or cylinder of body {soles[0].section['body']!r} collides: "
+            "its contacts are guessed from its inertia: measure the sole and correct feet.left and "
+            "feet.right"
+        )
+    if not balanced:
+        wrong.append(
+            "no standing pose found with level soles and the centre of mass over the feet: correct "
+            "the angles of [standing]"
+        )
+    description = description_of(Path(path).with_suffix(".toml"), table)
+    try:
+        robot = robot_of(description)
+    except InputError as error:
+        return Proposal(found, soles, table, (*wrong, str(error)))
+    table |= sections(size_of(description, robot))
+    return Proposal(found, soles, table, tuple(wrong))
+
+
+def names(found: Survey, soles: Sequence[Sole], angles: dict[str, float]) -> dict[str, Any]:
+    """What the TOML says by names."""
+    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in found.path.stem)
+    left, right = ([found.model.joint(j).name for j in leg] for leg in found.legs)
+    joints: dict[str, Any] = {"left": left, "right": right}
+    if found.weld:
+        joints["weld"] = list(found.weld)
+    feet = {side: sole.section for side, sole in zip(SIDES, soles, strict=True)}
+    return {
+        "name": stem,
+        "model": found.path.name,
+        "standing": angles,
+        "joints": joints,
+        "feet": feet,
+    }
+
+
+def size_of(description: Description, robot: Robot) -> Size:
+    """What the rules read of a robot."""
+    model = compile_model(description)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key(description.standing_key).id)
+    mujoco.mj_forward(model, data)
+    M = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, M)
+    address = [int(model.joint(name).dofadr[0]) for name in description.joints]
+    mass, height = float(robot.mass), float(robot.standing_height)
+    return Size(mass / MASS, height / HEIGHT, robot, M.diagonal()[address])
+
+
+def sections(size: Size) -> dict[str, Any]:
+    """What the TOML says by numbers."""
+    return {
+        "limits": {"min_height": round(0.55 * float(size.robot.standing_height), 2)},
+        "gait": gait(size),
+        "mpc": mpc(size),
+        "footstep": footstep(size),
+        "legs": legs(size),
+        "weights": weights(size),
+        "loss": {"L_ctrl": _short(size.mass**-2)},
+        "plants": plants(size),
+    }
+
+
+def gait(size: Size) -> dict[str, int]:
+    """Ticks of 10 ms."""
+    ticks = round(20 * math.sqrt(size.height))
+    return {"stance": ticks, "swing": ticks}
+
+
+def mpc(size: Size) -> dict[str, Any]:
+    """Horizon, force limit and share of the sole."""
+    section = {
+        "step_ticks": max(3, math.ceil(0.15 * gait(size)["swing"])),
+        "max_force": float(f"{2.5 * _weight(size.robot):.2g}"),
+        "effort_reference": "gravity",
+    }
+    share = sole_share(size.robot)
+    return section if share == 1.0 else {**section, "sole": share}
+
+
+def sole_share(robot: Robot) -> float:
+    """Share of the sole that the plan uses."""
+    most = 0.6 if robot.structure.contact == "flat" else 1.0
+    reach = ankle_reach(robot)
+    if reach is None:
+        return most
+    return max(min(most, math.floor(100.0 * reach / float(robot.toe)) / 100.0), 0.3)
+
+
+def ankle_reach(robot: Robot) -> float | None:
+    """How far ahead of the ankle it can hold the weight [m]; None without an ankle or a toe."""
+    axes, limits = robot.joint_axis[0], robot.torque_limit[: len(robot.joint_axis[0])]
+    last = [i for i in range(len(axes) - 2, len(axes)) if abs(axes[i][1]) > 0.7]
+    if not last or robot.toe <= 0.0:
+        return None
+    return float(limits[last[-1]]) / _weight(robot)
+
+
+def footstep(size: Size) -> dict[str, float]:
+    """Stance width [m] and gain [s] of the footstep rule."""
+    half = 0.5 * foot_distance(size.robot)
+    return {"width": round(0.85 * half, 3), "feedback": round(0.12 * math.sqrt(size.height), 3)}
+
+
+def foot_distance(robot: Robot) -> float:
+    """Distance of the foot points across, standing [m]."""
+    model = compile_model(robot.description)
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key(robot.description.standing_key).id)
+    mujoco.mj_kinematics(model, data)
+    left, right = (data.site(foot.point).xpos for foot in robot.description.named_feet)
+    return float(left[1] - right[1])
+
+
+def legs(size: Size) -> dict[str, Any]:
+    """Swing path and joint gains; those of a joint are the mean of both legs'."""
+    count = size.robot.description.leg_joints
+    inertia = size.inertia.reshape(2, count).mean(axis=0)
+    limit = size.robot.torque_limit.reshape(2, count).min(axis=0)
+    kp = np.minimum(inertia * _W**2, _KP_PER_LIMIT * limit)
+    return {
+        "height": round(0.06 * float(size.robot.standing_height) / 0.69, 3),
+        "landing": -0.005,
+        "kp": [_short(x) for x in kp],
+        "kd": [_short(x) for x in np.sqrt(kp * inertia)],
+        "gravity_compensation": True,
+    }
+
+
+def weights(size: Size) -> dict[str, Any]:
+    """Q as HECTOR's; R by the squares of mass, and of mass and height."""
+    force, moment = size.mass**-2, (size.mass * size.height) ** -2
+    nominal = {"euler": 50, "position": [50, 50, 250], "ang_velocity": 1, "velocity": 1}
+    expert = {"euler": [100, 100, 250], "position": [200, 200, 300]}
+    expert |= {"ang_velocity": 1, "velocity": 1}
+    return {
+        "nominal": nominal | {"force": _short(0.3e-4 * force), "moment": _short(0.3e-3 * moment)},
+        "expert": expert
+        | {
+            "force": [_short(x * force) for x in (1e-4, 1e-4, 5e-4)],
+            "moment": _short(1e-2 * moment),
+        },
+    }
+
+
+def plants(size: Size) -> dict[str, float]:
+    """How large the imperfections of the plants are."""
+    torque = _short(size.mass * size.height)
+    return {
+        "joint_friction": torque,
+        "joint_damping": torque,
+        "push": _short(size.mass),
+        "trunk_com": _short(size.height),
+        "payload": _short(size.mass),
+    }
+
+
+def _weight(robot: Robot) -> float:
+    return float(robot.mass * robot.gravity[2])  # [N]
+
+
+def _short(x: float) -> float:
+    """Three digits."""
+    return float(f"{x:.3g}")
+
+
+def as_toml(table: dict[str, Any], comments: Sequence[str]) -> str:
+    """A proposal as the text of a file."""
+    lines = [f"# {line}" for line in comments]
+    lines += [_line(key, value) for key, value in table.items() if not isinstance(value, dict)]
+    for name, section in table.items():
+        if isinstance(section, dict):
+            deep = all(isinstance(value, dict) for value in section.values()) and section
+            parts = {f"{name}.{key}": value for key, value in section.items()} if deep else {}
+            for title, part in (parts or {name: section}).items():
+                lines += ["", f"[{title}]", *(_line(key, value) for key, value in part.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _line(key: str, value: Any) -> str:
+    """A key and its value, a long list of words on several lines."""
+    bare = key.replace("_", "").replace("-", "")
+    name = key if bare.isalnum() and bare.isascii() else json.dumps(key)
+    text = f"{name} = {_value(value)}"
+    if len(text) <= _COLUMNS or not isinstance(value, list):
+        return text
+    rows, row = [], ""
+    for word in map(_value, value):
+        if row and len(row) + len(word) + 5 > _COLUMNS:
+            rows.append(row)
+            row = ""
+        row += f"{' ' if row else ''}{word},"
+    return "\n".join([f"{name} = [", *(f"  {r}" for r in (*rows, row)), "]"])
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, float):
+        return f"{value:.10g}" if abs(value) < 1e15 else repr(value)
+    return json.dumps(value)

@@ -1,0 +1,242 @@
+"""Where the feet of a surveyed robot touch the floor.
+
+Of the primitive geoms of a foot that collide with the floor, those points count that lie within
+5 mm of the lowest one when all joints are zero. Where the lowest box of a foot is tilted then, its
+lower face is the sole, else what is level. A sole that is wider than 2 cm at its front and at
+its back, under a leg of six joints or more, is flat: four corners. One that is longer than 2 cm is
+a line from heel to toe, any other a point. Both feet get the same lengths.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.rebuild import SHAPES
+from hector_jax.robot.survey import Survey, at_zero, below
+
+SIDES = ("left", "right")
+_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
+_SAME_SOLE = 5e-3  # [m] above the lowest point
+_WIDE = 0.02  # [m]
+_ALIKE, _ALIKE_GUESSES = 0.01, 0.03  # [m] between the feet
+_LEVEL, _UPRIGHT = np.cos(np.radians((0.5, 45.0)))  # tilts of a box that count
+_FLAT_FROM = 6  # joints of a leg that can keep a flat sole level
+_DOWN = np.array([0.0, 0.0, -1.0])
+_RIM = 16  # points on a cylinder's edge
+
+
+class Sole(NamedTuple):
+    """One foot."""
+
+    section: dict[str, Any]  # of the TOML
+    contacts: Float[np.ndarray, "c 3"]  # in the axes of the sole, from the last joint [m]
+    point: Float[np.ndarray, "3"]  # where wrenches act, likewise
+    axes: Float[np.ndarray, "3 3"]  # of the sole in the trunk's, all joints at zero
+    guessed: bool  # from the foot's inertia: the file has no geoms
+
+
+def find_soles(found: Survey) -> tuple[Sole, Sole]:
+    """Both feet of a robot.
+
+    Raises:
+        InputError: one line: the feet differ.
+    """
+    data = at_zero(found.model)
+    axes = [_axes(found, data, leg) for leg in found.legs]
+    touch = [_floor_points(found, data, leg, R) for leg, R in zip(found.legs, axes, strict=True)]
+    guessed = any(len(points) == 0 for points in touch)
+    if guessed:
+        touch = [_box_of_inertia(found, data, leg) for leg in found.legs]
+    elif named := _named(found, data):
+        return named
+    outlines = [_outline(points, len(found.legs[0])) for points in touch]
+    left, right = outlines[0], _mirrored(outlines[1])
+    near = _ALIKE_GUESSES if guessed else _ALIKE
+    if len(left) != len(right) or np.abs(left - right).max() > near:
+        raise InputError(
+            f"{found.path}: the left foot touches at {np.round(left, 4).tolist()} from its last "
+            f"joint and the mirrored right one at {np.round(right, 4).tolist()}, expected the same"
+        )
+    mean = np.round(0.5 * (left + right), 4)
+    return (
+        _placed(found, data, 0, mean, axes[0], guessed),
+        _placed(found, data, 1, _mirrored(mean), axes[1], guessed),
+    )
+
+
+def _mirrored(contacts: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 3"]:
+    """The other foot's, in the order of this one's."""
+    order = [1, 0, 3, 2] if len(contacts) == 4 else list(range(len(contacts)))
+    return contacts[order] * [1.0, -1.0, 1.0]
+
+
+def _foot_geoms(found: Survey, leg: Sequence[int]) -> list[int]:
+    """Primitives of a foot that collide, with the floor where there is one."""
+    model = found.model
+    bodies = below(model, int(model.jnt_bodyid[leg[-1]]))
+    bits = [
+        (int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in range(model.ngeom)
+    ]
+    floor = [
+        bits[g]
+        for g in range(model.ngeom)
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE and any(bits[g])
+    ]
+    inside = [
+        g
+        for g in range(model.ngeom)
+        if model.geom_bodyid[g] in bodies and model.geom_type[g] in SHAPES and any(bits[g])
+    ]
+    on_floor = [g for g in inside if any(bits[g][0] & a or bits[g][1] & c for c, a in floor)]
+    return on_floor if floor else inside
+
+
+def _axes(found: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
+    """Axes of the sole in those of the trunk, as columns."""
+    boxes = [g for g in _foot_geoms(found, leg) if found.model.geom_type[g] == _BOX]
+    if not boxes:
+        return np.eye(3)
+    R = data.geom_xmat[min(boxes, key=lambda g: data.geom_xpos[g][2])].reshape(3, 3)
+    face = int(np.argmax(np.abs(R[2])))
+    up = R[:, face] * np.sign(R[2, face])
+    if not _UPRIGHT < up[2] < _LEVEL:
+        return np.eye(3)
+    ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    ahead /= np.linalg.norm(ahead)
+    return np.column_stack([ahead, np.cross(up, ahead), up])
+
+
+def _floor_points(
+    found: Survey, data: mujoco.MjData, leg: Sequence[int], axes: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Points of the sole in its axes, from the last joint."""
+    geoms = _foot_geoms(found, leg)
+    if not geoms:
+        return np.zeros((0, 3))
+    down = -axes[:, 2]
+    points = np.concatenate([_support(found.model, data, g, down) for g in geoms])
+    points = (points - data.xanchor[leg[-1]]) @ axes
+    return points[points[:, 2] <= points[:, 2].min() + _SAME_SOLE]
+
+
+def _support(
+    model: mujoco.MjModel, data: mujoco.MjData, g: int, down: Float[np.ndarray, "3"] = _DOWN
+) -> Float[np.ndarray, "n 3"]:
+    """Extreme points of a geom; for what is round the lowest ones."""
+    shape, size = int(model.geom_type[g]), model.geom_size[g]
+    center, R = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
+    if shape == _BOX:
+        signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+        return center + (signs * size) @ R.T
+    if shape == _ELLIPSOID:
+        local = R.T @ down
+        return (center + R @ (size**2 * local / np.linalg.norm(size * local)))[None]
+    if shape == _SPHERE:
+        return (center + size[0] * down)[None]
+    ends = center + np.outer([-size[1], size[1]], R[:, 2])
+    if shape == _CAPSULE:
+        return ends + size[0] * down
+    angles = np.arange(_RIM) * 2.0 * np.pi / _RIM
+    rim = size[0] * (np.outer(np.cos(angles), R[:, 0]) + np.outer(np.sin(angles), R[:, 1]))
+    across = down - R[:, 2] * (R[:, 2] @ down)
+    steep = np.linalg.norm(across)
+    if steep > 1e-6:
+        rim = np.concatenate([rim, size[0] * across[None] / steep])
+    return (ends[:, None] + rim).reshape(-1, 3)
+
+
+def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray, "c 3"]:
+    """Corners front left, front right, back left, back right; or toe and heel; or a point."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = 0.5 * (low + high)
+    z = points[:, 2].min()
+    front, back = (points[side] for side in (points[:, 0] >= middle[0], points[:, 0] <= middle[0]))
+    width = min(np.ptp(front[:, 1]), np.ptp(back[:, 1]))
+    if high[0] - low[0] <= _WIDE:
+        return np.array([[middle[0], middle[1], z]])
+    if width <= _WIDE or joints < _FLAT_FROM:
+        return np.array([[high[0], middle[1], z], [low[0], middle[1], z]])
+    return np.array(
+        [
+            [high[0], front[:, 1].max(), z],
+            [high[0], front[:, 1].min(), z],
+            [low[0], back[:, 1].max(), z],
+            [low[0], back[:, 1].min(), z],
+        ]
+    )
+
+
+def _box_of_inertia(
+    found: Survey, data: mujoco.MjData, leg: Sequence[int]
+) -> Float[np.ndarray, "4 3"]:
+    """Lower corners of the box that has the mass and inertia of the foot's last body."""
+    model, body = found.model, int(found.model.jnt_bodyid[leg[-1]])
+    mass, spread = model.body_mass[body], model.body_inertia[body]
+    square = 1.5 * (spread.sum() - 2.0 * spread) / max(mass, 1e-9)
+    size = np.sqrt(np.maximum(square, 1e-6))
+    R = data.ximat[body].reshape(3, 3)
+    half = np.abs(R) @ size
+    center = data.xipos[body] - data.xanchor[leg[-1]]
+    signs = np.array([[a, b, -1.0] for a in (-1, 1) for b in (-1, 1)])
+    return center + signs * half
+
+
+def _placed(
+    found: Survey,
+    data: mujoco.MjData,
+    side: int,
+    contacts: Float[np.ndarray, "c 3"],
+    axes: Float[np.ndarray, "3 3"],
+    guessed: bool,
+) -> Sole:
+    """A foot by places in the frame of the body that its last joint moves."""
+    model, last = found.model, found.legs[side][-1]
+    body = int(model.jnt_bodyid[last])
+    R, origin = data.xmat[body].reshape(3, 3), data.xpos[body] - data.xanchor[last]
+    places = (contacts @ axes.T - origin) @ R
+    ahead, middle = contacts[:, 0], 0.5 * (contacts.min(axis=0) + contacts.max(axis=0))
+    section: dict[str, Any] = {"body": model.body(body).name}
+    digits = 4 if np.allclose(np.abs(axes.T @ R).max(axis=0), 1.0, rtol=0.0, atol=1e-9) else 8
+    if np.abs(origin - np.round(origin, 4)).max() > 1e-9:
+        digits = 8
+    section["contacts"] = [_numbers(place, digits) for place in places]
+    point = np.array([0.0, middle[1], middle[2]])
+    under = ahead.min() < -1e-3 and ahead.max() > 1e-3
+    if len(contacts) == 1 or not under:  # the last joint is not above the sole
+        point = middle
+        section["point"] = _numbers((axes @ point - origin) @ R, digits)
+    return Sole(section, contacts, point, axes, guessed)
+
+
+def _numbers(place: Float[np.ndarray, "3"], digits: int) -> list[float]:
+    return [round(float(x), digits) + 0.0 for x in place]
+
+
+def _named(found: Survey, data: mujoco.MjData) -> tuple[Sole, Sole] | None:
+    """Feet of two named spheres and a named site each, as HECTOR's."""
+    model, soles = found.model, []
+    for leg in found.legs:
+        geoms, body = _foot_geoms(found, leg), int(model.jnt_bodyid[leg[-1]])
+        sites = [s for s in range(model.nsite) if int(model.site_bodyid[s]) == body]
+        right = len(geoms) == 2 and len(sites) == 1 and model.site(sites[0]).name
+        if not right or any(
+            model.geom_type[g] != _SPHERE
+            or not model.geom(g).name
+            or int(model.geom_bodyid[g]) != body
+            for g in geoms
+        ):
+            return None
+        anchor = data.xanchor[leg[-1]]
+        heel, toe = sorted(geoms, key=lambda g: data.geom_xpos[g][0])
+        contacts = np.concatenate([_support(model, data, g) for g in (toe, heel)]) - anchor
+        point = data.site_xpos[sites[0]] - anchor
+        if np.abs(contacts[:, 2] - point[2]).max() > 1e-3:
+            return None
+        names = {"point": model.site(sites[0]).name}
+        names |= {"toe": model.geom(toe).name, "heel": model.geom(heel).name}
+        soles.append(Sole(names, contacts, point, np.eye(3), guessed=False))
+    return soles[0], soles[1]

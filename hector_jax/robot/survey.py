@@ -1,0 +1,208 @@
+"""The robot in an MJCF or URDF of which nothing else is known: trunk, legs, knees.
+
+All is read in the pose in which the trunk is at the origin and all joints are zero. A leg is a
+chain of three to seven hinges from where the two legs part down to the last hinge. The legs are the
+two such chains that mirror each other and end lowest; the left one is that whose first joint has
+the larger y or, where both have the same, whose name says so. What turns about y swings a leg
+forwards: the knee is the one of these joints, but the first, that is farthest from hip and sole.
+"""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
+from hector_jax.robot.elements import drop_unused
+from hector_jax.robot.links import MASSLESS
+from hector_jax.robot.mjcf import read_mjcf, refusal
+
+_HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
+_MIRRORED = 0.03  # [m] between a joint and the mirror image of the other leg's
+_BENDS = 0.7  # least share of y in the axis of a joint that swings the leg forwards
+_DIRECTIONS = ("roll", "pitch", "yaw")
+
+
+class Survey(NamedTuple):
+    """What a file holds."""
+
+    path: Path
+    model: mujoco.MjModel  # without motors, keyframes and meshes
+    trunk: int  # body
+    legs: tuple[tuple[int, ...], tuple[int, ...]]  # joints, left then right, from the trunk down
+    weld: tuple[str, ...]  # joints of no leg
+    knee: int  # of a leg, counted from 0
+    forwards: bool  # whether the knees point ahead
+
+
+def survey(path: Path) -> Survey:
+    """Find the robot in a file, see the module.
+
+    Raises:
+        InputError: one line saying what is missing and how to mend it.
+    """
+    path = Path(path)
+    root = read_mjcf(path)
+    drop_unused(path, root, (), None)
+    model = _compile(path, root)
+    free = [j for j in range(model.njnt) if model.jnt_type[j] == _FREE]
+    if len(free) > 1:
+        names = ", ".join(model.joint(j).name for j in free)
+        raise InputError(f"{path}: free joints {names}, expected one at most, the trunk's")
+    legs = _legs(path, model, free)
+    trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[_body(model, legs[0][0])])
+    data = at_zero(model)
+    others = [j for j in range(model.njnt) if j not in (*free, *legs[0], *legs[1])]
+    if unnamed := [model.body(_body(model, j)).name for j in others if not model.joint(j).name]:
+        raise InputError(
+            f"{path}: a joint of body {unnamed[0]!r} has no name, expected one: it is to be welded"
+        )
+    knee = _knee(path, model, data, legs[0])
+    span = model.jnt_range[legs[0][knee]] * np.sign(data.xaxis[legs[0][knee]][1])
+    return Survey(
+        path=path,
+        model=model,
+        trunk=trunk,
+        legs=legs,
+        weld=tuple(model.joint(j).name for j in others),
+        knee=knee,
+        forwards=bool(span[np.argmax(np.abs(span))] > 0.0),
+    )
+
+
+def at_zero(model: mujoco.MjModel) -> mujoco.MjData:
+    """Kinematics with all joints at zero, free bodies upright at the origin."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    for j in range(model.njnt):
+        start = model.jnt_qposadr[j]
+        if model.jnt_type[j] == _FREE:
+            data.qpos[start + 3] = 1.0
+        elif model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL:
+            data.qpos[start] = 1.0
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    return data
+
+
+def axis_words(axis: Float[np.ndarray, "3"]) -> str:
+    """An axis in the trunk's frame in words.
+
+    >>> axis_words(np.array([0.0, -1.0, 0.0])), axis_words(np.array([0.0, 0.82, -0.57]))
+    ('-y pitch', '+y pitch, turned by 35 deg')
+    """
+    main = int(np.argmax(np.abs(axis)))
+    sign = "-" if axis[main] < 0.0 else "+"
+    words = f"{sign}{'xyz'[main]} {_DIRECTIONS[main]}"
+    tilt = np.degrees(np.arccos(min(abs(axis[main]), 1.0)))
+    return words if tilt < 1.0 else f"{words}, turned by {tilt:.0f} deg"
+
+
+def below(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and all below it."""
+    inside = [body]
+    for b in range(body + 1, model.nbody):
+        if int(model.body_parentid[b]) in inside:
+            inside.append(b)
+    return inside
+
+
+def _compile(path: Path, root: ElementTree.Element) -> mujoco.MjModel:
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+        for part in (*spec.actuators, *spec.keys):
+            spec.delete(part)
+        spec.compiler.boundmass = MASSLESS
+        spec.compiler.boundinertia = 1e-12
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
+
+
+def _body(model: mujoco.MjModel, joint: int) -> int:
+    return int(model.jnt_bodyid[joint])
+
+
+def _chains(model: mujoco.MjModel, free: Sequence[int]) -> list[tuple[int, ...]]:
+    """Joints on the way to each last joint, from the world down."""
+    ways: dict[int, tuple[int, ...]] = {0: ()}
+    inner: set[int] = set()
+    for body in range(1, model.nbody):
+        above = ways[int(model.body_parentid[body])]
+        first = int(model.body_jntadr[body])
+        own = tuple(first + i for i in range(model.body_jntnum[body]) if first + i not in free)
+        ways[body] = above + own
+        if own:
+            inner |= set(ways[body][:-1])
+    return sorted({way for way in ways.values() if way and way[-1] not in inner})
+
+
+def _legs(
+    path: Path, model: mujoco.MjModel, free: Sequence[int]
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Joints of the left and the right leg."""
+    data, found = at_zero(model), []
+    for one, other in combinations(_chains(model, free), 2):
+        common = sum(a == b for a, b in zip(one, other, strict=False))
+        a, b = one[common:], other[common:]
+        hinges = all(model.jnt_type[j] == _HINGE for j in (*a, *b))
+        right_length = FEWEST_JOINTS <= len(a) <= MOST_JOINTS and len(a) == len(b)
+        if hinges and right_length and _mirrored(data.xanchor[list(a)], data.xanchor[list(b)]):
+            found.append((_lowest(model, data, a[-1]), -len(a), a, b))
+    if not found:
+        ends = (f"{model.joint(way[-1]).name} ({len(way)})" for way in _chains(model, free))
+        raise InputError(
+            f"{path}: no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} "
+            "hinges that mirror each other; chains by their last joint: "
+            f"{', '.join(ends) or 'none'}"
+        )
+    *_, one, other = min(found)
+    if _is_right(model, data, one, other):
+        one, other = other, one
+    return one, other
+
+
+def _mirrored(one: Float[np.ndarray, "j 3"], other: Float[np.ndarray, "j 3"]) -> bool:
+    return bool(np.abs(one - other * [1.0, -1.0, 1.0]).max() <= _MIRRORED)
+
+
+def _lowest(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> float:
+    """Height at which a chain ends [m], to the millimetre."""
+    return round(min(data.xipos[b][2] for b in below(model, _body(model, joint))), 3)
+
+
+def _is_right(
+    model: mujoco.MjModel, data: mujoco.MjData, one: Sequence[int], other: Sequence[int]
+) -> bool:
+    """Whether the first of two legs is the right one."""
+    y = data.xanchor[one[0]][1] - data.xanchor[other[0]][1]
+    if abs(y) > 1e-3:
+        return bool(y < 0.0)
+    name = model.joint(one[0]).name.lower()
+    return re.search(r"right|(^|_)r(_|$)", name) is not None
+
+
+def _knee(path: Path, model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int]) -> int:
+    """Which joint of a leg is the knee."""
+    axes, anchors = data.xaxis[list(leg)], data.xanchor[list(leg)]
+    bend = [i for i in range(len(leg)) if abs(axes[i][1]) >= _BENDS]
+    if len(bend) < 2:
+        words = ", ".join(f"{model.joint(j).name} {axis_words(data.xaxis[j])}" for j in leg)
+        raise InputError(
+            f"{path}: {len(bend)} joints of the left leg turn about y, expected hip and knee at "
+            f"least: turn the model so that x is ahead; joints: {words}"
+        )
+    end = data.xipos[_body(model, leg[-1])]
+    hip = anchors[bend[0]]
+
+    def apart(i: int) -> float:
+        return float(min(np.linalg.norm(anchors[i] - place) for place in (hip, end)))
+
+    return max(bend[1:], key=apart)

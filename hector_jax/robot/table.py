@@ -1,0 +1,143 @@
+"""What is known of a robot, as a short table in plain words."""
+
+import textwrap
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from hector_jax.robot.checks import trunk_body
+from hector_jax.robot.model import Robot, compile_model
+from hector_jax.robot.propose import ankle_reach, sole_share
+from hector_jax.robot.source import build_spec
+from hector_jax.robot.survey import Survey, at_zero, axis_words
+
+_HEADER = ("joint", "axis", "range [rad]", "motor [N m]", "link [kg]", "standing [rad]")
+_HEAVY = 0.35  # share of the legs in the mass
+
+
+def table_of(robot: Robot) -> list[str]:
+    """The lines of a robot that can be loaded."""
+    description = robot.description
+    count = description.leg_joints
+    share = float(robot.link_mass.sum() / robot.mass)
+    model = compile_model(description)
+    trunk = model.body(trunk_body(model)).name
+    rows = [
+        (
+            _both(description.joints[i], description.joints[count + i]),
+            axis_words(robot.joint_axis[0, i]),
+            f"{robot.joint_lower[i]:+.2f} to {robot.joint_upper[i]:+.2f}",
+            f"{robot.torque_limit[i]:.3g}",
+            f"{robot.link_mass[0, i]:.3g}",
+            f"{robot.standing_joints[i]:+.2f}",
+        )
+        for i in range(count)
+    ]
+    return [
+        f"robot    {description.name}: {robot.mass:.4g} kg, trunk {trunk!r}; standing, its centre "
+        f"of mass is {robot.standing_height:.3g} m high",
+        f"legs     {count} joints each, {100 * share:.0f} % of the mass; knees bend "
+        f"{_way(_forwards(robot))}; axes and numbers of the left leg:",
+        *_columns([_HEADER, *rows]),
+        f"feet     {robot.structure.contact}: {_sole(robot)}",
+        *_words("fixed", description.weld),
+    ]
+
+
+def table_of_survey(found: Survey) -> list[str]:
+    """The lines of a robot of which only the legs are known."""
+    model, data = found.model, at_zero(found.model)
+    rows = [
+        (
+            _both(model.joint(left).name, model.joint(right).name),
+            axis_words(data.xaxis[left]),
+            "{:+.2f} to {:+.2f}".format(*model.jnt_range[left])
+            if model.jnt_limited[left]
+            else "none",
+        )
+        for left, right in zip(*found.legs, strict=True)
+    ]
+    mass = float(model.body_subtreemass[found.trunk])
+    return [
+        f"robot    {mass:.4g} kg, trunk {model.body(found.trunk).name!r}",
+        f"legs     {len(rows)} joints each; knees bend {_way(found.forwards)}; axes and numbers of "
+        "the left leg:",
+        *_columns([_HEADER[:3], *rows]),
+        *_words("fixed", found.weld),
+    ]
+
+
+def mended(robot: Robot) -> list[str]:
+    """What of the model's file is read otherwise than it stands there, a line each."""
+    notes = build_spec(robot.description).notes
+    return [note for note in notes if not note.startswith("fixed: ")]  # as the table has them
+
+
+def remarks(robot: Robot) -> list[str]:
+    """What can be walked with and is likely to be trouble, and how to mend it."""
+    share, lines = float(robot.link_mass.sum() / robot.mass), []
+    control = {name: dict(section) for name, section in robot.description.control}
+    if share > _HEAVY and not control.get("legs", {}).get("gravity_compensation"):
+        lines.append(
+            f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they stretch: "
+            "set legs.gravity_compensation = true and bend the knees"
+        )
+    reach, used = ankle_reach(robot), control.get("mpc", {}).get("sole", 1.0)
+    if reach is not None and reach < 0.99 * used * float(robot.toe):
+        lines.append(
+            f"the ankle can hold the weight {100 * reach:.1f} cm ahead of it and the plan uses "
+            f"{100 * used * float(robot.toe):.1f} cm: set mpc.sole = {sole_share(robot):g}"
+        )
+    if robot.heel > 1.2 * robot.toe:
+        lines.append(
+            "the heel is longer than the toe: if the robot looks along -x, turn the model so that "
+            "x is ahead"
+        )
+    force = control.get("mpc", {}).get("max_force", 500.0)
+    weight = float(robot.mass * robot.gravity[2])
+    if force < 1.5 * weight:
+        lines.append(
+            f"mpc.max_force is {force:.3g} N, {force / weight:.2g} times the weight: set "
+            f"{2.5 * weight:.2g}"
+        )
+    return lines
+
+
+def _way(forwards: bool) -> str:
+    return "forwards" if forwards else "backwards"
+
+
+def _forwards(robot: Robot) -> bool:
+    """Whether the knees point ahead: the largest bend about y in the standing pose."""
+    bend = robot.standing_joints[: robot.description.leg_joints] * robot.joint_axis[0, :, 1]
+    inner = bend[1:-1] if len(bend) > 3 else bend[1:]
+    return bool(inner[np.argmax(np.abs(inner))] > 0.0)
+
+
+def _sole(robot: Robot) -> str:
+    if robot.structure.contact == "point":
+        return "one contact each"
+    text = f"{100 * robot.toe:.1f} cm ahead of the foot point, {100 * robot.heel:.1f} cm behind it"
+    if robot.structure.contact == "flat":
+        text += f", {100 * robot.half_width:.1f} cm to either side"
+    return text
+
+
+def _both(left: str, right: str) -> str:
+    """Two names in one cell."""
+    return f"{left}, {right}"
+
+
+def _words(title: str, words: Sequence[str]) -> list[str]:
+    """Names under a title."""
+    lines = textwrap.wrap(", ".join(words) or "no joint", 91, break_on_hyphens=False)
+    return [f"{title if i == 0 else '':8s} {line}" for i, line in enumerate(lines)]
+
+
+def _columns(rows: Sequence[Iterable[str]]) -> list[str]:
+    cells = [tuple(row) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        "  " + "  ".join(f"{x:{w}}" for x, w in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    ]
