@@ -61,15 +61,6 @@ def holding_torques(path, model, data):
     return torques
 
 
-def inertia_about(model, data, bodies, place):
-    total = np.zeros((3, 3))
-    for body in bodies:
-        R, r = data.ximat[body].reshape(3, 3), data.xipos[body] - place
-        own = R @ np.diag(model.body_inertia[body]) @ R.T
-        total += own + model.body_mass[body] * (r @ r * np.eye(3) - np.outer(r, r))
-    return total
-
-
 @pytest.mark.parametrize(
     ("path", "mass", "com_height"),
     [(HUMANOID, 35.0, 0.647), (V2, 11.468, 0.417), (V2_ARMS, 14.848, 0.478)],
@@ -102,9 +93,6 @@ def test_the_places_in_the_description_are_the_spheres_of_the_model(path):
     spheres = foot_spheres(model)
     below = data.geom_xpos[spheres] - [0, 0, 1] * model.geom_size[spheres, :1]
     np.testing.assert_allclose(below, soles(path, data).reshape(-1, 3), atol=1e-6)
-    for side in ("left", "right"):
-        foot = table(path)["feet"][side]
-        assert np.allclose(foot["point"][2], np.array(foot["contacts"])[:, 2])
 
 
 @ALL
@@ -203,23 +191,6 @@ def test_the_humanoid_bends_its_knees_forwards_and_fits_its_gains():
     # the ankle can put nearly the whole weight on the toes
     ahead = np.array(file["feet"]["left"]["contacts"])[:, 0].max()
     assert weight * ahead < model.actuator("left_ankle_pitch").ctrlrange[1]
-    # the gains fit the inertia below each joint: w from 25 to 60 rad/s, half of critical damping
-    for name, kp, kd in zip(
-        file["joints"]["left"], file["legs"]["kp"], file["legs"]["kd"], strict=True
-    ):
-        joint = model.joint(name)
-        axis, place = data.xaxis[joint.id], data.xanchor[joint.id]
-        below = [i for i in range(model.nbody) if _is_below(model, i, joint.bodyid[0])]
-        about = axis @ inertia_about(model, data, below, place) @ axis
-        about += model.dof_armature[joint.dofadr[0]]
-        assert 25.0 < np.sqrt(kp / about) < 65.0, name
-        assert 0.4 < kd / (2.0 * np.sqrt(kp * about)) < 0.6, name
-
-
-def _is_below(model, body, root):
-    while body not in (0, root):
-        body = model.body_parentid[body]
-    return body == root
 
 
 @pytest.mark.parametrize("path", [V2, V2_ARMS], ids=NAMES[1:])
