@@ -7,6 +7,7 @@ time does not.
 
 import sys
 import time
+from pathlib import Path
 
 from benchmarks.measuring import Check, Report, pin_one_core, show
 
@@ -16,9 +17,9 @@ if __name__ == "__main__":
 import jax
 import numpy as np
 
-from hector_jax.control.controller import WalkConfig, actuate, init_memory, step_plan
+from hector_jax.control.controller import actuate, init_memory, step_plan, walk_config
 from hector_jax.control.reference import anchor_at, named_command
-from hector_jax.control.weights import expert
+from hector_jax.control.weights import expert, nominal
 from hector_jax.core.runtime import setup_jax
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
@@ -29,10 +30,11 @@ from hector_jax.sim.world import ideal
 SECONDS = 10.0
 
 
-def measure(seconds: float = SECONDS) -> Report:
-    """Walk straight, then time every tick of it."""
+def measure(seconds: float = SECONDS, robot_file: Path | None = None) -> Report:
+    """Walk straight, then time every tick of it; of HECTOR, or of another robot's file."""
     setup_jax()
-    config, robot, weights = WalkConfig(), load_robot(), expert()
+    robot = load_robot(robot_file)
+    config, weights = walk_config(robot), nominal(robot) if robot_file else expert()
     command = named_command("straight")
     rows: list[np.ndarray] = []
 
@@ -40,7 +42,8 @@ def measure(seconds: float = SECONDS) -> Report:
         known = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(known[sensing.coordinates(world)])
 
-    walked = walk(config, robot, Job(weights, command, ideal(), seconds), on_sample=record)
+    job = Job(weights, command, ideal(robot.description), seconds)
+    walked = walk(config, robot, job, on_sample=record)
     count, no_error = substeps(config), sensing.no_error(robot)
     readings = rows[-round(seconds * 1000) - 1 :: count][: round(seconds / config.gait.tick)]
 
@@ -97,4 +100,5 @@ def measure(seconds: float = SECONDS) -> Report:
 
 
 if __name__ == "__main__":
-    show(measure(*map(float, sys.argv[1:])))
+    seconds, *file = sys.argv[1:] or [SECONDS]
+    show(measure(float(seconds), *map(Path, file)))
