@@ -234,7 +234,7 @@ def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
             lambda text: re.sub("<keyframe>.*</keyframe>", "", text, flags=re.DOTALL).replace(
                 '<freejoint name="base"/>', ""
             ),
-            "free joint",
+            "no keyframe 'standing'",
         ),
         (lambda text: text[: len(text) // 2], "hector.xml"),
         (lambda text: text.replace("left_foot_point", "left_fot_point"), "left_foot_point"),
@@ -242,7 +242,7 @@ def test_an_unwritable_folder(monkeypatch, capsys, tmp_path):
             lambda text: "".join(
                 line for line in text.splitlines(True) if '<motor name="right_ankle"' not in line
             ),
-            "10",
+            "right_ankle",
         ),
     ],
 )

@@ -90,7 +90,8 @@ class MpcConfig:
         object.__setattr__(self, "contact", model)
         object.__setattr__(self, "constraints", tuple(chosen))
         if not self.on("inputs"):
-            raise InputError("MpcConfig.constraints must have one on the inputs, or feet can pull")
+            text = "MpcConfig.constraints must have one on the inputs, or feet can pull"
+            raise InputError(f"{text}, got {tuple(chosen)}")
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """The numbers, to be traced."""

@@ -240,7 +240,7 @@ def _walk_one(
     data = mjx.make_data(model)
     if program.single:
         model, data = mjx_model.to_single((model, data))
-    walk = _Walk(robot, job, model, data, error=jnp.asarray(sensing.no_error(robot)))
+    walk = _Walk(robot, job, model, data, error=sensing.no_error(robot))
     carry = _standing(program, walk, _Physics(qpos, jnp.zeros(model.nv), jnp.zeros(model.nv)))
     begin, each = first_tick(program.config), program.substeps // program.period
     ticks = jnp.arange(begin, program.last_start + program.ticks)

@@ -173,9 +173,9 @@ def measure(
     return Measurement(estimate, joints, reading.joint_rates), state.euler[2]
 
 
-def no_error(robot: Robot) -> Float[np.ndarray, " errors"]:
+def no_error(robot: Robot) -> Float[Array, " errors"]:
     """Errors of an estimate that has none: those of a State in its order, then the joints'."""
-    return np.zeros(12 + len(robot.joint_lower))
+    return jnp.zeros(12 + len(robot.joint_lower))
 
 
 def draw_errors(

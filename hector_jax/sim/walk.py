@@ -46,7 +46,7 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     count = substeps(config)
 
     def begin(robot: Robot, reading: Array) -> Memory:
-        still = jnp.zeros(()), jnp.asarray(sensing.no_error(robot))
+        still = jnp.zeros(()), sensing.no_error(robot)
         return init_memory(robot, loop.measure(robot, reading, *still))
 
     def samples(robot, command, anchor, tick, yaw, readings, contacts, place) -> Sample:
