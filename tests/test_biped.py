@@ -183,6 +183,11 @@ def test_mjx_takes_any_robot_and_knows_what_may_not_touch_the_floor(strider):
             ["joints: must be different names, got 'left_roll' twice"],
         ),
         ("toe = ", "tow = ", ["feet: left: unknown field 'tow'", "did you mean 'toe'?"]),
+        (
+            "linkage = [5, 4]",
+            "armature = [0.01]",
+            ["joints: armature must be a number for each of the 5 joints", "got (0.01,)"],
+        ),
         ("linkage = [5, 4]", "linkage = [6, 4]", ["joints: linkage must be two", "from 1 to 5"]),
         ("[joints]", '[joints]\naxes = "zxyyy"', ["joints: unknown field 'axes'"]),
         ("nominal.force = 3.6e-5", "", ["weights: nominal: missing field 'force'"]),

@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 from published import JOINTS, MOTOR, SHIN, small, urdf_of
 
+from hector_jax.control.controller import walk_config
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import expert
 from hector_jax.robot.description import MODEL_PATH, Description, Foot, read_description
+from hector_jax.robot.model import load_robot, robot_of
 from hector_jax.robot.source import build_spec
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import ideal
+from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 ARRAYS = (
@@ -125,6 +133,20 @@ def test_a_urdf_is_the_robot_that_its_numbers_are(tmp_path, world):
     np.testing.assert_allclose(
         mass_matrix(model, got), mass_matrix(hector, expected), atol=1e-9, rtol=0
     )
+
+
+@pytest.mark.slow
+def test_a_urdf_of_hector_walks_like_it(tmp_path):
+    text = urdf_of(mujoco.MjModel.from_xml_path(str(MODEL_PATH)))
+    armature = (0.008, 0.008, 0.008, 0.016, 0.008)
+    own, ideally = load_robot(), ideal()
+    urdf = robot_of(by_numbers(tmp_path, text, armature=armature))
+
+    def loss(robot):
+        job = Job(expert(), named_command("straight"), ideally)
+        return float(total(PAPER_LOSS, losses(PAPER_LOSS, walk(walk_config(own), robot, job))))
+
+    assert loss(urdf) == pytest.approx(loss(own), rel=0.01)
 
 
 def test_a_urdf_without_effort_names_the_joint(tmp_path):

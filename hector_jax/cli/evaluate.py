@@ -1,6 +1,7 @@
 """Evaluation of weight sets, walks and runs."""
 
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,11 +20,11 @@ from hector_jax.report import pictures
 from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
-from hector_jax.robot.model import load_robot
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.folder import RESULT, load_run
-from hector_jax.sim.diagnosis import startup_fall
-from hector_jax.tuning.loss import loss_of_robot
+from hector_jax.sim.diagnosis import StartupFall, startup_fall
+from hector_jax.tuning.loss import Loss, loss_of_robot
 
 
 def evaluate(args: Evaluate) -> None:
@@ -80,31 +81,16 @@ def walk(args: Walk) -> None:
     samples = round(config.gait.tick / float(trajectory.period))  # of each plan
     plans = np.asarray(trajectory.residual)[::samples]
     unsolved = int(np.sum(~(plans <= SOLVED)))
-    fell = bool(score.fallen) and not unsolved  # without a plan it is no fall of these weights
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
+    # without a plan it is no fall of these weights
+    walked = _Walked(score, upright, startup, bool(score.fallen) and not unsolved)
     if args.json:
-        losses = {part: float(value) for part, value in score.losses.items()}
-        errors = {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
-        solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
-        told = {"seconds": upright if startup is None else startup.time, "fell": fell}
-        told |= {} if startup is None else {"startup": startup._asdict()}
-        told |= {} if plant is None else {"plant": plant.description.name}
-        # a walk that falls at once has no errors
-        print(as_json({**told, **losses, **errors, **solved}))
+        print(as_json(_as_table(walked, plans, unsolved, plant)))
     else:
-        end = "fell after" if fell else "ended after" if score.fallen else "walked"
-        end = f"{end} {upright:.2f} s" if startup is None else str(startup)
         on = "" if plant is None else f" on {plant.description.name}"
-        print(
-            f"{course.name} in {args.world}{on}, {printable(args.weights)} weights: {end}; ", end=""
-        )
-        terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in loss)
-        print(f"L {score.L / 1e6:.3f}e6 ({terms})")
-        cm, degrees = 100 * score.rms_position, np.degrees(score.rms_euler)
-        if upright > 0.0:
-            print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
-            print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
+        what = f"{course.name} in {args.world}{on}, {printable(args.weights)} weights"
+        _print_walk(walked, loss, what)
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
@@ -119,6 +105,41 @@ def walk(args: Walk) -> None:
             name: trajectory,
         }
         pictures.film(args.video, robot, walks)
+
+
+class _Walked(NamedTuple):
+    """What is told of a walk."""
+
+    score: metrics.Score
+    upright: float  # [s]
+    startup: StartupFall | None
+    fell: bool
+
+
+def _as_table(
+    walked: _Walked, plans: np.ndarray, unsolved: int, plant: Robot | None
+) -> dict[str, Any]:
+    score, startup = walked.score, walked.startup
+    losses = {part: float(value) for part, value in score.losses.items()}
+    errors = {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
+    solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
+    told = {"seconds": walked.upright if startup is None else startup.time, "fell": walked.fell}
+    told |= {} if startup is None else {"startup": startup._asdict()}
+    told |= {} if plant is None else {"plant": plant.description.name}
+    # a walk that falls at once has no errors
+    return {**told, **losses, **errors, **solved}
+
+
+def _print_walk(walked: _Walked, loss: Loss, what: str) -> None:
+    score, upright, startup, fell = walked
+    end = "fell after" if fell else "ended after" if score.fallen else "walked"
+    end = f"{end} {upright:.2f} s" if startup is None else str(startup)
+    terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in loss)
+    print(f"{what}: {end}; L {score.L / 1e6:.3f}e6 ({terms})")
+    cm, degrees = 100 * score.rms_position, np.degrees(score.rms_euler)
+    if upright > 0.0:
+        print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
+        print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
 
 
 def compare(args: Compare) -> None:

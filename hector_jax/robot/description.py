@@ -7,6 +7,7 @@
     left, right = three to seven names each
     linkage = [5, 4]                   # the fifth joint's motor turns the fourth too; or none
     weld = ["waist"]                   # hinges that are fixed in the standing pose
+    armature = a number each           # [kg m^2] of a leg's motors, which a URDF cannot state
     [feet]                             # by names in the model, or by places in a body's frame
     left, right = { point = site on the sole, toe = geom, heel = geom }
     left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # 1, 2 or 4 contacts
@@ -100,6 +101,7 @@ class Description:
     joints: tuple[str, ...] = _leg("left") + _leg("right")
     linkage: tuple[int, int] | None = (5, 4)  # of a leg, counted from 1: whose motor turns which
     weld: tuple[str, ...] = ()  # joints
+    armature: tuple[float, ...] = ()  # [kg m^2] of the joints of a leg; else the model's
     feet: tuple[Foot, Foot] = (_named_foot("left"), _named_foot("right"))
     min_height: float = MIN_HEIGHT  # [m] of the centre of mass; below it the robot has fallen
     max_tilt: float = MAX_TILT  # [rad] of roll or pitch; beyond it too
@@ -145,6 +147,7 @@ class _Joints:
     right: tuple[str, ...] = _leg("right")
     linkage: tuple[int, int] | None = None
     weld: tuple[str, ...] = ()
+    armature: Annotated[tuple[float, ...], NOT_NEGATIVE] = ()
 
     def __post_init__(self) -> None:
         names, count = self.left + self.right + self.weld, len(self.left)
@@ -156,6 +159,11 @@ class _Joints:
         if len(set(names)) < len(names):
             twin = next(name for name in names if names.count(name) > 1)
             raise InputError(f"must be different names, got {short_repr(twin)} twice")
+        if len(self.armature) not in (0, count):
+            raise InputError(
+                f"armature must be a number for each of the {count} joints of a leg, "
+                f"got {short_repr(self.armature)}"
+            )
         if self.linkage and (
             not all(1 <= i <= count for i in self.linkage) or len(set(self.linkage)) < 2
         ):
@@ -299,6 +307,7 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         joints=file.joints.left + file.joints.right,
         linkage=file.joints.linkage,
         weld=file.joints.weld,
+        armature=file.joints.armature,
         feet=feet,
         min_height=file.limits.min_height,
         max_tilt=file.limits.max_tilt,

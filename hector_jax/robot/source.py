@@ -127,6 +127,8 @@ def _read(description: Description, root: ElementTree.Element) -> _File:
     joints = [names.index(joint) for joint in description.joints]
     first = int(model.jnt_bodyid[joints[0]])
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first])
+    if description.armature:
+        model.dof_armature[model.jnt_dofadr[joints]] = 2 * description.armature
     file = _File(description, spec, model, trunk, joints, free[0] if free else -1)
     _check_joints(file)
     _check_world(file)
@@ -267,6 +269,7 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
         ("frames of the joints put into their anchors", not at_origin and order),
         (f"torque motors {motors}", not _motors_right(file, limits)),
         ("floor added" if not floor else "floor replaced", not _floor_right(file)),
+        ("armature of the joints set", description.armature),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
         ("contact bits, friction and shapes set", not _contacts_right(file)),
         ("standing pose by angles", not isinstance(description.standing, str)),

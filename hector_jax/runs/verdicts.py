@@ -111,6 +111,12 @@ def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
     return one, walk if with_walk else None
 
 
+def _file_name(config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk: bool) -> str:
+    parts = config.rollout.walk, repr(config.loss), robot, job, *([job.plant] if job.plant else [])
+    (name, seed), stem = case, "walk" if with_walk else "score"
+    return f"{stem}-{name}-{seed}-{content_key(*parts, code=_CODE)}.npz"
+
+
 def _say_unsolved(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
     for name, each in walks.items():
         worst = np.max([walk.score.residual for walk in each])
@@ -179,12 +185,10 @@ def judge(
     if folder is None:
         results = dict(make(list(jobs), {}))
     else:
-        paths = {}
-        for (name, seed), job in jobs.items():
-            parts = walk_config, repr(config.loss), robot, job, *([plant] if plant else [])
-            key = content_key(*parts, code=_CODE)
-            stem = f"walk-{name}" if with_walk((name, seed)) else f"score-{name}"
-            paths[name, seed] = folder / f"{stem}-{seed}-{key}.npz"
+        paths = {
+            case: folder / _file_name(config, robot, case, job, with_walk(case))
+            for case, job in jobs.items()
+        }
         like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     walks = {
