@@ -188,7 +188,7 @@ def test_sizes_scale_with_mass_and_height(humanoid):
     assert config.gait.stance == config.gait.swing == round(20 * np.sqrt(h))
     assert config.mpc.step_ticks * config.mpc.horizon > config.gait.swing
     assert config.mpc.max_force == pytest.approx(2.5 * robot.mass * robot.gravity[2], rel=0.02)
-    assert (config.mpc.effort_reference, config.mpc.sole) == ("gravity", 0.6)
+    assert (config.mpc.effort_reference, config.mpc.sole_width) == ("gravity", 0.6)
     force, moment = description.nominal[-2][0], description.nominal[-1][0]
     assert force == pytest.approx(0.3e-4 / m**2, rel=6e-3)
     assert moment == pytest.approx(0.3e-3 / (m * h) ** 2, rel=6e-3)
@@ -254,11 +254,11 @@ def test_a_model_that_cannot_be_used_is_shown_as_far_as_it_goes(monkeypatch, cap
 def test_what_is_likely_trouble_is_told():
     robot = robot_of(read_description(HUMANOID))
     assert not remarks(robot)
-    bare = replace(robot.description, control=(("mpc", (("max_force", 900.0), ("sole", 0.6))),))
+    bare = replace(
+        robot.description, control=(("mpc", (("max_force", 900.0), ("sole_width", 0.6))),)
+    )
     (heavy,) = remarks(robot._replace(description=bare))
     assert heavy.startswith("the legs are 41 % of the mass")
-    weak = robot._replace(torque_limit=0.1 * robot.torque_limit)
-    assert any("set mpc.sole = 0.3" in line for line in remarks(weak))
     described = replace(robot.description, control=(("mpc", (("max_force", 300.0),)),))
     assert any(
         "mpc.max_force is 300 N" in line for line in remarks(robot._replace(description=described))

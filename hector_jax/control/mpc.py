@@ -64,7 +64,7 @@ class MpcConfig:
     step_ticks: int = 3  # ticks per step: dt = 0.03 s
     friction: float = 0.6  # mu; at most the floor's own, or the feet slip
     max_force: float = 500.0  # [N] per foot
-    sole: float = 1.0  # share of the sole's lengths that the plan uses, from the foot point
+    sole_width: float = 1.0  # share of a flat sole's half width that the plan uses
     line_friction: bool = True  # False leaves LINE_FRICTION out of the constraints
     effort_reference: str = (
         "zero"  # R prices u (the paper), or u less "gravity", the weight's share
@@ -78,7 +78,7 @@ class MpcConfig:
         check(
             self,
             **rules,
-            sole=SHARE,
+            sole_width=SHARE,
             step_ticks=AT_LEAST_ONE,
             effort_reference=("zero", "gravity"),
         )
@@ -225,8 +225,7 @@ def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
     """Rows of the constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
     feet, (robot, parameters, _, horizon) = condensed.feet, problem
     selection = jnp.asarray(config.contact_model.selection, feet.dtype)
-    lengths = {name: config.sole * getattr(robot, name) for name in ("toe", "heel", "half_width")}
-    robot = robot._replace(**lengths)
+    robot = robot._replace(half_width=config.sole_width * robot.half_width)
 
     def of_contact(yaw: Float[Array, ""]) -> Rows:
         contact = Contact(

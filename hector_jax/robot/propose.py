@@ -7,8 +7,7 @@ of mass m and height h:
     step_ticks               0.15 swing, rounded up, at least 3: ten steps see past the next step
     max_force                2.5 m g
     effort_reference         "gravity": else the plan jumps before single stance
-    sole                     0.6 of a flat foot, or it rolls over its edge; of any foot not more
-                             than its ankle can hold with the weight on it
+    sole_width               0.6 of a flat foot, or it rolls over its edge
     width                    0.85 of half the distance of the foot points, standing
     feedback                 0.12 s sqrt(h / h0)
     height                   0.06 m h / 0.69 m of a swinging foot; landing -0.005 m
@@ -151,26 +150,8 @@ def mpc(size: Size) -> dict[str, Any]:
         "max_force": float(f"{2.5 * _weight(size.robot):.2g}"),
         "effort_reference": "gravity",
     }
-    share = sole_share(size.robot)
-    return section if share == 1.0 else {**section, "sole": share}
-
-
-def sole_share(robot: Robot) -> float:
-    """Share of the sole that the plan uses."""
-    most = 0.6 if robot.structure.contact == "flat" else 1.0
-    reach = ankle_reach(robot)
-    if reach is None:
-        return most
-    return max(min(most, math.floor(100.0 * reach / float(robot.toe)) / 100.0), 0.3)
-
-
-def ankle_reach(robot: Robot) -> float | None:
-    """How far ahead of the ankle it can hold the weight [m]; None without an ankle or a toe."""
-    axes, limits = robot.joint_axis[0], robot.torque_limit[: len(robot.joint_axis[0])]
-    last = [i for i in range(len(axes) - 2, len(axes)) if abs(axes[i][1]) > 0.7]
-    if not last or robot.toe <= 0.0:
-        return None
-    return float(limits[last[-1]]) / _weight(robot)
+    flat = size.robot.structure.contact == "flat"
+    return {**section, "sole_width": 0.6} if flat else section
 
 
 def footstep(size: Size) -> dict[str, float]:

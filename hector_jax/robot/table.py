@@ -7,7 +7,6 @@ import numpy as np
 
 from hector_jax.robot.checks import trunk_body
 from hector_jax.robot.model import Robot, compile_model
-from hector_jax.robot.propose import ankle_reach, sole_share
 from hector_jax.robot.source import build_spec
 from hector_jax.robot.survey import Survey, at_zero, axis_words
 
@@ -81,12 +80,6 @@ def remarks(robot: Robot) -> list[str]:
         lines.append(
             f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they stretch: "
             "set legs.gravity_compensation = true and bend the knees"
-        )
-    reach, used = ankle_reach(robot), control.get("mpc", {}).get("sole", 1.0)
-    if reach is not None and reach < 0.99 * used * float(robot.toe):
-        lines.append(
-            f"the ankle can hold the weight {100 * reach:.1f} cm ahead of it and the plan uses "
-            f"{100 * used * float(robot.toe):.1f} cm: set mpc.sole = {sole_share(robot):g}"
         )
     if robot.heel > 1.2 * robot.toe:
         lines.append(
