@@ -2,7 +2,7 @@ r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stanc
 
     minimise    sum_{k=1}^{N} |x_k - x_ref,k|^2_Q + sum_{k=0}^{N-1} |u_k|^2_R
     subject to  x_{k+1} = A_k x_k + B_k u_k            dynamics
-                lower <= C u_k <= upper                each stance foot: `contact.CONSTRAINTS`
+                lower <= C u_k <= upper                each stance foot: `contact`
                 F = M = 0                              each foot in the air
 
 States are condensed away, and a foot in the air has no variables, nor have the components of the
