@@ -148,6 +148,20 @@ def test_a_fall_in_the_start_up_is_told_before_any_tuning(monkeypatch, capsys):
     assert f"before any tuning, straight on hfs with nominal weights: {TEXT}\n" in said
 
 
+def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
+    def scored(L):
+        score = metrics.score_like()
+        score = score._replace(losses=score.losses | {"L": np.array(L)})
+        last = pretend_walk().initial
+        return [verdicts.ScoredWalk(score, np.array(4.0), last, "", "")]
+
+    walks = {"nominal": scored(2e6), "without": scored(3e6), "with": scored(1e6)}
+    tuning._say_worse("straight", verdicts.ScoredWalks(walks, {}))
+    said = capsys.readouterr().err
+    assert "straight: on the high-fidelity simulator `without` walks with L 3e6, nominal" in said
+    assert "`with`" not in said
+
+
 # How a fall in the start-up is told
 
 

@@ -319,7 +319,19 @@ def _walk_sets(
         title = f"walking{where} on the high-fidelity simulator"
         on_hfs = judge(command, [simulator], [0], title=title, folder=run.artefacts / "hfs")
         walks[name] = standin, on_hfs
+        _say_worse(name, on_hfs)
     return walks
+
+
+def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
+    """Say where what was tuned walks worse than what it was tuned from."""
+    L = {each: float(scores[0].L) for each, scores in on_hfs.scores.items()}
+    for each in ("without", "with"):
+        if L[each] > L["nominal"]:
+            say(
+                f"{name}: on the high-fidelity simulator `{each}` walks with L {L[each] / 1e6:.3g}"
+                f"e6, nominal with {L['nominal'] / 1e6:.3g}e6: its model is wrong about this robot"
+            )
 
 
 def _result(
