@@ -275,7 +275,7 @@ def test_a_search_refuses_wrong_input_before_it_makes_a_folder(
 def test_a_search_leaves_weights_with_a_card_and_walks_nothing_twice(monkeypatch, capsys, tmp_path):
     """Two generations of short walks on all trajectories; the second call finds all done."""
     short = TuneConfig(rollout=RolloutConfig(ticks=20))
-    monkeypatch.setattr(tunings, "TuneConfig", lambda rollout: short)
+    monkeypatch.setattr(tunings, "TuneConfig", lambda **settings: short)
     flags = ("search", "--traj", "all", "--budget", "9", "--population", "4", "--engine", "c")
     folders = ("--out", tmp_path / "found", "--record", tmp_path / "record", "--processes", "1")
     assert call(monkeypatch, *flags, *folders) == 0

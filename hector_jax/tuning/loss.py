@@ -150,7 +150,9 @@ def check_loss(loss: Any) -> None:
         raise InputError(f"{what} must be a tuple of LossTerm, got {short_repr(loss)}")
     names = [term.name for term in loss]
     if not names or len(set(names)) < len(names) or not all(n.startswith("L_") for n in names):
-        raise InputError(f"{what} must have terms of unlike names L_..., got {short_repr(names)}")
+        raise InputError(
+            f"{what} must have terms of unlike names L_..., got {short_repr(tuple(names))}"
+        )
     for term in loss:
         if not isinstance(term.weight, (int, float)) or term.weight not in NOT_NEGATIVE:
             got = short_repr(term.weight)
