@@ -80,7 +80,7 @@ def links_of(
     frames: dict[int, Pose] = {}  # of a link in its parent link, by joint
     parents: dict[int, int] = {-1: -1}
     poses: dict[int, dict[int, Pose]] = {-1: {}}
-    for body in _subtree(model, root):
+    for body in subtree(model, root):
         first = model.body_jntadr[body]
         own = [int(first + i) for i in range(model.body_jntnum[body])]
         if body == root:
@@ -114,7 +114,7 @@ def links_of(
     ]
 
 
-def _subtree(model: mujoco.MjModel, root: int) -> list[int]:
+def subtree(model: mujoco.MjModel, root: int) -> list[int]:
     """A body and all below it, parents first."""
     inside = [root]
     for body in range(root + 1, model.nbody):

@@ -27,12 +27,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.description import Description, description_of
+from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot, compile_model, robot_of
 from hector_jax.robot.soles import SIDES, Sole, find_soles
 from hector_jax.robot.stand import standing_pose
@@ -162,11 +164,7 @@ def footstep(size: Size) -> dict[str, float]:
 
 def foot_distance(robot: Robot) -> float:
     """Distance of the foot points across, standing [m]."""
-    model = compile_model(robot.description)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key(robot.description.standing_key).id)
-    mujoco.mj_kinematics(model, data)
-    left, right = (data.site(foot.point).xpos for foot in robot.description.named_feet)
+    left, right = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
     return float(left[1] - right[1])
 
 

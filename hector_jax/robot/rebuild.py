@@ -17,11 +17,11 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.description import Description, Foot
+from hector_jax.robot.checks import ON_FLOOR
+from hector_jax.robot.description import Description, Foot, NamedFoot
 from hector_jax.robot.links import Link, Pose, pose_of
 from hector_jax.robot.mjcf import TIME_STEP
 
-ON_FLOOR = 1e-3  # [m] that a sole may be off the floor
 CONTACT_RADIUS = 0.01  # [m]
 SHAPES = tuple(
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
@@ -38,19 +38,12 @@ SOLVER = {
 _SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _ROBOT_GEOM = {"friction": [0.1, 0.005, 0.0001], "solmix": 0.0, "priority": 0}
-_BITS = {None: (0, 1), 0: (2, 5), 1: (4, 3)}  # contype, conaffinity of trunk and legs
+BITS = {None: (0, 1), 0: (2, 5), 1: (4, 3)}  # contype, conaffinity of trunk and legs
 _SOLE_BITS = ((2, 4), (4, 2))
 _FLOOR_BITS = {"contype": 0, "conaffinity": 1, "condim": 3}
 _GREY, _DARK = [0.75, 0.78, 0.82, 1.0], [0.1, 0.1, 0.1, 1.0]
 _STICK = 0.02  # [m] radius
 _SHORTEST = 1e-3  # [m] half length of a capsule
-
-
-class Feet(NamedTuple):
-    """Names of what the soles have."""
-
-    points: tuple[str, str]  # sites
-    contacts: tuple[tuple[str, ...], tuple[str, ...]]  # spheres, by foot
 
 
 class Pieces(NamedTuple):
@@ -63,8 +56,8 @@ class Pieces(NamedTuple):
     trunk_quat: Float[np.ndarray, "4"]  # standing
 
 
-def rebuild(description: Description, pieces: Pieces) -> tuple[mujoco.MjSpec, Feet]:
-    """The spec, with a keyframe "standing" (or as the description calls it), and the feet's names.
+def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
+    """The spec, with the names of `Description.named_feet` and `Description.standing_key`.
 
     Raises:
         InputError: one line: the soles are not level in the standing pose.
@@ -79,9 +72,10 @@ def rebuild(description: Description, pieces: Pieces) -> tuple[mujoco.MjSpec, Fe
     for index, body in enumerate(bodies):
         _add_geoms(pieces, index, body, named)
     _add_sticks(pieces, bodies)
-    feet = Feet(*zip(*(_add_foot(spec, description, pieces, i) for i in (0, 1)), strict=True))
-    _add_standing(spec, description, pieces, feet)
-    return spec, feet
+    for side in (0, 1):
+        _add_foot(spec, description, pieces, side)
+    _add_standing(spec, description, pieces)
+    return spec
 
 
 def _empty(description: Description, model: mujoco.MjModel) -> mujoco.MjSpec:
@@ -175,7 +169,7 @@ def _add_geoms(pieces: Pieces, index: int, body: mujoco.MjsBody, named: set[str]
     model, link = pieces.model, pieces.links[index]
     count = (len(pieces.links) - 1) // 2
     leg = None if index == 0 else (index - 1) // count
-    bits = _BITS[leg] if leg is None or index % count else _SOLE_BITS[leg]
+    bits = BITS[leg] if leg is None or index % count else _SOLE_BITS[leg]
     geoms = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in link.bodies]
     geoms = [g for g in geoms if model.geom_type[g] in SHAPES]
     touch = [bool(model.geom_contype[g] | model.geom_conaffinity[g]) for g in geoms]
@@ -250,12 +244,10 @@ def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> tuple[mujoco.MjModel,
     return model, data
 
 
-def _add_foot(
-    spec: mujoco.MjSpec, description: Description, pieces: Pieces, side: int
-) -> tuple[str, tuple[str, ...]]:
-    """Site and contact spheres of a foot; names of both."""
+def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, side: int) -> None:
+    """Site and contact spheres of a foot."""
     foot, path, model = description.feet[side], description.model, pieces.model
-    last = (side + 1) * len(description.joints) // 2
+    last, names = (side + 1) * description.leg_joints, description.named_feet[side]
     link = pieces.links[last]
     if foot.body is not None:
         named = {model.body(b).name: pose for b, pose in link.bodies.items()}
@@ -264,23 +256,22 @@ def _add_foot(
                 f"{path}: feet.{_SIDES[side]}.body is {foot.body!r}, expected one that joint "
                 f"{description.joints[last - 1]!r} moves: {', '.join(named)}"
             )
-        return _place_foot(spec, foot, pieces, link, named[foot.body], _SIDES[side])
-    point, names = str(foot.point), tuple(map(str, foot.contacts))
-    for name in names:
+        _place_foot(spec, foot, names, pieces, link, named[foot.body])
+        return
+    for name in names.contacts:
         there = spec.geom(name)
         if there is None or there.parent.name != link.name or there.type != _SPHERE:
             raise InputError(f"{path}: no sphere {name!r} on body {link.name!r}")
-    own = [s for s in range(model.nsite) if model.site(s).name == point]
+    own = [s for s in range(model.nsite) if model.site(s).name == names.point]
     if not own or int(model.site_bodyid[own[0]]) not in link.bodies:
-        raise InputError(f"{path}: no site {point!r} on body {link.name!r}")
+        raise InputError(f"{path}: no site {names.point!r} on body {link.name!r}")
     pose = link.bodies[int(model.site_bodyid[own[0]])]
-    _add_site(spec, link, point, pose.p + pose.R @ model.site_pos[own[0]])
-    return point, names
+    _add_site(spec, link, names.point, pose.p + pose.R @ model.site_pos[own[0]])
 
 
 def _place_foot(
-    spec: mujoco.MjSpec, foot: Foot, pieces: Pieces, link: Link, pose: Pose, side: str
-) -> tuple[str, tuple[str, ...]]:
+    spec: mujoco.MjSpec, foot: Foot, names: NamedFoot, pieces: Pieces, link: Link, pose: Pose
+) -> None:
     """Spheres whose lowest points, standing, are the contacts, and the site."""
     places = np.array([pose.p + pose.R @ np.array(place) for place in foot.contacts])
     _, data = _standing_data(spec, pieces)
@@ -288,8 +279,7 @@ def _place_foot(
     up = CONTACT_RADIUS * R.T[:, 2]
     for place in places:
         _add_stick(body, places.mean(axis=0) + up, place + up, CONTACT_RADIUS)
-    names = tuple(f"{side}_contact_{i}" for i in range(len(places)))
-    for name, place in zip(names, places, strict=True):
+    for name, place in zip(names.contacts, places, strict=True):
         if taken := spec.geom(name):
             taken.name = ""
         looks = {"mass": 0.0, "group": 2, "rgba": _DARK, **_ROBOT_GEOM, **_FLOOR_BITS}
@@ -301,24 +291,22 @@ def _place_foot(
         point = R.T @ np.array([0.0, middle[1], middle[2]])
     else:
         point = pose.p + pose.R @ np.array(foot.point)
-    _add_site(spec, link, f"{side}_point", point)
-    return f"{side}_point", names
+    _add_site(spec, link, names.point, point)
 
 
 def _add_site(spec: mujoco.MjSpec, link: Link, name: str, place: Float[np.ndarray, "3"]) -> None:
     spec.body(link.name).add_site(name=name, pos=place, size=[0.005] * 3, group=4)
 
 
-def _add_standing(
-    spec: mujoco.MjSpec, description: Description, pieces: Pieces, feet: Feet
-) -> None:
+def _add_standing(spec: mujoco.MjSpec, description: Description, pieces: Pieces) -> None:
     """The keyframe: the lowest contact on the floor, all others with it.
 
     Raises:
         InputError: a contact is more than ON_FLOOR above the lowest one.
     """
     model, data = _standing_data(spec, pieces)
-    heights = {name: lowest(model, data, name) for side in feet.contacts for name in side}
+    names = [name for foot in description.named_feet for name in foot.contacts]
+    heights = {name: lowest(model, data, name) for name in names}
     low = min(heights.values())
     if max(heights.values()) - low > ON_FLOOR:
         above = ", ".join(f"{name} {1e3 * (h - low):.1f}" for name, h in heights.items())
@@ -328,12 +316,7 @@ def _add_standing(
         )
     qpos = [0.0, 0.0, -low, *pieces.trunk_quat, *pieces.angles]
     spec.body(pieces.links[0].name).pos = qpos[:3]
-    spec.add_key(name=standing_name(description), qpos=qpos)
-
-
-def standing_name(description: Description) -> str:
-    """Name of the keyframe."""
-    return description.standing if isinstance(description.standing, str) else "standing"
+    spec.add_key(name=description.standing_key, qpos=qpos)
 
 
 def lowest(model: mujoco.MjModel, data: mujoco.MjData, sphere: str) -> float:

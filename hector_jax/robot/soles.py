@@ -15,8 +15,9 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
+from hector_jax.robot.links import subtree
 from hector_jax.robot.rebuild import SHAPES
-from hector_jax.robot.survey import Survey, at_zero, below
+from hector_jax.robot.survey import Survey, at_zero
 
 SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
@@ -77,7 +78,7 @@ def _mirrored(contacts: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 3"]:
 def _foot_geoms(found: Survey, leg: Sequence[int]) -> list[int]:
     """Primitives of a foot that collide, with the floor where there is one."""
     model = found.model
-    bodies = below(model, int(model.jnt_bodyid[leg[-1]]))
+    bodies = subtree(model, int(model.jnt_bodyid[leg[-1]]))
     bits = [
         (int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in range(model.ngeom)
     ]

@@ -9,39 +9,28 @@ become torque motors, and floor, solver and contacts are set. Each such change i
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean, one_line
+from hector_jax.robot.checks import ON_FLOOR, expect, listed, require
 from hector_jax.robot.description import Description
 from hector_jax.robot.elements import drop_unused
 from hector_jax.robot.links import MASSLESS, Link, links_of
 from hector_jax.robot.mjcf import read_mjcf, refusal
-from hector_jax.robot.rebuild import (
-    ON_FLOOR,
-    SHAPES,
-    SOLVER,
-    Pieces,
-    lowest,
-    rebuild,
-    standing_name,
-)
+from hector_jax.robot.rebuild import BITS, SHAPES, SOLVER, Pieces, lowest, rebuild
 
 _JOINT = mujoco.mjtJoint
 _MOST_FRICTION = 0.2  # of the robot's geoms; of two that touch the larger one counts
-_LEG_BITS = {None: (0, 1), 0: (2, 5), 1: (4, 3)}  # contype, conaffinity: no other ones
 
 
 class Source(NamedTuple):
-    """A robot in the form that all later code reads."""
+    """A robot in the form that all later code reads; `Description.named_feet` has its names."""
 
     spec: mujoco.MjSpec
-    points: tuple[str, str]  # sites, where wrenches act
-    contacts: tuple[tuple[str, ...], tuple[str, ...]]  # spheres on the soles, by foot
-    standing: str  # keyframe
     notes: tuple[str, ...]  # what was mended, a line each
 
 
@@ -69,19 +58,15 @@ def build_spec(description: Description) -> Source:
     limits = [_torque_limit(file, joint) for joint in file.joints]
     changes = ["a URDF, with neither motors nor a floor"] if root.tag == "robot" else []
     changes += _changes(file, limits)
-    standing = standing_name(description)
-    if not changes:
-        notes += _set_options(file) + _lower(file)
-        points, contacts = zip(*((f.point, f.contacts) for f in description.feet), strict=True)
-        return Source(file.spec, points, contacts, standing, tuple(notes))
-    notes += _set_options(file)
     fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
     links = links_of(file.model, file.trunk, file.joints, fixed)
     _check_links(description, links)
+    notes += _set_options(file)
+    if not changes:
+        return Source(file.spec, (*notes, *_lower(file)))
     legs = [angles[joint] for joint in file.joints]
-    pieces = Pieces(file.model, links, limits, legs, trunk_quat)
-    spec, feet = rebuild(description, pieces)
-    return Source(spec, *feet, standing, (*notes, *changes))
+    spec = rebuild(description, Pieces(file.model, links, limits, legs, trunk_quat))
+    return Source(spec, (*notes, *changes))
 
 
 def compile_spec(description: Description, spec: mujoco.MjSpec) -> mujoco.MjModel:
@@ -96,9 +81,12 @@ def compile_spec(description: Description, spec: mujoco.MjSpec) -> mujoco.MjMode
         raise InputError(f"{description.model}: MuJoCo refuses it: {one_line(error)}") from None
 
 
-def _read(description: Description, root: ElementTree.Element) -> _File:
-    """Compile a file without motors and keyframes, and find the robot in it."""
-    path = description.model
+def compile_bare(path: Path, root: ElementTree.Element) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """The spec of a file, and its model without motors and keyframes, which need not fit.
+
+    Raises:
+        InputError: MuJoCo's refusal in one line.
+    """
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
         bare = spec.copy()
@@ -107,23 +95,29 @@ def _read(description: Description, root: ElementTree.Element) -> _File:
         # what is welded may have no mass; the links are checked when they are one
         bare.compiler.boundmass = MASSLESS
         bare.compiler.boundinertia = 1e-12
-        model = bare.compile()
+        return spec, bare.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
+
+
+def _read(description: Description, root: ElementTree.Element) -> _File:
+    """Compile a file and find the robot in it."""
+    path = description.model
+    spec, model = compile_bare(path, root)
     names = [model.joint(j).name for j in range(model.njnt)]
     for joint in (*description.joints, *description.weld):
-        _require(path, "joint", joint, names)
+        require(path, "joint", joint, names)
     for motor in _motors(spec):
         text = f"actuator {motor.name!r} drives no joint {motor.target!r}"
-        _expect(path, motor.target in names, text + did_you_mean(motor.target, names))
+        expect(path, motor.target in names, text + did_you_mean(motor.target, names))
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _JOINT.mjJNT_FREE]
-    _expect(
+    expect(
         path,
         len(free) < 2,
-        f"{len(free)} free joints, expected exactly one, of the trunk; joints: {_listed(names)}",
+        f"{len(free)} free joints, expected exactly one, of the trunk; joints: {listed(names)}",
     )
     fixed = [names[j] for j in free if names[j] in description.weld]
-    _expect(path, not fixed, f"weld names {_listed(fixed)}, the free joint, expected hinges")
+    expect(path, not fixed, f"weld names {listed(fixed)}, the free joint, expected hinges")
     joints = [names.index(joint) for joint in description.joints]
     first = int(model.jnt_bodyid[joints[0]])
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first])
@@ -143,18 +137,18 @@ def _check_joints(file: _File) -> None:
         for j in range(model.njnt)
         if j not in (*file.joints, file.free) and model.joint(j).name not in weld
     ]
-    text = f"joints {_listed(extra)} are of no leg: add them to weld or remove them"
-    _expect(path, not extra, text)
+    text = f"joints {listed(extra)} are of no leg: add them to weld or remove them"
+    expect(path, not extra, text)
     for j in file.joints:
         body, this = int(model.jnt_bodyid[j]), f"joint {model.joint(j).name!r}"
-        _expect(path, model.jnt_type[j] == _JOINT.mjJNT_HINGE, f"{this} is not a hinge")
+        expect(path, model.jnt_type[j] == _JOINT.mjJNT_HINGE, f"{this} is not a hinge")
         on = model.body(body).name
         text = f"{this} is not below the trunk, body {model.body(file.trunk).name!r}"
-        _expect(path, model.body_rootid[body] == file.trunk and body != file.trunk, text)
+        expect(path, model.body_rootid[body] == file.trunk and body != file.trunk, text)
         text = f"{this} shares body {on!r} with another joint, expected a body for each"
-        _expect(path, model.body_jntnum[body] == 1, text)
+        expect(path, model.body_jntnum[body] == 1, text)
         text = f"{this} has no range, expected its limits (in a URDF: revolute, lower and upper)"
-        _expect(path, model.jnt_limited[j], text)
+        expect(path, model.jnt_limited[j], text)
 
 
 def _check_world(file: _File) -> None:
@@ -162,18 +156,18 @@ def _check_world(file: _File) -> None:
     path, model = file.description.model, file.model
     gravity = model.opt.gravity
     right = np.all(gravity[:2] == 0.0) and gravity[2] < 0.0
-    _expect(path, right, f"gravity is {gravity}, expected 0 0 and a negative number")
+    expect(path, right, f"gravity is {gravity}, expected 0 0 and a negative number")
     for g in _world_geoms(file):
         plane = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE
         text = (
             f"geom {model.geom(g).name or g!r} of the world is terrain, expected a plane at z = 0"
         )
-        _expect(path, plane, text)
+        expect(path, plane, text)
         level = abs(model.geom_pos[g][2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
         text = (
             f"floor {model.geom(g).name or g!r} is at {model.geom_pos[g]}, expected level at z = 0"
         )
-        _expect(path, level, text)
+        expect(path, level, text)
 
 
 def _world_geoms(file: _File) -> list[int]:
@@ -191,16 +185,16 @@ def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarr
     known = (*description.joints, *description.weld)
     if not isinstance(pose, str):
         for name, _ in pose:
-            _require(path, "joint", name, known)
+            require(path, "joint", name, known)
         angles = dict.fromkeys((names[name] for name in known), 0.0)
         return angles | {names[name]: angle for name, angle in pose}, upright
     keys = [key for key in file.spec.keys if key.name == pose]
     hint = "; a URDF has none" if urdf else ""
     text = f"no keyframe {pose!r}{hint}; expected one, or standing = {{ joint = angle }}"
-    _expect(path, keys, text)
+    expect(path, keys, text)
     qpos = np.array(keys[0].qpos)
     text = f"keyframe {pose!r} has {len(qpos)} numbers, expected {model.nq}"
-    _expect(path, len(qpos) == model.nq, text)
+    expect(path, len(qpos) == model.nq, text)
     angles = {names[name]: float(qpos[model.jnt_qposadr[names[name]]]) for name in known}
     if file.free >= 0:
         start = model.jnt_qposadr[file.free]
@@ -225,7 +219,7 @@ def _torque_limit(file: _File, joint: int) -> float:
         found.append(np.abs(model.jnt_actfrcrange[joint]).min())
     text = f"joint {name!r} has no torque limit, expected forcerange or ctrlrange of its motor, "
     text += "actuatorfrcrange of the joint, or effort in a URDF"
-    _expect(file.description.model, found and min(found) > 0.0, text)
+    expect(file.description.model, found and min(found) > 0.0, text)
     return float(min(found))
 
 
@@ -260,8 +254,8 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
     floor, motors = _world_geoms(file), "replace the actuators" if file.spec.actuators else "added"
     lines = (
         ("free joint added to the trunk", file.free < 0),
-        (f"fixed: {_listed(description.weld)}", description.weld),
-        (f"made one with their parents: {_listed(static)}", static),
+        (f"fixed: {listed(description.weld)}", description.weld),
+        (f"made one with their parents: {listed(static)}", static),
         (
             "joints put in order, left leg first",
             file.free >= 0 and not order and not description.weld,
@@ -283,19 +277,19 @@ def _set_options(file: _File) -> list[str]:
     wrong = [name for name, value in SOLVER.items() if getattr(option, name) != value]
     for name in wrong:
         setattr(option, name, SOLVER[name])
-    return [f"option {_listed(wrong)} set"] if wrong else []
+    return [f"option {listed(wrong)} set"] if wrong else []
 
 
 def _motors_right(file: _File, limits: Sequence[float]) -> bool:
     motors, names = list(file.spec.actuators), file.description.joints
     if [motor.target for motor in motors] != list(names):
         return False
-    span = lambda motor: {*map(float, motor.ctrlrange), *map(float, motor.forcerange)}  # noqa: E731
     return all(
         _is_motor(motor)
         and motor.gainprm[0] == motor.gear[0] == 1.0
-        and motor.ctrlrange[1] == limit
-        and span(motor) <= {-limit, limit, 0.0}
+        and _limited(motor.ctrllimited, motor.ctrlrange)
+        and tuple(motor.ctrlrange) == (-limit, limit)
+        and tuple(motor.forcerange) in ((0.0, 0.0), (-limit, limit))
         for motor, limit in zip(motors, limits, strict=True)
     )
 
@@ -317,7 +311,7 @@ def _contacts_right(file: _File) -> bool:
             continue
         while above and above not in roots:
             above = int(model.body_parentid[above])
-        contype, conaffinity = _LEG_BITS[roots.index(above) if above else None]
+        contype, conaffinity = BITS[roots.index(above) if above else None]
         end = model.geom(g).name in ends
         right = (
             not model.geom_contype[g] & ~contype and not model.geom_conaffinity[g] & ~conaffinity
@@ -353,23 +347,9 @@ def _check_links(description: Description, links: Sequence[Link]) -> None:
     path, count = description.model, len(description.joints) // 2
     for index, link in enumerate(links):
         text = f"body {link.name!r} moves and has no mass: give it an <inertial>"
-        _expect(path, link.mass > 0.0, text)
+        expect(path, link.mass > 0.0, text)
         if index:
             above = 0 if index % count == 1 else index - 1
             text = f"joint {description.joints[index - 1]!r} is on body {links[link.parent].name!r}"
             text += f", expected {links[above].name!r}: name each leg from the trunk down"
-            _expect(path, link.parent == above, text)
-
-
-def _expect(path: Path, right: Any, message: str) -> None:
-    if not right:
-        raise InputError(f"{path}: {one_line(message) if len(message) < 300 else message}")
-
-
-def _require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:
-    text = f"no {kind} {name!r}{did_you_mean(name, names)}; {kind}s: {_listed(names)}"
-    _expect(path, name in names, text)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(name for name in names if name) or "none"
+            expect(path, link.parent == above, text)

@@ -8,7 +8,6 @@ forwards: the knee is the one of these joints, but the first, that is farthest f
 """
 
 import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
@@ -21,8 +20,9 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
 from hector_jax.robot.elements import drop_unused
-from hector_jax.robot.links import MASSLESS
-from hector_jax.robot.mjcf import read_mjcf, refusal
+from hector_jax.robot.links import subtree
+from hector_jax.robot.mjcf import read_mjcf
+from hector_jax.robot.source import compile_bare
 
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 _MIRRORED = 0.03  # [m] between a joint and the mirror image of the other leg's
@@ -51,7 +51,7 @@ def survey(path: Path) -> Survey:
     path = Path(path)
     root = read_mjcf(path)
     drop_unused(path, root, (), None)
-    model = _compile(path, root)
+    _, model = compile_bare(path, root)
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _FREE]
     if len(free) > 1:
         names = ", ".join(model.joint(j).name for j in free)
@@ -105,27 +105,6 @@ def axis_words(axis: Float[np.ndarray, "3"]) -> str:
     return words if tilt < 1.0 else f"{words}, turned by {tilt:.0f} deg"
 
 
-def below(model: mujoco.MjModel, body: int) -> list[int]:
-    """A body and all below it."""
-    inside = [body]
-    for b in range(body + 1, model.nbody):
-        if int(model.body_parentid[b]) in inside:
-            inside.append(b)
-    return inside
-
-
-def _compile(path: Path, root: ElementTree.Element) -> mujoco.MjModel:
-    try:
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-        for part in (*spec.actuators, *spec.keys):
-            spec.delete(part)
-        spec.compiler.boundmass = MASSLESS
-        spec.compiler.boundinertia = 1e-12
-        return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
-
-
 def _body(model: mujoco.MjModel, joint: int) -> int:
     return int(model.jnt_bodyid[joint])
 
@@ -175,7 +154,7 @@ def _mirrored(one: Float[np.ndarray, "j 3"], other: Float[np.ndarray, "j 3"]) ->
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> float:
     """Height at which a chain ends [m], to the millimetre."""
-    return round(min(data.xipos[b][2] for b in below(model, _body(model, joint))), 3)
+    return round(min(data.xipos[b][2] for b in subtree(model, _body(model, joint))), 3)
 
 
 def _is_right(
