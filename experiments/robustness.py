@@ -42,9 +42,9 @@ from hector_jax.core.console import exit_code
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
+from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report.report import WORLDS
 from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.model import Robot, load_robot

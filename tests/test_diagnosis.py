@@ -53,7 +53,7 @@ def recorded(height=0.0, angles=(0.0, 0.0), knee=0.0, *, fallen=True, touching="
         torque=torque,
         touching=touching,
         fallen=fallen,
-        walked=fallen_at_once() if walked is None else walked,
+        trajectory=fallen_at_once() if walked is None else walked,
     )
 
 
@@ -115,7 +115,9 @@ def settled(height):
 
 
 def lines(monkeypatch, record):
-    monkeypatch.setattr(diagnosis, "record", lambda *args: record._replace(time=record.time + 2.0))
+    monkeypatch.setattr(
+        diagnosis, "record_walk", lambda *args: record._replace(time=record.time + 2.0)
+    )
     return not_the_weights(WalkConfig(), ROBOT, JOB)
 
 
@@ -140,7 +142,7 @@ def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
 
 
 def test_a_fall_in_the_start_up_is_told_before_any_tuning(monkeypatch, capsys):
-    monkeypatch.setattr(diagnosis, "record", lambda *args: recorded())
+    monkeypatch.setattr(diagnosis, "record_walk", lambda *args: recorded())
     monkeypatch.setattr(diagnosis, "startup_fall", lambda *args: FALL)
     with ThreadPoolExecutor(1) as pool:
         tuning._say_what_no_weights_mend(pool, TuneConfig(), ROBOT, command_of("straight"))

@@ -23,7 +23,7 @@ from hector_jax.robot.description import (
 from hector_jax.robot.model import compile_model, robot_of
 from hector_jax.robot.propose import HEIGHT, MASS, as_toml, propose, size_of
 from hector_jax.robot.soles import find_soles
-from hector_jax.robot.survey import survey
+from hector_jax.robot.survey import survey_file
 from hector_jax.robot.table import remarks
 from hector_jax.tuning.loss import loss_of_robot
 
@@ -35,7 +35,7 @@ def loaded(proposal):
     """Description, robot and controller of a proposal, from the text of its file."""
     table = tomllib.loads(as_toml(proposal.table, ["a comment"]))
     assert table == proposal.table
-    description = description_of(proposal.found.path.with_suffix(".toml"), table)
+    description = description_of(proposal.survey.path.with_suffix(".toml"), table)
     robot = robot_of(description)
     loss_of_robot(description)
     return description, robot, walk_config(robot)
@@ -68,11 +68,11 @@ def test_a_proposal_loads_and_names_joints_and_feet_as_the_robots_own_toml(path)
         assert (got.contacts, got.body) == (expected.contacts, expected.body)
     np.testing.assert_allclose(robot.foot_point, robot_of(own).foot_point, atol=1e-9)
     assert len(config.legs.kp) == own.leg_joints
-    assert proposal.found.forwards == (path == HUMANOID)
+    assert proposal.survey.forwards == (path == HUMANOID)
 
 
 def test_legs_are_told_from_arms_and_what_is_of_no_leg_is_welded(tmp_path):
-    found = survey(small(tmp_path).model)
+    found = survey_file(small(tmp_path).model)
     legs = [[found.model.joint(j).name for j in leg] for leg in found.legs]
     assert legs == [
         [f"{s}_{j}" for j in ("roll", "pitch", "knee", "ankle")] for s in ("left", "right")
@@ -90,7 +90,7 @@ def test_a_urdf_is_proposed_as_the_mjcf_that_it_came_from(tmp_path):
     description = read_description(HUMANOID)
     path = tmp_path / "humanoid.urdf"
     path.write_text(urdf_of(compile_model(description)))
-    found, own = survey(path), survey(description.model)
+    found, own = survey_file(path), survey_file(description.model)
     names = [[one.model.joint(j).name for leg in one.legs for j in leg] for one in (found, own)]
     assert names[0] == names[1]
     assert found.forwards
@@ -102,7 +102,7 @@ def test_a_turned_model_is_told_to_be_turned(tmp_path):
     text = re.sub(r'axis="0 1 0"', 'axis="0 0 1"', text)
     path.write_text(text)
     with pytest.raises(InputError, match="turn about y, expected hip and knee"):
-        survey(path)
+        survey_file(path)
 
 
 def test_a_model_without_legs_names_its_chains(tmp_path):
@@ -113,7 +113,7 @@ def test_a_model_without_legs_names_its_chains(tmp_path):
         "</body></body></worldbody></mujoco>"
     )
     with pytest.raises(InputError, match=r"no two legs found, .* by their last joint: two \(2\)"):
-        survey(path)
+        survey_file(path)
 
 
 def meshes_only(folder):
@@ -140,7 +140,7 @@ def test_a_tilted_box_is_the_sole_and_is_level_standing(tmp_path):
     text = re.sub(r'<geom type="sphere" size="0.005" mass="0.01"/>', "", text)
     assert text.count(box) == 2
     path.write_text(text.replace(box, f'{box} euler="0 0.2 0"'))
-    for sole in find_soles(survey(path)):
+    for sole in find_soles(survey_file(path)):
         np.testing.assert_allclose(sole.axes[:, 2], [np.sin(0.2), 0.0, np.cos(0.2)], atol=1e-9)
     proposal = propose(path)
     assert proposal.wrong == ()

@@ -18,8 +18,7 @@ from hector_jax.core.environment import environment
 from hector_jax.core.files import as_json
 from hector_jax.core.inputs import one_line
 from hector_jax.core.runtime import cache_folder
-from hector_jax.core.trajectory import Trajectory
-from hector_jax.grfm.dataset import SOLVED
+from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.report.motion import motions
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.description import MODEL_PATH

@@ -14,8 +14,8 @@ from hector_jax.core.console import Broken, say
 from hector_jax.core.files import as_json, write_json
 from hector_jax.core.inputs import InputError, plural, printable
 from hector_jax.core.runtime import workers
+from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree_file import save_tree
-from hector_jax.grfm.dataset import SOLVED
 from hector_jax.report import pictures
 from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.report import print_table

@@ -34,7 +34,7 @@ def examine_robot(args: RobotFlags) -> None:
     try:
         robot = robot_of(description_of(path, proposal.table))
     except InputError:
-        print("\n".join([*table_of_survey(proposal.found), *_list("wrong", proposal.wrong)]))
+        print("\n".join([*table_of_survey(proposal.survey), *_list("wrong", proposal.wrong)]))
         raise
     _check(robot)
     _print_table(robot, [*proposal.wrong, *remarks(robot)])

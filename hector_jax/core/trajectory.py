@@ -17,6 +17,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 
 MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen
+SOLVED = 1e-6  # worst relative KKT residual of a plan that counts: is learned from, is a result
 MAX_TILT = 0.8  # [rad] of roll or pitch; beyond it too
 
 

@@ -20,7 +20,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import Load, State, Trajectory, Wrench
+from hector_jax.core.trajectory import SOLVED, Load, State, Trajectory, Wrench
 from hector_jax.grfm.effect import HISTORY, Window, from_yaw_frame, turn
 from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
@@ -28,7 +28,6 @@ from hector_jax.sim.world import NO_PUSH, Push
 
 ALONG = np.array([1.0, -1.0, 1.0])  # mirror, left for right: of positions, velocities, forces
 ACROSS = -ALONG  # and of angles, angular velocities, moments
-SOLVED = 1e-6  # worst relative KKT residual of a command that is learned from
 
 
 class Dataset(NamedTuple):

@@ -173,10 +173,10 @@ def _check_couplings(path: Path, root: ElementTree.Element, joints: Sequence[str
                 for name, value in element.attrib.items()
                 if name not in ("name", "class")
             }
-            if part.get("active") != "false" and (found := sorted(words & of_legs)):
+            if part.get("active") != "false" and (coupled := sorted(words & of_legs)):
+                what = f"{path}: <{part.tag}> of <{tag}> couples {', '.join(coupled)}"
                 raise InputError(
-                    f"{path}: <{part.tag}> of <{tag}> couples {', '.join(found)}, expected legs of "
-                    "free hinges: remove it, or weld a joint of it"
+                    f"{what}, expected legs of free hinges: remove it, or weld a joint of it"
                 )
 
 

@@ -164,17 +164,23 @@ def robot_of(description: Description) -> Robot:
     )
 
 
-@quiet_mujoco()
 def compile_model(description: Description) -> mujoco.MjModel:
-    """The compiled and checked model of a description.
+    """The compiled and checked model of a description; raises as `build_model`."""
+    return build_model(description)[1]
+
+
+@quiet_mujoco()
+def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """The spec of a description, and its compiled and checked model.
 
     Raises:
         InputError: one line saying what came, what was expected and what there is. The file must be
             one that `source.build_spec` takes and that compiles to the biped of `checks`.
     """
-    model = compile_spec(description, build_spec(description).spec)
+    spec = build_spec(description).spec
+    model = compile_spec(description, spec)
     check_model(description, model)
-    return model
+    return spec, model
 
 
 def _composite_inertia(

@@ -38,7 +38,7 @@ from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot, compile_model, robot_of
 from hector_jax.robot.soles import SIDES, Sole, find_soles
 from hector_jax.robot.stand import standing_pose
-from hector_jax.robot.survey import Survey, survey
+from hector_jax.robot.survey import Survey, survey_file
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _W = 30.0  # [rad/s] of the swing leg's joints
@@ -49,7 +49,7 @@ _COLUMNS = 100
 class Proposal(NamedTuple):
     """A TOML for a file."""
 
-    found: Survey
+    survey: Survey
     soles: tuple[Sole, Sole]
     table: dict[str, Any]
     wrong: tuple[str, ...]  # what is to be mended by hand, a line each
@@ -70,10 +70,10 @@ def propose(path: Path) -> Proposal:
     Raises:
         InputError: one line saying what is missing in the file and how to mend it.
     """
-    found = survey(path)
-    soles = find_soles(found)
-    angles, balanced = standing_pose(found, soles)
-    table = names(found, soles, angles)
+    survey = survey_file(path)
+    soles = find_soles(survey)
+    angles, balanced = standing_pose(survey, soles)
+    table = names(survey, soles, angles)
     wrong = []
     if soles[0].guessed:
         wrong.append(
@@ -90,22 +90,22 @@ def propose(path: Path) -> Proposal:
     try:
         robot = robot_of(description)
     except InputError as error:
-        return Proposal(found, soles, table, (*wrong, str(error)))
+        return Proposal(survey, soles, table, (*wrong, str(error)))
     table |= sections(size_of(description, robot))
-    return Proposal(found, soles, table, tuple(wrong))
+    return Proposal(survey, soles, table, tuple(wrong))
 
 
-def names(found: Survey, soles: Sequence[Sole], angles: dict[str, float]) -> dict[str, Any]:
+def names(survey: Survey, soles: Sequence[Sole], angles: dict[str, float]) -> dict[str, Any]:
     """What the TOML says by names."""
-    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in found.path.stem)
-    left, right = ([found.model.joint(j).name for j in leg] for leg in found.legs)
+    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in survey.path.stem)
+    left, right = ([survey.model.joint(j).name for j in leg] for leg in survey.legs)
     joints: dict[str, Any] = {"left": left, "right": right}
-    if found.weld:
-        joints["weld"] = list(found.weld)
+    if survey.weld:
+        joints["weld"] = list(survey.weld)
     feet = {side: sole.section for side, sole in zip(SIDES, soles, strict=True)}
     return {
         "name": stem,
-        "model": found.path.name,
+        "model": survey.path.name,
         "standing": angles,
         "joints": joints,
         "feet": feet,

@@ -40,32 +40,32 @@ class Sole(NamedTuple):
     guessed: bool  # from the foot's inertia: the file has no geoms
 
 
-def find_soles(found: Survey) -> tuple[Sole, Sole]:
+def find_soles(survey: Survey) -> tuple[Sole, Sole]:
     """Both feet of a robot.
 
     Raises:
         InputError: one line: the feet differ.
     """
-    data = at_zero(found.model)
-    axes = [_axes(found, data, leg) for leg in found.legs]
-    touch = [_floor_points(found, data, leg, R) for leg, R in zip(found.legs, axes, strict=True)]
+    data = at_zero(survey.model)
+    axes = [_axes(survey, data, leg) for leg in survey.legs]
+    touch = [_floor_points(survey, data, leg, R) for leg, R in zip(survey.legs, axes, strict=True)]
     guessed = any(len(points) == 0 for points in touch)
     if guessed:
-        touch = [_box_of_inertia(found, data, leg) for leg in found.legs]
-    elif named := _named(found, data):
+        touch = [_box_of_inertia(survey, data, leg) for leg in survey.legs]
+    elif named := _named(survey, data):
         return named
-    outlines = [_outline(points, len(found.legs[0])) for points in touch]
+    outlines = [_outline(points, len(survey.legs[0])) for points in touch]
     left, right = outlines[0], _mirrored(outlines[1])
     near = _ALIKE_GUESSES if guessed else _ALIKE
     if len(left) != len(right) or np.abs(left - right).max() > near:
         raise InputError(
-            f"{found.path}: the left foot touches at {np.round(left, 4).tolist()} from its last "
+            f"{survey.path}: the left foot touches at {np.round(left, 4).tolist()} from its last "
             f"joint and the mirrored right one at {np.round(right, 4).tolist()}, expected the same"
         )
     mean = np.round(0.5 * (left + right), 4)
     return (
-        _placed(found, data, 0, mean, axes[0], guessed),
-        _placed(found, data, 1, _mirrored(mean), axes[1], guessed),
+        _placed(survey, data, 0, mean, axes[0], guessed),
+        _placed(survey, data, 1, _mirrored(mean), axes[1], guessed),
     )
 
 
@@ -75,9 +75,9 @@ def _mirrored(contacts: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 3"]:
     return contacts[order] * [1.0, -1.0, 1.0]
 
 
-def _foot_geoms(found: Survey, leg: Sequence[int]) -> list[int]:
+def _foot_geoms(survey: Survey, leg: Sequence[int]) -> list[int]:
     """Primitives of a foot that collide, with the floor where there is one."""
-    model = found.model
+    model = survey.model
     bodies = subtree(model, int(model.jnt_bodyid[leg[-1]]))
     bits = [
         (int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in range(model.ngeom)
@@ -96,9 +96,9 @@ def _foot_geoms(found: Survey, leg: Sequence[int]) -> list[int]:
     return on_floor if floor else inside
 
 
-def _axes(found: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
+def _axes(survey: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
     """Axes of the sole in those of the trunk, as columns."""
-    boxes = [g for g in _foot_geoms(found, leg) if found.model.geom_type[g] == _BOX]
+    boxes = [g for g in _foot_geoms(survey, leg) if survey.model.geom_type[g] == _BOX]
     if not boxes:
         return np.eye(3)
     R = data.geom_xmat[min(boxes, key=lambda g: data.geom_xpos[g][2])].reshape(3, 3)
@@ -112,14 +112,14 @@ def _axes(found: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.nd
 
 
 def _floor_points(
-    found: Survey, data: mujoco.MjData, leg: Sequence[int], axes: Float[np.ndarray, "3 3"]
+    survey: Survey, data: mujoco.MjData, leg: Sequence[int], axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Points of the sole in its axes, from the last joint."""
-    geoms = _foot_geoms(found, leg)
+    geoms = _foot_geoms(survey, leg)
     if not geoms:
         return np.zeros((0, 3))
     down = -axes[:, 2]
-    points = np.concatenate([_support(found.model, data, g, down) for g in geoms])
+    points = np.concatenate([_support(survey.model, data, g, down) for g in geoms])
     points = (points - data.xanchor[leg[-1]]) @ axes
     return points[points[:, 2] <= points[:, 2].min() + _SAME_SOLE]
 
@@ -172,10 +172,10 @@ def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray,
 
 
 def _box_of_inertia(
-    found: Survey, data: mujoco.MjData, leg: Sequence[int]
+    survey: Survey, data: mujoco.MjData, leg: Sequence[int]
 ) -> Float[np.ndarray, "4 3"]:
     """Lower corners of the box that has the mass and inertia of the foot's last body."""
-    model, body = found.model, int(found.model.jnt_bodyid[leg[-1]])
+    model, body = survey.model, int(survey.model.jnt_bodyid[leg[-1]])
     mass, spread = model.body_mass[body], model.body_inertia[body]
     square = 1.5 * (spread.sum() - 2.0 * spread) / max(mass, 1e-9)
     size = np.sqrt(np.maximum(square, 1e-6))
@@ -187,7 +187,7 @@ def _box_of_inertia(
 
 
 def _placed(
-    found: Survey,
+    survey: Survey,
     data: mujoco.MjData,
     side: int,
     contacts: Float[np.ndarray, "c 3"],
@@ -195,7 +195,7 @@ def _placed(
     guessed: bool,
 ) -> Sole:
     """A foot by places in the frame of the body that its last joint moves."""
-    model, last = found.model, found.legs[side][-1]
+    model, last = survey.model, survey.legs[side][-1]
     body = int(model.jnt_bodyid[last])
     R, origin = data.xmat[body].reshape(3, 3), data.xpos[body] - data.xanchor[last]
     places = (contacts @ axes.T - origin) @ R
@@ -217,11 +217,11 @@ def _numbers(place: Float[np.ndarray, "3"], digits: int) -> list[float]:
     return [round(float(x), digits) + 0.0 for x in place]
 
 
-def _named(found: Survey, data: mujoco.MjData) -> tuple[Sole, Sole] | None:
+def _named(survey: Survey, data: mujoco.MjData) -> tuple[Sole, Sole] | None:
     """Feet of two named spheres and a named site each, as HECTOR's."""
-    model, soles = found.model, []
-    for leg in found.legs:
-        geoms, body = _foot_geoms(found, leg), int(model.jnt_bodyid[leg[-1]])
+    model, soles = survey.model, []
+    for leg in survey.legs:
+        geoms, body = _foot_geoms(survey, leg), int(model.jnt_bodyid[leg[-1]])
         sites = [s for s in range(model.nsite) if int(model.site_bodyid[s]) == body]
         right = len(geoms) == 2 and len(sites) == 1 and model.site(sites[0]).name
         if not right or any(

@@ -207,20 +207,20 @@ def _torque_limit(file: _File, joint: int) -> float:
 
     Of its actuators' forces, of the control of a motor, and of the joint itself (effort in a URDF).
     """
-    name, model, found = file.model.joint(joint).name, file.model, []
+    name, model, torques = file.model.joint(joint).name, file.model, []
     for motor in _motors(file.spec):
         if motor.target == name:
             gear = abs(motor.gear[0])
             if _limited(motor.forcelimited, motor.forcerange):
-                found.append(gear * np.abs(motor.forcerange).min())
+                torques.append(gear * np.abs(motor.forcerange).min())
             if _is_motor(motor) and _limited(motor.ctrllimited, motor.ctrlrange):
-                found.append(gear * abs(motor.gainprm[0]) * np.abs(motor.ctrlrange).min())
+                torques.append(gear * abs(motor.gainprm[0]) * np.abs(motor.ctrlrange).min())
     if model.jnt_actfrclimited[joint]:
-        found.append(np.abs(model.jnt_actfrcrange[joint]).min())
+        torques.append(np.abs(model.jnt_actfrcrange[joint]).min())
     text = f"joint {name!r} has no torque limit, expected forcerange or ctrlrange of its motor, "
     text += "actuatorfrcrange of the joint, or effort in a URDF"
-    expect(file.description.model, found and min(found) > 0.0, text)
-    return float(min(found))
+    expect(file.description.model, torques and min(torques) > 0.0, text)
+    return float(min(torques))
 
 
 def _motors(spec: mujoco.MjSpec) -> list:

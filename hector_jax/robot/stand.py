@@ -27,12 +27,12 @@ _SOLVED = (2e-3, 5e-3)  # [rad] of the soles, [m] of the centre of mass
 _ROUND, _NOTHING = 4, 2e-4  # digits, [rad]
 
 
-def standing_pose(found: Survey, soles: Sequence[Sole]) -> tuple[dict[str, float], bool]:
+def standing_pose(survey: Survey, soles: Sequence[Sole]) -> tuple[dict[str, float], bool]:
     """Angle [rad] by joint, those at zero left out, and whether soles and balance are right."""
-    model, legs = found.model, [list(leg) for leg in found.legs]
+    model, legs = survey.model, [list(leg) for leg in survey.legs]
     bend, angles, right = KNEE, np.zeros(2 * len(legs[0])), False
     for _ in range(_TRIALS):
-        angles, right = _solve(found, soles, bend)
+        angles, right = _solve(survey, soles, bend)
         if right:
             break
         bend *= _LESS
@@ -42,28 +42,28 @@ def standing_pose(found: Survey, soles: Sequence[Sole]) -> tuple[dict[str, float
 
 
 def _solve(
-    found: Survey, soles: Sequence[Sole], bend: float
+    survey: Survey, soles: Sequence[Sole], bend: float
 ) -> tuple[Float[np.ndarray, " joints"], bool]:
     """Angles of both legs with the knees at a bend [rad]."""
-    model, data = found.model, at_zero(found.model)
-    joints = [*found.legs[0], *found.legs[1]]
-    address, count = model.jnt_qposadr[joints], len(found.legs[0])
-    bodies = [int(model.jnt_bodyid[leg[-1]]) for leg in found.legs]
+    model, data = survey.model, at_zero(survey.model)
+    joints = [*survey.legs[0], *survey.legs[1]]
+    address, count = model.jnt_qposadr[joints], len(survey.legs[0])
+    bodies = [int(model.jnt_bodyid[leg[-1]]) for leg in survey.legs]
     zero = [data.xmat[b].reshape(3, 3).copy() for b in bodies]
     local = [R.T @ sole.axes for R, sole in zip(zero, soles, strict=True)]  # sole in the body
     anchors = [
-        data.xanchor[leg[-1]] - data.xpos[b] for leg, b in zip(found.legs, bodies, strict=True)
+        data.xanchor[leg[-1]] - data.xpos[b] for leg, b in zip(survey.legs, bodies, strict=True)
     ]
     points = [
         R.T @ (anchor + sole.axes @ sole.point)
         for R, anchor, sole in zip(zero, anchors, soles, strict=True)
     ]
     flat = len(soles[0].contacts) > 1
-    knees = [found.knee, count + found.knee]
+    knees = [survey.knee, count + survey.knee]
     low, high = _ranges(model, joints)
     start = np.clip(np.zeros(2 * count), low, high)
     for knee in knees:
-        sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if found.forwards else -1.0)
+        sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if survey.forwards else -1.0)
         start[knee] = np.clip(sign * bend, low[knee], high[knee])
     free = [i for i in range(2 * count) if i not in knees]
 
@@ -78,7 +78,7 @@ def _solve(
             R = data.xmat[body].reshape(3, 3)
             turns.append(Rotation.from_matrix(R @ own).as_rotvec())
             ahead += 0.5 * (data.xpos[body] + R @ point)[0]
-        return np.concatenate(turns) * flat, float(data.subtree_com[found.trunk][0] - ahead)
+        return np.concatenate(turns) * flat, float(data.subtree_com[survey.trunk][0] - ahead)
 
     def residuals(x: Float[np.ndarray, " free"]) -> np.ndarray:
         turn, ahead = errors(x)

@@ -42,7 +42,7 @@ class Survey(NamedTuple):
     forwards: bool  # whether the knees point ahead
 
 
-def survey(path: Path) -> Survey:
+def survey_file(path: Path) -> Survey:
     """Find the robot in a file, see the module.
 
     Raises:
@@ -127,22 +127,22 @@ def _legs(
     path: Path, model: mujoco.MjModel, free: Sequence[int]
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Joints of the left and the right leg."""
-    data, found = at_zero(model), []
+    data, pairs = at_zero(model), []
     for one, other in combinations(_chains(model, free), 2):
         common = sum(a == b for a, b in zip(one, other, strict=False))
         a, b = one[common:], other[common:]
         hinges = all(model.jnt_type[j] == _HINGE for j in (*a, *b))
         right_length = FEWEST_JOINTS <= len(a) <= MOST_JOINTS and len(a) == len(b)
         if hinges and right_length and _mirrored(data.xanchor[list(a)], data.xanchor[list(b)]):
-            found.append((_lowest(model, data, a[-1]), -len(a), a, b))
-    if not found:
+            pairs.append((_lowest(model, data, a[-1]), -len(a), a, b))
+    if not pairs:
         ends = (f"{model.joint(way[-1]).name} ({len(way)})" for way in _chains(model, free))
         raise InputError(
             f"{path}: no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} "
             "hinges that mirror each other; chains by their last joint: "
             f"{', '.join(ends) or 'none'}"
         )
-    *_, one, other = min(found)
+    *_, one, other = min(pairs)
     if _is_right(model, data, one, other):
         one, other = other, one
     return one, other

@@ -43,9 +43,9 @@ def table_of(robot: Robot) -> list[str]:
     ]
 
 
-def table_of_survey(found: Survey) -> list[str]:
+def table_of_survey(survey: Survey) -> list[str]:
     """The lines of a robot of which only the legs are known."""
-    model, data = found.model, at_zero(found.model)
+    model, data = survey.model, at_zero(survey.model)
     rows = [
         (
             _both(model.joint(left).name, model.joint(right).name),
@@ -54,15 +54,15 @@ def table_of_survey(found: Survey) -> list[str]:
             if model.jnt_limited[left]
             else "none",
         )
-        for left, right in zip(*found.legs, strict=True)
+        for left, right in zip(*survey.legs, strict=True)
     ]
-    mass = float(model.body_subtreemass[found.trunk])
+    mass = float(model.body_subtreemass[survey.trunk])
     return [
-        f"robot    {mass:.4g} kg, trunk {model.body(found.trunk).name!r}",
-        f"legs     {len(rows)} joints each; knees bend {_way(found.forwards)}; axes and numbers of "
-        "the left leg:",
+        f"robot    {mass:.4g} kg, trunk {model.body(survey.trunk).name!r}",
+        f"legs     {len(rows)} joints each; knees bend {_way(survey.forwards)}; axes and numbers "
+        "of the left leg:",
         *_columns([_HEADER[:3], *rows]),
-        *_words("fixed", found.weld),
+        *_words("fixed", survey.weld),
     ]
 
 

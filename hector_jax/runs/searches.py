@@ -12,8 +12,8 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar, say
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import plural
+from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.grfm.dataset import SOLVED
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.search import cmaes as searching

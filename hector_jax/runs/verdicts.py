@@ -14,16 +14,16 @@ from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar, say
 from hector_jax.core.inputs import plural
-from hector_jax.core.trajectory import State, Trajectory
+from hector_jax.core.trajectory import SOLVED, State, Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.grfm.collection import Walks, walks_like
-from hector_jax.grfm.dataset import SOLVED, at_interval
+from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.metrics import Score
-from hector_jax.sim.diagnosis import StartupFall, startup_fall
+from hector_jax.sim.diagnosis import startup_fall
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
@@ -94,13 +94,16 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
 
 
 def _score_walk(
-    loss: Loss, walk: Trajectory, commit: str, startup: StartupFall | None
+    pool: Executor, config: TuneConfig, robot: Robot, job: Job, walk: Trajectory, commit: str
 ) -> ScoredWalk:
-    up = int(np.sum(~np.asarray(walk.fallen)))
+    up, startup = int(np.sum(~np.asarray(walk.fallen))), None
+    if not up:
+        known = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
+        startup = pool.submit(startup_fall, *known).result()
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
     upright = np.asarray(up * float(walk.period) if startup is None else startup.time)
     text = "" if startup is None else str(startup)
-    return ScoredWalk(metrics.score(loss, walk), upright, last, commit, text)
+    return ScoredWalk(metrics.score(config.loss, walk), upright, last, commit, text)
 
 
 def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
@@ -168,7 +171,6 @@ def judge(
         for name, weights in sets.items()
     }
 
-    host = jax.tree.map(np.asarray, robot)  # for another process
     with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
 
     def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
@@ -176,11 +178,7 @@ def judge(
         walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
         for case, walk in zip(missing, walks, strict=True):
             samples = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
-            startup = None
-            if np.asarray(walk.fallen)[0]:
-                job = on_host(jobs[case])
-                startup = pool.submit(startup_fall, walk_config, host, job).result()
-            yield case, (_score_walk(config.loss, walk, commit, startup), samples)
+            yield case, (_score_walk(pool, config, robot, jobs[case], walk, commit), samples)
 
     if folder is None:
         results = dict(make(list(jobs), {}))

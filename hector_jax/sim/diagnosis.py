@@ -12,14 +12,13 @@ from jaxtyping import Bool, Float
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.core.headless import mujoco
-from hector_jax.core.trajectory import Trajectory
+from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job, first_tick, substeps
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import World
 
-UNSOLVED = 1e-6  # a relative KKT residual from here on is no solution
 AT_LIMIT = 0.98  # of a torque limit: behind a lag the limit is only approached
 MOST_AT_LIMIT = 0.05  # share of a walk for which a motor may be at its limit
 MOST_BEFORE_FALL = 0.1  # the same before a fall, where something has to be to blame
@@ -38,7 +37,7 @@ class Record(NamedTuple):
     torque: Float[np.ndarray, "n joints"]  # as a share of the motor's limit
     touching: str  # what touches the floor at the end and is no foot; empty where nothing does
     fallen: bool  # the last row is that of a fall
-    walked: Trajectory
+    trajectory: Trajectory
 
     @property
     def tilt(self) -> Float[np.ndarray, " n"]:
@@ -61,7 +60,7 @@ class StartupFall(NamedTuple):
         )
 
 
-def record(config: WalkConfig, robot: Robot, job: Job) -> Record:
+def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
     """Walk once with each millisecond recorded.
 
     Args:
@@ -85,7 +84,7 @@ def record(config: WalkConfig, robot: Robot, job: Job) -> Record:
         rows.append((height, roll, pitch, share, fallen))
         touching[:] = parts
 
-    walked = walk(config, robot, job, on_sample=append)
+    trajectory = walk(config, robot, job, on_sample=append)
     heights, rolls, pitches, torques, fallen = zip(*rows, strict=True)
     lead = (job.start_tick - first_tick(config)) * substeps(config)
     return Record(
@@ -95,7 +94,7 @@ def record(config: WalkConfig, robot: Robot, job: Job) -> Record:
         torque=np.array(torques),
         touching=", ".join(touching),
         fallen=fallen[-1],
-        walked=walked,
+        trajectory=trajectory,
     )
 
 
@@ -128,41 +127,41 @@ def startup_fall(config: WalkConfig, robot: Robot, job: Job) -> StartupFall | No
     Args:
         config, robot, job: as those of `walk`.
     """
-    found = record(config, robot, job._replace(seconds=config.gait.tick))
-    if not np.asarray(found.walked.fallen)[0]:
+    record = record_walk(config, robot, job._replace(seconds=config.gait.tick))
+    if not np.asarray(record.trajectory.fallen)[0]:
         return None
-    finite = np.flatnonzero(np.isfinite(found.height) & np.isfinite(found.tilt))
+    finite = np.flatnonzero(np.isfinite(record.height) & np.isfinite(record.tilt))
     last = finite[-1] if len(finite) else 0
     return StartupFall(
-        time=min(float(found.time[-1]), 0.0),
-        height=float(found.height[last]),
-        tilt=float(found.tilt[last]),
-        cause=likeliest_cause(robot, found),
+        time=min(float(record.time[-1]), 0.0),
+        height=float(record.height[last]),
+        tilt=float(record.tilt[last]),
+        cause=likeliest_cause(robot, record),
     )
 
 
-def likeliest_cause(robot: Robot, found: Record) -> str:
+def likeliest_cause(robot: Robot, record: Record) -> str:
     """The likeliest cause of a fall, from what came before the robot was half over."""
-    if not found.fallen or not np.isfinite(found.height[-1]):
+    if not record.fallen or not np.isfinite(record.height[-1]):
         return "the physics diverges (joint gains too large, masses or inertias too small)"
-    if not np.max(found.walked.residual) <= UNSOLVED:
+    if not np.max(record.trajectory.residual) <= SOLVED:
         return "a QP of the MPC is not solved"
     low, tilted = robot.description.limits
     standing = float(robot.standing_height)
-    over = (found.tilt > 0.5 * tilted) | (found.height < 0.5 * (standing + low))
+    over = (record.tilt > 0.5 * tilted) | (record.height < 0.5 * (standing + low))
     count = max(int(np.argmax(over)) if over.any() else len(over), 1)
-    if lines := at_limit(robot, found.torque[:count], MOST_BEFORE_FALL):
+    if lines := at_limit(robot, record.torque[:count], MOST_BEFORE_FALL):
         return lines[0]
-    error = found.height[:count] - standing
-    if _grows(error, found.tilt[:count] / tilted):
+    error = record.height[:count] - standing
+    if _grows(error, record.tilt[:count] / tilted):
         way = "sinks" if error[-1] < 0.0 else "rises"
         return (
             f"the centre of mass {way} steadily, by {100 * abs(error[-1]):.0f} cm while still "
             "upright (the feet do not reach the floor as planned, joint gains or mass are wrong)"
         )
-    if found.touching and found.tilt[-1] <= tilted and found.height[-1] >= low:
-        return f"{found.touching} touches the floor"
-    roll, pitch = found.angles[-1]
+    if record.touching and record.tilt[-1] <= tilted and record.height[-1] >= low:
+        return f"{record.touching} touches the floor"
+    roll, pitch = record.angles[-1]
     if abs(roll) > abs(pitch):
         way = "to the right" if roll > 0.0 else "to the left"
     else:
@@ -205,11 +204,11 @@ def not_the_weights(config: WalkConfig, robot: Robot, job: Job) -> list[str]:
     Args:
         config, robot, job: as those of `walk`.
     """
-    found = record(config, robot, job)
-    if np.asarray(found.walked.fallen)[0]:
+    record = record_walk(config, robot, job)
+    if np.asarray(record.trajectory.fallen)[0]:
         return [str(startup_fall(config, robot, job))]
-    end = found.time[-1] - FALLING * found.fallen
-    time = float(found.walked.period) * np.arange(1, len(found.walked.fallen) + 1)
+    end = record.time[-1] - FALLING * record.fallen
+    time = float(record.trajectory.period) * np.arange(1, len(record.trajectory.fallen) + 1)
     upright = (time > SETTLED) & (time <= end)
-    torque = found.torque[found.time <= end]
-    return [*_steady_height(found.walked, upright), *at_limit(robot, torque, MOST_AT_LIMIT)]
+    torque = record.torque[record.time <= end]
+    return [*_steady_height(record.trajectory, upright), *at_limit(robot, torque, MOST_AT_LIMIT)]

@@ -24,8 +24,7 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.mjcf import TIME_STEP
-from hector_jax.robot.model import compile_model, quiet_mujoco
-from hector_jax.robot.source import build_spec
+from hector_jax.robot.model import build_model, quiet_mujoco
 
 LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold
@@ -205,8 +204,7 @@ def _check(imperfections: Imperfections) -> None:
 
 
 def _model(description: Description, slack: bool) -> mujoco.MjModel:
-    compile_model(description)  # for its checks
-    spec = build_spec(description).spec
+    spec, _ = build_model(description)
     # what is only looked at, and gives its body no mass, costs time and room in every plant
     for geom in list(spec.geoms):
         geom.material = ""
