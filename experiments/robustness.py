@@ -102,7 +102,7 @@ def weight_sets(named: Sequence[str], robot: Robot | None = None) -> dict[str, W
             raise InputError(
                 f"--set must be NAME=FILE, a new NAME of letters, digits and _, got {text!r}"
             )
-        sets[name] = load_weights(Path(file))
+        sets[name] = load_weights(Path(file), robot)
     return sets
 
 

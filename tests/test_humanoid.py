@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import jsonschema
 import numpy as np
 import pytest
 from scipy.optimize import linprog
@@ -15,11 +16,13 @@ from hector_jax.control.contact import CORNER_FRICTION, FLAT_FOOT, Contact, rows
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
+from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.export import TOLERANCE, controller, export_controller, load_controller
 from hector_jax.runs.export_check import check, record
+from hector_jax.runs.export_weights import weights_schema
 from hector_jax.sim.loop import Job
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
@@ -104,6 +107,16 @@ def test_the_bounds_of_a_flat_foot_are_its_edges():
 def test_the_controller_of_flat_feet_has_six_inputs_a_foot():
     assert CONFIG.mpc.contact_model == FLAT_FOOT
     assert (FLAT_FOOT.inputs, len(CONFIG.legs.kp)) == (6, 6)
+
+
+def test_gains_in_a_weights_file_are_one_for_each_joint(tmp_path):
+    gains = {"kp": np.full(6, 120.0)}
+    save_weights(tmp_path / "six.json", nominal(ROBOT)._replace(others=gains))
+    weights = load_weights(tmp_path / "six.json", ROBOT)
+    np.testing.assert_array_equal(CONFIG.parameters(weights).legs.kp, gains["kp"])
+    with pytest.raises(ValueError, match="others.kp must be 5 numbers"):
+        load_weights(tmp_path / "six.json")
+    jsonschema.validate(weights_tree(weights), weights_schema(ROBOT))
 
 
 def test_gradient_of_the_humanoid_over_50_ticks_is_that_of_differences():

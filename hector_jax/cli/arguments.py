@@ -32,7 +32,7 @@ def weights(text: str, robot: Robot) -> Weights:
         InputError: the file holds none.
     """
     named = {"nominal": nominal, "expert": expert}
-    return named[text](robot) if text in named else load_weights(Path(text))
+    return named[text](robot) if text in named else load_weights(Path(text), robot)
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:

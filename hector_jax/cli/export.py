@@ -21,7 +21,7 @@ def export_controller(args: Export) -> None:
     begun = read_request(args.run) if is_run else None
     robot = arguments.robot_of(args.run, begun) if begun else load_robot(args.robot)
     course = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
-    weights = load_weights(path)
+    weights = load_weights(path, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
     say("exporting the controller and comparing it with the live one on a walk")

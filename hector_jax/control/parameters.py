@@ -24,6 +24,8 @@ from hector_jax.control.footstep import FootstepParameters
 from hector_jax.control.legs import LegParameters
 from hector_jax.control.mpc import MpcParameters
 from hector_jax.control.weights import Weights, nominal
+from hector_jax.robot.description import HECTOR
+from hector_jax.robot.model import Robot
 
 
 class Parameters(NamedTuple):
@@ -40,7 +42,12 @@ class Tunable(NamedTuple):
     path: str  # "mpc.weights.Q"
     lower: float
     upper: float
-    shape: tuple[int, ...] = ()  # in `Weights.others`
+    each_joint: bool = False  # a number for each joint of a leg, else one
+
+    def shape(self, robot: Robot | None = None) -> tuple[int, ...]:
+        """Of the part in `Weights.others` of a robot, HECTOR by default."""
+        description = HECTOR if robot is None else robot.description
+        return (description.leg_joints,) if self.each_joint else ()
 
     def read(self, parameters: Parameters) -> Any:
         """The part: a number or a tree of them."""
@@ -66,8 +73,8 @@ TUNABLES = {
     "friction": Tunable("mpc.friction", 0.1, 1.0),
     "gravity_compensation": Tunable("legs.gravity_compensation", 0.0, 1.0),
     "foot_height": Tunable("legs.height", 0.02, 0.2),
-    "kp": Tunable("legs.kp", 1.0, 300.0, (5,)),
-    "kd": Tunable("legs.kd", 0.05, 10.0, (5,)),
+    "kp": Tunable("legs.kp", 1.0, 300.0, each_joint=True),
+    "kd": Tunable("legs.kd", 0.05, 10.0, each_joint=True),
 }
 """What can be tuned beside Q and R, by the names that `Weights.others` has for them."""
 

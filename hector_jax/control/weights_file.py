@@ -13,6 +13,7 @@ from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.settings import Range, read_json, validation_error
 from hector_jax.core.trajectory import State, Wrench
+from hector_jax.robot.model import Robot
 
 WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
 _MOST_WEIGHTS = 1_000_000  # bytes
@@ -41,10 +42,14 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
     write_json(path, tree | weights_tree(weights))
 
 
-def load_weights(path: Path) -> Weights:
+def load_weights(path: Path, robot: Robot | None = None) -> Weights:
     """Read weights that `save_weights` or a person wrote.
 
     Q and R are in `WEIGHTS`, not held to the box; others are.
+
+    Args:
+        path: JSON file.
+        robot: that they are for, HECTOR by default; gains have a number for each joint of its legs.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, unknown, of the wrong
@@ -67,18 +72,19 @@ def load_weights(path: Path) -> Weights:
             name: _numbers(path, f"{part}.{name}", tree[part][name], shape, WEIGHTS)
             for name, shape in entries.items()
         }
-    return Weights(State(**values["Q"]), Wrench(**values["R"]), _others(path, others))
+    return Weights(State(**values["Q"]), Wrench(**values["R"]), _others(path, others, robot))
 
 
-def _others(path: Path, others: Any) -> dict[str, np.ndarray]:
+def _others(path: Path, others: Any, robot: Robot | None) -> dict[str, np.ndarray]:
     if not isinstance(others, Mapping):
         raise InputError(f"{path}: others must be an object, got {json.dumps(others)[:60]}")
     values = {}
     for name, value in others.items():
         if name not in TUNABLES:
             raise InputError(f"{path}: others: {unknown('tunable', name, TUNABLES)}")
-        _, lower, upper, shape = TUNABLES[name]
-        values[name] = _numbers(path, f"others.{name}", value, shape, Range(lower, upper))
+        one = TUNABLES[name]
+        box = Range(one.lower, one.upper)
+        values[name] = _numbers(path, f"others.{name}", value, one.shape(robot), box)
     return values
 
 

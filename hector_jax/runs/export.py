@@ -130,7 +130,7 @@ def export(
     # the card vouches for the others: it goes first and comes last
     (folder / "controller.json").unlink(missing_ok=True)
     save_weights(folder / "weights.json", weights, SCHEMA)
-    write_json(folder / SCHEMA, weights_schema())
+    write_json(folder / SCHEMA, weights_schema(robot))
     np.savez(rows := io.BytesIO(), **as_arrays(walked))
     contents = {f"controller-{place}.jaxexport": blob for place, blob in blobs.items()}
     contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()

@@ -28,11 +28,11 @@ _STATES = ("roll, pitch, yaw", "x, y, z", "their rates: wx, wy, wz", "vx, vy, vz
 _INPUTS = ("force, foot 0 (left)", "force, foot 1 (right)", "moment, foot 0", "moment, foot 1")
 
 
-def weights_schema() -> dict[str, Any]:
-    """JSON schema (draft 2020-12) of a weights file."""
+def weights_schema(robot: Robot | None = None) -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of a weights file of a robot, HECTOR by default."""
     schema = _schema(weights_tree(nominal()))
     others = {
-        name: _schema(np.zeros(one.shape).tolist(), Range(one.lower, one.upper))
+        name: _schema(np.zeros(one.shape(robot)).tolist(), Range(one.lower, one.upper))
         for name, one in TUNABLES.items()
     }
     schema["properties"] |= {

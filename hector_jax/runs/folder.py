@@ -265,7 +265,7 @@ def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Wei
     """
     path = folder / "weights" / f"{name}.json"
     if path.exists():
-        return load_weights(path), name
+        return load_weights(path, robot), name
     published = {"nominal": nominal, "expert": expert}
     if name in published:
         return published[name](robot), name
