@@ -18,14 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import COMMANDS, UNSEEN, Command, named_command
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import Range, check, from_table, read_toml
-from hector_jax.robot.kinematics import foot_poses
+from hector_jax.robot.kinematics import knee_joints
 from hector_jax.robot.model import Robot
 
 _MOST_SECONDS = 600.0
@@ -137,7 +136,7 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
     expert weights, 6 s from standing) it says 1.55, 1.04, 1.20 m/s and 3.5 rad/s; it walked 1.6,
     1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
     """
-    hip, knee, ankle = _knee(robot)
+    hip, knee, ankle = knee_joints(robot)
     axis = robot.joint_axis[0]
     turns = [np.argmax(np.abs(axis[:, direction])) for direction in (2, 0)]  # yaw, roll
 
@@ -167,24 +166,6 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
         aside=float(min(reach, height * np.tan(roll)) / stance),
         turn=float(yaw / stance),
     )
-
-
-def _knee(robot: Robot) -> tuple[int, int, int]:
-    """Hip, knee and ankle of a leg: the joint that makes it shorter, and its parallels about it."""
-    count = robot.description.leg_joints
-    standing = robot.standing_joints[:count]
-
-    def length(joints: np.ndarray) -> float:
-        both = jnp.asarray(np.concatenate([joints, robot.standing_joints[count:]]))
-        foot = foot_poses(robot, both).position[0]
-        return float(np.linalg.norm(foot - robot.joint_origin[0, 0]))
-
-    slopes = [abs(length(standing + 1e-4 * e) - length(standing - 1e-4 * e)) for e in np.eye(count)]
-    knee = int(np.argmax(slopes[1:])) + 1
-    parallel = np.abs(robot.joint_axis[0] @ robot.joint_axis[0, knee]) > 0.9
-    above, below = np.flatnonzero(parallel[:knee]), np.flatnonzero(parallel[knee + 1 :])
-    hip = int(above[-1]) if len(above) else 0
-    return hip, knee, knee + 1 + int(below[0]) if len(below) else count - 1
 
 
 def beyond(limits: Limits, command: Command) -> str | None:

@@ -118,6 +118,28 @@ def leg_gravity(
     return jnp.sum(chain.axis * moment, axis=-1).reshape(-1)
 
 
+def knee_joints(robot: Robot) -> tuple[int, int, int]:
+    """Hip, knee and ankle of a leg, counted from the trunk.
+
+    The knee is the joint that changes the leg's length most in the standing pose; hip and ankle are
+    the joints nearest to it with parallel axes, or the first and the last one.
+    """
+    count = robot.description.leg_joints
+    standing = robot.standing_joints[:count]
+
+    def length(joints: np.ndarray) -> float:
+        both = jnp.asarray(np.concatenate([joints, robot.standing_joints[count:]]))
+        foot = foot_poses(robot, both).position[0]
+        return float(np.linalg.norm(foot - robot.joint_origin[0, 0]))
+
+    slopes = [abs(length(standing + 1e-4 * e) - length(standing - 1e-4 * e)) for e in np.eye(count)]
+    knee = int(np.argmax(slopes[1:])) + 1
+    parallel = np.abs(robot.joint_axis[0] @ robot.joint_axis[0, knee]) > 0.9
+    above, below = np.flatnonzero(parallel[:knee]), np.flatnonzero(parallel[knee + 1 :])
+    hip = int(above[-1]) if len(above) else 0
+    return hip, knee, knee + 1 + int(below[0]) if len(below) else count - 1
+
+
 class _Leg(NamedTuple):
     """Constants of a leg."""
 

@@ -3,9 +3,8 @@
 import textwrap
 from collections.abc import Iterable, Sequence
 
-import numpy as np
-
 from hector_jax.robot.checks import trunk_body
+from hector_jax.robot.kinematics import knee_joints
 from hector_jax.robot.model import Robot, compile_model
 from hector_jax.robot.source import build_spec
 from hector_jax.robot.survey import Survey, at_zero, axis_words
@@ -101,10 +100,9 @@ def _way(forwards: bool) -> str:
 
 
 def _forwards(robot: Robot) -> bool:
-    """Whether the knees point ahead: the largest bend about y in the standing pose."""
-    bend = robot.standing_joints[: robot.description.leg_joints] * robot.joint_axis[0, :, 1]
-    inner = bend[1:-1] if len(bend) > 3 else bend[1:]
-    return bool(inner[np.argmax(np.abs(inner))] > 0.0)
+    """Whether the knees point ahead in the standing pose."""
+    _, knee, _ = knee_joints(robot)
+    return bool(robot.standing_joints[knee] * robot.joint_axis[0, knee, 1] > 0.0)
 
 
 def _sole(robot: Robot) -> str:
