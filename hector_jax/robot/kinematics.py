@@ -283,32 +283,37 @@ def _searched_leg(
 ) -> Float[Array, " j"]:
     rows = np.array(placed)
 
-    def error(joints: Array, target: tuple[Array, Array, Array]) -> Array:
-        """Of the foot point [m] and of the sole [rad], in the rows that the leg places."""
-        position, yaw, up = target
+    def error(
+        joints: Array, position: Array, yaw: Array, up: Array
+    ) -> tuple[Float[Array, "r"], Float[Array, "r j"]]:
+        """Of the foot point [m] and of the sole [rad], in the rows that the leg places, and its J."""
         chain = _any_chain(*leg[:4], joints)
         pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
-        wanted = (rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))).T @ rot_z(yaw)
-        turn = _rotation_vector(wanted.T @ chain.rotation)
-        return jnp.concatenate([chain.foot - position, turn])[rows]
+        to_wanted = rot_z(yaw).T @ rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))
+        turn = _rotation_vector(to_wanted @ chain.rotation)
+        moves = jnp.cross(chain.axis, chain.foot - chain.origin).T
+        turns = _rotation_vector_rates(turn) @ to_wanted @ chain.axis.T
+        found = jnp.concatenate([chain.foot - position, turn])
+        return found[rows], jnp.concatenate([moves, turns])[rows]
 
-    def step(joints: Array, target: tuple[Array, Array, Array]) -> Array:
+    def step(joints: Array, *target: Array) -> Array:
         still = jax.lax.stop_gradient(joints)
-        now, J = error(still, target), jax.jacfwd(error)(still, fixed)
+        now, J = error(still, *target)
+        J = jax.lax.stop_gradient(J)
         damping = _DAMPING * jax.lax.stop_gradient(now @ now) + 1e-12
         damped = J @ J.T + damping * jnp.eye(len(rows), dtype=J.dtype)
         rest = leg.standing - still  # of what the foot leaves free
         return rest - J.T @ jnp.linalg.solve(damped, now + J @ rest)
 
     def improved(joints: Array, _: None) -> tuple[Array, None]:
-        moved = joints + jnp.clip(step(joints, fixed), -_LARGEST_STEP, _LARGEST_STEP)
+        moved = joints + jnp.clip(step(joints, *fixed), -_LARGEST_STEP, _LARGEST_STEP)
         return jnp.clip(moved, leg.lower, leg.upper), None
 
     target = (position, yaw, up)
     fixed = jax.lax.stop_gradient(target)
     joints, _ = jax.lax.scan(improved, jax.lax.stop_gradient(start), length=steps)
     # one step more, the only one that is differentiated: its derivative is that of the solution
-    return joints + step(joints, target)
+    return joints + step(joints, *target)
 
 
 def _rotation_vector(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -319,3 +324,13 @@ def _rotation_vector(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
     sine = jnp.sqrt(jnp.where(small, 1.0, square))
     angle = jnp.arctan2(sine, 0.5 * (jnp.trace(R) - 1.0))
     return jnp.where(small, 1.0, angle / sine) * vector
+
+
+def _rotation_vector_rates(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """From angular velocity to the rate of a rotation vector: the inverse left Jacobian of SO(3)."""
+    square = vector @ vector
+    small = square < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    second = jnp.where(small, 1.0 / 12.0, (1.0 - 0.5 * angle / jnp.tan(0.5 * angle)) / angle**2)
+    K = skew(vector)
+    return jnp.eye(3, dtype=vector.dtype) - 0.5 * K + second * (K @ K)
