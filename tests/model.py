@@ -1,5 +1,7 @@
 """The model that tests of tunings share: a rollout of 50 ticks, compiled once for all of them."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +12,15 @@ from hector_jax.control.reference import standing_anchor
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.residual import init, with_statistics
+from hector_jax.robot.description import TuningSettings
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
 ROBOT = load_robot()
+LEARNS_TOUCHDOWNS = ROBOT._replace(
+    description=replace(ROBOT.description, tuning=TuningSettings(touchdown_error=True))
+)
 ANCHOR = standing_anchor(ROBOT)
 SHORT = RolloutConfig(ticks=50)
 CONFIG = TuneConfig(rollout=SHORT)

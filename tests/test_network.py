@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import LEARNS_TOUCHDOWNS
 from synthetic import synthetic_walk
 
 from hector_jax.control.gait import GaitConfig
@@ -38,7 +39,7 @@ def untrained(data, variant="residual", seed=0, **sizes):
 @pytest.fixture(scope="module")
 def data():
     walks = [at_interval(synthetic_walk(i, 60), 0.01) for i in range(2)]
-    return make_dataset(load_robot(), jax.tree.map(lambda *x: np.stack(x), *walks))[0]
+    return make_dataset(LEARNS_TOUCHDOWNS, jax.tree.map(lambda *x: np.stack(x), *walks))[0]
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +222,18 @@ def test_a_net_from_a_file_of_the_old_names_comes_back(tmp_path, data, robot):
     jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], params)
 
 
+def test_a_net_of_a_file_without_touchdowns_lands_as_planned(tmp_path, data, robot):
+    params, path = untrained(data), tmp_path / "net.npz"
+    save_net(path, params, robot=robot, about={})
+    about = read_card(path)["about"]
+    old, as_planned = (
+        params._replace(linear=params.linear._replace(touchdown=leaf))
+        for leaf in (None, jnp.zeros_like(params.linear.touchdown))
+    )
+    save_tree(path, old, kind="grfm-residual", robot=robot, about=about)
+    jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], as_planned)
+
+
 def test_a_net_of_another_variant_is_refused_by_name(tmp_path, params, robot):
     save_net(tmp_path / "net.npz", params, robot=robot, about={})
     with pytest.raises(ValueError, match="net.npz: holds grfm-paper, expected .*grfm-residual"):
@@ -248,6 +261,9 @@ def test_a_mirrored_window_has_the_mirrored_effect(data):
         )
         np.testing.assert_allclose(here.legs.force * ALONG, there.legs.force, atol=1e-9)
         np.testing.assert_allclose(here.legs.torque * ACROSS, there.legs.torque, atol=1e-9)
+        error = here.touchdown_error
+        assert np.any(error != 0.0)
+        np.testing.assert_allclose(error[::-1] * ALONG, there.touchdown_error, atol=1e-9)
 
 
 def test_a_command_that_stays_is_returned_as_it_is(data, window):
@@ -290,16 +306,25 @@ def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data):
         changes=jnp.asarray(0.2 * rng.normal(size=true.changes.shape)),
         legs_bias=jnp.asarray(rng.normal(size=true.legs_bias.shape)),
         legs=jnp.asarray(0.0 * true.legs),
+        touchdown=jnp.asarray(np.random.default_rng(1).normal(size=true.touchdown.shape)),
     )
     told = jax.jit(jax.vmap(as_effect(true)))(jax.tree.map(jnp.asarray, data.window))
+    error = np.array(told.touchdown_error)
+    error[::20] += 1e3  # robots that fall
     known = data._replace(
-        label=jax.tree.map(np.asarray, told.wrench), legs=jax.tree.map(np.asarray, told.legs)
+        label=jax.tree.map(np.asarray, told.wrench),
+        legs=jax.tree.map(np.asarray, told.legs),
+        touchdown_error=error,
+        lands=~data.window.contact,
     )
     found = jax.jit(jax.vmap(as_effect(fit_gated(known))))(jax.tree.map(jnp.asarray, data.window))
     for part in ("force", "moment"):
         error = getattr(found.wrench, part) - getattr(told.wrench, part)
         assert np.mean(error**2) < 0.05 * np.var(getattr(told.wrench, part))
     np.testing.assert_allclose(found.legs.force, told.legs.force, atol=0.05)
+    lands = ~data.window.contact
+    error = np.asarray(found.touchdown_error - told.touchdown_error)[lands]
+    assert np.abs(error).max() < 0.02 * np.asarray(told.touchdown_error)[lands].std()
 
 
 def test_a_leg_pushes_only_while_it_swings(data, window):

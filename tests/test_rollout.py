@@ -4,10 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import PLAIN, SHORT, small_effect
+from model import LEARNS_TOUCHDOWNS, PLAIN, SHORT, small_effect
 
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
+from hector_jax.core.geometry import rot_z
+from hector_jax.grfm.dataset import make_dataset
+from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import TuneConfig, tune_step
@@ -37,6 +40,28 @@ def test_named_weights_walk_every_trajectory(robot, anchor, name, weights):
     assert not trajectory.fallen.any()
     assert trajectory.residual.max() < 1e-8
     assert total(PAPER_LOSS, losses(PAPER_LOSS, trajectory)) < 3e6
+
+
+def test_a_foot_lands_where_phi_says_and_a_dataset_reads_it_back(robot, anchor):
+    shift = np.array([[0.03, -0.02, 0.0], [0.01, 0.02, 0.001]])
+    moved = jax.tree_util.Partial(
+        lambda window: last_command(window)._replace(touchdown_error=jnp.asarray(shift))
+    )
+    command = named_command("c")
+    planned, walked = (
+        walk(SHORT, robot, nominal(), command, anchor, phi) for phi in (last_command, moved)
+    )
+    lands = np.flatnonzero(np.diff(planned.contact[:, 1].astype(int)) == 1)[0] + 1
+    yaw = planned.state.euler[lands - 2, 2]
+    found = walked.feet[lands, 1] - planned.feet[lands, 1]
+    np.testing.assert_allclose(found, rot_z(yaw) @ shift[1], atol=1e-9)
+
+    stacked = jax.tree.map(lambda x: np.asarray(x)[None], walked)
+    data, _ = make_dataset(LEARNS_TOUCHDOWNS, stacked)
+    assert data.lands.sum(axis=0).tolist() == [1, 1]
+    foot = np.nonzero(data.lands)[1]
+    np.testing.assert_allclose(data.touchdown_error[data.lands], shift[foot], atol=1e-9)
+    assert not make_dataset(robot, stacked)[0].lands.any()  # as its description asks
 
 
 def test_a_foot_in_the_air_gets_no_wrench(robot, anchor):

@@ -1,9 +1,10 @@
 """How walks become samples of phi.
 
 A sample belongs to one tick: the commands of the tick and of those before, the mean wrench that the
-ground returned over the tick, and the load on the trunk that a rigid body would have needed beside
-it to move as the trunk moved (that of the legs), all in the robot's yaw frame at the start of the
-tick. Training and validation are split by walk: samples of one walk are too alike.
+ground returned over the tick, the load on the trunk that a rigid body would have needed beside it
+to move as the trunk moved (that of the legs), and, in the last tick of a swing, how far from its
+planned touchdown the foot landed, all in the robot's yaw frame at the start of the tick. Training
+and validation are split by walk: samples of one walk are too alike.
 """
 
 import math
@@ -13,11 +14,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from hector_jax.control import gait
-from hector_jax.control.controller import walk_config
-from hector_jax.control.gait import GaitConfig
+from hector_jax.control.controller import WalkConfig, walk_config
+from hector_jax.control.footstep import touchdown_points
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import SOLVED, Load, State, Trajectory, Wrench
@@ -36,6 +37,8 @@ class Dataset(NamedTuple):
     window: Window  # what phi may look at, yaw frame
     label: Wrench  # (n, 2, 3) each, mean effect over the tick, yaw frame
     legs: Load  # (n, 3) each, what moved the rigid body beside the effect, yaw frame
+    touchdown_error: Float[Array, "n 2 3"]  # [m] from planned touchdown to where it is, yaw frame
+    lands: Bool[Array, "n 2"]  # whether the foot touches down at the end of the tick
     state: State  # (n, 3) each, true state at the start of the tick, world frame
     walk: Int[Array, " n"]  # which walk
     tick: Int[Array, " n"]  # which tick of it
@@ -98,7 +101,7 @@ def make_dataset(
         unsolved QP, or a push, which would pass for one by the legs. The first HISTORY - 1 ticks of
         a walk have no full history and are no samples.
     """
-    config = walk_config(robot).gait
+    config = walk_config(robot)
     count = len(walks.fallen)
     starts = np.broadcast_to(np.asarray(start_tick, np.int32), (count,))
     pushes = jax.tree.map(
@@ -117,7 +120,7 @@ def _all_samples(config, robot, numbers, starts, pushes, walks):
 
 
 def _samples(
-    config: GaitConfig,
+    config: WalkConfig,
     robot: Robot,
     number: Int[Array, ""],
     start_tick: Int[Array, ""],
@@ -138,7 +141,7 @@ def _samples(
     to_yaw_frame = jax.vmap(lambda vectors, yaw: turn(vectors, -yaw))
     commands = to_yaw_frame(jax.tree.map(newest_first, walk.command), before.euler[:, 2])
     label = to_yaw_frame(jax.tree.map(lambda w: w[first:], walk.effect), before.euler[:, 2])
-    legs = jax.vmap(partial(srbm.unexplained, robot, dt=config.tick))(
+    legs = jax.vmap(partial(srbm.unexplained, robot, dt=config.gait.tick))(
         before,
         jax.tree.map(lambda s: s[first:], walk.state),
         jax.tree.map(lambda w: w[first:], walk.effect),
@@ -146,21 +149,48 @@ def _samples(
     )
     legs = to_yaw_frame(legs, before.euler[:, 2])
     tick = jnp.arange(first, ticks)
+    contact, later = walk.contact[first:], lambda x: jnp.concatenate([x[first + 1 :], x[-1:]])
+    planned = _planned_touchdowns(
+        config,
+        robot,
+        before,
+        jax.tree.map(lambda r: r[first - 1 : -1], walk.reference),
+        start_tick + tick,
+    )
+    error = to_yaw_frame(later(walk.feet) - planned, before.euler[:, 2])
+    lands = later(walk.contact) & ~contact & ~later(walk.fallen)[:, None]
+    lands &= robot.description.tuning.touchdown_error
     window = Window(
         commands=commands,
-        contact=walk.contact[first:],
-        since_switch=gait.since_switch(config, start_tick + tick),
+        contact=contact,
+        since_switch=gait.since_switch(config.gait, start_tick + tick),
         base=jax.vmap(from_yaw_frame)(before),
     )
     finite = [
         jnp.isfinite(w).reshape(len(tick), -1).all(axis=1)
-        for w in jax.tree.leaves((commands, label, legs))
+        for w in jax.tree.leaves((commands, label, legs, error))
     ]
     solved = walk.residual[first:] <= SOLVED
-    begin, end = config.tick * tick[:, None], config.tick * (tick[:, None] + 1)
+    begin, end = config.gait.tick * tick[:, None], config.gait.tick * (tick[:, None] + 1)
     acts = (push.start < end) & (push.start + push.duration > begin) & push.force.any(axis=-1)
     usable = jnp.stack([~walk.fallen[first:], solved, ~acts.any(axis=1), *finite]).all(axis=0)
-    return Dataset(window, label, legs, before, jnp.full_like(tick, number), tick), usable
+    walks = jnp.full_like(tick, number)
+    return Dataset(window, label, legs, error, lands, before, walks, tick), usable
+
+
+def _planned_touchdowns(
+    config: WalkConfig, robot: Robot, state: State, reference: State, tick: Int[Array, " n"]
+) -> Float[Array, "n 2 3"]:
+    """Where the controller would have had the feet touch down, by the true state at each tick."""
+    period = config.gait.tick
+    times = {"stance": period * config.gait.stance, "swing": period * config.gait.swing}
+
+    def at(state: State, reference: State, tick: Int[Array, ""]) -> Float[Array, "2 3"]:
+        remaining = period * gait.ticks_to_touchdown(config.gait, tick)
+        rule = partial(touchdown_points, config.footstep, robot, config.footstep.parameters)
+        return rule(state=state, reference=reference, remaining=remaining, **times).position
+
+    return jax.vmap(at)(state, reference, tick)
 
 
 def with_mirror(dataset: Dataset) -> Dataset:
@@ -190,6 +220,8 @@ def with_mirror(dataset: Dataset) -> Dataset:
         ),
         label=flip(dataset.label),
         legs=Load(dataset.legs.force * ALONG, dataset.legs.torque * ACROSS),
+        touchdown_error=dataset.touchdown_error[:, ::-1] * ALONG,
+        lands=dataset.lands[:, ::-1],
         state=flip_state(dataset.state),
     )
     return jax.tree.map(lambda *both: np.concatenate(both), dataset, image)

@@ -34,6 +34,9 @@ class Effect(NamedTuple):
 
     wrench: Wrench  # of the ground on each foot
     legs: Load  # of the moving legs on the trunk; zero where phi does not model it
+    touchdown_error: Float[
+        Array, "*batch 2 3"
+    ]  # [m] from planned touchdown to where each foot lands
 
 
 class Phi(NamedTuple):
@@ -52,11 +55,11 @@ class Phi(NamedTuple):
     widths: Callable[[Any], tuple[int, ...]] = lambda params: ()  # `hidden` of given params
 
 
-Vectors = TypeVar("Vectors", Wrench, Load)
+Vectors = TypeVar("Vectors")  # a tree of arrays whose last axis is x, y, z
 
 
 def turn(vectors: Vectors, yaw: Float[Array, ""]) -> Vectors:
-    """Turn wrenches or loads about z: by `yaw` [rad] from the yaw frame to the world."""
+    """Turn vectors about z: by `yaw` [rad] from the yaw frame to the world."""
     R = rot_z(yaw)
     return jax.tree.map(lambda v: v @ R.T, vectors)
 
@@ -73,9 +76,9 @@ def from_yaw_frame(state: State) -> State:
 
 
 def ground_effect(wrench: Wrench) -> Effect:
-    """The effect of a ground wrench alone: the moving legs put no load on the trunk."""
+    """The effect of a ground wrench alone: no load of moving legs, feet land as planned."""
     zero = jnp.zeros_like(wrench.force[0])
-    return Effect(wrench, Load(zero, zero))
+    return Effect(wrench, Load(zero, zero), jnp.zeros_like(wrench.force))
 
 
 def in_dtype_of(window: Window, tree: Any) -> Any:

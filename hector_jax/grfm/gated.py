@@ -1,11 +1,15 @@
 """The linear part of phi: gated by contact and by the time since the stance last switched.
 
-Two maps, each fitted by ridge regression to what the high-fidelity simulator shows:
+Three maps, each fitted by ridge regression to what the high-fidelity simulator shows:
 
 - **ground**: what the ground returns to a foot is the command itself (nothing, for a foot planned
   to swing), a bias of the tick since the switch, and terms in the latest changes of the commands.
 - **legs**: the push that the moving legs give the trunk, which a rigid body cannot know: a bias of
   the tick, and terms in the motion of the base and in the latest changes of the commands.
+- **touchdown**: how far from its planned touchdown a foot lands: a bias, and terms in the motion of
+  the base and in the horizontal force commanded on the other foot, by which the planned point
+  moves. A swinging leg sags and lags, so the lever of its force is not the planned one. The fit is
+  robust, because a robot that is about to fall lands anywhere.
 
 A command that stays is returned as it is, by construction. It has to be: the walks were recorded in
 closed loop, where the controller asks for whatever the ground withheld, so that over a step the
@@ -31,8 +35,10 @@ from hector_jax.grfm.nets import NO_EPOCHS
 
 CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
 MOTION = 3  # of the base: yaw rate, forward and sideways velocity
+TOUCHDOWN = MOTION + 2  # and the force on the other foot, forward and sideways
 GATES = (0.0, 0.01, 0.03, 0.08, 0.19)  # [s] after a switch, where the terms of the legs may differ
 RIDGE, RIDGE_LEGS = 0.03, 1e-3  # penalty on standardised terms, relative to the number of samples
+HUBER, HUBER_ROUNDS = 2.0, 20  # where errors count linearly, in medians of the error
 _SIGNS = np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])])  # of force and moment, by foot
 _FLOOR = 0.05  # least scale of a change, relative to the largest of its kind
 
@@ -48,7 +54,7 @@ class View(NamedTuple):
 
 
 class GatedMap(NamedTuple):
-    """Both maps; the axis of 2 is swing, stance, that of 6 force and moment (torque)."""
+    """The three maps; the axis of 2 is swing, stance, that of 6 force and moment (torque)."""
 
     ticks: Float[Array, " ticks"]  # [s] after a switch, where a bias is given
     gates: Float[Array, " gates"]  # [s] after a switch, where terms of the legs are given
@@ -56,6 +62,7 @@ class GatedMap(NamedTuple):
     changes: Float[Array, "2 changes 6"]
     legs_bias: Float[Array, "ticks 6"]
     legs: Float[Array, "gates terms 6"]  # of motion, then changes
+    touchdown: Float[Array, "terms 3"]  # [m] of 1, motion, force on the other foot
 
 
 def init(key: Key[Array, ""], hidden: tuple[int, ...] = ()) -> GatedMap:
@@ -68,6 +75,7 @@ def init(key: Key[Array, ""], hidden: tuple[int, ...] = ()) -> GatedMap:
         changes=jnp.zeros((2, CHANGES, 6)),
         legs_bias=jnp.zeros((0, 6)),
         legs=jnp.zeros((len(GATES), CHANGES + MOTION, 6)),
+        touchdown=jnp.zeros((1 + TOUCHDOWN, 3)),
     )
 
 
@@ -112,8 +120,10 @@ def from_views(values: Float[Array, "2 6"]) -> Wrench:
     return Wrench(back[:, :3], back[:, 3:])
 
 
-def apply_gated(gated: GatedMap, window: Window, view: View) -> tuple[Float[Array, "2 6"], Load]:
-    """Ground wrench as each foot sees it, and the load of the legs on the trunk in the yaw frame.
+def apply_gated(
+    gated: GatedMap, window: Window, view: View
+) -> tuple[Float[Array, "2 6"], Load, Float[Array, "2 3"]]:
+    """Ground wrench as each foot sees it; load of the legs, error of the touchdown [m], yaw frame.
 
     Args:
         gated: fitted maps.
@@ -130,14 +140,16 @@ def apply_gated(gated: GatedMap, window: Window, view: View) -> tuple[Float[Arra
     terms = jnp.concatenate([view.motion, view.changes], axis=-1)
     push = tick @ gated.legs_bias + jnp.einsum("g,fi,gio->fo", gate, terms, gated.legs)
     back = from_views(push * view.alone[:, None])
-    return ground, Load(back.force.sum(axis=0), back.moment.sum(axis=0))
+    shift = gated.touchdown[0] + _touchdown_terms(view) @ gated.touchdown[1:]
+    shift = shift * jnp.asarray(_SIGNS[:, :3], shift.dtype)
+    return ground, Load(back.force.sum(axis=0), back.moment.sum(axis=0)), shift
 
 
 def apply(gated: GatedMap, window: Window) -> Effect:
     """Effect of the linear part alone for one window."""
     gated, window = in_dtype_of(window, gated), in_dtype_of(window, window)
-    ground, legs = apply_gated(gated, window, views(window))
-    return Effect(from_views(ground), legs)
+    ground, legs, shift = apply_gated(gated, window, views(window))
+    return Effect(from_views(ground), legs, shift)
 
 
 def labels_in_view(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +160,7 @@ def labels_in_view(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_gated(dataset: Dataset) -> GatedMap:
-    """Ridge regression of both maps; every sample is seen by both feet."""
+    """Ridge regression of the maps; every sample is seen by both feet."""
     window = jax.tree.map(jnp.asarray, dataset.window)
     view = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
@@ -179,8 +191,45 @@ def fit_gated(dataset: Dataset) -> GatedMap:
         changes=np.stack(slope) / scale[:, None],
         legs_bias=legs_bias,
         legs=legs_slope.reshape(len(gates), -1, 6) / term_scale[:, None],
+        touchdown=_fit_touchdown(view, dataset),
     )
     return jax.tree.map(jnp.asarray, maps)
+
+
+def _touchdown_terms(view: View) -> Array:
+    across = view.command[..., ::-1, :2] * jnp.array([1.0, -1.0], view.command.dtype)
+    return jnp.concatenate([view.motion, across], axis=-1)
+
+
+def _fit_touchdown(view: View, dataset: Dataset) -> np.ndarray:
+    lands = dataset.lands
+    if not lands.any():
+        return np.zeros((1 + TOUCHDOWN, 3))
+    terms = np.asarray(_touchdown_terms(view))[lands]
+    y, scale = np.asarray(dataset.touchdown_error * _SIGNS[:, :3])[lands], _spread(terms)
+    bias, slope = np.split(_huber_ridge(terms / scale, y), [1])
+    return np.concatenate([bias, slope / scale[:, None]])
+
+
+def _huber_ridge(terms: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Coefficients (1 + terms, outputs) of one and the terms by the Huber loss, penalised.
+
+    Each round weighs the samples by their errors in the round before.
+    """
+    one = np.ones((len(y), 1))
+
+    def fit(y: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        return np.concatenate(_ridge(RIDGE_LEGS, weight, weight * terms, weight * y))
+
+    def robust(y: np.ndarray) -> np.ndarray:
+        found = fit(y, one)
+        for _ in range(HUBER_ROUNDS):
+            error = np.abs(y - found[0] - terms @ found[1:])
+            limit = HUBER * np.median(error)
+            found = fit(y, np.sqrt(np.minimum(1.0, limit / np.maximum(error, 1e-9))))
+        return found
+
+    return np.concatenate([robust(column[:, None]) for column in y.T], axis=1)
 
 
 def _spread(x: np.ndarray) -> np.ndarray:
@@ -201,7 +250,7 @@ def _ridge(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients of the free columns and of the penalised ones, in the mean square."""
     if len(y) == 0:
-        return np.zeros((free.shape[1], 6)), np.zeros((terms.shape[1], 6))
+        return np.zeros((free.shape[1], y.shape[1])), np.zeros((terms.shape[1], y.shape[1]))
     columns = np.concatenate([free, terms], axis=1)
     penalties = np.r_[np.full(free.shape[1], 1e-6), np.full(terms.shape[1], penalty)]
     gram = columns.T @ columns / len(y) + np.diag(penalties)

@@ -95,16 +95,32 @@ def load_net(
             with a number that is not finite.
     """
     name, card = read_net_card(path, variant)
-    like = layout(name, tuple(card["about"]["hidden"]))
+    zeros = layout(name, tuple(card["about"]["hidden"]))
     arrays = card.get("arrays")
-    old = _IN_OLD_FILES if isinstance(arrays, dict) and "left" in arrays else {}
+    arrays = arrays if isinstance(arrays, dict) else {}
+    like = jax.tree_util.tree_map_with_path(
+        lambda path, leaf: leaf if _is_in_file(path, arrays) else None, zeros
+    )
+    old = _IN_OLD_FILES if "left" in arrays else {}
     fields = {field: old.get(field, field) for field in like._fields}
     tree = {fields[field]: leaf for field, leaf in like._asdict().items()}
     tree, card = load_tree(path, tree, kind=card["kind"], robot=robot)
     params = like._replace(**{field: tree[entry] for field, entry in fields.items()})
+    params = jax.tree.map(
+        lambda zero, leaf: zero if leaf is None else leaf,
+        zeros,
+        params,
+        is_leaf=lambda x: x is None,
+    )
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise InputError(f"{path}: a parameter of the net is not finite")
     return params, name, card
+
+
+def _is_in_file(path: Any, arrays: Any) -> bool:
+    """Whether a file has a parameter: files of before it was there have no `touchdown`."""
+    name = jax.tree_util.keystr(path, simple=True, separator=".")
+    return not name.endswith("touchdown") or name in arrays
 
 
 def layout(variant: str, hidden: tuple[int, ...]) -> Params:

@@ -70,7 +70,7 @@ def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.nda
 
     def one(window: Window) -> tuple[View, Array, Array]:
         view = views(window)
-        ground, _ = gated.apply_gated(linear, window, view)
+        ground, *_ = gated.apply_gated(linear, window, view)
         return view, hats(window.since_switch, linear.ticks), ground
 
     window = jax.tree.map(jnp.asarray, dataset.window)
@@ -121,7 +121,7 @@ def _output(raw: Array, trust: Array) -> Array:
 def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
     def one(window: Window) -> tuple[Array, Array, Array]:
         view = views(window)
-        ground, _ = gated.apply_gated(params.linear, window, view)
+        ground, *_ = gated.apply_gated(params.linear, window, view)
         return ground, *_inputs(params, window, view)
 
     window = jax.tree.map(jnp.asarray, dataset.window)
@@ -155,12 +155,12 @@ def apply(params: ResidualParams, window: Window) -> Effect:
     """Effect of a trained net for one window."""
     params, window = in_dtype_of(window, params), in_dtype_of(window, window)
     view = views(window)
-    ground, legs = gated.apply_gated(params.linear, window, view)
+    ground, legs, shift = gated.apply_gated(params.linear, window, view)
     x, trust = _inputs(params, window, view)
     members = jax.vmap(lambda net: _bounded(nets.apply_net(net, x)))
     added = jnp.concatenate([members(params.force), members(params.moment)], axis=-1)
     added = trust[:, None] * params.residual_rms * added
-    return Effect(gated.from_views(ground + added.mean(axis=0)), legs)
+    return Effect(gated.from_views(ground + added.mean(axis=0)), legs, shift)
 
 
 RESIDUAL = Phi("residual", ResidualParams, init, fit, apply, lambda p: nets.widths(p.force))

@@ -17,6 +17,7 @@
     [weights]
     nominal, expert = { euler, position, ang_velocity, velocity, force, moment }   # x, y, z or one
     [loss]                             # weights of the terms of the loss: L_Eul, L_pos, L_ctrl
+    [tuning]                           # fields of TuningSettings
     [plants]                           # fields of PlantSizes
 
 What is left out is as in assets/hector.toml. Masses, lengths, joint and torque limits are the
@@ -89,6 +90,20 @@ class PlantSizes:
         check(self)
 
 
+@dataclass(frozen=True)
+class TuningSettings:
+    """How this robot is tuned, where it is not as HECTOR."""
+
+    lead: Annotated[int, NOT_NEGATIVE] = 0  # gait ticks of a rollout in place, before the command
+    touchdown_error: bool = False  # whether the net learns how far from the plan the feet land
+    choice_plants: Annotated[int, NOT_NEGATIVE] = (
+        0  # where the best iteration is chosen; 0: the last
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Description:
@@ -109,6 +124,7 @@ class Description:
     nominal: tuple[Triple, ...] | None = None  # in the order of _Diagonals; None: as HECTOR's
     expert: tuple[Triple, ...] | None = None  # likewise
     loss: tuple[tuple[str, float], ...] = ()  # alphas by term; of the others those of the paper
+    tuning: TuningSettings = TuningSettings()
     plants: PlantSizes = PlantSizes()
 
     def __post_init__(self) -> None:
@@ -258,6 +274,7 @@ class _File:
     legs: dict | None = None
     weights: _Weights = _Weights()
     loss: dict[str, float] | None = None
+    tuning: TuningSettings = TuningSettings()
     plants: PlantSizes = PlantSizes()
 
     def __post_init__(self) -> None:
@@ -319,6 +336,7 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         nominal=weights.nominal and weights.nominal.rows(),
         expert=weights.expert and weights.expert.rows(),
         loss=tuple((file.loss or {}).items()),
+        tuning=file.tuning,
         plants=file.plants,
     )
 

@@ -285,8 +285,8 @@ def _searched_leg(
 
     def error(
         joints: Array, position: Array, yaw: Array, up: Array
-    ) -> tuple[Float[Array, "r"], Float[Array, "r j"]]:
-        """Of the foot point [m] and of the sole [rad], in the rows that the leg places, and its J."""
+    ) -> tuple[Float[Array, " rows"], Float[Array, "rows j"]]:
+        """Of foot point [m] and sole [rad], in the rows that the leg places; and its Jacobian."""
         chain = _any_chain(*leg[:4], joints)
         pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
         to_wanted = rot_z(yaw).T @ rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))
@@ -327,7 +327,7 @@ def _rotation_vector(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def _rotation_vector_rates(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """From angular velocity to the rate of a rotation vector: the inverse left Jacobian of SO(3)."""
+    """From angular velocity to the rate of a rotation vector (inverse left Jacobian of SO(3))."""
     square = vector @ vector
     small = square < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1.0, square))

@@ -17,6 +17,9 @@ of mass m and height h:
     Q                        HECTOR's
     R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; of nominal 0.3 of that
     L_ctrl                   times (m0 / m)^2
+    lead                     one gait cycle in place before the command of a rollout
+    touchdown_error          true: heavy legs miss the planned touchdown by some centimetres
+    choice_plants            4: a model that nobody has tried misleads a tuning sooner or later
     joint_friction, _damping times m h / (m0 h0); push, payload: m / m0; trunk_com: h / h0
     min_height               0.55 h
 """
@@ -135,6 +138,7 @@ def sections(size: Size) -> dict[str, Any]:
         "legs": legs(size),
         "weights": weights(size),
         "loss": {"L_ctrl": _short(size.mass**-2)},
+        "tuning": tuning(size),
         "plants": plants(size),
     }
 
@@ -197,6 +201,12 @@ def weights(size: Size) -> dict[str, Any]:
             "moment": _short(1e-2 * moment),
         },
     }
+
+
+def tuning(size: Size) -> dict[str, Any]:
+    """The tuner's model, and how the best iteration is chosen."""
+    lead = sum(gait(size).values())
+    return {"lead": lead, "touchdown_error": True, "choice_plants": 4}
 
 
 def plants(size: Size) -> dict[str, float]:

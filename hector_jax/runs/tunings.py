@@ -17,6 +17,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
+from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
@@ -241,7 +242,10 @@ def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
     Raises:
         InputError: one line naming the file and what is wrong in it.
     """
-    rollout = RolloutConfig(walk=walk_config(robot))
+    try:
+        rollout = RolloutConfig(walk=walk_config(robot), lead=robot.description.tuning.lead)
+    except InputError as error:
+        raise InputError(f"{robot.description.path}: {error}") from None
     return TuneConfig(rollout=rollout, loss=loss_of_robot(robot.description), **settings)
 
 

@@ -159,7 +159,7 @@ def _respond(
         base=from_yaw_frame(state),
     )
     answer = effect(seen)
-    return Effect(turn(answer.wrench, yaw), turn(answer.legs, yaw))
+    return turn(answer, yaw)
 
 
 def _move(
@@ -199,12 +199,12 @@ def _on_real_ground(
     carry: Carry, acting: Effect, planned: Plan, belief: _Belief, variation: Variation | None
 ) -> tuple[Effect, Feet]:
     """What acts on the body within the ground's friction, and where the feet really are."""
-    touchdown = planned.touchdown
+    position = planned.touchdown.position + acting.touchdown_error
     if variation is not None:
         assert belief.error is not None  # see `_believe`
-        touchdown = touchdown._replace(position=touchdown.position - belief.error.position)
+        position = position - belief.error.position
         acting = acting._replace(wrench=_within_friction(acting.wrench, variation.friction))
-    return acting, feet_where(planned.contact, carry.feet, touchdown)
+    return acting, feet_where(planned.contact, carry.feet, Feet(position, planned.touchdown.yaw))
 
 
 def _sample(
