@@ -1,6 +1,7 @@
 """Which iteration of a tuning is taken."""
 
 from concurrent.futures import Executor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -9,7 +10,9 @@ from model import CONFIG, ROBOT
 
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal
+from hector_jax.robot.description import TuningSettings
 from hector_jax.runs import choice, verdicts
+from hector_jax.runs.metrics import score_like
 from hector_jax.tuning.difftune import Iteration, Tuning
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.status import StepStatus
@@ -28,7 +31,7 @@ def _tuning(count):
     return Tuning(history, nominal(), history[-1].weights, "")
 
 
-def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp_path):
+def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp_path, capsys):
     def judge(pool, config, robot, sets, command, plants, seeds, **notes):
         del pool, config, robot, notes
         assert (len(plants), list(seeds)) == (3, [0, 1, 2])
@@ -40,16 +43,23 @@ def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp
             worse = 1000.0 * name.startswith("without")
             return scale * (worse + 100.0 + (number - 8) ** 2)
 
-        scores = {name: [SimpleNamespace(L=loss(name))] * 3 for name in sets}
+        scores = {
+            name: [score_like(loss=CONFIG.loss)._replace(losses={"L": np.array(loss(name))})] * 3
+            for name in sets
+        }
         return SimpleNamespace(scores=scores)
 
     monkeypatch.setattr(verdicts, "judge", judge)
     commands = named_command("straight"), named_command("c")
     tunings = {"with": _tuning(17), "without": _tuning(9)}
-    notes = {"seconds": 4.0, "folder": tmp_path, "title": ""}
-    chosen = choice.choose(Executor(), CONFIG, ROBOT, tunings, commands, 3, **notes)
+    description = replace(ROBOT.description, tuning=TuningSettings(choice_plants=3))
+    asks = ROBOT._replace(description=description)
+    notes = {"seconds": 4.0, "folder": tmp_path}
+    chosen = choice.choose(Executor(), CONFIG, asks, tunings, commands, **notes)
     one = chosen["with"]
     assert (one.iteration, one.of) == (8, 16)
     np.testing.assert_array_equal(one.weights.Q.euler, 9 * nominal().Q.euler)
-    assert one.against_start < 1.0 == one.last_against_start  # 16 is as far from the best as 0
-    assert (chosen["without"].iteration, chosen["without"].against_start) == (0, 1.0)
+    assert chosen["without"].iteration == 0
+    said = capsys.readouterr().err
+    assert "with: iteration 8 of 16 walks best there: L -39 % against the start" in said
+    assert choice.choose(Executor(), CONFIG, ROBOT, tunings, commands, **notes) == {}

@@ -34,7 +34,6 @@ from hector_jax.report.run import Report, write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
-from hector_jax.runs.choice import Choice
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.nets import TrainedNet
@@ -155,7 +154,7 @@ class _Tuned(NamedTuple):
     tunings: dict[str, Tuned]
     shifts: list[dict[str, Any]]  # of each refresh
     sets: dict[str, Weights]
-    choices: dict[str, Choice]  # of the iterations of each tuning; empty where the last is taken
+    choices: dict[str, choice.Choice]  # empty where the last iterations are taken
 
 
 def _tune_in(folder: Path, args: Tune) -> None:
@@ -259,8 +258,8 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     run_folder.check_agreement(run.folder, begun, here)
     if begun.get("start", here["start"]) != here["start"]:  # a number came or went
         raise InputError(f"{run.folder}: begun with a start of other numbers beside Q and R")
-    write_json(path, {**begun, **now})
-    return {**begun, **now}
+    write_json(path, begun | now)
+    return begun | now
 
 
 def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
@@ -291,46 +290,29 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         )
         shifts.append(shift)
         name = "with_refreshed" + (str(count) if count > 1 else "")
-        title = f"tuning {run.name} with the net refreshed"
-        tuned |= step({name: run.problem(net.params)}, title=title)
-    choices = _choose(pool, run, tuned)
-    last = {name: one.tuning.converged for name, one in tuned.items()}
-    sets = {
-        "nominal": nominal(run.robot),
-        "expert": expert(run.robot),
-        **({} if run.args.start in NAMED_WEIGHTS else {"start": run.start}),
-        **{f"{name}_ten": tuned[name].tuning.ten for name in problems},
-        **(last | {name: one.weights for name, one in choices.items()}),
-    }
-    for name, weights in sets.items():
-        save_weights(run.folder / "weights" / f"{name}.json", weights)
-    return _Tuned(tuned, shifts, sets, choices)
-
-
-def _choose(pool: Executor, run: _Run, tuned: Mapping[str, Tuned]) -> dict[str, Choice]:
-    """The best iteration of each tuning, where the robot's description asks for the choice."""
-    count = run.robot.description.tuning.choice_plants
-    if not count:
-        return {}
+        problem = {name: run.problem(net.params)}
+        tuned |= step(problem, title=f"tuning {run.name} with the net refreshed")
     choices = choice.choose(
         pool,
         run.config,
         run.robot,
         {name: one.tuning for name, one in tuned.items()},
         [one.command for one in run.trajectories],
-        count,
         seconds=run.seconds,
         folder=run.artefacts / "choice",
-        title=f"choosing an iteration on {plural(count, 'plant')} around the simulator's",
         commit=run.commit,
     )
-    for name, one in choices.items():
-        say(
-            f"{name}: iteration {one.iteration} of {one.of} walks best on {plural(count, 'plant')} "
-            f"around the high-fidelity simulator: L {100 * (one.against_start - 1):+.0f} % against "
-            f"the start, the last one {100 * (one.last_against_start - 1):+.0f} %"
-        )
-    return choices
+    sets = {
+        "nominal": nominal(run.robot),
+        "expert": expert(run.robot),
+        **({} if run.args.start in NAMED_WEIGHTS else {"start": run.start}),
+        **{f"{name}_ten": tuned[name].tuning.ten for name in problems},
+        **{name: one.tuning.converged for name, one in tuned.items()},
+        **{name: one.weights for name, one in choices.items()},
+    }
+    for name, weights in sets.items():
+        save_weights(run.folder / "weights" / f"{name}.json", weights)
+    return _Tuned(tuned, shifts, sets, choices)
 
 
 def _walk_sets(
@@ -390,9 +372,8 @@ def _result(
     if tuned.shifts:
         result["refresh"] = tuned.shifts
     if tuned.choices:
-        result["chosen"] = {
-            name: {"iteration": one.iteration, "of": one.of} for name, one in tuned.choices.items()
-        }
+        chosen = tuned.choices.items()
+        result["chosen"] = {n: {"iteration": one.iteration, "of": one.of} for n, one in chosen}
     write_json(run.folder / RESULT, result)
     return result, by_name
 

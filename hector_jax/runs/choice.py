@@ -15,8 +15,11 @@ import numpy as np
 
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights
+from hector_jax.core.console import say
+from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
 from hector_jax.runs import verdicts
+from hector_jax.runs.metrics import Score
 from hector_jax.sim.world import Estimator, hfs_drawn
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
@@ -41,8 +44,6 @@ class Choice(NamedTuple):
     weights: Weights
     iteration: int  # accepted ones before it
     of: int  # accepted ones
-    against_start: float  # mean loss on the plants, by that of the start
-    last_against_start: float  # likewise, of the last iteration
 
 
 def choose(
@@ -51,60 +52,59 @@ def choose(
     robot: Robot,
     tunings: Mapping[str, Tuning],
     commands: Sequence[Command],
-    plants: int,
     *,
     seconds: float,
     folder: Path,
-    title: str,
     commit: str = "",
 ) -> dict[str, Choice]:
-    """Walk the paths of tunings and take the best point of each.
+    """Walk the paths of tunings and take the best point of each; nothing where no plants are asked.
 
     Args:
         pool: worker processes.
-        config, robot: controller and loss, nominal body.
+        config, robot: controller and loss, nominal body with the number of plants.
         tunings: by name; from one start.
         commands, seconds: what to walk, and how long. All commands count alike.
-        plants: how many to walk on.
         folder: of the scores, where walks that are there are not walked again.
-        title: for the person who waits.
         commit: to note with what is walked now.
     """
+    if not (count := robot.description.tuning.choice_plants):
+        return {}
     paths = {name: [i.weights for i in one.history if i.accepted] for name, one in tunings.items()}
     points = {
         name: sorted({round(share * (len(path) - 1)) for share in SHARES})
         for name, path in paths.items()
     }
-    label = lambda name, i: f"{name}-{i}" if i else "start"  # noqa: E731
-    sets = {label(name, i): paths[name][i] for name in paths for i in points[name]}
+    sets = {_label(name, i): paths[name][i] for name in paths for i in points[name]}
+    title = f"choosing an iteration on {plural(count, 'plant')} around the simulator's"
+    notes = {"title": title, "seconds": seconds, "folder": folder, "commit": commit}
     drawn = [
         hfs_drawn(_FIRST_SEED + k, 0.4, robot.description)._replace(estimator=_ESTIMATOR)
-        for k in range(plants)
+        for k in range(count)
     ]
-    each = []
-    for command in commands:
-        judged = verdicts.judge(
-            pool,
-            config,
-            robot,
-            sets,
-            command,
-            drawn,
-            range(plants),
-            title=title,
-            seconds=seconds,
-            folder=folder,
-            commit=commit,
-        )
-        L = {
-            n: np.mean([float(score.L) for score in scores]) for n, scores in judged.scores.items()
-        }
-        each.append({name: loss / L["start"] for name, loss in L.items()})
-    ratio = {name: float(np.mean([one[name] for one in each])) for name in sets}
+    each = [
+        verdicts.judge(pool, config, robot, sets, command, drawn, range(count), **notes).scores
+        for command in commands
+    ]
+    ratio = {name: np.mean([_against_start(one)[name] for one in each]) for name in sets}
 
     def best(name: str) -> Choice:
         path, last = paths[name], len(paths[name]) - 1
-        i = min(points[name], key=lambda i: ratio[label(name, i)])
-        return Choice(path[i], i, last, ratio[label(name, i)], ratio[label(name, last)])
+        i = min(points[name], key=lambda i: ratio[_label(name, i)])
+        say(
+            f"{name}: iteration {i} of {last} walks best there: L "
+            f"{100 * (ratio[_label(name, i)] - 1):+.0f} % against the start, the last one "
+            f"{100 * (ratio[_label(name, last)] - 1):+.0f} %"
+        )
+        return Choice(path[i], i, last)
 
     return {name: best(name) for name in paths}
+
+
+def _label(name: str, iteration: int) -> str:
+    return f"{name}-{iteration}" if iteration else "start"
+
+
+def _against_start(scores: Mapping[str, Sequence[Score]]) -> dict[str, float]:
+    """Mean loss of each set on the plants, by that of the start."""
+    L = {name: np.mean([float(one.L) for one in each]) for name, each in scores.items()}
+    return {name: float(loss / L["start"]) for name, loss in L.items()}

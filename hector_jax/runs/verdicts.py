@@ -120,6 +120,11 @@ def _file_name(config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk
     return f"{stem}-{name}-{seed}-{content_key(*parts, code=_CODE)}.npz"
 
 
+def _restored(one: ScoredWalk) -> ScoredWalk:
+    """A walk from a file, where texts are arrays."""
+    return one._replace(commit=str(one.commit), startup=str(one.startup))
+
+
 def _say_unsolved(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
     for name, each in walks.items():
         worst = np.max([walk.score.residual for walk in each])
@@ -164,20 +169,19 @@ def judge(
     Raises:
         InputError: the folder cannot be written.
     """
-    walk_config = config.rollout.walk
     jobs = {
         (name, seed): Job(weights, command, imperfections, seconds, seed, plant=plant)
         for imperfections, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
-
+    tick = config.rollout.walk.gait.tick
     with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
 
     def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
         there = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
         walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
         for case, walk in zip(missing, walks, strict=True):
-            samples = at_interval(walk, walk_config.gait.tick) if with_walk(case) else None
+            samples = at_interval(walk, tick) if with_walk(case) else None
             yield case, (_score_walk(pool, config, robot, jobs[case], walk, commit), samples)
 
     if folder is None:
@@ -189,11 +193,7 @@ def judge(
         }
         like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
-    walks = {
-        case: one._replace(commit=str(one.commit), startup=str(one.startup))
-        for case, (one, _) in results.items()
-    }
-    by_set = {name: [walks[name, seed] for seed in seeds] for name in sets}
+    by_set = {name: [_restored(results[name, seed][0]) for seed in seeds] for name in sets}
     _say_unsolved(by_set)
     _say_startup_falls(by_set)
     first = {name: results[name, seeds[0]][1] for name in sets if folder is not None}
