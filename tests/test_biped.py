@@ -21,16 +21,18 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.files import write_json
 from hector_jax.core.geometry import rot_x, rot_y, rot_z
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, has_fallen
 from hector_jax.grfm.collection import load_walks
 from hector_jax.robot import kinematics
-from hector_jax.robot.description import Description, read_description
+from hector_jax.robot.description import Description, TuningSettings, read_description
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses
 from hector_jax.robot.model import compile_model, describe, load_robot
 from hector_jax.runs import folder as runs
 from hector_jax.runs import nets, replay
 from hector_jax.runs.export import find_weights
 from hector_jax.runs.nets import CollectConfig
+from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mjx_model import batched_model, find_places
 from hector_jax.sim.walk import walk
@@ -220,6 +222,14 @@ def test_a_wrong_description_is_refused_in_one_line(tmp_path, old, new, words):
     assert "\n" not in message
     for word in words:
         assert word in message
+
+
+def test_a_lead_before_the_gait_begins_is_refused_with_its_key():
+    settings = TuningSettings(lead=1000)
+    robot = load_robot()
+    robot = robot._replace(description=replace(robot.description, tuning=settings))
+    with pytest.raises(InputError, match=r"hector.toml: tuning.lead .* at most \d+ .*1000"):
+        tune_config(robot)
 
 
 def test_a_description_that_is_missing_or_too_big_is_refused(tmp_path):

@@ -10,7 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.geometry import rot_x, rot_y, rot_z
-from hector_jax.robot.kinematics import foot_jacobians, foot_poses, inverse_legs, leg_gravity
+from hector_jax.robot.kinematics import (
+    _rotation_vector,
+    _rotation_vector_rates,
+    foot_jacobians,
+    foot_poses,
+    inverse_legs,
+    leg_gravity,
+)
 from hector_jax.robot.model import compile_model, describe, load_robot
 
 LEGS = {  # axes in the trunk frame, from the trunk down
@@ -173,3 +180,16 @@ def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
     np.testing.assert_allclose(
         jax.jvp(feet, (at(jnp.asarray(0.05)),), (rates,))[1], moved, atol=1e-6
     )
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 2e-4, 1.0, 3.0])
+def test_rates_of_a_rotation_vector_are_those_of_differences(angle):
+    vector = angle * np.array([2.0, -1.0, 2.0]) / 3.0
+
+    def turned(by):
+        whole = Rotation.from_rotvec(by) * Rotation.from_rotvec(vector)
+        return np.asarray(_rotation_vector(jnp.asarray(whole.as_matrix())))
+
+    steps = 1e-6 * np.eye(3)
+    expected = np.stack([turned(e) - turned(-e) for e in steps], axis=1) / 2e-6
+    np.testing.assert_allclose(_rotation_vector_rates(jnp.asarray(vector)), expected, atol=1e-8)

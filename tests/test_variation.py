@@ -7,15 +7,14 @@ import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
-from hector_jax.core.trajectory import Load, State, Wrench
-from hector_jax.grfm.effect import Effect, last_command
+from hector_jax.core.trajectory import State, Wrench
+from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.rollout import RolloutConfig, _moved_by, _within_friction, rollout
 from hector_jax.tuning.rollout import no_variation as as_believed
 
 ROBOT = load_robot()
-NOTHING = Load(jnp.zeros(3), jnp.zeros(3))
 FEET = jnp.array([[0.02, 0.08, 0.0], [-0.01, -0.08, 0.0]])
 DT = 0.01
 
@@ -44,7 +43,7 @@ def assert_same(one, other):
 
 def moved(variation, now, before=None, feet_before=FEET):
     before = now if before is None else before
-    now, before = Effect(now, NOTHING), Effect(before, NOTHING)
+    now, before = ground_effect(now), ground_effect(before)
     return _moved_by(variation, ROBOT, tilted(), now, FEET, before, feet_before, DT)
 
 
@@ -74,7 +73,7 @@ def test_a_force_through_the_true_centre_of_mass_does_not_turn_the_body():
     up = Wrench(jnp.zeros((2, 3)).at[0, 2].set(50.0), jnp.zeros((2, 3)))
     under = jnp.array([[0.01, -0.02, -0.4]] * 2)
     variation = no_variation()._replace(com=offset)
-    now = Effect(up, NOTHING)
+    now = ground_effect(up)
     found = _moved_by(variation, ROBOT, state, now, under, now, under, DT)
     np.testing.assert_allclose(found.ang_velocity, 0.0, atol=1e-12)
     beside = _moved_by(no_variation(), ROBOT, state, now, under, now, under, DT)

@@ -194,6 +194,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             norms=norms,
             errors=run.net.errors,
             shifts=tuned.shifts,
+            chosen=result.get("chosen", {}),
             pictures=_draw(run, tuned, standin, on_hfs),
             film=_film(run, standin),
             config=settings,
@@ -253,6 +254,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
         "command": commands[0] if len(commands) == 1 else commands,
         "seconds": run.seconds,
         "start": weights_tree(run.start),
+        "choice_plants": run.robot.description.tuning.choice_plants,
     }
     here = json.loads(as_json(now))
     run_folder.check_agreement(run.folder, begun, here)
@@ -379,13 +381,12 @@ def _result(
 
 
 def _draw(run: _Run, tuned: _Tuned, walks: ScoredWalks, on_hfs: ScoredWalks) -> list[Picture]:
-    net = run.net
-    effects = {"linear": as_effect(net.linear), "residual": as_effect(net.params)}
+    effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}
     sampled = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
     curves = fidelity.curves(run.robot, sampled, effects)
     histories = {name: one.tuning for name, one in tuned.tunings.items()}
     return pictures.of_run(
-        run.folder, run.config, tuned.sets, histories, walks.first, curves, net.course
+        run.folder, run.config, tuned.sets, histories, walks.first, curves, run.net.course
     )
 
 
@@ -395,6 +396,5 @@ def _film(run: _Run, walks: ScoredWalks) -> Picture | str:
         return "left out (--no-video)"
     pair = {name: walks.first[name] for name in ("nominal", "with")}
     film = run.folder / "film.mp4"
-    caption = "Nominal and tuned weights on the first stand-in plant."
     reason = pictures.film(film, run.robot, pair, run.folder / "film.png")
-    return reason or Picture(film.name, caption)
+    return reason or Picture(film.name, "Nominal and tuned weights on the first stand-in plant.")

@@ -159,7 +159,7 @@ def _samples(
     )
     error = to_yaw_frame(later(walk.feet) - planned, before.euler[:, 2])
     lands = later(walk.contact) & ~contact & ~later(walk.fallen)[:, None]
-    lands &= robot.description.tuning.touchdown_error
+    lands &= jnp.isfinite(error).all(axis=-1) & robot.description.tuning.touchdown_error
     window = Window(
         commands=commands,
         contact=contact,
@@ -168,7 +168,7 @@ def _samples(
     )
     finite = [
         jnp.isfinite(w).reshape(len(tick), -1).all(axis=1)
-        for w in jax.tree.leaves((commands, label, legs, error))
+        for w in jax.tree.leaves((commands, label, legs))
     ]
     solved = walk.residual[first:] <= SOLVED
     begin, end = config.gait.tick * tick[:, None], config.gait.tick * (tick[:, None] + 1)

@@ -34,9 +34,7 @@ class Effect(NamedTuple):
 
     wrench: Wrench  # of the ground on each foot
     legs: Load  # of the moving legs on the trunk; zero where phi does not model it
-    touchdown_error: Float[
-        Array, "*batch 2 3"
-    ]  # [m] from planned touchdown to where each foot lands
+    touchdown_error: Float[Array, "*batch 2 3"]  # [m] from planned touchdown to true one
 
 
 class Phi(NamedTuple):

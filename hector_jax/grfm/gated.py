@@ -1,15 +1,15 @@
 """The linear part of phi: gated by contact and by the time since the stance last switched.
 
-Three maps, each fitted by ridge regression to what the high-fidelity simulator shows:
+Three maps, each fitted to what the high-fidelity simulator shows:
 
 - **ground**: what the ground returns to a foot is the command itself (nothing, for a foot planned
   to swing), a bias of the tick since the switch, and terms in the latest changes of the commands.
 - **legs**: the push that the moving legs give the trunk, which a rigid body cannot know: a bias of
   the tick, and terms in the motion of the base and in the latest changes of the commands.
 - **touchdown**: how far from its planned touchdown a foot lands: a bias, and terms in the motion of
-  the base and in the horizontal force commanded on the other foot, by which the planned point
-  moves. A swinging leg sags and lags, so the lever of its force is not the planned one. The fit is
-  robust, because a robot that is about to fall lands anywhere.
+  the base and in the horizontal force commanded on the other foot, which accelerates the base and
+  so moves the planned point. A swinging leg sags and lags, so the lever of its force is not the
+  planned one. The fit is robust, because a robot that is about to fall lands anywhere.
 
 A command that stays is returned as it is, by construction. It has to be: the walks were recorded in
 closed loop, where the controller asks for whatever the ground withheld, so that over a step the
@@ -37,7 +37,7 @@ CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
 MOTION = 3  # of the base: yaw rate, forward and sideways velocity
 TOUCHDOWN = MOTION + 2  # and the force on the other foot, forward and sideways
 GATES = (0.0, 0.01, 0.03, 0.08, 0.19)  # [s] after a switch, where the terms of the legs may differ
-RIDGE, RIDGE_LEGS = 0.03, 1e-3  # penalty on standardised terms, relative to the number of samples
+RIDGE, RIDGE_MOTION = 0.03, 1e-3  # penalty on standardised terms, relative to the number of samples
 HUBER, HUBER_ROUNDS = 2.0, 20  # where errors count linearly, in medians of the error
 _SIGNS = np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])])  # of force and moment, by foot
 _FLOOR = 0.05  # least scale of a change, relative to the largest of its kind
@@ -183,7 +183,7 @@ def fit_gated(dataset: Dataset) -> GatedMap:
     term_scale = np.concatenate([_spread(view.motion[alone]), scale])
     terms = np.concatenate([view.motion, view.changes], axis=-1)[alone] / term_scale
     gated = (gate[alone][:, :, None] * terms[:, None]).reshape(len(terms), -1)
-    legs_bias, legs_slope = _ridge(RIDGE_LEGS, tick[alone], gated, legs[alone])
+    legs_bias, legs_slope = _ridge(RIDGE_MOTION, tick[alone], gated, legs[alone])
     maps = GatedMap(
         ticks=ticks,
         gates=gates,
@@ -196,12 +196,14 @@ def fit_gated(dataset: Dataset) -> GatedMap:
     return jax.tree.map(jnp.asarray, maps)
 
 
-def _touchdown_terms(view: View) -> Array:
+def _touchdown_terms(view: View) -> Float[Array, "*batch terms"]:
+    """Motion of the base and horizontal force on the other foot, as a foot sees them."""
     across = view.command[..., ::-1, :2] * jnp.array([1.0, -1.0], view.command.dtype)
     return jnp.concatenate([view.motion, across], axis=-1)
 
 
-def _fit_touchdown(view: View, dataset: Dataset) -> np.ndarray:
+def _fit_touchdown(view: View, dataset: Dataset) -> Float[np.ndarray, "terms 3"]:
+    """The map of the errors of touchdowns, of the samples in which a foot lands."""
     lands = dataset.lands
     if not lands.any():
         return np.zeros((1 + TOUCHDOWN, 3))
@@ -219,7 +221,7 @@ def _huber_ridge(terms: np.ndarray, y: np.ndarray) -> np.ndarray:
     one = np.ones((len(y), 1))
 
     def fit(y: np.ndarray, weight: np.ndarray) -> np.ndarray:
-        return np.concatenate(_ridge(RIDGE_LEGS, weight, weight * terms, weight * y))
+        return np.concatenate(_ridge(RIDGE_MOTION, weight, weight * terms, weight * y))
 
     def robust(y: np.ndarray) -> np.ndarray:
         found = fit(y, one)

@@ -52,7 +52,7 @@ def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any])
     """
     phi = variant_of(params)
     facts = {
-        "units": "N, N m",
+        "units": "N, N m, m",
         "frames": "yaw frame of the robot at the tick",
         "hidden": list(phi.widths(params)),
     }
@@ -106,19 +106,14 @@ def load_net(
     tree = {fields[field]: leaf for field, leaf in like._asdict().items()}
     tree, card = load_tree(path, tree, kind=card["kind"], robot=robot)
     params = like._replace(**{field: tree[entry] for field, entry in fields.items()})
-    params = jax.tree.map(
-        lambda zero, leaf: zero if leaf is None else leaf,
-        zeros,
-        params,
-        is_leaf=lambda x: x is None,
-    )
+    params = jax.tree.map(lambda zero, leaf: zero if leaf is None else leaf, zeros, params)
     if not all(np.isfinite(p).all() for p in jax.tree.leaves(params)):
         raise InputError(f"{path}: a parameter of the net is not finite")
     return params, name, card
 
 
 def _is_in_file(path: Any, arrays: Any) -> bool:
-    """Whether a file has a parameter: files of before it was there have no `touchdown`."""
+    """Whether a file has a parameter; older files have no `touchdown`."""
     name = jax.tree_util.keystr(path, simple=True, separator=".")
     return not name.endswith("touchdown") or name in arrays
 

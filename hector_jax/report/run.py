@@ -32,6 +32,7 @@ class Report(NamedTuple):
     environment: Mapping[str, str]
     command: str  # that makes this run again
     shifts: Sequence[Mapping[str, Any]] = ()  # of each refresh: nets.refresh
+    chosen: Mapping[str, Mapping[str, int]] = {}  # iteration that was taken, where not the last
 
 
 def write_report(folder: Path, report: Report) -> Path:
@@ -49,12 +50,13 @@ def write_report(folder: Path, report: Report) -> Path:
     return folder / "report.md"
 
 
-def tuning_section(name: str, tuning: Tuning) -> str:
+def tuning_section(name: str, tuning: Tuning, chosen: Mapping[str, int] | None = None) -> str:
     """What a tuning did, under a heading of its name; one along walks begins after the paper's."""
     return render(
         "tuning.md.j2",
         name=name,
         tuning=tuning,
+        chosen=chosen,
         paper=PAPER_ITERATIONS,
         refusals=_refusals,
         at_bounds=_at_bounds,

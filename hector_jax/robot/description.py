@@ -25,7 +25,7 @@ model's; a description rides on its `Robot` and is static under jit.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -96,9 +96,7 @@ class TuningSettings:
 
     lead: Annotated[int, NOT_NEGATIVE] = 0  # gait ticks of a rollout in place, before the command
     touchdown_error: bool = False  # whether the net learns how far from the plan the feet land
-    choice_plants: Annotated[int, NOT_NEGATIVE] = (
-        0  # where the best iteration is chosen; 0: the last
-    )
+    choice_plants: Annotated[int, NOT_NEGATIVE] = 0  # on which an iteration is chosen; 0: the last
 
     def __post_init__(self) -> None:
         check(self)
@@ -124,8 +122,9 @@ class Description:
     nominal: tuple[Triple, ...] | None = None  # in the order of _Diagonals; None: as HECTOR's
     expert: tuple[Triple, ...] | None = None  # likewise
     loss: tuple[tuple[str, float], ...] = ()  # alphas by term; of the others those of the paper
-    tuning: TuningSettings = TuningSettings()
     plants: PlantSizes = PlantSizes()
+    # no part of its repr, of which hashes of a robot are made: walks do not depend on it
+    tuning: TuningSettings = field(default=TuningSettings(), repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "control", _frozen(self.control))

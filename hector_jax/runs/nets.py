@@ -205,7 +205,7 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
     about = {
         "made_of": made_of[0],
         **({"and_of": made_of[1:]} if made_of[1:] else {}),
-        "settings": training_settings(config),
+        "settings": training_settings(config, robot),
         "samples": {**sizes, "dropped": parts.dropped},
         "held_out": held_out,
         "errors": errors,
@@ -238,7 +238,7 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
         linear = jax.tree.unflatten(structure, map(np.array, about["linear"]))
         held_out = list(about["held_out"])
         settings, made_of = dict(about["settings"]), dict(about["made_of"])
-        trained = {k: v for k, v in settings.items() if k != "code"}
+        trained = {k: v for k, v in settings.items() if k not in ("code", "touchdown_error")}
         config = from_table(f"{path}: about.settings", TrainConfig, trained)
         course = History(**{n: np.array(about["course"][n], float) for n in History._fields})
         errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
@@ -248,9 +248,10 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
     return TrainedNet(params, linear, errors, course, config, (), held_out), followed_from
 
 
-def training_settings(config: TrainConfig) -> dict[str, Any]:
+def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:
     """All that a net follows from beside its walks, as JSON values for its card."""
-    return {**asdict(config), "code": code_hash(*TRAINING_CODE)}
+    learned = {"touchdown_error": robot.description.tuning.touchdown_error}
+    return {**asdict(config), **learned, "code": code_hash(*TRAINING_CODE)}
 
 
 def load_or_train(
@@ -279,7 +280,7 @@ def load_or_train(
         if not path.exists():
             return _train(config, robot, (walks,), path)
     trained, about = load_net(path, robot, config.variant)
-    check_settings(path, about["settings"], training_settings(config))
+    check_settings(path, about["settings"], training_settings(config, robot))
     check_settings(path, about["made_of"], made_of)
     return trained._replace(folders=(walks,))
 

@@ -242,10 +242,13 @@ def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
     Raises:
         InputError: one line naming the file and what is wrong in it.
     """
-    try:
-        rollout = RolloutConfig(walk=walk_config(robot), lead=robot.description.tuning.lead)
-    except InputError as error:
-        raise InputError(f"{robot.description.path}: {error}") from None
+    walk, lead = walk_config(robot), robot.description.tuning.lead
+    if lead > -walk.gait.first_tick:
+        raise InputError(
+            f"{robot.description.path}: tuning.lead must be at most {-walk.gait.first_tick} ticks, "
+            f"those of the gait before the command, got {lead}"
+        )
+    rollout = RolloutConfig(walk=walk, lead=lead)
     return TuneConfig(rollout=rollout, loss=loss_of_robot(robot.description), **settings)
 
 

@@ -85,9 +85,10 @@ def walk_all(
 
 
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
-    """A walk on the plain single rigid body, `seconds` long, from standing."""
+    """A walk on the plain single rigid body, `seconds` long, begun as a rollout of a tuning."""
     controller = walk_config(robot)
-    config = RolloutConfig(controller, ticks=round(seconds / controller.gait.tick))
+    ticks, lead = round(seconds / controller.gait.tick), robot.description.tuning.lead
+    config = RolloutConfig(controller, ticks=ticks, lead=lead)
     walked = jax.jit(rollout, static_argnums=0)
     anchor = standing_anchor(robot)
     return jax.device_get(walked(config, robot, weights, command, anchor, last_command))

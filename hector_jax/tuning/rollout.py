@@ -2,7 +2,7 @@
 
 This is the only world that is differentiated. A tick solves the MPC, asks phi what the ground
 returns and moves the body; in between, nothing is remembered but what `Carry` holds. A foot in the
-air is carried at its planned touchdown point, where an early touchdown that phi predicts acts too.
+air is carried where phi says that it lands, and an early touchdown that phi predicts acts there.
 
 A `Variation` makes the body and its ground differ from what the controller believes, for weights
 that have to bear with that.
