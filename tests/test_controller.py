@@ -204,7 +204,7 @@ def test_the_numbers_beside_the_weights_are_those_of_the_weights_or_of_the_confi
     assert (parameters.footstep.turn, parameters.legs.height) == (0.9, 0.1)
     jax.tree.map(np.testing.assert_array_equal, parameters.mpc.weights, expert())
     for name, one in TUNABLES.items():
-        assert np.shape(one.read(CONFIG.parameters(expert()))) == one.shape, name
+        assert np.shape(one.read(CONFIG.parameters(expert()))) == one.shape(), name
 
 
 def test_before_the_gait_both_feet_share_the_weight():
