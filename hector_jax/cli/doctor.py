@@ -84,8 +84,8 @@ def examine() -> tuple[dict[str, str], list[str]]:
         return facts, faults
     faults += [
         f"self-test: the robot does not walk in {world}"
-        for world, walked in walks.items()
-        if walked.fallen.any() or not walked.residual.max() <= SOLVED
+        for world, trajectory in walks.items()
+        if trajectory.fallen.any() or not trajectory.residual.max() <= SOLVED
     ]
     try:
         facts["video"] = f"works ({_film(robot, walks['ideal'])})"
@@ -106,8 +106,8 @@ def _walks(robot: Robot) -> dict[str, Trajectory]:
     }
 
 
-def _film(robot: Robot, walked: Trajectory) -> str:
+def _film(robot: Robot, trajectory: Trajectory) -> str:
     """Draw a film; the back end that drew it."""
     with tempfile.TemporaryDirectory() as folder:
-        pair = motions(robot, {"one": walked, "other": walked})
+        pair = motions(robot, {"one": trajectory, "other": trajectory})
         return write_film(Path(folder) / "film.mp4", robot, pair, VideoConfig(rate=2))

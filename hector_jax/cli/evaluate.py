@@ -41,8 +41,8 @@ def evaluate(args: Evaluate) -> None:
     config = tunings.tune_config(robot)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        known = pool, config, robot, sets, course.command, plants, seeds
-        walks = verdicts.judge(*known, title=title, seconds=seconds, plant=plant)
+        inputs = pool, config, robot, sets, course.command, plants, seeds
+        walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
     result = metrics.as_result(verdict, args.world)
     if plant is not None:
@@ -84,13 +84,13 @@ def walk(args: Walk) -> None:
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
     # without a plan it is no fall of these weights
-    walked = _Walked(score, upright, startup, bool(score.fallen) and not unsolved)
+    result = _Walked(score, upright, startup, bool(score.fallen) and not unsolved)
     if args.json:
-        print(as_json(_as_table(walked, plans, unsolved, plant)))
+        print(as_json(_as_table(result, plans, unsolved, plant)))
     else:
         on = "" if plant is None else f" on {plant.description.name}"
         what = f"{course.name} in {args.world}{on}, {printable(args.weights)} weights"
-        _print_walk(walked, loss, what)
+        _print_walk(result, loss, what)
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
@@ -117,21 +117,21 @@ class _Walked(NamedTuple):
 
 
 def _as_table(
-    walked: _Walked, plans: np.ndarray, unsolved: int, plant: Robot | None
+    result: _Walked, plans: np.ndarray, unsolved: int, plant: Robot | None
 ) -> dict[str, Any]:
-    score, startup = walked.score, walked.startup
+    score, startup = result.score, result.startup
     losses = {part: float(value) for part, value in score.losses.items()}
     errors = {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
     solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
-    told = {"seconds": walked.upright if startup is None else startup.time, "fell": walked.fell}
-    told |= {} if startup is None else {"startup": startup._asdict()}
-    told |= {} if plant is None else {"plant": plant.description.name}
+    summary = {"seconds": result.upright if startup is None else startup.time, "fell": result.fell}
+    summary |= {} if startup is None else {"startup": startup._asdict()}
+    summary |= {} if plant is None else {"plant": plant.description.name}
     # a walk that falls at once has no errors
-    return {**told, **losses, **errors, **solved}
+    return {**summary, **losses, **errors, **solved}
 
 
-def _print_walk(walked: _Walked, loss: Loss, what: str) -> None:
-    score, upright, startup, fell = walked
+def _print_walk(result: _Walked, loss: Loss, what: str) -> None:
+    score, upright, startup, fell = result
     end = "fell after" if fell else "ended after" if score.fallen else "walked"
     end = f"{end} {upright:.2f} s" if startup is None else str(startup)
     terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in loss)

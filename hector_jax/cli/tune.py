@@ -216,8 +216,8 @@ def _say_what_no_weights_mend(
     """Walk once with nominal weights on the simulator; a line for what is not the weights."""
     seconds = course.seconds or Walk.seconds
     job = Job(nominal(robot), course.command, hfs(robot.description), seconds)
-    known = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-    for line in pool.submit(not_the_weights, *known).result():
+    inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
+    for line in pool.submit(not_the_weights, *inputs).result():
         say(f"before any tuning, {course.name} on hfs with nominal weights: {line}")
 
 

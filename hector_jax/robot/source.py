@@ -182,11 +182,11 @@ def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarr
     description, model = file.description, file.model
     path, pose, upright = description.model, description.standing, np.array([1.0, 0.0, 0.0, 0.0])
     names = {model.joint(j).name: j for j in range(model.njnt)}
-    known = (*description.joints, *description.weld)
+    hinges = (*description.joints, *description.weld)
     if not isinstance(pose, str):
         for name, _ in pose:
-            require(path, "joint", name, known)
-        angles = dict.fromkeys((names[name] for name in known), 0.0)
+            require(path, "joint", name, hinges)
+        angles = dict.fromkeys((names[name] for name in hinges), 0.0)
         return angles | {names[name]: angle for name, angle in pose}, upright
     keys = [key for key in file.spec.keys if key.name == pose]
     hint = "; a URDF has none" if urdf else ""
@@ -195,7 +195,7 @@ def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarr
     qpos = np.array(keys[0].qpos)
     text = f"keyframe {pose!r} has {len(qpos)} numbers, expected {model.nq}"
     expect(path, len(qpos) == model.nq, text)
-    angles = {names[name]: float(qpos[model.jnt_qposadr[names[name]]]) for name in known}
+    angles = {names[name]: float(qpos[model.jnt_qposadr[names[name]]]) for name in hinges}
     if file.free >= 0:
         start = model.jnt_qposadr[file.free]
         upright = qpos[start + 3 : start + 7]

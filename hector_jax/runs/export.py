@@ -123,15 +123,15 @@ def export(
     blobs = {
         place: export_controller(config, robot, weights, platform=place) for place in PLATFORMS
     }
-    walked = record(config, robot, weights, command=command, seconds=seconds)
+    recorded = record(config, robot, weights, command=command, seconds=seconds)
     _, example = controller(config, robot, weights)
-    result = check(config, load_controller(blobs["cpu"]), example, walked)
+    result = check(config, load_controller(blobs["cpu"]), example, recorded)
     _require_same(result)
     # the card vouches for the others: it goes first and comes last
     (folder / "controller.json").unlink(missing_ok=True)
     save_weights(folder / "weights.json", weights, SCHEMA)
     write_json(folder / SCHEMA, weights_schema(robot))
-    np.savez(rows := io.BytesIO(), **as_arrays(walked))
+    np.savez(rows := io.BytesIO(), **as_arrays(recorded))
     contents = {f"controller-{place}.jaxexport": blob for place, blob in blobs.items()}
     contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
     contents["check.npz"] = rows.getvalue()
@@ -142,12 +142,12 @@ def export(
         "name": name,
         "sha256": {one: hashlib.sha256((folder / one).read_bytes()).hexdigest() for one in files},
         "signature": signature(example),
-        "constants": _constants(config, robot, walked.lead),
+        "constants": _constants(config, robot, recorded.lead),
         "weights": weights_tree(weights),
         "controller": to_table(config),
         "robot": tree_hash(robot),
         "versions": versions(),
-        "check": {"milliseconds": len(walked.torque), **result._asdict()},
+        "check": {"milliseconds": len(recorded.torque), **result._asdict()},
     }
     write_json(folder / "controller.json", card)
     return card

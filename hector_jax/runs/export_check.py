@@ -61,8 +61,8 @@ def record(
         entries = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(entries[sensing.coordinates(world)])
 
-    walked = walk(config, robot, Job(weights, command, plant, seconds), on_sample=append)
-    if np.asarray(walked.fallen).any():
+    trajectory = walk(config, robot, Job(weights, command, plant, seconds), on_sample=append)
+    if np.asarray(trajectory.fallen).any():
         raise InputError(
             f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "
             "no walk to check the export on"
@@ -83,9 +83,9 @@ def record(
         measurement=host(measurements(np.stack(rows[:-1]))),
         command=command,
         standing=host(standing_anchor(robot)),
-        anchor=host(anchor_at(robot, jax.tree.map(jnp.asarray, walked.initial), 0)),
+        anchor=host(anchor_at(robot, jax.tree.map(jnp.asarray, trajectory.initial), 0)),
         lead=lead,
-        wrench=host(walked.command),
+        wrench=host(trajectory.command),
         torque=np.stack(torques),
     )
 
@@ -102,7 +102,7 @@ class Check(NamedTuple):
 
 
 def check(
-    config: WalkConfig, control: Callable[..., tuple], example: tuple, walked: Record
+    config: WalkConfig, control: Callable[..., tuple], example: tuple, recorded: Record
 ) -> Check:
     """Run an exported controller along a recorded walk, and time it, numpy in, numpy out.
 
@@ -110,12 +110,12 @@ def check(
         config: for its times.
         control: from `load_controller`.
         example: its arguments, from `controller`.
-        walked: from `record`.
+        recorded: from `record`.
     """
-    state, joints, rates = walked.measurement
+    state, joints, rates = recorded.measurement
     measured = state._asdict() | {"joints": joints, "joint_rates": rates}
     command, standing, anchor = jax.device_put(
-        [part._asdict() for part in (walked.command, walked.standing, walked.anchor)]
+        [part._asdict() for part in (recorded.command, recorded.standing, recorded.anchor)]
     )
     jax.block_until_ready(control(*example))  # the first call is slower
     carry, answers, spent = example[0], [], []
@@ -123,7 +123,7 @@ def check(
         now = {name: rows[i] for name, rows in measured.items()}
         wall, cpu = time.perf_counter(), time.process_time()
         carry, out = control(
-            carry, np.int32(i), now, command, standing if i < walked.lead else anchor
+            carry, np.int32(i), now, command, standing if i < recorded.lead else anchor
         )
         np.asarray(out["torque"])
         spent.append((time.perf_counter() - wall, time.process_time() - cpu))
@@ -138,23 +138,23 @@ def check(
         return {name: float(value) for name, value in values.items()}
 
     return Check(
-        force=float(np.abs(out["force"][walked.lead :] - walked.wrench.force).max()),
-        moment=float(np.abs(out["moment"][walked.lead :] - walked.wrench.moment).max()),
-        torque=float(np.abs(out["torque"] - walked.torque).max()),
+        force=float(np.abs(out["force"][recorded.lead :] - recorded.wrench.force).max()),
+        moment=float(np.abs(out["moment"][recorded.lead :] - recorded.wrench.moment).max()),
+        torque=float(np.abs(out["torque"] - recorded.torque).max()),
         unsolved=int((~np.isin(out["status"][plans], (Status.SOLVED, Status.NOT_UNIQUE))).sum()),
         plan_ms=spread(np.array(spent)[plans]),
         hold_ms=spread(np.array(spent)[~plans]),
     )
 
 
-def as_arrays(walked: Record) -> dict[str, Any]:
+def as_arrays(recorded: Record) -> dict[str, Any]:
     """A record as named arrays, for whoever checks the controller on the robot's computer."""
-    state, joints, rates = walked.measurement
+    state, joints, rates = recorded.measurement
     groups = {
         "measured": state._asdict() | {"joints": joints, "joint_rates": rates},
-        "command": walked.command._asdict(),
-        "standing": walked.standing._asdict(),
-        "anchor": walked.anchor._asdict(),
-        "out": {**walked.wrench._asdict(), "torque": walked.torque},
+        "command": recorded.command._asdict(),
+        "standing": recorded.standing._asdict(),
+        "anchor": recorded.anchor._asdict(),
+        "out": {**recorded.wrench._asdict(), "torque": recorded.torque},
     }
     return {f"{group}.{name}": row for group, rows in groups.items() for name, row in rows.items()}

@@ -169,7 +169,7 @@ def replay(path: Path) -> Replay:
     is_cpu = jax.default_backend() == "cpu"
     with jax.default_device(None if is_cpu else jax.local_devices(backend="cpu")[0]):
         evaluation = jax.device_get(tune_step(config, *inputs))
-        walked = jax.device_get(jax.jit(rollout, static_argnums=0)(config.rollout, *inputs))
+        trajectory = jax.device_get(jax.jit(rollout, static_argnums=0)(config.rollout, *inputs))
     same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, evaluation)
     then, now = about["environment"], environment()
     return Replay(
@@ -177,7 +177,7 @@ def replay(path: Path) -> Replay:
         iteration=about["iteration"],
         recorded=_summary(about["reason"], dump.seen),
         again=_summary(rejection_reason(config, evaluation), evaluation),
-        first=_first(config, walked),
+        first=_first(config, trajectory),
         same=all(jax.tree.leaves(same)),
         changed={
             name: [then.get(name), now.get(name)]
@@ -198,12 +198,13 @@ def _summary(reason: str, evaluation: Evaluation) -> dict[str, Any]:
     return {"reason": reason, **{name: float(x) for name, x in numbers.items()}}
 
 
-def _first(config: TuneConfig, walked: Trajectory) -> dict[str, int | None]:
-    rows = [np.reshape(x, (len(walked.fallen), -1)) for x in (*walked.state, *walked.command)]
+def _first(config: TuneConfig, trajectory: Trajectory) -> dict[str, int | None]:
+    series = *trajectory.state, *trajectory.command
+    rows = [np.reshape(x, (len(trajectory.fallen), -1)) for x in series]
     wrong = {
         "not finite": ~np.isfinite(np.concatenate(rows, axis=1)).all(axis=1),
-        "fallen": walked.fallen,
-        "unsolved": ~(walked.residual <= config.residual),
+        "fallen": trajectory.fallen,
+        "unsolved": ~(trajectory.residual <= config.residual),
     }
     return {name: int(np.argmax(at)) if at.any() else None for name, at in wrong.items()}
 

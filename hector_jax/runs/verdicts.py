@@ -79,8 +79,8 @@ def walk_all(
     pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
 ) -> Walks:
     """Walks of jobs whose commands are alike, at the plan interval."""
-    walked = walk_jobs(pool, config, robot, jobs, title)
-    walks = [at_interval(walk, config.rollout.walk.gait.tick) for walk in walked]
+    trajectories = walk_jobs(pool, config, robot, jobs, title)
+    walks = [at_interval(walk, config.rollout.walk.gait.tick) for walk in trajectories]
     return Walks(stack(jobs), stack(walks))
 
 
@@ -89,9 +89,9 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     controller = walk_config(robot)
     ticks, lead = round(seconds / controller.gait.tick), robot.description.tuning.lead
     config = RolloutConfig(controller, ticks=ticks, lead=lead)
-    walked = jax.jit(rollout, static_argnums=0)
+    roll_out = jax.jit(rollout, static_argnums=0)
     anchor = standing_anchor(robot)
-    return jax.device_get(walked(config, robot, weights, command, anchor, last_command))
+    return jax.device_get(roll_out(config, robot, weights, command, anchor, last_command))
 
 
 def _score_walk(
@@ -99,8 +99,8 @@ def _score_walk(
 ) -> ScoredWalk:
     up, startup = int(np.sum(~np.asarray(walk.fallen))), None
     if not up:
-        known = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-        startup = pool.submit(startup_fall, *known).result()
+        inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
+        startup = pool.submit(startup_fall, *inputs).result()
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
     upright = np.asarray(up * float(walk.period) if startup is None else startup.time)
     text = "" if startup is None else str(startup)

@@ -182,8 +182,8 @@ def _grows(error: Float[np.ndarray, " n"], tilt: Float[np.ndarray, " n"]) -> boo
     return bool(early < middle < late)
 
 
-def _steady_height(walked: Trajectory, rows: Bool[np.ndarray, " T"]) -> list[str]:
-    errors = (walked.state.position - walked.reference.position)[rows, 2]
+def _steady_height(trajectory: Trajectory, rows: Bool[np.ndarray, " T"]) -> list[str]:
+    errors = (trajectory.state.position - trajectory.reference.position)[rows, 2]
     if len(errors) < 3:
         return []
     error, parts = errors.mean(), [part.mean() for part in np.array_split(errors, 3)]

@@ -157,10 +157,10 @@ _window_gradient = jax.jit(window_gradient, static_argnums=0, static_argnames="m
 
 
 def follow(
-    config: TuneConfig, robot: Robot, *walked: Any, measured: bool = True
+    config: TuneConfig, robot: Robot, *window: Any, measured: bool = True
 ) -> tuple[Trace, Evaluation]:
     """`window_gradient` with the rollout and the loss of a tuning, compiled."""
-    return _window_gradient(config.rollout, config.loss, robot, *walked, measured=measured)
+    return _window_gradient(config.rollout, config.loss, robot, *window, measured=measured)
 
 
 def _with_command_before(
@@ -240,8 +240,8 @@ def step_adaptation(
     trace = carry.trace or init_trace(anchor, state, last, carry.weights)
     carry = carry._replace(trace=trace)
     if len(carry.used) == config.window:
-        walked = carry.states, carry.used, tick - config.window
-        trace, evaluation = _follow_window(config, robot, command, anchor, effect, trace, *walked)
+        window = carry.states, carry.used, tick - config.window
+        trace, evaluation = _follow_window(config, robot, command, anchor, effect, trace, *window)
         status = step_status(config.tune, evaluation)
         row = carry.windows, carry.weights, evaluation, status, carry.led
         iteration = Iteration(*jax.tree.map(np.asarray, row))
