@@ -84,6 +84,16 @@ def test_the_errors_by_phase_and_axis_make_up_the_whole(parts):
     axes = share * told.stance + (1 - share) * told.swing
     np.testing.assert_allclose(axes[:3].mean(), told.force)
     np.testing.assert_allclose(axes[3:].mean(), told.moment)
+    assert not told.touchdown.any()  # HECTOR's description does not ask for it
+
+
+def test_the_error_of_touchdowns_is_that_of_feet_that_land(parts):
+    data = parts[1]
+    away = np.where(data.lands[..., None], np.nan, np.ones(3))
+    lands = ~data.window.contact & (np.arange(len(data.walk)) % 3 == 0)[:, None]
+    away = np.where(lands[..., None], [0.02, -0.01, 0.5], away)
+    learned = data._replace(lands=lands, touchdown_error=away)
+    np.testing.assert_allclose(errors(last_command, learned).touchdown, [4.0, 1.0])
 
 
 def test_the_kept_nets_are_those_of_the_best_held_out_epochs(parts, trained):

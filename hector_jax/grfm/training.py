@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import check
-from hector_jax.core.trajectory import Wrench
 from hector_jax.grfm.dataset import Dataset
-from hector_jax.grfm.effect import Window
+from hector_jax.grfm.effect import Effect, Window
 from hector_jax.grfm.nets import FitConfig, History, Progress
 from hector_jax.grfm.network import VARIANTS, Params
 
@@ -36,6 +35,8 @@ class Errors(NamedTuple):
     moment: float
     stance: Float[np.ndarray, "6"]  # per axis, of feet planned to stand
     swing: Float[np.ndarray, "6"]  # of feet planned to swing
+    # forward and sideways [cm^2], of feet that land; zero where no touchdowns are learned
+    touchdown: Float[np.ndarray, "2"]
 
 
 def train(
@@ -66,21 +67,25 @@ def train(
 
 
 @jax.jit
-def predict(effect: jax.tree_util.Partial, window: Window) -> Wrench:
+def predict(effect: jax.tree_util.Partial, window: Window) -> Effect:
     """What a phi returns for a batch of windows."""
-    return jax.vmap(effect)(window).wrench
+    return jax.vmap(effect)(window)
 
 
 def errors(effect: jax.tree_util.Partial, dataset: Dataset) -> Errors:
     """Mean square errors of a phi on a dataset."""
     predicted = predict(effect, jax.tree.map(jnp.asarray, dataset.window))
-    squares = jax.tree.map(lambda g, label: np.asarray((g - label) ** 2), predicted, dataset.label)
+    squares = jax.tree.map(
+        lambda g, label: np.asarray((g - label) ** 2), predicted.wrench, dataset.label
+    )
     axes = np.concatenate(squares, axis=-1)  # (n, 2, 6)
+    away = (predicted.touchdown_error - dataset.touchdown_error)[dataset.lands]
     return Errors(
         force=float(squares.force.mean()),
         moment=float(squares.moment.mean()),
         stance=axes[dataset.window.contact].mean(axis=0),
         swing=axes[~dataset.window.contact].mean(axis=0),
+        touchdown=1e4 * np.square(away[:, :2]).sum(axis=0) / max(len(away), 1),
     )
 
 

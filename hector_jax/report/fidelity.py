@@ -67,7 +67,7 @@ def by_phase(
     since, stands = dataset.window.since_switch, np.asarray(dataset.window.contact)
     errors: dict[str, dict[str, dict[str, list[float]]]] = {}
     for name, effect in effects.items():
-        guess = predict(effect, jax.tree.map(jnp.asarray, dataset.window))
+        guess = predict(effect, jax.tree.map(jnp.asarray, dataset.window)).wrench
         pairs = zip(guess, dataset.label, strict=True)
         square = np.concatenate([np.square(np.asarray(g) - y) for g, y in pairs], axis=-1)
         errors[name] = {}
@@ -206,7 +206,7 @@ def curves(
     wrenches = {
         "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
         "measured": samples.label,
-        **{names[n]: predict(effect, window) for n, effect in effects.items() if n in names},
+        **{names[n]: predict(effect, window).wrench for n, effect in effects.items() if n in names},
     }
 
     def by_tick(values: Any) -> np.ndarray:
@@ -239,7 +239,7 @@ def write_report(
 
 
 def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
-    """Mean square errors, labelled: of force and moment, then by contact and axis.
+    """Mean square errors, labelled: of force and moment, by contact and axis, of touchdowns.
 
     Args:
         errors: of several phis, as `training.report` has them.
@@ -254,5 +254,10 @@ def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[floa
             (f"{axis}, {contact} [{_UNITS[kind]}]", [one[contact][i] for one in errors])
             for contact in ("stance", "swing")
             for i, (axis, kind) in enumerate(_AXES.items())
+        ),
+        *(
+            (f"touchdown, {axis} [cm^2]", [one["touchdown"][i] for one in errors])
+            for i, axis in enumerate(("forward", "sideways"))
+            if all(any(one.get("touchdown", ())) for one in errors)
         ),
     ]
