@@ -89,9 +89,8 @@ def test_the_errors_by_phase_and_axis_make_up_the_whole(parts):
 
 def test_the_error_of_touchdowns_is_that_of_feet_that_land(parts):
     data = parts[1]
-    away = np.where(data.lands[..., None], np.nan, np.ones(3))
     lands = ~data.window.contact & (np.arange(len(data.walk)) % 3 == 0)[:, None]
-    away = np.where(lands[..., None], [0.02, -0.01, 0.5], away)
+    away = np.where(lands[..., None], [0.02, -0.01, 0.5], np.nan)
     learned = data._replace(lands=lands, touchdown_error=away)
     np.testing.assert_allclose(errors(last_command, learned).touchdown, [4.0, 1.0])
 
