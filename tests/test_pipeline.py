@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import table
+from model import LEARNS_TOUCHDOWNS
 from pretend import pretend_history, pretend_walk
 from synthetic import synthetic_walk
 
@@ -82,6 +83,18 @@ def test_no_walk_is_in_two_parts(tmp_path, robot):
     net = nets.train(TrainConfig("paper", epochs=1), robot, tmp_path, tmp_path / "net.npz")
     held = nets.held_out_walks(robot, net)
     assert set(np.asarray(held.job.seed)) == walks[2]
+
+
+def test_a_net_that_learns_no_touchdowns_says_so_where_they_are_asked_for(tmp_path, capsys):
+    def walks(jobs):
+        return (synthetic_walk(job.seed, 45) for job in jobs)
+
+    collect(tmp_path, draw_jobs(0, 5), walks, robot=LEARNS_TOUCHDOWNS)
+    for variant, says in (("linear", 1), ("gated", 0)):
+        config, path = TrainConfig(variant), tmp_path / f"{variant}.npz"
+        nets.train(config, LEARNS_TOUCHDOWNS, tmp_path, path)
+        line = f"tuning.touchdown_error: the net {variant} does not learn where the feet land"
+        assert capsys.readouterr().err.count(line) == says
 
 
 def test_a_net_is_trained_once(tmp_path, robot, quick, monkeypatch):

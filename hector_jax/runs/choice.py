@@ -21,7 +21,7 @@ from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.metrics import Score
-from hector_jax.sim.world import Estimator, hfs_drawn
+from hector_jax.sim.world import hfs_drawn, truth
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 # of the accepted iterations: where a path is walked
@@ -29,15 +29,13 @@ SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
 _FIRST_SEED = 7000  # of the plants, drawn as `hfs-varied` but none of its seeds
 # White noise: encoders of 14 bits; a gyroscope on a vibrating trunk; velocity and position by both
 # over a leg of about 0.7 m.
-_ESTIMATOR = Estimator(
-    position=np.array(0.001),
-    velocity=np.array(0.02),
-    angle=np.array(0.001),
-    ang_velocity=np.array(0.02),
-    joint=np.array(0.0004),
-    drift=np.array(0.0),
-    drift_yaw=np.array(0.0),
-)
+_SIGMAS = {
+    "position": 0.001,  # [m]
+    "velocity": 0.02,  # [m/s]
+    "angle": 0.001,  # [rad]
+    "ang_velocity": 0.02,  # [rad/s]
+    "joint": 0.0004,  # [rad]
+}
 
 
 class Choice(NamedTuple):
@@ -79,8 +77,9 @@ def choose(
     sets = {_label(name, i): paths[name][i].weights for name in paths for i in points[name]}
     title = f"choosing an iteration on {plural(count, 'plant')} drawn around the hfs"
     notes = {"title": title, "seconds": seconds, "folder": folder, "commit": commit}
+    noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
     drawn = [
-        hfs_drawn(_FIRST_SEED + k, 0.4, robot.description)._replace(estimator=_ESTIMATOR)
+        hfs_drawn(_FIRST_SEED + k, 0.4, robot.description)._replace(estimator=noisy)
         for k in range(count)
     ]
     each = [

@@ -13,7 +13,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import nominal
-from hector_jax.core.console import bar, say_if_slow
+from hector_jax.core.console import bar, say, say_if_slow
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError, plural, short_repr
@@ -200,6 +200,11 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
             "net": network.as_effect(params),
         }
         errors = training.report(effects, parts.held_out)
+    if parts.held_out.lands.any() and errors["net"]["touchdown"] == errors["raw"]["touchdown"]:
+        say(
+            f"{robot.description.path}: tuning.touchdown_error: the net {config.variant} does not "
+            "learn where the feet land"
+        )
     held_out = np.unique(parts.held_out.walk).tolist()
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {

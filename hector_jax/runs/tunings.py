@@ -13,11 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
-from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
@@ -33,7 +31,7 @@ from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import rollout_config
 
 # modules that decide the numbers, for `content_key`
 TUNING_CODE = ("tuning.difftune", "grfm.network")
@@ -242,14 +240,8 @@ def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
     Raises:
         InputError: one line naming the file and what is wrong in it.
     """
-    walk, lead = walk_config(robot), robot.description.tuning.lead
-    if lead > -walk.gait.first_tick:
-        raise InputError(
-            f"{robot.description.path}: tuning.lead must be at most {-walk.gait.first_tick} ticks, "
-            f"those of the gait before the command, got {lead}"
-        )
-    rollout = RolloutConfig(walk=walk, lead=lead)
-    return TuneConfig(rollout=rollout, loss=loss_of_robot(robot.description), **settings)
+    loss = loss_of_robot(robot.description)
+    return TuneConfig(rollout=rollout_config(robot), loss=loss, **settings)
 
 
 def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:

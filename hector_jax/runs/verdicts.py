@@ -30,7 +30,7 @@ from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import rollout, rollout_config
 
 _CODE = (
     "sim.walk",
@@ -86,9 +86,7 @@ def walk_all(
 
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
     """A walk on the plain single rigid body, `seconds` long, begun as a rollout of a tuning."""
-    controller = walk_config(robot)
-    ticks, lead = round(seconds / controller.gait.tick), robot.description.tuning.lead
-    config = RolloutConfig(controller, ticks=ticks, lead=lead)
+    config = rollout_config(robot, round(seconds / walk_config(robot).gait.tick))
     roll_out = jax.jit(rollout, static_argnums=0)
     anchor = standing_anchor(robot)
     return jax.device_get(roll_out(config, robot, weights, command, anchor, last_command))

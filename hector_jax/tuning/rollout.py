@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 
 from hector_jax import qp
 from hector_jax.control import gait
-from hector_jax.control.controller import Plan, WalkConfig, contacts_needed, plan
+from hector_jax.control.controller import Plan, WalkConfig, contacts_needed, plan, walk_config
 from hector_jax.control.footstep import Feet, feet_where
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
@@ -51,6 +51,19 @@ class RolloutConfig:
                 "RolloutConfig.lead must not reach back before the gait starts "
                 f"({-self.walk.gait.first_tick} ticks), got {self.lead}"
             )
+
+
+def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutConfig:
+    """The rollout that a robot's description asks for.
+
+    Raises:
+        InputError: one line naming the file, the key and what was expected.
+    """
+    walk, lead = walk_config(robot), robot.description.tuning.lead
+    try:
+        return RolloutConfig(walk=walk, ticks=ticks, lead=lead)
+    except InputError as error:
+        raise InputError(f"{robot.description.path}: tuning: {error}") from None
 
 
 class Variation(NamedTuple):
