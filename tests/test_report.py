@@ -149,6 +149,19 @@ def test_the_report_tells_everything_that_was_promised(tmp_path):
         assert words in text, words
 
 
+def test_the_report_names_the_iteration_that_was_taken_and_the_errors_of_touchdowns(tmp_path):
+    plain, line = write_report(tmp_path, _report()).read_text(), "`with` is iteration 3 of 9"
+    assert line not in plain
+    assert "touchdown" not in plain
+    report = _report()
+    errors = {name: one | {"touchdown": [9.0, 4.0]} for name, one in report.errors.items()}
+    asked = report._replace(chosen={"with": {"iteration": 3, "of": 9}}, errors=errors)
+    text = write_report(tmp_path, asked).read_text()
+    assert text.count(line) == 1
+    assert "`without` is iteration" not in text
+    assert "| touchdown, sideways [cm^2] | 4 | 4 | 4 |" in text
+
+
 def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_path):
     plain = write_report(tmp_path, _report()).read_text()
     assert "efresh" not in plain

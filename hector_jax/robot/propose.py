@@ -19,7 +19,7 @@ of mass m and height h:
     L_ctrl                   times (m0 / m)^2
     lead                     one gait cycle in place before the command of a rollout
     touchdown_error          true: heavy legs miss the planned touchdown by some centimetres
-    choice_plants            4: a model that nobody has tried misleads a tuning sooner or later
+    choice_plants            4: a tuning can gain on the model and lose on the robot
     joint_friction, _damping times m h / (m0 h0); push, payload: m / m0; trunk_com: h / h0
     min_height               0.55 h
 """

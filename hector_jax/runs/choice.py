@@ -1,10 +1,9 @@
 """The step `choose`: the iteration of a tuning that walks best on the high-fidelity simulator.
 
-A model is wrong somewhere, and a long descent finds out where: from some iteration on the weights
-get better on the model and worse on the robot. A few points of the path, its start among them, walk
-on plants drawn around the hfs, of which neither the tuner nor an evaluation sees anything. Their
-estimate of the state is noisy: a rollout knows its state exactly, so nothing keeps a tuning from
-gains that amplify noise.
+The rigid-body model is wrong in places: from some iteration on a tuning can gain on the model and
+lose on the robot. A few points of the path, its start among them, walk on plants drawn around the
+hfs, of which neither the tuner nor an evaluation sees anything. Their estimate of the state is
+noisy: a rollout knows its state exactly, so nothing keeps a tuning from gains that amplify noise.
 """
 
 from collections.abc import Mapping, Sequence
