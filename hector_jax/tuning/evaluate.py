@@ -12,6 +12,7 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, weights_to_vector
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, unknown
+from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
@@ -25,6 +26,21 @@ class Evaluation(NamedTuple):
     gradient: Weights  # dL/dtheta
     fallen: Float[Array, "*batch"]  # share of the ticks after a fall
     residual: Float[Array, "*batch"]  # largest of the rollout; infinite where a QP is not unique
+
+
+def evaluation(walk: Callable[[Weights], Trajectory], weights: Weights, loss: Loss) -> Evaluation:
+    """Loss of what weights walk, and its gradient by the weights."""
+
+    def objective(weights: Weights) -> tuple[Array, tuple]:
+        trajectory = walk(weights)
+        terms = losses(loss, trajectory)
+        seen = terms, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+        return total(loss, terms), seen
+
+    (value, (terms, fallen, residual)), gradient = jax.value_and_grad(objective, has_aux=True)(
+        weights
+    )
+    return Evaluation(value, terms, gradient, fallen, residual)
 
 
 def evaluate(
@@ -46,16 +62,9 @@ def evaluate(
     Source: Eq. 9, 11.
     """
 
-    def objective(weights: Weights) -> tuple[Array, tuple]:
-        trajectory = rollout(config, robot, weights, command, anchor, effect, variation)
-        terms = losses(loss, trajectory)
-        seen = terms, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
-        return total(loss, terms), seen
-
-    (value, (terms, fallen, residual)), gradient = jax.value_and_grad(objective, has_aux=True)(
-        weights
+    return evaluation(
+        lambda w: rollout(config, robot, w, command, anchor, effect, variation), weights, loss
     )
-    return Evaluation(value, terms, gradient, fallen, residual)
 
 
 evaluate_jit = jax.jit(evaluate, static_argnums=0)

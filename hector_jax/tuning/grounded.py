@@ -1,0 +1,141 @@
+"""Rollouts grounded on a measured walk: the model, and at each tick what it missed there.
+
+With the weights that were walked such a rollout is the walk itself, so its errors are the measured
+ones and its gradient is that along the walk (Eq. 9, 10). With weights nearby it is what the model
+says that they change. Tuning on the model alone ends where the model errs; from there this goes on
+for some steps with every walk.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Int
+
+from hector_jax import qp
+from hector_jax.control.controller import measured_feet
+from hector_jax.control.footstep import Feet
+from hector_jax.control.legs import Measurement
+from hector_jax.control.reference import Command, anchor_at
+from hector_jax.control.weights import Weights
+from hector_jax.core.arrays import Array
+from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.grfm.effect import HISTORY
+from hector_jax.robot.model import Robot
+from hector_jax.tuning.evaluate import Evaluation, evaluation
+from hector_jax.tuning.loss import Loss
+from hector_jax.tuning.rollout import Carry, RolloutConfig, step_carry
+
+
+class Missed(NamedTuple):
+    """What a model misses in a tick: measured less modelled, at its end."""
+
+    state: State
+    feet: Feet
+
+
+class Ground(NamedTuple):
+    """A measured walk of T ticks, as rollouts need it; its first tick holds the first command."""
+
+    start: Carry  # at the end of the first tick
+    tick: Int[Array, ""]  # gait tick there
+    missed: Missed  # (T - 1, ...)
+
+
+@partial(jax.jit, static_argnums=0)
+def ground(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    walk: Trajectory,
+    start_tick: Int[Array, ""] | int = 0,
+) -> Ground:
+    """What the model missed of a walk.
+
+    Args:
+        config: controller, and the T ticks of the walk.
+        robot: nominal body.
+        weights, command: that were walked.
+        effect: phi.
+        walk: nobody fell in it; sampled at the plan interval or finer.
+        start_tick: gait tick of t = 0.
+
+    Raises:
+        ValueError: the walk's samples do not fill the ticks.
+    """
+    samples, ticks = len(walk.fallen), config.ticks
+    if samples % ticks:
+        raise ValueError(
+            f"a measured walk must have a whole number of samples in each of its {ticks} ticks, "
+            f"got {samples} samples"
+        )
+    ends = slice(samples // ticks - 1, None, samples // ticks)
+
+    def feet_of(state: State, joints: Array) -> Feet:
+        return measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints)))
+
+    states = jax.tree.map(lambda x: x[ends], walk.state)
+    measured = Missed(states, jax.vmap(feet_of)(states, walk.joints[ends]))
+    held = jax.tree.map(lambda w: jnp.broadcast_to(w[0], (HISTORY, *w.shape[1:])), walk.command)
+    anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
+
+    def at(now: Missed, commands: Wrench) -> Carry:
+        return Carry(now.state, now.feet, commands, anchor, jnp.asarray(False))
+
+    def one(commands: Wrench, inputs: tuple) -> tuple[Wrench, Missed]:
+        now, then, tick = inputs
+        after, _ = step_carry(config, robot, weights, command, effect, at(now, commands), tick)
+        missed = jax.tree.map(jnp.subtract, then, Missed(after.state, after.feet))
+        return after.commands, missed
+
+    now, then = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
+    _, missed = jax.lax.scan(one, held, (now, then, tick + jnp.arange(ticks - 1)))
+    return Ground(at(jax.tree.map(lambda x: x[0], measured), held), tick, missed)
+
+
+def grounded_rollout(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    ground: Ground,
+) -> Trajectory:
+    """Walk on the model from the end of a walk's first tick, adding what it missed of the walk.
+
+    Returns:
+        Trajectory of T - 1 samples. Nothing raises: read `fallen` and `residual`.
+    """
+
+    @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
+    def one(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
+        missed, tick = inputs
+        after, sample = step_carry(config, robot, weights, command, effect, carry, tick)
+        state, feet = jax.tree.map(jnp.add, Missed(after.state, after.feet), missed)
+        fallen = carry.fallen | has_fallen(state, *robot.description.limits)
+        after = after._replace(state=state, feet=feet, fallen=fallen)
+        return after, sample._replace(state=state, feet=feet.position, fallen=fallen)
+
+    ticks = ground.tick + jnp.arange(len(ground.missed.feet.yaw))
+    _, samples = jax.lax.scan(one, ground.start, (ground.missed, ticks))
+    initial = ground.start.state
+    return samples._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
+
+
+@partial(jax.jit, static_argnums=0)
+def evaluate_grounded(
+    config: RolloutConfig,
+    robot: Robot,
+    weights: Weights,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    ground: Ground,
+    loss: Loss,
+) -> Evaluation:
+    """Loss of a grounded rollout and its gradient by the weights, as `evaluate` of one."""
+    return evaluation(
+        lambda w: grounded_rollout(config, robot, w, command, effect, ground), weights, loss
+    )
