@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import check_model, check_soles, trunk_body
 from hector_jax.robot.description import DESCRIPTION_PATH, Description, read_description
+from hector_jax.robot.links import inertia_about
 from hector_jax.robot.source import build_spec, compile_spec
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
@@ -137,7 +138,11 @@ def robot_of(description: Description) -> Robot:
     toe, heel, half_width = _sole_lengths(contacts)
     return Robot(
         mass=model.body_subtreemass[trunk].copy(),
-        inertia=R_wb.T @ _composite_inertia(model, data, com) @ R_wb,
+        inertia=R_wb.T
+        @ inertia_about(
+            com, model.body_mass, model.body_inertia, data.ximat.reshape(-1, 3, 3), data.xipos
+        )
+        @ R_wb,
         com_offset=R_wb.T @ (com - data.xpos[trunk]),
         gravity=0.0 - model.opt.gravity,
         joint_origin=legs.origin,
@@ -181,18 +186,6 @@ def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel
     model = compile_spec(description, spec)
     check_model(description, model)
     return spec, model
-
-
-def _composite_inertia(
-    model: mujoco.MjModel, data: mujoco.MjData, com: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Inertia of the whole robot about `com`, joints frozen, world axes."""
-    R = data.ximat.reshape(-1, 3, 3)
-    own = np.einsum("bij,bj,bkj->bik", R, model.body_inertia, R)
-    arm = data.xipos - com
-    square = np.einsum("bi,bi->b", arm, arm)[:, None, None] * np.eye(3)
-    steiner = model.body_mass[:, None, None] * (square - arm[:, :, None] * arm[:, None, :])
-    return (own + steiner).sum(axis=0)
 
 
 class _Legs(NamedTuple):

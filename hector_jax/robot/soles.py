@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.links import subtree
+from hector_jax.robot.links import at_zero, subtree
 from hector_jax.robot.rebuild import SHAPES
-from hector_jax.robot.survey import Survey, at_zero
+from hector_jax.robot.survey import Survey
 
 SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES

@@ -18,7 +18,7 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean, one_line
 from hector_jax.robot.checks import ON_FLOOR, expect, listed, require
 from hector_jax.robot.description import Description
-from hector_jax.robot.elements import drop_unused
+from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import MASSLESS, Link, links_of
 from hector_jax.robot.mjcf import read_mjcf, refusal
 from hector_jax.robot.rebuild import BITS, SHAPES, SOLVER, Pieces, lowest, rebuild
@@ -52,8 +52,8 @@ def build_spec(description: Description) -> Source:
     path = description.model
     root = read_mjcf(path)
     name = description.standing if isinstance(description.standing, str) else None
-    notes = drop_unused(path, root, description.joints, name)
-    file = _read(description, root)
+    spec, notes = spec_of(path, root, description.joints, name)
+    file = _read(description, root, spec)
     angles, trunk_quat = _standing(file, root.tag == "robot")
     limits = [_torque_limit(file, joint) for joint in file.joints]
     changes = ["a URDF, with neither motors nor a floor"] if root.tag == "robot" else []
@@ -81,29 +81,28 @@ def compile_spec(description: Description, spec: mujoco.MjSpec) -> mujoco.MjMode
         raise InputError(f"{description.model}: MuJoCo refuses it: {one_line(error)}") from None
 
 
-def compile_bare(path: Path, root: ElementTree.Element) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """The spec of a file, and its model without motors and keyframes, which need not fit.
+def compile_bare(path: Path, root: ElementTree.Element, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The model of a file without motors and keyframes, which need not fit.
 
     Raises:
         InputError: MuJoCo's refusal in one line.
     """
+    bare = spec.copy()
+    for part in (*bare.actuators, *bare.keys):
+        bare.delete(part)
+    # what is welded may have no mass; the links are checked when they are one
+    bare.compiler.boundmass = MASSLESS
+    bare.compiler.boundinertia = 1e-12
     try:
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-        bare = spec.copy()
-        for part in (*bare.actuators, *bare.keys):
-            bare.delete(part)
-        # what is welded may have no mass; the links are checked when they are one
-        bare.compiler.boundmass = MASSLESS
-        bare.compiler.boundinertia = 1e-12
-        return spec, bare.compile()
+        return bare.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
+        raise refusal(path, root, error) from None
 
 
-def _read(description: Description, root: ElementTree.Element) -> _File:
+def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSpec) -> _File:
     """Compile a file and find the robot in it."""
     path = description.model
-    spec, model = compile_bare(path, root)
+    model = compile_bare(path, root, spec)
     names = [model.joint(j).name for j in range(model.njnt)]
     for joint in (*description.joints, *description.weld):
         require(path, "joint", joint, names)

@@ -19,8 +19,8 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
-from hector_jax.robot.elements import drop_unused
-from hector_jax.robot.links import subtree
+from hector_jax.robot.elements import spec_of
+from hector_jax.robot.links import at_zero, subtree
 from hector_jax.robot.mjcf import read_mjcf
 from hector_jax.robot.source import compile_bare
 
@@ -50,8 +50,8 @@ def survey_file(path: Path) -> Survey:
     """
     path = Path(path)
     root = read_mjcf(path)
-    drop_unused(path, root, (), None)
-    _, model = compile_bare(path, root)
+    spec, _ = spec_of(path, root, (), None)
+    model = compile_bare(path, root, spec)
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _FREE]
     if len(free) > 1:
         names = ", ".join(model.joint(j).name for j in free)
@@ -75,21 +75,6 @@ def survey_file(path: Path) -> Survey:
         knee=knee,
         forwards=bool(span[np.argmax(np.abs(span))] > 0.0),
     )
-
-
-def at_zero(model: mujoco.MjModel) -> mujoco.MjData:
-    """Kinematics with all joints at zero, free bodies upright at the origin."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = 0.0
-    for j in range(model.njnt):
-        start = model.jnt_qposadr[j]
-        if model.jnt_type[j] == _FREE:
-            data.qpos[start + 3] = 1.0
-        elif model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL:
-            data.qpos[start] = 1.0
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    return data
 
 
 def axis_words(axis: Float[np.ndarray, "3"]) -> str:

@@ -5,9 +5,10 @@ from collections.abc import Iterable, Sequence
 
 from hector_jax.robot.checks import trunk_body
 from hector_jax.robot.kinematics import knee_joints
+from hector_jax.robot.links import at_zero
 from hector_jax.robot.model import Robot, compile_model
 from hector_jax.robot.source import build_spec
-from hector_jax.robot.survey import Survey, at_zero, axis_words
+from hector_jax.robot.survey import Survey, axis_words
 
 _HEADER = ("joint", "axis", "range [rad]", "motor [N m]", "link [kg]", "standing [rad]")
 _HEAVY = 0.35  # share of the legs in the mass
