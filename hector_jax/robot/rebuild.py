@@ -35,6 +35,22 @@ SOLVER = {
     "iterations": 10,
     "ls_iterations": 10,
 }
+_SCENE = """<mujoco>
+  <compiler angle="radian"/>
+  <visual>
+    <global offwidth="1280" offheight="720"/>
+    <headlight ambient="0.4 0.4 0.4"/>
+  </visual>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.86 0.90 0.94" rgb2="0.36 0.47 0.62"
+             width="256" height="1536"/>
+  </asset>
+  <worldbody>
+    <light pos="-1 -1.4 3.4" dir="0.28 0.4 -0.87" type="directional"/>
+    <geom name="floor" type="plane" size="0 0 0.05" rgba="0.6 0.63 0.67 1" contype="1"
+          conaffinity="0" friction="0.8 0.005 0.0001" solref="0.01 1" solmix="1"/>
+  </worldbody>
+</mujoco>"""
 _SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _ROBOT_GEOM = {"friction": [0.1, 0.005, 0.0001], "solmix": 0.0, "priority": 0}
@@ -79,37 +95,11 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
 
 
 def _empty(description: Description, model: mujoco.MjModel) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec()
+    spec = mujoco.MjSpec.from_string(_SCENE)
     spec.modelname = description.name
-    spec.compiler.degree = False
     for name, value in SOLVER.items():
         setattr(spec.option, name, value)
     spec.option.gravity = model.opt.gravity
-    vision = spec.visual
-    vision.global_.offwidth, vision.global_.offheight = 1280, 720
-    vision.headlight.ambient = [0.4, 0.4, 0.4]
-    spec.add_texture(
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.86, 0.90, 0.94],
-        rgb2=[0.36, 0.47, 0.62],
-        width=256,
-        height=1536,
-    )
-    spec.worldbody.add_light(
-        pos=[-1.0, -1.4, 3.4], dir=[0.28, 0.4, -0.87], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    )
-    spec.worldbody.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0.0, 0.0, 0.05],
-        rgba=[0.6, 0.63, 0.67, 1.0],
-        contype=1,
-        conaffinity=0,
-        friction=[0.8, 0.005, 0.0001],
-        solref=[0.01, 1.0],
-        solmix=1.0,
-    )
     return spec
 
 
