@@ -39,3 +39,7 @@ from hector_jax.control.reference import (
 )
 from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, expert, nominal
+
+__all__ = [  # pyright: ignore[reportUnsupportedDunderAll]
+    name for name, x in globals().items() if getattr(x, "__module__", "").startswith(__name__)
+]

@@ -41,12 +41,15 @@ DIRECTION_NAMES = tuple(
 """Names of the 18 directions in which the weights move when the feet share one R."""
 
 
-def _weights(
-    euler: tuple, position: tuple, ang_velocity: tuple, velocity: tuple, force: tuple, moment: tuple
-) -> Weights:
-    rows = [np.array(row, float) for row in (euler, position, ang_velocity, velocity)]
-    both = [np.array([row, row], float) for row in (force, moment)]
-    return Weights(State(*rows), Wrench(*both))
+def _weights(rows: tuple) -> Weights:
+    """Of the diagonals by three, in the order of State and Wrench, one R for both feet."""
+    Q, R = np.array(rows[:4], float), np.array(rows[4:], float)
+    return Weights(State(*Q), Wrench(*(np.stack([row, row]) for row in R)))
+
+
+_NOMINAL = ((50.0,) * 3, (50.0,) * 3, (1.0,) * 3, (1.0,) * 3, (1e-4,) * 3, (1e-3,) * 3)
+_EXPERT = ((100.0, 100.0, 250.0), (200.0, 200.0, 300.0), (1.0,) * 3, (1.0,) * 3)
+_EXPERT += ((1e-4, 1e-4, 5e-4), (1e-2,) * 3)
 
 
 def nominal(robot: Robot | None = None) -> Weights:
@@ -54,10 +57,7 @@ def nominal(robot: Robot | None = None) -> Weights:
 
     Those of a robot are in its description; without one, HECTOR's.
     """
-    if robot is not None and robot.description.nominal is not None:
-        return _weights(*robot.description.nominal)
-    ones = (1.0, 1.0, 1.0)
-    return _weights((50.0,) * 3, (50.0,) * 3, ones, ones, (1e-4,) * 3, (1e-3,) * 3)
+    return _weights(robot and robot.description.nominal or _NOMINAL)
 
 
 def expert(robot: Robot | None = None) -> Weights:
@@ -65,12 +65,7 @@ def expert(robot: Robot | None = None) -> Weights:
 
     Those of a robot are in its description; without one, HECTOR's.
     """
-    if robot is not None and robot.description.expert is not None:
-        return _weights(*robot.description.expert)
-    ones = (1.0, 1.0, 1.0)
-    return _weights(
-        (100.0, 100.0, 250.0), (200.0, 200.0, 300.0), ones, ones, (1e-4, 1e-4, 5e-4), (1e-2,) * 3
-    )
+    return _weights(robot and robot.description.expert or _EXPERT)
 
 
 def weights_to_vector(weights: Weights) -> Float[Array, "*batch 24"]:
