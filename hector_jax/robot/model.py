@@ -129,7 +129,9 @@ def robot_of(description: Description) -> Robot:
     com = data.subtree_com[trunk]
     standing_joints = key.qpos[model.jnt_qposadr[_ids(model, description)]]
     legs = _legs(description, model)
-    frames = [_turned(axes, q) for axes, q in zip(legs.axis, _halves(standing_joints), strict=True)]
+    frames = [
+        _turned(axes, q) for axes, q in zip(legs.axis, standing_joints.reshape(2, -1), strict=True)
+    ]
     sole = np.stack([(R_wb @ R).T for R in frames])
     sole = np.where(np.abs(sole - np.eye(3)).max() <= _SAME, np.eye(3), sole)  # rounding
     contacts = np.einsum("fij,fcj->fci", sole.mT, legs.contacts - legs.foot_point[:, None])
@@ -205,10 +207,6 @@ def _ids(model: mujoco.MjModel, description: Description) -> np.ndarray:
     return np.array([model.joint(name).id for name in description.joints])
 
 
-def _halves(joints: np.ndarray) -> np.ndarray:
-    return joints.reshape(2, -1)
-
-
 def _legs(description: Description, model: mujoco.MjModel) -> _Legs:
     """Read off the pose in which the trunk is at the origin and all joints are zero."""
     data = mujoco.MjData(model)
@@ -225,7 +223,7 @@ def _legs(description: Description, model: mujoco.MjModel) -> _Legs:
     return _Legs(
         origin=anchor - above,
         axis=data.xaxis[joint].reshape(2, -1, 3).copy(),
-        mass=_halves(model.body_mass[link]),
+        mass=model.body_mass[link].reshape(2, -1),
         com=data.xipos[link].reshape(2, -1, 3) - anchor,
         foot_point=points - foot,
         contacts=data.geom_xpos[spheres] - foot[:, None],
@@ -277,7 +275,7 @@ def _placed(
     First the position, then the pitch of the sole, its yaw and its roll, as far as the joints go.
     """
     rows: list[int] = []
-    joints, axes, origin = _halves(standing)[0], legs.axis[0], legs.origin[0]
+    joints, axes, origin = standing.reshape(2, -1)[0], legs.axis[0], legs.origin[0]
     frames = [_turned(axes[:i], joints[:i]) for i in range(len(joints) + 1)]
     anchors = np.cumsum([R @ step for R, step in zip(frames, origin, strict=False)], axis=0)
     foot = anchors[-1] + frames[-1] @ legs.foot_point[0]

@@ -24,6 +24,7 @@ from hector_jax.robot.mjcf import read_mjcf, refusal
 from hector_jax.robot.rebuild import BITS, SHAPES, SOLVER, Pieces, lowest, rebuild
 
 _JOINT = mujoco.mjtJoint
+_MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
 _MOST_FRICTION = 0.2  # of the robot's geoms; of two that touch the larger one counts
 
 
@@ -158,15 +159,10 @@ def _check_world(file: _File) -> None:
     expect(path, right, f"gravity is {gravity}, expected 0 0 and a negative number")
     for g in _world_geoms(file):
         plane = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE
-        text = (
-            f"geom {model.geom(g).name or g!r} of the world is terrain, expected a plane at z = 0"
-        )
-        expect(path, plane, text)
-        level = abs(model.geom_pos[g][2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
-        text = (
-            f"floor {model.geom(g).name or g!r} is at {model.geom_pos[g]}, expected level at z = 0"
-        )
-        expect(path, level, text)
+        name, place = model.geom(g).name or repr(g), model.geom_pos[g]
+        expect(path, plane, f"geom {name} of the world is terrain, expected a plane at z = 0")
+        level = abs(place[2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
+        expect(path, level, f"floor {name} is at {place}, expected level at z = 0")
 
 
 def _world_geoms(file: _File) -> list[int]:
@@ -234,13 +230,7 @@ def _limited(flag: mujoco.mjtLimited, span: Float[np.ndarray, "2"]) -> bool:
 
 def _is_motor(motor: mujoco.MjsActuator) -> bool:
     """Whether its control is a force."""
-    kinds = (motor.gaintype, motor.biastype, motor.dyntype)
-    plain = (
-        mujoco.mjtGain.mjGAIN_FIXED,
-        mujoco.mjtBias.mjBIAS_NONE,
-        mujoco.mjtDyn.mjDYN_NONE,
-    )
-    return kinds == plain
+    return (motor.gaintype, motor.biastype, motor.dyntype) == _MOTOR
 
 
 def _changes(file: _File, limits: Sequence[float]) -> list[str]:
@@ -251,17 +241,15 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
     order = [file.free, *file.joints] == list(range(model.njnt))
     at_origin = not np.any(model.jnt_pos) and not np.any(model.qpos0[7:])
     floor, motors = _world_geoms(file), "replace the actuators" if file.spec.actuators else "added"
+    bits = [(model.geom_contype[g], model.geom_conaffinity[g]) for g in floor]
     lines = (
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {listed(description.weld)}", description.weld),
         (f"made one with their parents: {listed(static)}", static),
-        (
-            "joints put in order, left leg first",
-            file.free >= 0 and not order and not description.weld,
-        ),
+        ("joints put in order, left leg first", file.free >= 0 and not (order or description.weld)),
         ("frames of the joints put into their anchors", not at_origin and order),
         (f"torque motors {motors}", not _motors_right(file, limits)),
-        ("floor added" if not floor else "floor replaced", not _floor_right(file)),
+        ("floor added" if not floor else "floor replaced", bits != [(1, 0)]),
         ("armature of the joints set", description.armature),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
         ("contact bits, friction and shapes set", not _contacts_right(file)),
@@ -291,12 +279,6 @@ def _motors_right(file: _File, limits: Sequence[float]) -> bool:
         and tuple(motor.forcerange) in ((0.0, 0.0), (-limit, limit))
         for motor, limit in zip(motors, limits, strict=True)
     )
-
-
-def _floor_right(file: _File) -> bool:
-    model, floor = file.model, _world_geoms(file)
-    bits = [(model.geom_contype[g], model.geom_conaffinity[g]) for g in floor]
-    return bits == [(1, 0)]
 
 
 def _contacts_right(file: _File) -> bool:

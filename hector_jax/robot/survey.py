@@ -118,8 +118,12 @@ def _legs(
         a, b = one[common:], other[common:]
         hinges = all(model.jnt_type[j] == _HINGE for j in (*a, *b))
         right_length = FEWEST_JOINTS <= len(a) <= MOST_JOINTS and len(a) == len(b)
-        if hinges and right_length and _mirrored(data.xanchor[list(a)], data.xanchor[list(b)]):
-            pairs.append((_lowest(model, data, a[-1]), -len(a), a, b))
+        if hinges and right_length:
+            apart = data.xanchor[list(a)] - data.xanchor[list(b)] * [1.0, -1.0, 1.0]
+            below = subtree(model, _body(model, a[-1]))
+            lowest = round(min(data.xipos[below, 2]), 3)  # [m], to the millimetre
+            if np.abs(apart).max() <= _MIRRORED:
+                pairs.append((lowest, -len(a), a, b))
     if not pairs:
         ends = (f"{model.joint(way[-1]).name} ({len(way)})" for way in _chains(model, free))
         raise InputError(
@@ -131,15 +135,6 @@ def _legs(
     if _is_right(model, data, one, other):
         one, other = other, one
     return one, other
-
-
-def _mirrored(one: Float[np.ndarray, "j 3"], other: Float[np.ndarray, "j 3"]) -> bool:
-    return bool(np.abs(one - other * [1.0, -1.0, 1.0]).max() <= _MIRRORED)
-
-
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> float:
-    """Height at which a chain ends [m], to the millimetre."""
-    return round(min(data.xipos[b][2] for b in subtree(model, _body(model, joint))), 3)
 
 
 def _is_right(

@@ -221,13 +221,8 @@ def _trajectory(
 
 def on_host(job: Job) -> Job:
     """The job with arrays of the host: what a process is sent must not sit on a device."""
-    host = partial(jax.tree.map, np.asarray)
-    return job._replace(
-        weights=host(job.weights),
-        command=host(job.command),
-        imperfections=host(job.imperfections),
-        plant=host(job.plant),
-    )
+    arrays = {name: getattr(job, name) for name in ("weights", "command", "imperfections", "plant")}
+    return job._replace(**jax.tree.map(np.asarray, arrays))
 
 
 def walk_many(
