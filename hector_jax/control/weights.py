@@ -26,11 +26,9 @@ class Weights(NamedTuple):
     others: Mapping[str, Any] = {}  # by the names of `parameters.TUNABLES`; else the config's
 
 
+_STATES = "roll pitch yaw x y z wx wy wz vx vy vz".split()
 WEIGHT_NAMES = tuple(
-    [
-        f"Q_{name}"
-        for name in ("roll", "pitch", "yaw", "x", "y", "z", "wx", "wy", "wz", "vx", "vy", "vz")
-    ]
+    [f"Q_{name}" for name in _STATES]
     + [f"R_{kind}{axis}_{foot}" for kind in "FM" for foot in ("left", "right") for axis in "xyz"]
 )
 """Names of the entries of `weights_to_vector`."""
@@ -77,10 +75,8 @@ def weights_to_vector(weights: Weights) -> Float[Array, "*batch 24"]:
 def vector_to_weights(vector: Float[Array, "*batch 24"]) -> Weights:
     """Weights from the 24 numbers of `weights_to_vector`."""
     rows = [vector[..., 3 * i : 3 * i + 3] for i in range(4)]
-    feet = [
-        vector[..., 12 + 6 * i : 18 + 6 * i].reshape(*vector.shape[:-1], 2, 3) for i in range(2)
-    ]
-    return Weights(State(*rows), Wrench(*feet))
+    feet = vector[..., 12:].reshape(*vector.shape[:-1], 2, 2, 3)
+    return Weights(State(*rows), Wrench(feet[..., 0, :, :], feet[..., 1, :, :]))
 
 
 def directions() -> Float[np.ndarray, "18 24"]:

@@ -127,7 +127,9 @@ def robot_of(description: Description) -> Robot:
     trunk = trunk_body(model)
     R_wb = data.xmat[trunk].reshape(3, 3)
     com = data.subtree_com[trunk]
-    standing_joints = key.qpos[model.jnt_qposadr[_ids(model, description)]]
+    joints = _ids(model, description)
+    standing_joints, ranges = key.qpos[model.jnt_qposadr[joints]], model.jnt_range[joints]
+    parts = model.body_mass, model.body_inertia, data.ximat.reshape(-1, 3, 3)
     legs = _legs(description, model)
     frames = [
         _turned(axes, q) for axes, q in zip(legs.axis, standing_joints.reshape(2, -1), strict=True)
@@ -140,11 +142,7 @@ def robot_of(description: Description) -> Robot:
     toe, heel, half_width = _sole_lengths(contacts)
     return Robot(
         mass=model.body_subtreemass[trunk].copy(),
-        inertia=R_wb.T
-        @ inertia_about(
-            com, model.body_mass, model.body_inertia, data.ximat.reshape(-1, 3, 3), data.xipos
-        )
-        @ R_wb,
+        inertia=R_wb.T @ inertia_about(com, *parts, data.xipos) @ R_wb,
         com_offset=R_wb.T @ (com - data.xpos[trunk]),
         gravity=0.0 - model.opt.gravity,
         joint_origin=legs.origin,
@@ -156,15 +154,15 @@ def robot_of(description: Description) -> Robot:
         toe=toe,
         heel=heel,
         half_width=half_width,
-        joint_lower=model.jnt_range[_ids(model, description), 0],
-        joint_upper=model.jnt_range[_ids(model, description), 1],
+        joint_lower=ranges[:, 0],
+        joint_upper=ranges[:, 1],
         torque_limit=model.actuator_ctrlrange[:, 1].copy(),
         standing_joints=standing_joints,
         standing_height=com[2].copy(),
         trunk_height=data.xpos[trunk][2].copy(),
         description=description,
         structure=Structure(
-            closed_form=_closed_form(legs, sole, model.jnt_range[_ids(model, description)]),
+            closed_form=_closed_form(legs, sole, ranges),
             placed=_placed(legs, standing_joints, sole),
             contact={1: "point", 2: "line", 4: "flat"}[contacts.shape[1]],
         ),

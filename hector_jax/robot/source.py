@@ -293,13 +293,11 @@ def _contacts_right(file: _File) -> bool:
         while above and above not in roots:
             above = int(model.body_parentid[above])
         contype, conaffinity = BITS[roots.index(above) if above else None]
-        end = model.geom(g).name in ends
-        right = (
-            not model.geom_contype[g] & ~contype and not model.geom_conaffinity[g] & ~conaffinity
-        )
-        right &= model.geom_condim[g] == (3 if end else 1) and model.geom_type[g] in SHAPES
-        right &= model.geom_friction[g, 0] <= _MOST_FRICTION
-        if not right or model.geom_solmix[g] or model.geom_priority[g]:
+        more = model.geom_contype[g] & ~contype or model.geom_conaffinity[g] & ~conaffinity
+        more = more or model.geom_solmix[g] or model.geom_priority[g]
+        right = model.geom_condim[g] == (3 if model.geom(g).name in ends else 1)
+        right = right and model.geom_friction[g, 0] <= _MOST_FRICTION
+        if more or not right or model.geom_type[g] not in SHAPES:
             return False
     return True
 

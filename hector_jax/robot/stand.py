@@ -99,7 +99,4 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[np.ndarray, n
     limited = model.jnt_limited[joints].astype(bool)
     low, high = model.jnt_range[joints].T
     margin = np.minimum(_MARGIN, 0.1 * (high - low))
-    return (
-        np.where(limited, low + margin, -np.pi),
-        np.where(limited, high - margin, np.pi),
-    )
+    return np.where(limited, low + margin, -np.pi), np.where(limited, high - margin, np.pi)

@@ -162,8 +162,10 @@ def likeliest_cause(robot: Robot, record: Record) -> str:
     if record.touching and record.tilt[-1] <= tilted and record.height[-1] >= low:
         return f"{record.touching} touches the floor"
     roll, pitch = record.angles[-1]
-    sideways, along = ("to the left", "to the right"), ("backwards", "forwards")
-    way = sideways[roll > 0.0] if abs(roll) > abs(pitch) else along[pitch > 0.0]
+    if abs(roll) > abs(pitch):
+        way = "to the right" if roll > 0.0 else "to the left"
+    else:
+        way = "forwards" if pitch > 0.0 else "backwards"
     return f"it tips over {way} (standing pose, joint gains, gait)"
 
 

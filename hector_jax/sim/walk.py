@@ -159,11 +159,8 @@ def _walk_ticks(
     errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
     anchor = jax.device_put(standing_anchor(robot, start))
     legs = jax.device_put(config.parameters(weights).legs)
-    memory, motors, yaw = (
-        programs.begin(body, plant.readings[0]),
-        init_actuators(joints),
-        jnp.zeros(()),
-    )
+    memory, motors = programs.begin(body, plant.readings[0]), init_actuators(joints)
+    yaw = jnp.zeros(())
     carry = None if retune is None else retune.init
     plan = samples = None
     for tick in range(begin, start + ticks):
