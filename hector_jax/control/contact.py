@@ -134,10 +134,16 @@ def rows(constraint: Constraint, of: Contact | Step, like: Array) -> Rows:
     return Rows(jnp.asarray(A, like.dtype), *bounds)
 
 
+def _by_sign(signs: list[int], A: list[Array]) -> Rows:
+    """Rows that are in turn at least zero (sign 1) and at most zero (-1)."""
+    above = np.tile(signs, len(A) // 2) > 0
+    return Rows(jnp.stack(A), np.where(above, 0.0, -np.inf), np.where(above, np.inf, 0.0))
+
+
 def _friction(contact: Contact) -> Rows:
     (fx, fy, fz), mu = contact.force, contact.friction
     A = [fx + fy - mu * fz, fx + fy + mu * fz, fx - fy - mu * fz, fx - fy + mu * fz]
-    return Rows(jnp.stack(A), np.array([-np.inf, 0.0] * 2), np.array([0.0, np.inf] * 2))
+    return _by_sign([-1, 1], A)
 
 
 def _unilateral_force(contact: Contact) -> Rows:
@@ -146,8 +152,7 @@ def _unilateral_force(contact: Contact) -> Rows:
 
 def _line_pressure(contact: Contact) -> Rows:
     fz, my = contact.force[2], contact.moment[1]
-    A = [my + contact.robot.toe * fz, my - contact.robot.heel * fz]
-    return Rows(jnp.stack(A), np.array([0.0, -np.inf]), np.array([np.inf, 0.0]))
+    return _by_sign([1, -1], [my + contact.robot.toe * fz, my - contact.robot.heel * fz])
 
 
 def _grip(contact: Contact) -> Array:
@@ -166,13 +171,12 @@ def _line_friction(contact: Contact) -> Rows:
     at_toe, at_heel = mz + heel * side, toe * side - mz
     toe_load, heel_load = grip * (heel * fz - my), grip * (toe * fz + my)
     A = [at_toe - toe_load, at_toe + toe_load, at_heel - heel_load, at_heel + heel_load]
-    return Rows(jnp.stack(A), np.array([-np.inf, 0.0] * 2), np.array([0.0, np.inf] * 2))
+    return _by_sign([-1, 1], A)
 
 
 def _side_pressure(contact: Contact) -> Rows:
     fz, mx, width = contact.force[2], contact.moment[0], contact.robot.half_width
-    A = [mx + width * fz, mx - width * fz]
-    return Rows(jnp.stack(A), np.array([0.0, -np.inf]), np.array([np.inf, 0.0]))
+    return _by_sign([1, -1], [mx + width * fz, mx - width * fz])
 
 
 def _half_sides(robot: Robot) -> tuple[Any, Any]:
@@ -183,8 +187,7 @@ def _half_sides(robot: Robot) -> tuple[Any, Any]:
 def _torsion(contact: Contact) -> Rows:
     fz, mz = contact.force[2], contact.moment[2]
     most = 0.5 * _grip(contact) * jnp.hypot(*_half_sides(contact.robot)) * fz
-    A = [mz + most, mz - most]
-    return Rows(jnp.stack(A), np.array([0.0, -np.inf]), np.array([np.inf, 0.0]))
+    return _by_sign([1, -1], [mz + most, mz - most])
 
 
 def _corner_friction(contact: Contact) -> Rows:
@@ -203,8 +206,7 @@ def _corner_friction(contact: Contact) -> Rows:
             low = a * (Y * along - mu * mx) + b * (X * across - mu * my)
             high = a * (Y * along + mu * mx) + b * (X * across + mu * my)
             A += [mz + load - low, mz - load + high]
-    bounds = np.array([0.0, -np.inf]), np.array([np.inf, 0.0])
-    return Rows(jnp.stack(A), *(np.tile(bound, len(A) // 2) for bound in bounds))
+    return _by_sign([1, -1], A)
 
 
 FRICTION = InputConstraint("friction", of=_friction)

@@ -51,13 +51,7 @@ class LegConfig:
 
     height: float = 0.08  # [m] apex of the swing foot
     landing: float = -0.005  # [m] height aimed at
-    kp: tuple[float, ...] = (
-        60.0,
-        60.0,
-        60.0,
-        60.0,
-        20.0,
-    )  # [N m/rad] yaw, roll, pitch, knee, ankle
+    kp: tuple[float, ...] = (60.0, 60.0, 60.0, 60.0, 20.0)  # [N m/rad] from hip yaw to ankle
     kd: tuple[float, ...] = (1.5, 1.5, 1.5, 1.5, 0.5)  # [N m s/rad]
     gravity_compensation: bool = False  # add the leg's own weight to the stance torque
 

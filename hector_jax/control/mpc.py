@@ -66,22 +66,15 @@ class MpcConfig:
     max_force: float = 500.0  # [N] per foot
     sole_width: float = 1.0  # share of a flat sole's half width that the plan uses
     line_friction: bool = True  # False leaves LINE_FRICTION out of the constraints
-    effort_reference: str = (
-        "zero"  # R prices u (the paper), or u less "gravity", the weight's share
-    )
+    effort_reference: str = "zero"  # R prices u (the paper); "gravity": u less the weight's share
     qp: QpConfig = QpConfig()
     contact: str = LINE_FOOT  # a ContactModel or its name
     constraints: tuple[str, ...] | None = None  # of Constraint or their names; else the contact's
 
     def __post_init__(self) -> None:
         rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
-        check(
-            self,
-            **rules,
-            sole_width=SHARE,
-            step_ticks=AT_LEAST_ONE,
-            effort_reference=("zero", "gravity"),
-        )
+        rules |= {"sole_width": SHARE, "step_ticks": AT_LEAST_ONE}
+        check(self, **rules, effort_reference=("zero", "gravity"))
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
             choose_part("MpcConfig.constraints", one, Constraint, CONSTRAINTS)
@@ -160,9 +153,8 @@ def _input_map(
 ) -> Float[Array, "12 b"]:
     """G with u = G v: the inputs of the contacts to the paper's u."""
     force, moment = jax.vmap(model.wrench)(foot_yaw)  # (2, 3, inputs)
-    return jnp.stack([jnp.einsum("sf,fxi->fxsi", feet, part) for part in (force, moment)]).reshape(
-        12, -1
-    )
+    parts = [jnp.einsum("sf,fxi->fxsi", feet, part) for part in (force, moment)]
+    return jnp.stack(parts).reshape(12, -1)
 
 
 def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int) -> Condensed:

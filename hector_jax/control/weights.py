@@ -26,11 +26,9 @@ class Weights(NamedTuple):
     others: Mapping[str, Any] = {}  # by the names of `parameters.TUNABLES`; else the config's
 
 
+_STATES = "roll pitch yaw x y z wx wy wz vx vy vz".split()
 WEIGHT_NAMES = tuple(
-    [
-        f"Q_{name}"
-        for name in ("roll", "pitch", "yaw", "x", "y", "z", "wx", "wy", "wz", "vx", "vy", "vz")
-    ]
+    [f"Q_{name}" for name in _STATES]
     + [f"R_{kind}{axis}_{foot}" for kind in "FM" for foot in ("left", "right") for axis in "xyz"]
 )
 """Names of the entries of `weights_to_vector`."""
@@ -41,12 +39,15 @@ DIRECTION_NAMES = tuple(
 """Names of the 18 directions in which the weights move when the feet share one R."""
 
 
-def _weights(
-    euler: tuple, position: tuple, ang_velocity: tuple, velocity: tuple, force: tuple, moment: tuple
-) -> Weights:
-    rows = [np.array(row, float) for row in (euler, position, ang_velocity, velocity)]
-    both = [np.array([row, row], float) for row in (force, moment)]
-    return Weights(State(*rows), Wrench(*both))
+def _weights(rows: tuple) -> Weights:
+    """Of the diagonals by three, in the order of State and Wrench, one R for both feet."""
+    Q, R = np.array(rows[:4], float), np.array(rows[4:], float)
+    return Weights(State(*Q), Wrench(*(np.stack([row, row]) for row in R)))
+
+
+_NOMINAL = ((50.0,) * 3, (50.0,) * 3, (1.0,) * 3, (1.0,) * 3, (1e-4,) * 3, (1e-3,) * 3)
+_EXPERT = ((100.0, 100.0, 250.0), (200.0, 200.0, 300.0), (1.0,) * 3, (1.0,) * 3)
+_EXPERT += ((1e-4, 1e-4, 5e-4), (1e-2,) * 3)
 
 
 def nominal(robot: Robot | None = None) -> Weights:
@@ -54,10 +55,7 @@ def nominal(robot: Robot | None = None) -> Weights:
 
     Those of a robot are in its description; without one, HECTOR's.
     """
-    if robot is not None and robot.description.nominal is not None:
-        return _weights(*robot.description.nominal)
-    ones = (1.0, 1.0, 1.0)
-    return _weights((50.0,) * 3, (50.0,) * 3, ones, ones, (1e-4,) * 3, (1e-3,) * 3)
+    return _weights(robot and robot.description.nominal or _NOMINAL)
 
 
 def expert(robot: Robot | None = None) -> Weights:
@@ -65,12 +63,7 @@ def expert(robot: Robot | None = None) -> Weights:
 
     Those of a robot are in its description; without one, HECTOR's.
     """
-    if robot is not None and robot.description.expert is not None:
-        return _weights(*robot.description.expert)
-    ones = (1.0, 1.0, 1.0)
-    return _weights(
-        (100.0, 100.0, 250.0), (200.0, 200.0, 300.0), ones, ones, (1e-4, 1e-4, 5e-4), (1e-2,) * 3
-    )
+    return _weights(robot and robot.description.expert or _EXPERT)
 
 
 def weights_to_vector(weights: Weights) -> Float[Array, "*batch 24"]:
@@ -82,10 +75,8 @@ def weights_to_vector(weights: Weights) -> Float[Array, "*batch 24"]:
 def vector_to_weights(vector: Float[Array, "*batch 24"]) -> Weights:
     """Weights from the 24 numbers of `weights_to_vector`."""
     rows = [vector[..., 3 * i : 3 * i + 3] for i in range(4)]
-    feet = [
-        vector[..., 12 + 6 * i : 18 + 6 * i].reshape(*vector.shape[:-1], 2, 3) for i in range(2)
-    ]
-    return Weights(State(*rows), Wrench(*feet))
+    feet = vector[..., 12:].reshape(*vector.shape[:-1], 2, 2, 3)
+    return Weights(State(*rows), Wrench(feet[..., 0, :, :], feet[..., 1, :, :]))
 
 
 def directions() -> Float[np.ndarray, "18 24"]:

@@ -37,13 +37,9 @@ _PACKAGES = (
 _ROOT = Path(__file__).parents[1]
 
 
+@cache  # every file's card asks for them
 def versions() -> dict[str, str]:
     """Versions of Python and of those packages that shape our numbers and are installed."""
-    return dict(_versions())
-
-
-@cache  # every file's card asks for them
-def _versions() -> dict[str, str]:
     installed = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:

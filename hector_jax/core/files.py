@@ -49,7 +49,11 @@ def write_file(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, path)
-        _sync(path.parent)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # of the name too; without it a rename may outlive its data
+        finally:
+            os.close(folder)
     except BaseException as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)
@@ -71,15 +75,6 @@ def append_file(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
     except OSError as error:
         raise _cannot_write(path, error) from error
-
-
-def _sync(folder: Path) -> None:
-    """Bring the names of a folder's files to the disk; without it a rename may outlive its data."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def make_folder(folder: Path) -> None:

@@ -25,11 +25,6 @@ def check_model(description: Description, model: mujoco.MjModel) -> None:
     Raises:
         InputError: one line saying what came, what was expected and what there is.
     """
-    _check_feet(description, model)
-    _check_standing(description, model)
-
-
-def _check_feet(description: Description, model: mujoco.MjModel) -> None:
     path = description.model
     sites = [model.site(i).name for i in range(model.nsite)]
     geoms = [model.geom(i).name for i in range(model.ngeom)]
@@ -45,6 +40,7 @@ def _check_feet(description: Description, model: mujoco.MjModel) -> None:
             geom = model.geom(end)
             right = geom.bodyid[0] == body and geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
             expect(path, right, f"geom {end!r} is not a sphere on body {name!r}")
+    _check_standing(description, model)
 
 
 def check_soles(path: Path, contacts: Float[np.ndarray, "2 c 3"]) -> None:
@@ -77,23 +73,21 @@ def check_soles(path: Path, contacts: Float[np.ndarray, "2 c 3"]) -> None:
 
 def _check_standing(description: Description, model: mujoco.MjModel) -> None:
     """The standing pose is within the limits, on the floor and in balance, and can be held."""
-    path, data, this = (
-        description.model,
-        mujoco.MjData(model),
-        f"keyframe {description.standing_key!r}",
-    )
+    path, data = description.model, mujoco.MjData(model)
+    this = f"keyframe {description.standing_key!r}"
     mujoco.mj_resetDataKeyframe(model, data, model.key(description.standing_key).id)
     mujoco.mj_forward(model, data)
     for name in description.joints:
         angle, limits = data.joint(name).qpos[0], model.joint(name).range
         text = f"{this} has joint {name!r} at {angle:.4g}, expected it in its range {limits}"
         expect(path, limits[0] <= angle <= limits[1], text)
-    ends = [(name, data.geom(name).xpos) for name in _ends(description)]
+    feet = description.named_feet
+    ends = [(name, data.geom(name).xpos) for foot in feet for name in foot.contacts]
     for name, place in ends:
         height = place[2] - model.geom(name).size[0]
         text = f"{this} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
         expect(path, abs(height) <= ON_FLOOR, text)
-    left, right = (data.site(foot.point).xpos[1] for foot in description.named_feet)
+    left, right = (data.site(foot.point).xpos[1] for foot in feet)
     text = f"{this} has the left foot at y = {left:.4g}, expected it left of the right one, at"
     expect(path, left > right, f"{text} {right:.4g}")
     com = data.subtree_com[trunk_body(model)]
@@ -130,11 +124,6 @@ def expect(path: Path, right: Any, message: str) -> None:
 def trunk_body(model: mujoco.MjModel) -> int:
     """Body that the free joint moves."""
     return int(model.jnt_bodyid[0])
-
-
-def _ends(description: Description) -> list[str]:
-    """Spheres of both feet."""
-    return [name for foot in description.named_feet for name in foot.contacts]
 
 
 def require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:

@@ -325,8 +325,7 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         weld=file.joints.weld,
         armature=file.joints.armature,
         feet=feet,
-        min_height=file.limits.min_height,
-        max_tilt=file.limits.max_tilt,
+        **vars(file.limits),
         control=tuple(
             (part, tuple(section.items()))
             for part in CONTROL

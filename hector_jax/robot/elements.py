@@ -1,27 +1,34 @@
-"""What a published MJCF or URDF holds beside the robot's body, dropped before MuJoCo reads it.
+"""What a published MJCF or URDF holds beside the robot's body, dropped before MuJoCo compiles it.
 
 Meshes, pictures, sensors, contact pairs and couplings are of no use here; the files that they name
 are never opened. A body whose mass comes from a mesh, and a coupling of leg joints, are refused.
 """
 
-import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from hector_jax.core.inputs import InputError, short_repr
+import numpy as np
 
-_MESHES = ("mesh", "sdf", "hfield")
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.robot.mjcf import refusal
+
+_MESHES = (
+    mujoco.mjtGeom.mjGEOM_MESH,
+    mujoco.mjtGeom.mjGEOM_SDF,
+    mujoco.mjtGeom.mjGEOM_HFIELD,
+)
 _COUPLINGS = ("equality", "tendon")
 _UNUSED = (*_COUPLINGS, "sensor", "contact", "deformable", "custom")
 _LINK_PARTS = ("inertial", "visual", "collision")
 _JOINT_PARTS = ("parent", "child", "origin", "axis", "limit", "dynamics")
 
 
-def drop_unused(
+def spec_of(
     path: Path, root: ElementTree.Element, joints: Sequence[str], keyframe: str | None
-) -> list[str]:
-    """Drop in place what is not needed, and say so in one line each.
+) -> tuple[mujoco.MjSpec, list[str]]:
+    """The spec of a file without what is not needed, and what was dropped, a line each.
 
     Args:
         path: the file.
@@ -30,31 +37,31 @@ def drop_unused(
         keyframe: the only one that stays.
 
     Raises:
-        InputError: one line naming a body that loses its mass, or a coupling of leg joints.
+        InputError: one line naming a body that loses its mass, or a coupling of leg joints; or
+            MuJoCo's refusal.
     """
-    if root.tag == "robot":
-        return _drop_of_urdf(path, root, joints)
-    _check_couplings(path, root, joints)
-    notes = []
-    for tag in _UNUSED:
-        parts = root.findall(tag)
-        if any(len(part) for part in parts):
-            notes.append(f"<{tag}> is not used")
-        _remove(root, parts)
-    for part in root.findall("actuator"):  # those of tendons, sites and bodies
-        _remove(part, [m for m in part if not {"joint", "jointinparent"} & set(m.attrib)])
-    for part in root.findall("keyframe"):
-        _remove(part, [key for key in part if key.get("name") != keyframe])
-        for key in part:
-            for name in ("ctrl", "act", "mpos", "mquat"):  # their number may change
-                key.attrib.pop(name, None)
-    dropped = _drop_mesh_geoms(path, root)
-    dropped += _drop_files(root)
-    return notes + _not_read(dropped)
-
-
-def _not_read(number: int) -> list[str]:
-    return [f"{number} meshes and pictures are not read"] if number else []
+    urdf, notes = root.tag == "robot", []
+    dropped = _drop_of_urdf(path, root, joints) if urdf else 0
+    if not urdf:
+        _check_couplings(path, root, joints)
+        for tag in _UNUSED:
+            parts = root.findall(tag)
+            if any(len(part) for part in parts):
+                notes.append(f"<{tag}> is not used")
+            _remove(root, parts)
+        for part in root.findall("actuator"):  # those of tendons, sites and bodies
+            _remove(part, [m for m in part if not {"joint", "jointinparent"} & set(m.attrib)])
+        for part in root.findall("keyframe"):
+            _remove(part, [key for key in part if key.get("name") != keyframe])
+            for key in part:
+                for name in ("ctrl", "act", "mpos", "mquat"):  # their number may change
+                    key.attrib.pop(name, None)
+    try:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+    except (ValueError, mujoco.FatalError) as error:
+        raise refusal(path, root, error) from None
+    dropped += _drop_meshes(path, spec)
+    return spec, [*notes, *[f"{dropped} meshes and pictures are not read"] * bool(dropped)]
 
 
 def _remove(parent: ElementTree.Element, children: Sequence[ElementTree.Element]) -> int:
@@ -63,100 +70,38 @@ def _remove(parent: ElementTree.Element, children: Sequence[ElementTree.Element]
     return len(children)
 
 
-def _reads_file(asset: ElementTree.Element) -> bool:
-    return asset.tag in ("mesh", "hfield", "skin") or any(
-        name.startswith("file") for name in asset.attrib
-    )
-
-
-def _drop_files(root: ElementTree.Element) -> int:
-    """Drop what is read from other files, and the mention of it. Returns how many."""
-    dropped = 0
-    for assets in root.findall("asset"):
-        dropped += _remove(assets, [part for part in assets if _reads_file(part)])
-    textures = {part.get("name") for part in root.iterfind("asset/texture")}
-    for material in root.iter("material"):
-        _remove(material, [x for x in material if x.get("texture") not in textures])
-        if material.get("texture") not in textures:
-            material.attrib.pop("texture", None)
-    for default in root.iter("default"):
-        for geom in default.findall("geom"):
-            geom.attrib.pop("mesh", None)
-            geom.attrib.pop("hfield", None)
-            if geom.get("type") in _MESHES:
-                del geom.attrib["type"]
-    for compiler in root.iter("compiler"):
-        for name in ("assetdir", "meshdir", "texturedir"):
-            compiler.attrib.pop(name, None)
-    return dropped
-
-
-def _drop_mesh_geoms(path: Path, root: ElementTree.Element) -> int:
-    classes, dropped = _geom_classes(root), 0
-    for body, parent, geom, inherited in _geoms(root):
-        attributes = {**classes.get(geom.get("class", inherited), {}), **geom.attrib}
-        if attributes.get("type") not in _MESHES and "mesh" not in attributes:
-            continue
-        parent.remove(geom)
-        dropped += 1
-        if body.tag == "worldbody":
-            collides = attributes.get("contype", "1") != "0"
-            if collides or attributes.get("conaffinity", "1") != "0":
+def _drop_meshes(path: Path, spec: mujoco.MjSpec) -> int:
+    """Drop what is read from other files, and what is made of it. Returns how much."""
+    meshes = [geom for geom in spec.geoms if geom.type in _MESHES or geom.meshname]
+    for geom in meshes:
+        body = geom.parent
+        if body.name == "world":
+            if geom.contype or geom.conaffinity:
                 raise InputError(
-                    f"{path}: geom {short_repr(geom.get('name', ''))} of the world is terrain, "
-                    "expected a plane at z = 0 or nothing"
+                    f"{path}: geom {short_repr(geom.name)} of the world is terrain, expected a "
+                    "plane at z = 0 or nothing"
                 )
-        elif _has_mass(root, attributes) and body.find("inertial") is None:
+        elif not body.explicitinertial and _has_mass(spec, geom):
             raise InputError(
-                f"{path}: body {short_repr(body.get('name', ''))} has its mass from a mesh, which "
-                "is not read: give the body an <inertial>"
+                f"{path}: body {short_repr(body.name)} has its mass from a mesh, which is not "
+                "read: give the body an <inertial>"
             )
-    return dropped
+    pictures = [x for x in spec.textures if x.file or x.content_type or any(x.cubefiles)]
+    dropped = [*meshes, *spec.meshes, *spec.hfields, *spec.skins, *pictures]
+    for part in dropped:
+        spec.delete(part)
+    textures = {texture.name for texture in spec.textures}
+    for material in spec.materials:
+        material.textures = [name if name in textures else "" for name in material.textures]
+    return len(dropped)
 
 
-def _has_mass(root: ElementTree.Element, attributes: dict[str, str]) -> bool:
+def _has_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
     """Whether a geom adds to the mass of a body without <inertial>."""
-    low, high = "0", "5"
-    for compiler in root.iter("compiler"):
-        low, high = compiler.get("inertiagrouprange", f"{low} {high}").split()[:2]
-        if compiler.get("inertiafromgeom") == "false":
-            return False
-    if not low <= attributes.get("group", "0") <= high:  # digits
-        return False
-    mass = attributes.get("mass", attributes.get("density", "1000"))
-    return not re.fullmatch(r"\s*[+-]?0*\.?0*(e.*)?\s*", mass)
-
-
-def _geom_classes(root: ElementTree.Element) -> dict[str, dict[str, str]]:
-    """Attributes of geoms by default class."""
-    classes: dict[str, dict[str, str]] = {"main": {}}
-
-    def add(default: ElementTree.Element, inherited: dict[str, str]) -> None:
-        own = dict(inherited)
-        for geom in default.findall("geom"):
-            own |= geom.attrib
-        classes[default.get("class", "main")] = own
-        for child in default.findall("default"):
-            add(child, own)
-
-    for default in root.findall("default"):
-        add(default, classes["main"])
-    return classes
-
-
-def _geoms(
-    root: ElementTree.Element,
-) -> Iterator[tuple[ElementTree.Element, ElementTree.Element, ElementTree.Element, str]]:
-    """Each geom with its body, the element that holds it and the class that it inherits."""
-    places = [(world, world, "main") for world in root.findall("worldbody")]
-    while places:
-        body, holder, inherited = places.pop(0)
-        inherited = holder.get("childclass", inherited)
-        for child in list(holder):
-            if child.tag == "geom":
-                yield body, holder, child, inherited
-            elif child.tag in ("body", "frame"):
-                places.append((child if child.tag == "body" else body, child, inherited))
+    low, high = spec.compiler.inertiagrouprange
+    read = spec.compiler.inertiafromgeom != mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    mass = geom.density if np.isnan(geom.mass) else geom.mass
+    return bool(read and low <= geom.group <= high and mass)
 
 
 def _check_couplings(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> None:
@@ -180,8 +125,8 @@ def _check_couplings(path: Path, root: ElementTree.Element, joints: Sequence[str
                 )
 
 
-def _drop_of_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> list[str]:
-    """Keep links of numbers and primitives, and joints without couplings."""
+def _drop_of_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> int:
+    """Keep links of numbers and primitives, and free joints. Returns how many meshes went."""
     dropped = 0
     for joint in root.findall("joint"):
         name = joint.get("name")
@@ -205,4 +150,4 @@ def _drop_of_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) 
     )
     root.remove(own)
     root.insert(0, own)
-    return _not_read(dropped)
+    return dropped

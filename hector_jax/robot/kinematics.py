@@ -80,22 +80,14 @@ def inverse_legs(
         start: joints nearby [rad]; the formula needs none.
         steps: of Newton (static).
     """
-    joints = robot.description.leg_joints
-    lower, upper, standing = (
-        jnp.asarray(part).reshape(2, joints)
-        for part in (robot.joint_lower, robot.joint_upper, robot.standing_joints)
-    )
+    leg = _leg_constants(robot)
     if robot.structure.closed_form:
-        yaw = jnp.clip(yaw, lower[:, 0], upper[:, 0])
+        yaw = jnp.clip(yaw, leg.lower[:, 0], leg.upper[:, 0])
         in_leg = jnp.stack([up[0] @ rot_z(yaw[0]), up[1] @ rot_z(yaw[1])])
         pitch = jnp.arctan2(in_leg[:, 0], in_leg[:, 2])
-        origin, foot_point = jnp.asarray(robot.joint_origin), jnp.asarray(robot.foot_point)
-        leg = _Leg(origin, foot_point, lower[:, 3], upper[:, 3])
         return jax.vmap(_inverse_leg)(leg, position, yaw, pitch).reshape(-1)
-    origin, axis, foot_point, sole = _constants(robot)
-    chain = _RobotLeg(origin, axis, foot_point, sole, lower, upper, standing)
     search = jax.vmap(partial(_searched_leg, robot.structure.placed, steps))
-    return search(chain, start.reshape(2, joints), position, yaw, up).reshape(-1)
+    return search(leg, start.reshape(leg.lower.shape), position, yaw, up).reshape(-1)
 
 
 def leg_gravity(
@@ -143,10 +135,13 @@ def knee_joints(robot: Robot) -> tuple[int, int, int]:
 class _Leg(NamedTuple):
     """Constants of a leg."""
 
-    origin: Float[Array, "*legs 5 3"]
+    origin: Float[Array, "*legs j 3"]
+    axis: Float[Array, "*legs j 3"]
     foot_point: Float[Array, "*legs 3"]
-    knee_lower: Float[Array, "*legs"]
-    knee_upper: Float[Array, "*legs"]
+    sole: Float[Array, "*legs 3 3"]
+    lower: Float[Array, "*legs j"]
+    upper: Float[Array, "*legs j"]
+    standing: Float[Array, "*legs j"]
 
 
 class _Chain(NamedTuple):
@@ -159,24 +154,19 @@ class _Chain(NamedTuple):
     frames: Float[Array, "2 j 3 3"]  # links' axes; computed only where they are used
 
 
-def _constants(robot: Robot) -> tuple[Array, Array, Array, Array]:
-    """Joint origins and axes, foot points and soles of both legs."""
+def _leg_constants(robot: Robot) -> _Leg:
+    """Those of both legs."""
     parts = (robot.joint_origin, robot.joint_axis, robot.foot_point, robot.sole)
-    origin, axis, foot_point, sole = map(jnp.asarray, parts)
-    return origin, axis, foot_point, sole
+    limits = (robot.joint_lower, robot.joint_upper, robot.standing_joints)
+    return _Leg(*map(jnp.asarray, parts), *(jnp.asarray(x).reshape(2, -1) for x in limits))
 
 
 def _chain(robot: Robot, joints: Float[Array, " joints"]) -> _Chain:
-    origin, axis, foot_point, sole = _constants(robot)
-    legs = joints.reshape(2, robot.description.leg_joints)
-    if robot.structure.closed_form:
-        return jax.vmap(_leg_chain)(origin, foot_point, legs)
-    return jax.vmap(_any_chain)(origin, axis, foot_point, sole, legs)
+    chain = _leg_chain if robot.structure.closed_form else _any_chain
+    return jax.vmap(chain)(_leg_constants(robot), joints.reshape(2, -1))
 
 
-def _leg_chain(
-    origin: Float[Array, "5 3"], foot_point: Float[Array, "3"], joints: Float[Array, "5"]
-) -> _Chain:
+def _leg_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
     pitches = jnp.cumsum(joints[2:])
     cy, sy = jnp.cos(joints[0]), jnp.sin(joints[0])
     cr, sr = jnp.cos(joints[1]), jnp.sin(joints[1])
@@ -195,10 +185,10 @@ def _leg_chain(
         axis=-1,
     )
     frames = jnp.concatenate([R_yaw[None], R_roll[None], R_pitch])
-    steps = jnp.concatenate([origin[1:], foot_point[None]])
+    steps = jnp.concatenate([leg.origin[1:], leg.foot_point[None]])
     # o_yaw, o_roll, ..., o_ankle, foot: each is the one before plus a step in its frame
     points = jnp.cumsum(
-        jnp.concatenate([origin[:1], jnp.sum(frames * steps[:, None, :], axis=-1)]), axis=0
+        jnp.concatenate([leg.origin[:1], jnp.sum(frames * steps[:, None, :], axis=-1)]), axis=0
     )
     axis = jnp.stack([R_yaw[:, 2], ahead, side, side, side])
     return _Chain(points[5], frames[4], points[:5], axis, frames)
@@ -207,7 +197,7 @@ def _leg_chain(
 def _inverse_leg(
     leg: _Leg, position: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]
 ) -> Float[Array, "5"]:
-    origin, foot_point, knee_lower, knee_upper = leg
+    origin, foot_point = leg.origin, leg.foot_point
     # target from the roll joint, in the yawed frame
     cy, sy = jnp.cos(yaw), jnp.sin(yaw)
     x, y, z = position - origin[0]
@@ -231,51 +221,33 @@ def _inverse_leg(
     thigh, shin = -origin[3, 2], -origin[4, 2]
     cos_knee = (x**2 + z**2 - thigh**2 - shin**2) / (2 * thigh * shin)
     # the limits keep both ends off +-1, where arccos has no slope
-    ends = jnp.cos(knee_lower), jnp.cos(knee_upper)
+    ends = jnp.cos(leg.lower[3]), jnp.cos(leg.upper[3])
     bend = jnp.arccos(jnp.clip(cos_knee, jnp.minimum(*ends), jnp.maximum(*ends)))
-    knee = jnp.where(knee_lower < 0.0, -bend, bend)
+    knee = jnp.where(leg.lower[3] < 0.0, -bend, bend)
     hip = jnp.arctan2(-x, -z) - jnp.arctan2(shin * jnp.sin(knee), thigh + shin * jnp.cos(knee))
     return jnp.stack([yaw, roll, hip, knee, pitch - hip - knee])
 
 
-def _any_chain(
-    origin: Float[Array, "j 3"],
-    axis: Float[Array, "j 3"],
-    foot_point: Float[Array, "3"],
-    sole: Float[Array, "3 3"],
-    joints: Float[Array, " j"],
-) -> _Chain:
+def _any_chain(leg: _Leg, joints: Float[Array, " j"]) -> _Chain:
     R, point = jnp.eye(3, dtype=joints.dtype), jnp.zeros(3, joints.dtype)
-    K = jax.vmap(skew)(axis.astype(joints.dtype))
+    K = jax.vmap(skew)(leg.axis.astype(joints.dtype))
     sin, cos = jnp.sin(joints)[:, None, None], jnp.cos(joints)[:, None, None]
     turns = jnp.eye(3, dtype=joints.dtype) + sin * K + (1.0 - cos) * (K @ K)  # Rodrigues
     points, axes, frames = [], [], []
-    for i in range(len(origin)):
-        point = point + R @ origin[i]
+    for origin, axis, turn in zip(leg.origin, leg.axis, turns, strict=True):
+        point = point + R @ origin
         points.append(point)
-        axes.append(R @ axis[i])
-        R = R @ turns[i]
+        axes.append(R @ axis)
+        R = R @ turn
         frames.append(R)
-    foot = point + R @ foot_point
-    return _Chain(foot, R @ sole, *(jnp.stack(rows) for rows in (points, axes, frames)))
-
-
-class _RobotLeg(NamedTuple):
-    """Constants of a leg of any kind."""
-
-    origin: Float[Array, "*legs j 3"]
-    axis: Float[Array, "*legs j 3"]
-    foot_point: Float[Array, "*legs 3"]
-    sole: Float[Array, "*legs 3 3"]
-    lower: Float[Array, "*legs j"]
-    upper: Float[Array, "*legs j"]
-    standing: Float[Array, "*legs j"]
+    foot = point + R @ leg.foot_point
+    return _Chain(foot, R @ leg.sole, *(jnp.stack(rows) for rows in (points, axes, frames)))
 
 
 def _searched_leg(
     placed: tuple[int, ...],
     steps: int,
-    leg: _RobotLeg,
+    leg: _Leg,
     start: Float[Array, " j"],
     position: Float[Array, "3"],
     yaw: Float[Array, ""],
@@ -287,7 +259,7 @@ def _searched_leg(
         joints: Array, position: Array, yaw: Array, up: Array
     ) -> tuple[Float[Array, " rows"], Float[Array, "rows j"]]:
         """Of foot point [m] and sole [rad], in the rows that the leg places; and its Jacobian."""
-        chain = _any_chain(*leg[:4], joints)
+        chain = _any_chain(leg, joints)
         pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
         to_wanted = rot_z(yaw).T @ rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))
         turn = _rotation_vector(to_wanted @ chain.rotation)

@@ -25,6 +25,10 @@ class Pose(NamedTuple):
     def __matmul__(self, other: "Pose") -> "Pose":
         return Pose(self.R @ other.R, self.p + self.R @ other.p)
 
+    def to(self, other: "Pose") -> "Pose":
+        """Another frame, given in the same one, in this one."""
+        return Pose(self.R.T @ other.R, self.R.T @ (other.p - self.p))
+
     @property
     def quat(self) -> Float[np.ndarray, "4"]:
         """The turn as a quaternion."""
@@ -53,18 +57,6 @@ def pose_of(pos: Float[np.ndarray, "3"], quat: Float[np.ndarray, "4"]) -> Pose:
     return Pose(R.reshape(3, 3), np.array(pos))
 
 
-def turned(model: mujoco.MjModel, body: Pose, joint: int, angle: float) -> Pose:
-    """The pose of a body when a joint of it is at an angle [rad], or a slide at a place [m]."""
-    address, axis = model.jnt_qposadr[joint], model.jnt_axis[joint]
-    angle -= model.qpos0[address]
-    if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-        return body @ Pose(p=axis * angle)
-    quat, anchor = np.zeros(4), model.jnt_pos[joint]
-    mujoco.mju_axisAngle2Quat(quat, axis, angle)
-    turn = pose_of(np.zeros(3), quat)
-    return body @ Pose(turn.R, anchor - turn.R @ anchor)
-
-
 def links_of(
     model: mujoco.MjModel, root: int, joints: Sequence[int], fixed: Mapping[int, float]
 ) -> list[Link]:
@@ -76,42 +68,46 @@ def links_of(
         joints: of the legs, each the only one of its body.
         fixed: angle [rad] by joint, of all other hinges and slides.
     """
-    link_of: dict[int, int] = {}  # joint's or -1, by body
-    frames: dict[int, Pose] = {}  # of a link in its parent link, by joint
-    parents: dict[int, int] = {-1: -1}
-    poses: dict[int, dict[int, Pose]] = {-1: {}}
+    # at zero of the legs' joints, whatever their references are
+    data = at_zero(model, {int(model.jnt_qposadr[j]): angle for j, angle in fixed.items()})
+    places = [Pose(R, p) for R, p in zip(data.xmat.reshape(-1, 3, 3), data.xpos, strict=True)]
+    roots = {-1: root} | {j: int(model.jnt_bodyid[j]) for j in joints}
+    frames = {
+        j: Pose(places[b].R, data.xanchor[j] if j >= 0 else places[b].p) for j, b in roots.items()
+    }
+    link_of: dict[int, int] = {}  # joint or -1, by body
+    joint_of = {body: joint for joint, body in roots.items()}
     for body in subtree(model, root):
-        first = model.body_jntadr[body]
-        own = [int(first + i) for i in range(model.body_jntnum[body])]
-        if body == root:
-            link, pose = -1, Pose()
-        else:
-            parent = int(model.body_parentid[body])
-            link = link_of[parent]
-            pose = poses[link][parent] @ pose_of(model.body_pos[body], model.body_quat[body])
-        for joint in own:
-            if joint in joints:
-                # at zero of the joint, whatever its reference is
-                anchor, frame = Pose(p=model.jnt_pos[joint]), turned(model, pose, joint, 0.0)
-                frames[joint], parents[joint] = frame @ anchor, link
-                link, pose = joint, Pose(p=-anchor.p)
-                poses[joint] = {}
-            elif joint in fixed:
-                pose = turned(model, pose, joint, fixed[joint])
-        link_of[body] = link
-        poses[link][body] = pose
-    order = [-1, *joints]
-    return [
-        Link(
-            name=model.body(root if joint < 0 else model.jnt_bodyid[joint]).name,
-            parent=-1 if joint < 0 else order.index(parents[joint]),
-            joint=joint,
-            pose=frames.get(joint, Pose()),
-            bodies=poses[joint],
-            **_composite(model, poses[joint]),
-        )
-        for joint in order
-    ]
+        link_of[body] = joint_of.get(body, link_of.get(int(model.body_parentid[body]), -1))
+    links = []
+    for joint, body in roots.items():
+        frame, above = frames[joint], link_of.get(int(model.body_parentid[body]), -1)
+        bodies = {b: frame.to(places[b]) for b, link in link_of.items() if link == joint}
+        pose, parent = Pose(), -1
+        if joint >= 0:
+            pose, parent = frames[above].to(frame), list(roots).index(above)
+        own = _composite(model, bodies)
+        links.append(Link(model.body(body).name, parent, joint, pose, *own, bodies))
+    return links
+
+
+def at_zero(model: mujoco.MjModel, places: Mapping[int, float] | None = None) -> mujoco.MjData:
+    """Kinematics with all joints at zero, free bodies upright at the origin.
+
+    Args:
+        model: compiled.
+        places: coordinates that are not zero, by their address.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    for kind, start in zip(model.jnt_type, model.jnt_qposadr, strict=True):
+        if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL):
+            data.qpos[start + 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)] = 1.0
+    for address, place in (places or {}).items():
+        data.qpos[address] = place
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    return data
 
 
 def subtree(model: mujoco.MjModel, root: int) -> list[int]:
@@ -123,22 +119,41 @@ def subtree(model: mujoco.MjModel, root: int) -> list[int]:
     return inside
 
 
-def _composite(model: mujoco.MjModel, bodies: Mapping[int, Pose]) -> dict:
+def _composite(
+    model: mujoco.MjModel, bodies: Mapping[int, Pose]
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
     """Mass, centre of mass and inertia of bodies that are one."""
-    parts = []
-    for body, pose in bodies.items():
-        if model.body_mass[body] > MASSLESS:
-            own = pose @ pose_of(model.body_ipos[body], model.body_iquat[body])
-            spread = own.R @ np.diag(model.body_inertia[body]) @ own.R.T
-            parts.append((model.body_mass[body], own.p, spread))
-    mass = sum(part[0] for part in parts)
-    if not parts:
-        return {"mass": 0.0, "com": np.zeros(3), "inertia": np.zeros((3, 3))}
-    com = sum(m * p for m, p, _ in parts) / mass
-    arms = [p - com for _, p, _ in parts]
-    steiner = (
-        m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-        for (m, _, _), arm in zip(parts, arms, strict=True)
+    heavy = [b for b in bodies if model.body_mass[b] > MASSLESS]
+    if not heavy:
+        return 0.0, np.zeros(3), np.zeros((3, 3))
+    poses = [bodies[b] @ pose_of(model.body_ipos[b], model.body_iquat[b]) for b in heavy]
+    R, places = (np.array(part) for part in zip(*poses, strict=True))
+    masses = model.body_mass[heavy]
+    com = masses @ places / masses.sum()
+    return (
+        float(masses.sum()),
+        com,
+        inertia_about(com, masses, model.body_inertia[heavy], R, places),
     )
-    inertia = sum(spread for _, _, spread in parts) + sum(steiner)
-    return {"mass": float(mass), "com": com, "inertia": inertia}
+
+
+def inertia_about(
+    point: Float[np.ndarray, "3"],
+    masses: Float[np.ndarray, " b"],
+    moments: Float[np.ndarray, "b 3"],
+    R: Float[np.ndarray, "b 3 3"],
+    places: Float[np.ndarray, "b 3"],
+) -> Float[np.ndarray, "3 3"]:
+    """Inertia [kg m^2] about a point of bodies that are one.
+
+    Args:
+        point: [m].
+        masses: [kg].
+        moments: principal moments of inertia [kg m^2].
+        R: axes of these, as columns.
+        places: centres of mass [m].
+    """
+    own = np.einsum("bij,bj,bkj->bik", R, moments, R)
+    arm = places - point
+    square = np.einsum("bi,bi->b", arm, arm)[:, None, None] * np.eye(3)
+    return (own + masses[:, None, None] * (square - arm[:, :, None] * arm[:, None, :])).sum(axis=0)

@@ -12,6 +12,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean, one_line, read_text, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
 
@@ -80,16 +81,15 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     return root
 
 
-def refusal(path: Path, root: ElementTree.Element, schema: str, error: Exception) -> InputError:
+def refusal(path: Path, root: ElementTree.Element, error: Exception) -> InputError:
     """MuJoCo's error in one line, with the nearest name that it would know.
 
     Args:
         path: the file.
         root: its elements.
-        schema: words of MJCF.
         error: MuJoCo's.
     """
-    message = one_line(error)
+    message, schema = one_line(error), mujoco.mj_printSchema(False, False)
     names = {element.get("name", "") for element in root.iter()} | set(re.findall(r"\w+", schema))
     # MuJoCo quotes what it does not know and what the matter is about: the first unknown one counts
     unknown = [word for word in re.findall(r"'([^']*)'", message) if word not in names]

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.checks import check_model, check_soles, trunk_body
 from hector_jax.robot.description import DESCRIPTION_PATH, Description, read_description
+from hector_jax.robot.links import inertia_about
 from hector_jax.robot.source import build_spec, compile_spec
 
 _CLOSED_AXES = np.eye(3)[[2, 0, 1, 1, 1]]  # yaw, roll, hip pitch, knee, ankle
@@ -126,9 +127,13 @@ def robot_of(description: Description) -> Robot:
     trunk = trunk_body(model)
     R_wb = data.xmat[trunk].reshape(3, 3)
     com = data.subtree_com[trunk]
-    standing_joints = key.qpos[model.jnt_qposadr[_ids(model, description)]]
+    joints = _ids(model, description)
+    standing_joints, ranges = key.qpos[model.jnt_qposadr[joints]], model.jnt_range[joints]
+    parts = model.body_mass, model.body_inertia, data.ximat.reshape(-1, 3, 3)
     legs = _legs(description, model)
-    frames = [_turned(axes, q) for axes, q in zip(legs.axis, _halves(standing_joints), strict=True)]
+    frames = [
+        _turned(axes, q) for axes, q in zip(legs.axis, standing_joints.reshape(2, -1), strict=True)
+    ]
     sole = np.stack([(R_wb @ R).T for R in frames])
     sole = np.where(np.abs(sole - np.eye(3)).max() <= _SAME, np.eye(3), sole)  # rounding
     contacts = np.einsum("fij,fcj->fci", sole.mT, legs.contacts - legs.foot_point[:, None])
@@ -137,7 +142,7 @@ def robot_of(description: Description) -> Robot:
     toe, heel, half_width = _sole_lengths(contacts)
     return Robot(
         mass=model.body_subtreemass[trunk].copy(),
-        inertia=R_wb.T @ _composite_inertia(model, data, com) @ R_wb,
+        inertia=R_wb.T @ inertia_about(com, *parts, data.xipos) @ R_wb,
         com_offset=R_wb.T @ (com - data.xpos[trunk]),
         gravity=0.0 - model.opt.gravity,
         joint_origin=legs.origin,
@@ -149,15 +154,15 @@ def robot_of(description: Description) -> Robot:
         toe=toe,
         heel=heel,
         half_width=half_width,
-        joint_lower=model.jnt_range[_ids(model, description), 0],
-        joint_upper=model.jnt_range[_ids(model, description), 1],
+        joint_lower=ranges[:, 0],
+        joint_upper=ranges[:, 1],
         torque_limit=model.actuator_ctrlrange[:, 1].copy(),
         standing_joints=standing_joints,
         standing_height=com[2].copy(),
         trunk_height=data.xpos[trunk][2].copy(),
         description=description,
         structure=Structure(
-            closed_form=_closed_form(legs, sole, model.jnt_range[_ids(model, description)]),
+            closed_form=_closed_form(legs, sole, ranges),
             placed=_placed(legs, standing_joints, sole),
             contact={1: "point", 2: "line", 4: "flat"}[contacts.shape[1]],
         ),
@@ -183,18 +188,6 @@ def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel
     return spec, model
 
 
-def _composite_inertia(
-    model: mujoco.MjModel, data: mujoco.MjData, com: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Inertia of the whole robot about `com`, joints frozen, world axes."""
-    R = data.ximat.reshape(-1, 3, 3)
-    own = np.einsum("bij,bj,bkj->bik", R, model.body_inertia, R)
-    arm = data.xipos - com
-    square = np.einsum("bi,bi->b", arm, arm)[:, None, None] * np.eye(3)
-    steiner = model.body_mass[:, None, None] * (square - arm[:, :, None] * arm[:, None, :])
-    return (own + steiner).sum(axis=0)
-
-
 class _Legs(NamedTuple):
     """Both legs, everything in the frame of its link."""
 
@@ -210,10 +203,6 @@ class _Legs(NamedTuple):
 def _ids(model: mujoco.MjModel, description: Description) -> np.ndarray:
     """The legs' joints in the package's order, whatever the file's."""
     return np.array([model.joint(name).id for name in description.joints])
-
-
-def _halves(joints: np.ndarray) -> np.ndarray:
-    return joints.reshape(2, -1)
 
 
 def _legs(description: Description, model: mujoco.MjModel) -> _Legs:
@@ -232,7 +221,7 @@ def _legs(description: Description, model: mujoco.MjModel) -> _Legs:
     return _Legs(
         origin=anchor - above,
         axis=data.xaxis[joint].reshape(2, -1, 3).copy(),
-        mass=_halves(model.body_mass[link]),
+        mass=model.body_mass[link].reshape(2, -1),
         com=data.xipos[link].reshape(2, -1, 3) - anchor,
         foot_point=points - foot,
         contacts=data.geom_xpos[spheres] - foot[:, None],
@@ -284,7 +273,7 @@ def _placed(
     First the position, then the pitch of the sole, its yaw and its roll, as far as the joints go.
     """
     rows: list[int] = []
-    joints, axes, origin = _halves(standing)[0], legs.axis[0], legs.origin[0]
+    joints, axes, origin = standing.reshape(2, -1)[0], legs.axis[0], legs.origin[0]
     frames = [_turned(axes[:i], joints[:i]) for i in range(len(joints) + 1)]
     anchors = np.cumsum([R @ step for R, step in zip(frames, origin, strict=False)], axis=0)
     foot = anchors[-1] + frames[-1] @ legs.foot_point[0]

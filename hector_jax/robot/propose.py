@@ -130,99 +130,71 @@ def size_of(description: Description, robot: Robot) -> Size:
 
 def sections(size: Size) -> dict[str, Any]:
     """What the TOML says by numbers."""
-    return {
-        "limits": {"min_height": round(0.55 * float(size.robot.standing_height), 2)},
-        "gait": gait(size),
-        "mpc": mpc(size),
-        "footstep": footstep(size),
-        "legs": legs(size),
-        "weights": weights(size),
-        "loss": {"L_ctrl": _short(size.mass**-2)},
-        "tuning": tuning(size),
-        "plants": plants(size),
-    }
-
-
-def gait(size: Size) -> dict[str, int]:
-    """Ticks of 10 ms."""
-    ticks = round(20 * math.sqrt(size.height))
-    return {"stance": ticks, "swing": ticks}
-
-
-def mpc(size: Size) -> dict[str, Any]:
-    """Horizon, force limit and share of the sole."""
-    section = {
-        "step_ticks": max(3, math.ceil(0.15 * gait(size)["swing"])),
-        "max_force": float(f"{2.5 * _weight(size.robot):.2g}"),
-        "effort_reference": "gravity",
-    }
-    flat = size.robot.structure.contact == "flat"
-    return {**section, "sole_width": 0.6} if flat else section
-
-
-def footstep(size: Size) -> dict[str, float]:
-    """Stance width [m] and gain [s] of the footstep rule."""
-    half = 0.5 * foot_distance(size.robot)
-    return {"width": round(0.85 * half, 3), "feedback": round(0.12 * math.sqrt(size.height), 3)}
-
-
-def foot_distance(robot: Robot) -> float:
-    """Distance of the foot points across, standing [m]."""
+    robot, mass, root = size.robot, size.mass, math.sqrt(size.height)
+    height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
+    ticks, torque = round(20 * root), _short(mass * size.height)
     left, right = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
-    return float(left[1] - right[1])
-
-
-def legs(size: Size) -> dict[str, Any]:
-    """Swing path and joint gains; those of a joint are the mean of both legs'."""
-    count = size.robot.description.leg_joints
-    inertia = size.inertia.reshape(2, count).mean(axis=0)
-    limit = size.robot.torque_limit.reshape(2, count).min(axis=0)
-    kp = np.minimum(inertia * _W**2, _KP_PER_LIMIT * limit)
+    flat = {"sole_width": 0.6} if robot.structure.contact == "flat" else {}
     return {
-        "height": round(0.06 * float(size.robot.standing_height) / 0.69, 3),
-        "landing": -0.005,
-        "kp": [_short(x) for x in kp],
-        "kd": [_short(x) for x in np.sqrt(kp * inertia)],
-        "gravity_compensation": True,
-    }
-
-
-def weights(size: Size) -> dict[str, Any]:
-    """Q as HECTOR's; R by the squares of mass, and of mass and height."""
-    force, moment = size.mass**-2, (size.mass * size.height) ** -2
-    nominal = {"euler": 50, "position": [50, 50, 250], "ang_velocity": 1, "velocity": 1}
-    expert = {"euler": [100, 100, 250], "position": [200, 200, 300]}
-    expert |= {"ang_velocity": 1, "velocity": 1}
-    return {
-        "nominal": nominal | {"force": _short(0.3e-4 * force), "moment": _short(0.3e-3 * moment)},
-        "expert": expert
-        | {
-            "force": [_short(x * force) for x in (1e-4, 1e-4, 5e-4)],
-            "moment": _short(1e-2 * moment),
+        "limits": {"min_height": round(0.55 * height, 2)},
+        "gait": {"stance": ticks, "swing": ticks},
+        "mpc": {
+            "step_ticks": max(3, math.ceil(0.15 * ticks)),
+            "max_force": float(f"{2.5 * weight:.2g}"),
+            "effort_reference": "gravity",
+            **flat,
+        },
+        "footstep": {
+            "width": round(0.85 * 0.5 * float(left[1] - right[1]), 3),
+            "feedback": round(0.12 * root, 3),
+        },
+        "legs": {
+            "height": round(0.06 * height / 0.69, 3),
+            "landing": -0.005,
+            **_gains(size),
+            "gravity_compensation": True,
+        },
+        "weights": _weights(size),
+        "loss": {"L_ctrl": _short(mass**-2)},
+        "tuning": {"lead": 2 * ticks, "touchdown_error": True, "choice_plants": 4},
+        "plants": {
+            "joint_friction": torque,
+            "joint_damping": torque,
+            "push": _short(mass),
+            "trunk_com": _short(size.height),
+            "payload": _short(mass),
         },
     }
 
 
-def tuning(size: Size) -> dict[str, Any]:
-    """The tuner's model, and how the best iteration is chosen."""
-    lead = sum(gait(size).values())
-    return {"lead": lead, "touchdown_error": True, "choice_plants": 4}
+def _gains(size: Size) -> dict[str, list[float]]:
+    """Gains of the joints of a leg, by the mean of both legs."""
+    inertia = size.inertia.reshape(2, -1).mean(axis=0)
+    limit = size.robot.torque_limit.reshape(2, -1).min(axis=0)
+    kp = np.minimum(inertia * _W**2, _KP_PER_LIMIT * limit)
+    return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
 
 
-def plants(size: Size) -> dict[str, float]:
-    """How large the imperfections of the plants are."""
-    torque = _short(size.mass * size.height)
+def _weights(size: Size) -> dict[str, Any]:
+    """Q as HECTOR's; R by the squares of mass, and of mass and height."""
+    force, moment = size.mass**-2, (size.mass * size.height) ** -2
+    still = {"ang_velocity": 1, "velocity": 1}
     return {
-        "joint_friction": torque,
-        "joint_damping": torque,
-        "push": _short(size.mass),
-        "trunk_com": _short(size.height),
-        "payload": _short(size.mass),
+        "nominal": {
+            "euler": 50,
+            "position": [50, 50, 250],
+            **still,
+            "force": _short(0.3e-4 * force),
+            "moment": _short(0.3e-3 * moment),
+        },
+        "expert": {
+            "euler": [100, 100, 250],
+            "position": [200, 200, 300],
+            **still,
+            "force": [_short(x * force) for x in (1e-4, 1e-4, 5e-4)],
+            "moment": _short(1e-2 * moment),
+        },
     }
-
-
-def _weight(robot: Robot) -> float:
-    return float(robot.mass * robot.gravity[2])  # [N]
 
 
 def _short(x: float) -> float:

@@ -35,10 +35,27 @@ SOLVER = {
     "iterations": 10,
     "ls_iterations": 10,
 }
+_SCENE = """<mujoco>
+  <compiler angle="radian"/>
+  <visual>
+    <global offwidth="1280" offheight="720"/>
+    <headlight ambient="0.4 0.4 0.4"/>
+  </visual>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.86 0.90 0.94" rgb2="0.36 0.47 0.62"
+             width="256" height="1536"/>
+  </asset>
+  <worldbody>
+    <light pos="-1 -1.4 3.4" dir="0.28 0.4 -0.87" type="directional"/>
+    <geom name="floor" type="plane" size="0 0 0.05" rgba="0.6 0.63 0.67 1" contype="1"
+          conaffinity="0" friction="0.8 0.005 0.0001" solref="0.01 1" solmix="1"/>
+  </worldbody>
+</mujoco>"""
 _SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _ROBOT_GEOM = {"friction": [0.1, 0.005, 0.0001], "solmix": 0.0, "priority": 0}
 BITS = {None: (0, 1), 0: (2, 5), 1: (4, 3)}  # contype, conaffinity of trunk and legs
+_SITE = {"size": [0.005] * 3, "group": 4}
 _SOLE_BITS = ((2, 4), (4, 2))
 _FLOOR_BITS = {"contype": 0, "conaffinity": 1, "condim": 3}
 _GREY, _DARK = [0.75, 0.78, 0.82, 1.0], [0.1, 0.1, 0.1, 1.0]
@@ -62,15 +79,20 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
     Raises:
         InputError: one line: the soles are not level in the standing pose.
     """
-    spec = _empty(description, pieces.model)
-    bodies = _add_links(spec, pieces)
-    for link, body in zip(pieces.links[1:], bodies[1:], strict=True):
-        _add_joint(pieces.model, link, body)
-    for joint, limit in zip(description.joints, pieces.limits, strict=True):
-        _add_motor(spec, joint, limit)
+    spec = mujoco.MjSpec.from_string(_SCENE)
+    spec.modelname = description.name
+    for name, value in SOLVER.items():
+        setattr(spec.option, name, value)
+    spec.option.gravity = pieces.model.opt.gravity
     named = {str(name) for foot in description.feet if foot.body is None for name in foot.contacts}
-    for index, body in enumerate(bodies):
-        _add_geoms(pieces, index, body, named)
+    bodies = []
+    for link in pieces.links:
+        bodies.append(_add_link(bodies[link.parent] if bodies else spec.worldbody, pieces, link))
+        _add_geoms(pieces, len(bodies) - 1, bodies[-1], named)
+    for joint, limit in zip(description.joints, pieces.limits, strict=True):
+        span = [-limit, limit]
+        limits = {"ctrllimited": True, "ctrlrange": span, "forcelimited": True, "forcerange": span}
+        spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, **limits)
     _add_sticks(pieces, bodies)
     for side in (0, 1):
         _add_foot(spec, description, pieces, side)
@@ -78,63 +100,22 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
     return spec
 
 
-def _empty(description: Description, model: mujoco.MjModel) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec()
-    spec.modelname = description.name
-    spec.compiler.degree = False
-    for name, value in SOLVER.items():
-        setattr(spec.option, name, value)
-    spec.option.gravity = model.opt.gravity
-    vision = spec.visual
-    vision.global_.offwidth, vision.global_.offheight = 1280, 720
-    vision.headlight.ambient = [0.4, 0.4, 0.4]
-    spec.add_texture(
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=[0.86, 0.90, 0.94],
-        rgb2=[0.36, 0.47, 0.62],
-        width=256,
-        height=1536,
+def _add_link(parent: mujoco.MjsBody, pieces: Pieces, link: Link) -> mujoco.MjsBody:
+    """The body of a link and its joint."""
+    model, j, I = pieces.model, link.joint, link.inertia  # noqa: E741
+    body = parent.add_body(
+        name=link.name,
+        pos=link.pose.p,
+        quat=link.pose.quat,
+        mass=link.mass,
+        ipos=link.com,
+        fullinertia=[I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]],
+        explicitinertial=True,
     )
-    spec.worldbody.add_light(
-        pos=[-1.0, -1.4, 3.4], dir=[0.28, 0.4, -0.87], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    )
-    spec.worldbody.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0.0, 0.0, 0.05],
-        rgba=[0.6, 0.63, 0.67, 1.0],
-        contype=1,
-        conaffinity=0,
-        friction=[0.8, 0.005, 0.0001],
-        solref=[0.01, 1.0],
-        solmix=1.0,
-    )
-    return spec
-
-
-def _add_links(spec: mujoco.MjSpec, pieces: Pieces) -> list:
-    bodies = []
-    for link in pieces.links:
-        parent = bodies[link.parent] if bodies else spec.worldbody
-        I = link.inertia  # noqa: E741
-        body = parent.add_body(
-            name=link.name,
-            pos=link.pose.p,
-            quat=link.pose.quat,
-            mass=link.mass,
-            ipos=link.com,
-            fullinertia=[I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]],
-            explicitinertial=True,
-        )
-        if not bodies:
-            body.add_freejoint(name="base")
-        bodies.append(body)
-    return bodies
-
-
-def _add_joint(model: mujoco.MjModel, link: Link, body: mujoco.MjsBody) -> None:
-    j, dof = link.joint, model.jnt_dofadr[link.joint]
+    if j < 0:
+        body.add_freejoint(name="base")
+        return body
+    dof = model.jnt_dofadr[j]
     body.add_joint(
         name=model.joint(j).name,
         type=mujoco.mjtJoint.mjJNT_HINGE,
@@ -150,18 +131,7 @@ def _add_joint(model: mujoco.MjModel, link: Link, body: mujoco.MjsBody) -> None:
         armature=model.dof_armature[dof],
         frictionloss=model.dof_frictionloss[dof],
     )
-
-
-def _add_motor(spec: mujoco.MjSpec, joint: str, limit: float) -> None:
-    spec.add_actuator(
-        name=joint,
-        target=joint,
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        ctrllimited=True,
-        ctrlrange=[-limit, limit],
-        forcelimited=True,
-        forcerange=[-limit, limit],
-    )
+    return body
 
 
 def _add_geoms(pieces: Pieces, index: int, body: mujoco.MjsBody, named: set[str]) -> None:
@@ -266,7 +236,8 @@ def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, sid
     if not own or int(model.site_bodyid[own[0]]) not in link.bodies:
         raise InputError(f"{path}: no site {names.point!r} on body {link.name!r}")
     pose = link.bodies[int(model.site_bodyid[own[0]])]
-    _add_site(spec, link, names.point, pose.p + pose.R @ model.site_pos[own[0]])
+    point = pose.p + pose.R @ model.site_pos[own[0]]
+    spec.body(link.name).add_site(name=names.point, pos=point, **_SITE)
 
 
 def _place_foot(
@@ -291,11 +262,7 @@ def _place_foot(
         point = R.T @ np.array([0.0, middle[1], middle[2]])
     else:
         point = pose.p + pose.R @ np.array(foot.point)
-    _add_site(spec, link, names.point, point)
-
-
-def _add_site(spec: mujoco.MjSpec, link: Link, name: str, place: Float[np.ndarray, "3"]) -> None:
-    spec.body(link.name).add_site(name=name, pos=place, size=[0.005] * 3, group=4)
+    body.add_site(name=names.point, pos=point, **_SITE)
 
 
 def _add_standing(spec: mujoco.MjSpec, description: Description, pieces: Pieces) -> None:

@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.links import subtree
+from hector_jax.robot.links import at_zero, subtree
 from hector_jax.robot.rebuild import SHAPES
-from hector_jax.robot.survey import Survey, at_zero
+from hector_jax.robot.survey import Survey
 
 SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
@@ -79,21 +79,14 @@ def _foot_geoms(survey: Survey, leg: Sequence[int]) -> list[int]:
     """Primitives of a foot that collide, with the floor where there is one."""
     model = survey.model
     bodies = subtree(model, int(model.jnt_bodyid[leg[-1]]))
-    bits = [
-        (int(model.geom_contype[g]), int(model.geom_conaffinity[g])) for g in range(model.ngeom)
-    ]
-    floor = [
-        bits[g]
-        for g in range(model.ngeom)
-        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE and any(bits[g])
-    ]
-    inside = [
-        g
-        for g in range(model.ngeom)
-        if model.geom_bodyid[g] in bodies and model.geom_type[g] in SHAPES and any(bits[g])
-    ]
-    on_floor = [g for g in inside if any(bits[g][0] & a or bits[g][1] & c for c, a in floor)]
-    return on_floor if floor else inside
+    contype, conaffinity = model.geom_contype, model.geom_conaffinity
+    collide = (contype | conaffinity) > 0
+    chosen = collide & np.isin(model.geom_bodyid, bodies) & np.isin(model.geom_type, SHAPES)
+    floor = collide & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    if floor.any():
+        own, theirs = (np.bitwise_or.reduce(bits[floor]) for bits in (contype, conaffinity))
+        chosen &= ((contype & theirs) | (conaffinity & own)) > 0
+    return np.flatnonzero(chosen).tolist()
 
 
 def _axes(survey: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
@@ -161,14 +154,8 @@ def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray,
         return np.array([[middle[0], middle[1], z]])
     if width <= _WIDE or joints < _FLAT_FROM:
         return np.array([[high[0], middle[1], z], [low[0], middle[1], z]])
-    return np.array(
-        [
-            [high[0], front[:, 1].max(), z],
-            [high[0], front[:, 1].min(), z],
-            [low[0], back[:, 1].max(), z],
-            [low[0], back[:, 1].min(), z],
-        ]
-    )
+    ends = (high[0], front[:, 1]), (low[0], back[:, 1])
+    return np.array([[x, y, z] for x, across in ends for y in (across.max(), across.min())])
 
 
 def _box_of_inertia(

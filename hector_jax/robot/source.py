@@ -18,12 +18,13 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean, one_line
 from hector_jax.robot.checks import ON_FLOOR, expect, listed, require
 from hector_jax.robot.description import Description
-from hector_jax.robot.elements import drop_unused
+from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import MASSLESS, Link, links_of
 from hector_jax.robot.mjcf import read_mjcf, refusal
 from hector_jax.robot.rebuild import BITS, SHAPES, SOLVER, Pieces, lowest, rebuild
 
 _JOINT = mujoco.mjtJoint
+_MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
 _MOST_FRICTION = 0.2  # of the robot's geoms; of two that touch the larger one counts
 
 
@@ -52,8 +53,8 @@ def build_spec(description: Description) -> Source:
     path = description.model
     root = read_mjcf(path)
     name = description.standing if isinstance(description.standing, str) else None
-    notes = drop_unused(path, root, description.joints, name)
-    file = _read(description, root)
+    spec, notes = spec_of(path, root, description.joints, name)
+    file = _read(description, root, spec)
     angles, trunk_quat = _standing(file, root.tag == "robot")
     limits = [_torque_limit(file, joint) for joint in file.joints]
     changes = ["a URDF, with neither motors nor a floor"] if root.tag == "robot" else []
@@ -81,29 +82,28 @@ def compile_spec(description: Description, spec: mujoco.MjSpec) -> mujoco.MjMode
         raise InputError(f"{description.model}: MuJoCo refuses it: {one_line(error)}") from None
 
 
-def compile_bare(path: Path, root: ElementTree.Element) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """The spec of a file, and its model without motors and keyframes, which need not fit.
+def compile_bare(path: Path, root: ElementTree.Element, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The model of a file without motors and keyframes, which need not fit.
 
     Raises:
         InputError: MuJoCo's refusal in one line.
     """
+    bare = spec.copy()
+    for part in (*bare.actuators, *bare.keys):
+        bare.delete(part)
+    # what is welded may have no mass; the links are checked when they are one
+    bare.compiler.boundmass = MASSLESS
+    bare.compiler.boundinertia = 1e-12
     try:
-        spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
-        bare = spec.copy()
-        for part in (*bare.actuators, *bare.keys):
-            bare.delete(part)
-        # what is welded may have no mass; the links are checked when they are one
-        bare.compiler.boundmass = MASSLESS
-        bare.compiler.boundinertia = 1e-12
-        return spec, bare.compile()
+        return bare.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise refusal(path, root, mujoco.mj_printSchema(False, False), error) from None
+        raise refusal(path, root, error) from None
 
 
-def _read(description: Description, root: ElementTree.Element) -> _File:
+def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSpec) -> _File:
     """Compile a file and find the robot in it."""
     path = description.model
-    spec, model = compile_bare(path, root)
+    model = compile_bare(path, root, spec)
     names = [model.joint(j).name for j in range(model.njnt)]
     for joint in (*description.joints, *description.weld):
         require(path, "joint", joint, names)
@@ -159,15 +159,10 @@ def _check_world(file: _File) -> None:
     expect(path, right, f"gravity is {gravity}, expected 0 0 and a negative number")
     for g in _world_geoms(file):
         plane = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE
-        text = (
-            f"geom {model.geom(g).name or g!r} of the world is terrain, expected a plane at z = 0"
-        )
-        expect(path, plane, text)
-        level = abs(model.geom_pos[g][2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
-        text = (
-            f"floor {model.geom(g).name or g!r} is at {model.geom_pos[g]}, expected level at z = 0"
-        )
-        expect(path, level, text)
+        name, place = model.geom(g).name or repr(g), model.geom_pos[g]
+        expect(path, plane, f"geom {name} of the world is terrain, expected a plane at z = 0")
+        level = abs(place[2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
+        expect(path, level, f"floor {name} is at {place}, expected level at z = 0")
 
 
 def _world_geoms(file: _File) -> list[int]:
@@ -235,13 +230,7 @@ def _limited(flag: mujoco.mjtLimited, span: Float[np.ndarray, "2"]) -> bool:
 
 def _is_motor(motor: mujoco.MjsActuator) -> bool:
     """Whether its control is a force."""
-    kinds = (motor.gaintype, motor.biastype, motor.dyntype)
-    plain = (
-        mujoco.mjtGain.mjGAIN_FIXED,
-        mujoco.mjtBias.mjBIAS_NONE,
-        mujoco.mjtDyn.mjDYN_NONE,
-    )
-    return kinds == plain
+    return (motor.gaintype, motor.biastype, motor.dyntype) == _MOTOR
 
 
 def _changes(file: _File, limits: Sequence[float]) -> list[str]:
@@ -252,17 +241,15 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
     order = [file.free, *file.joints] == list(range(model.njnt))
     at_origin = not np.any(model.jnt_pos) and not np.any(model.qpos0[7:])
     floor, motors = _world_geoms(file), "replace the actuators" if file.spec.actuators else "added"
+    bits = [(model.geom_contype[g], model.geom_conaffinity[g]) for g in floor]
     lines = (
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {listed(description.weld)}", description.weld),
         (f"made one with their parents: {listed(static)}", static),
-        (
-            "joints put in order, left leg first",
-            file.free >= 0 and not order and not description.weld,
-        ),
+        ("joints put in order, left leg first", file.free >= 0 and not (order or description.weld)),
         ("frames of the joints put into their anchors", not at_origin and order),
         (f"torque motors {motors}", not _motors_right(file, limits)),
-        ("floor added" if not floor else "floor replaced", not _floor_right(file)),
+        ("floor added" if not floor else "floor replaced", bits != [(1, 0)]),
         ("armature of the joints set", description.armature),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
         ("contact bits, friction and shapes set", not _contacts_right(file)),
@@ -294,12 +281,6 @@ def _motors_right(file: _File, limits: Sequence[float]) -> bool:
     )
 
 
-def _floor_right(file: _File) -> bool:
-    model, floor = file.model, _world_geoms(file)
-    bits = [(model.geom_contype[g], model.geom_conaffinity[g]) for g in floor]
-    return bits == [(1, 0)]
-
-
 def _contacts_right(file: _File) -> bool:
     """Whether the geoms of the robot touch the floor and the other leg as they should."""
     model, count = file.model, len(file.joints) // 2
@@ -312,13 +293,11 @@ def _contacts_right(file: _File) -> bool:
         while above and above not in roots:
             above = int(model.body_parentid[above])
         contype, conaffinity = BITS[roots.index(above) if above else None]
-        end = model.geom(g).name in ends
-        right = (
-            not model.geom_contype[g] & ~contype and not model.geom_conaffinity[g] & ~conaffinity
-        )
-        right &= model.geom_condim[g] == (3 if end else 1) and model.geom_type[g] in SHAPES
-        right &= model.geom_friction[g, 0] <= _MOST_FRICTION
-        if not right or model.geom_solmix[g] or model.geom_priority[g]:
+        more = model.geom_contype[g] & ~contype or model.geom_conaffinity[g] & ~conaffinity
+        more = more or model.geom_solmix[g] or model.geom_priority[g]
+        right = model.geom_condim[g] == (3 if model.geom(g).name in ends else 1)
+        right = right and model.geom_friction[g, 0] <= _MOST_FRICTION
+        if more or not right or model.geom_type[g] not in SHAPES:
             return False
     return True
 

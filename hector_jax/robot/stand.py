@@ -15,8 +15,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
+from hector_jax.robot.links import at_zero
 from hector_jax.robot.soles import Sole
-from hector_jax.robot.survey import Survey, at_zero
+from hector_jax.robot.survey import Survey
 
 KNEE = 1.0  # [rad]
 _LESS = 0.85  # of the bend, per trial
@@ -98,7 +99,4 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[np.ndarray, n
     limited = model.jnt_limited[joints].astype(bool)
     low, high = model.jnt_range[joints].T
     margin = np.minimum(_MARGIN, 0.1 * (high - low))
-    return (
-        np.where(limited, low + margin, -np.pi),
-        np.where(limited, high - margin, np.pi),
-    )
+    return np.where(limited, low + margin, -np.pi), np.where(limited, high - margin, np.pi)

@@ -19,8 +19,8 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
-from hector_jax.robot.elements import drop_unused
-from hector_jax.robot.links import subtree
+from hector_jax.robot.elements import spec_of
+from hector_jax.robot.links import at_zero, subtree
 from hector_jax.robot.mjcf import read_mjcf
 from hector_jax.robot.source import compile_bare
 
@@ -50,8 +50,8 @@ def survey_file(path: Path) -> Survey:
     """
     path = Path(path)
     root = read_mjcf(path)
-    drop_unused(path, root, (), None)
-    _, model = compile_bare(path, root)
+    spec, _ = spec_of(path, root, (), None)
+    model = compile_bare(path, root, spec)
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _FREE]
     if len(free) > 1:
         names = ", ".join(model.joint(j).name for j in free)
@@ -75,21 +75,6 @@ def survey_file(path: Path) -> Survey:
         knee=knee,
         forwards=bool(span[np.argmax(np.abs(span))] > 0.0),
     )
-
-
-def at_zero(model: mujoco.MjModel) -> mujoco.MjData:
-    """Kinematics with all joints at zero, free bodies upright at the origin."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = 0.0
-    for j in range(model.njnt):
-        start = model.jnt_qposadr[j]
-        if model.jnt_type[j] == _FREE:
-            data.qpos[start + 3] = 1.0
-        elif model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL:
-            data.qpos[start] = 1.0
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    return data
 
 
 def axis_words(axis: Float[np.ndarray, "3"]) -> str:
@@ -133,8 +118,12 @@ def _legs(
         a, b = one[common:], other[common:]
         hinges = all(model.jnt_type[j] == _HINGE for j in (*a, *b))
         right_length = FEWEST_JOINTS <= len(a) <= MOST_JOINTS and len(a) == len(b)
-        if hinges and right_length and _mirrored(data.xanchor[list(a)], data.xanchor[list(b)]):
-            pairs.append((_lowest(model, data, a[-1]), -len(a), a, b))
+        if hinges and right_length:
+            apart = data.xanchor[list(a)] - data.xanchor[list(b)] * [1.0, -1.0, 1.0]
+            below = subtree(model, _body(model, a[-1]))
+            lowest = round(min(data.xipos[below, 2]), 3)  # [m], to the millimetre
+            if np.abs(apart).max() <= _MIRRORED:
+                pairs.append((lowest, -len(a), a, b))
     if not pairs:
         ends = (f"{model.joint(way[-1]).name} ({len(way)})" for way in _chains(model, free))
         raise InputError(
@@ -146,15 +135,6 @@ def _legs(
     if _is_right(model, data, one, other):
         one, other = other, one
     return one, other
-
-
-def _mirrored(one: Float[np.ndarray, "j 3"], other: Float[np.ndarray, "j 3"]) -> bool:
-    return bool(np.abs(one - other * [1.0, -1.0, 1.0]).max() <= _MIRRORED)
-
-
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> float:
-    """Height at which a chain ends [m], to the millimetre."""
-    return round(min(data.xipos[b][2] for b in subtree(model, _body(model, joint))), 3)
 
 
 def _is_right(

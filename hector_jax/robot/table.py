@@ -5,11 +5,13 @@ from collections.abc import Iterable, Sequence
 
 from hector_jax.robot.checks import trunk_body
 from hector_jax.robot.kinematics import knee_joints
+from hector_jax.robot.links import at_zero
 from hector_jax.robot.model import Robot, compile_model
 from hector_jax.robot.source import build_spec
-from hector_jax.robot.survey import Survey, at_zero, axis_words
+from hector_jax.robot.survey import Survey, axis_words
 
 _HEADER = ("joint", "axis", "range [rad]", "motor [N m]", "link [kg]", "standing [rad]")
+_WAYS = {True: "forwards", False: "backwards"}
 _HEAVY = 0.35  # share of the legs in the mass
 
 
@@ -18,11 +20,13 @@ def table_of(robot: Robot) -> list[str]:
     description = robot.description
     count = description.leg_joints
     share = float(robot.link_mass.sum() / robot.mass)
+    _, knee, _ = knee_joints(robot)
+    forwards = robot.standing_joints[knee] * robot.joint_axis[0, knee, 1] > 0.0
     model = compile_model(description)
     trunk = model.body(trunk_body(model)).name
     rows = [
         (
-            _both(description.joints[i], description.joints[count + i]),
+            f"{description.joints[i]}, {description.joints[count + i]}",
             axis_words(robot.joint_axis[0, i]),
             f"{robot.joint_lower[i]:+.2f} to {robot.joint_upper[i]:+.2f}",
             f"{robot.torque_limit[i]:.3g}",
@@ -35,7 +39,7 @@ def table_of(robot: Robot) -> list[str]:
         f"robot    {description.name}: {robot.mass:.4g} kg, trunk {trunk!r}; standing, its centre "
         f"of mass is {robot.standing_height:.3g} m high",
         f"legs     {count} joints each, {100 * share:.0f} % of the mass; knees bend "
-        f"{_way(_forwards(robot))}; axes and numbers of the left leg:",
+        f"{_WAYS[forwards]}; axes and numbers of the left leg:",
         *_columns([_HEADER, *rows]),
         f"feet     {robot.structure.contact}: {_sole(robot)}",
         *_words("fixed", description.weld),
@@ -47,7 +51,7 @@ def table_of_survey(survey: Survey) -> list[str]:
     model, data = survey.model, at_zero(survey.model)
     rows = [
         (
-            _both(model.joint(left).name, model.joint(right).name),
+            f"{model.joint(left).name}, {model.joint(right).name}",
             axis_words(data.xaxis[left]),
             "{:+.2f} to {:+.2f}".format(*model.jnt_range[left])
             if model.jnt_limited[left]
@@ -58,7 +62,7 @@ def table_of_survey(survey: Survey) -> list[str]:
     mass = float(model.body_subtreemass[survey.trunk])
     return [
         f"robot    {mass:.4g} kg, trunk {model.body(survey.trunk).name!r}",
-        f"legs     {len(rows)} joints each; knees bend {_way(survey.forwards)}; axes and numbers "
+        f"legs     {len(rows)} joints each; knees bend {_WAYS[survey.forwards]}; axes and numbers "
         "of the left leg:",
         *_columns([_HEADER[:3], *rows]),
         *_words("fixed", survey.weld),
@@ -95,16 +99,6 @@ def remarks(robot: Robot) -> list[str]:
     return lines
 
 
-def _way(forwards: bool) -> str:
-    return "forwards" if forwards else "backwards"
-
-
-def _forwards(robot: Robot) -> bool:
-    """Whether the knees point ahead in the standing pose."""
-    _, knee, _ = knee_joints(robot)
-    return bool(robot.standing_joints[knee] * robot.joint_axis[0, knee, 1] > 0.0)
-
-
 def _sole(robot: Robot) -> str:
     if robot.structure.contact == "point":
         return "one contact each"
@@ -112,11 +106,6 @@ def _sole(robot: Robot) -> str:
     if robot.structure.contact == "flat":
         text += f", {100 * robot.half_width:.1f} cm to either side"
     return text
-
-
-def _both(left: str, right: str) -> str:
-    """Two names in one cell."""
-    return f"{left}, {right}"
 
 
 def _words(title: str, words: Sequence[str]) -> list[str]:

@@ -58,11 +58,8 @@ class Contacts(NamedTuple):
 def coordinates(world: World) -> Int[np.ndarray, " reading"]:
     """Where a flat reading's entries are in (qpos, qvel, 0); no backlash reads the zero."""
     model = world.model
-    slack = (
-        world.slack_qpos
-        if world.slack_qpos.size
-        else np.full(len(world.joint_qpos), model.nq + model.nv)
-    )
+    rigid = np.full(len(world.joint_qpos), model.nq + model.nv)
+    slack = world.slack_qpos if world.slack_qpos.size else rigid
     trunk_rates, joint_rates = model.nq + np.arange(6), model.nq + world.joint_dof
     return np.concatenate([np.arange(7), trunk_rates, world.joint_qpos, joint_rates, slack])
 

@@ -159,11 +159,8 @@ def _walk_ticks(
     errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
     anchor = jax.device_put(standing_anchor(robot, start))
     legs = jax.device_put(config.parameters(weights).legs)
-    memory, motors, yaw = (
-        programs.begin(body, plant.readings[0]),
-        init_actuators(joints),
-        jnp.zeros(()),
-    )
+    memory, motors = programs.begin(body, plant.readings[0]), init_actuators(joints)
+    yaw = jnp.zeros(())
     carry = None if retune is None else retune.init
     plan = samples = None
     for tick in range(begin, start + ticks):
@@ -221,13 +218,8 @@ def _trajectory(
 
 def on_host(job: Job) -> Job:
     """The job with arrays of the host: what a process is sent must not sit on a device."""
-    host = partial(jax.tree.map, np.asarray)
-    return job._replace(
-        weights=host(job.weights),
-        command=host(job.command),
-        imperfections=host(job.imperfections),
-        plant=host(job.plant),
-    )
+    arrays = {name: getattr(job, name) for name in ("weights", "command", "imperfections", "plant")}
+    return job._replace(**jax.tree.map(np.asarray, arrays))
 
 
 def walk_many(
