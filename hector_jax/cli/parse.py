@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import NAMED_WEIGHTS, Command, Source, Tune, command, command_name
+from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Source, Tune, command
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import (
     SEED,
@@ -85,9 +85,7 @@ def print_completion(shell: str) -> None:
 
 
 def _all_commands(words: Sequence[str]) -> Any:
-    kinds = [
-        Annotated[kind, tyro.conf.subcommand(command_name(kind))] for kind in get_args(Command)
-    ]
+    kinds = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()]
     return _tyro(Union[tuple(kinds)], words, prog="hector", description=_ABOUT)  # noqa: UP007
 
 

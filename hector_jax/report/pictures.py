@@ -119,7 +119,7 @@ def of_view(
     if courses:
         plots.losses(folder / "losses.png", loss, courses)
     say("making the film")
-    pair = motions(robot, dict(zip(plots.titles(walks), walks.values(), strict=True)))
+    pair = motions(robot, plots.style.titled(walks))
     write_film(folder / "film.mp4", robot, pair)
     write_strip(folder / "film.png", robot, pair)
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
 from hector_jax.report.motion import COLOURS, INK
-from hector_jax.report.plots.walks import distances
+from hector_jax.report.plots import distances
 from hector_jax.report.video import Scene
 
 _WINDOW = 4.0  # [s] of the reference that a film keeps in view
