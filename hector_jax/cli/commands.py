@@ -207,7 +207,7 @@ def export_controller(args: flags.Export) -> None:
     with locked(folder):
         inputs = config or walk_config(robot), robot, weights, course.command
         card = export.export(*inputs, folder, **about)
-    print_result(args.json, card, partial(_print_check, card["check"]))
+    print_result(args.json, card, lambda: _print_check(card["check"]))
     say(f"the export is in {folder}")
 
 

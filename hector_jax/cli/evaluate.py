@@ -20,10 +20,11 @@ from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, printable
 from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import SOLVED
+from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import training
 from hector_jax.grfm.collection import Walks
-from hector_jax.grfm.dataset import make_dataset
+from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
@@ -188,4 +189,6 @@ def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -
         for seed, plant in enumerate(arguments.plants("standin", range(count), robot.description))
     ]
     title = f"walking on {plural(count, 'stand-in plant')}, for information"
-    return verdicts.walk_all(pool, config, robot, jobs, title)
+    walks = verdicts.walk_jobs(pool, config, robot, jobs, title)
+    tick = config.rollout.walk.gait.tick
+    return Walks(stack(jobs), stack([at_interval(walk, tick) for walk in walks]))

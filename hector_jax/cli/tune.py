@@ -36,9 +36,6 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
-from hector_jax.runs.metrics import Verdict
-from hector_jax.runs.nets import TrainedNet
-from hector_jax.runs.tunings import Problem
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
@@ -128,7 +125,7 @@ class _Run(NamedTuple):
     trajectories: tuple[NamedCommand, ...]
     seconds: float  # of each walk
     config: TuneConfig
-    net: TrainedNet
+    net: nets.TrainedNet
     commit: str
 
     @property
@@ -142,11 +139,11 @@ class _Run(NamedTuple):
         return ", ".join(one.name for one in self.trajectories)
 
     @property
-    def problems(self) -> dict[str, Problem]:
+    def problems(self) -> dict[str, tunings.Problem]:
         """All trajectories, to be tuned without and with the net."""
         command, *others = (one.command for one in self.trajectories)
         params = {"without": None, "with": self.net.params}
-        return {name: Problem(command, net, tuple(others)) for name, net in params.items()}
+        return {name: tunings.Problem(command, net, tuple(others)) for name, net in params.items()}
 
 
 class _Tuned(NamedTuple):
@@ -216,7 +213,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     say(f"the report is {report}")
 
 
-def _net(pool: Executor, args: Tune, robot: Robot) -> TrainedNet:
+def _net(pool: Executor, args: Tune, robot: Robot) -> nets.TrainedNet:
     if args.net is not None:
         return nets.load_net(args.net, robot, args.variant)[0]
     data = arguments.folder_of(args.data, args.robot, robot)
@@ -332,16 +329,16 @@ def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
 
 def _result(
     run: _Run, tuned: _Tuned, walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
-) -> tuple[dict[str, Any], dict[str, Verdict]]:
+) -> tuple[dict[str, Any], dict[str, metrics.Verdict]]:
     """Write result.json; its content, and the verdicts: of all walks, and by trajectory."""
 
-    def verdict(names: Sequence[str], world: int) -> Verdict:
+    def verdict(names: Sequence[str], world: int) -> metrics.Verdict:
         each = [walks[name][world] for name in names]
         scores = {n: [s for one in each for s in one.scores[n]] for n in tuned.sets}
         seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
         return metrics.make_verdict(run.config.loss, seeds, scores)
 
-    def content(names: Sequence[str], one: Verdict) -> dict[str, Any]:
+    def content(names: Sequence[str], one: metrics.Verdict) -> dict[str, Any]:
         result = metrics.as_result(one)
         for name, there in metrics.as_result(verdict(names, 1), "hfs")["sets"].items():
             result["sets"][name] |= there

@@ -111,12 +111,11 @@ def of_view(
     walks = {name: one.walk for name, one in views.items()}
     plots.tracking(folder / "tracking.png", walks)
     plots.path_from_above(folder / "path.png", walks)
-    after = list(views.values())[-1]
-    period, ticks = float(after.walk.period), len(after.walk.fallen)
-    first = min(0.4, period * ticks)  # [s], two steps
-    plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
-    courses = {name: histories[name] for name in ("without", "with") if histories.get(name)}
-    if courses:
+    after, ground = list(views.values())[-1]
+    period = float(after.period)
+    first = min(0.4, period * len(after.fallen))  # [s], two steps
+    plots.wrenches(folder / "wrenches.png", period, ground, seconds=first)
+    if courses := {name: histories[name] for name in ("without", "with") if histories.get(name)}:
         plots.losses(folder / "losses.png", loss, courses)
     say("making the film")
     pair = motions(robot, plots.style.titled(walks))

@@ -181,9 +181,7 @@ def weights(
         names: of the weights, such as `WEIGHT_NAMES`.
         sets: `nominal`, `expert` and the tuned `without`, `with`, flat in the order of `names`.
     """
-    ratio = {
-        name: np.asarray(values) / np.asarray(sets["nominal"]) for name, values in sets.items()
-    }
+    ratio = {name: np.divide(values, sets["nominal"]) for name, values in sets.items()}
     bars = [name for name in ("without", "with") if name in sets]
     with drawing(path, 10.0, 3.4) as figure:
         axes = figure.subplots()
