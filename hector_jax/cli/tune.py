@@ -31,7 +31,7 @@ from hector_jax.grfm.jobs import PIECES
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import Picture, print_table
-from hector_jax.report.run import Report, write_report
+from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
@@ -189,20 +189,18 @@ def _tune_in(folder: Path, args: Tune) -> None:
     verdict, (standin, on_hfs) = by_name[run.name], walks[trajectories[0].name]
     report = write_report(
         folder,
-        Report(
-            trajectory=run.name,
-            verdict=verdict,
-            tunings=tuned.tunings,
-            norms=norms,
-            errors=run.net.errors,
-            shifts=tuned.shifts,
-            chosen=result.get("chosen", {}),
-            pictures=_draw(run, tuned, standin, on_hfs),
-            film=_film(run, standin),
-            config=settings,
-            environment=made_with,
-            command=as_command("hector tune", run_folder.as_begun(args)),
-        ),
+        trajectory=run.name,
+        verdict=verdict,
+        tunings=tuned.tunings,
+        norms=norms,
+        errors=run.net.errors,
+        shifts=tuned.shifts,
+        chosen=result.get("chosen", {}),
+        pictures=_draw(run, tuned, standin, on_hfs),
+        film=_film(run, standin),
+        config=settings,
+        environment=made_with,
+        command=as_command("hector tune", run_folder.as_begun(args)),
     )
 
     def in_words() -> None:
