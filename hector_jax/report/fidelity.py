@@ -161,9 +161,7 @@ def drifts(
 
 
 def as_result(
-    whole: Mapping[str, Mapping[str, Any]],
-    phases: Mapping[str, Any],
-    drifts: Mapping[str, Drift],
+    whole: Mapping[str, Mapping[str, Any]], phases: Mapping[str, Any], drifts: Mapping[str, Drift]
 ) -> dict[str, Any]:
     """All errors of one world as JSON values; `whole` is `training.report`."""
 

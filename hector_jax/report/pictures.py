@@ -90,11 +90,7 @@ def of_nets(
 
 
 def of_view(
-    folder: Path,
-    robot: Robot,
-    histories: Histories,
-    loss: Loss,
-    views: Mapping[str, ViewedWalk],
+    folder: Path, robot: Robot, histories: Histories, loss: Loss, views: Mapping[str, ViewedWalk]
 ) -> None:
     """Draw what the page of `view` shows, as a film and pictures.
 

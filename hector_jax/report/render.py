@@ -149,11 +149,7 @@ def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rat
 
 
 def _frame(
-    scene: Scene,
-    plot: np.ndarray,
-    box: tuple[int, int, int, int],
-    halves: list[np.ndarray],
-    k: int,
+    scene: Scene, plot: np.ndarray, box: tuple[int, int, int, int], halves: list[np.ndarray], k: int
 ) -> Image.Image:
     """Join both halves, their labels, and the plot below, pale where time has not come yet."""
     time, last = scene.times[k], max(motion.times[-1] for motion in scene.motions.values())

@@ -116,6 +116,11 @@ def _say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
             say(f"{name}: {len(falls)} of {plural(len(each), 'walk')} {falls[0]}")
 
 
+def _restored(one: ScoredWalk) -> ScoredWalk:
+    """A walk from a file, where texts are arrays."""
+    return one._replace(commit=str(one.commit), startup=str(one.startup))
+
+
 def judge(
     pool: Executor,
     config: TuneConfig,
@@ -171,13 +176,7 @@ def judge(
         }
         like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
-    by_set = {  # texts are arrays in a file
-        name: [
-            one._replace(commit=str(one.commit), startup=str(one.startup))
-            for one, _ in (results[name, seed] for seed in seeds)
-        ]
-        for name in sets
-    }
+    by_set = {name: [_restored(results[name, seed][0]) for seed in seeds] for name in sets}
     _say_faults(by_set)
     first = {name: results[name, seeds[0]][1] for name in sets if folder is not None}
     return ScoredWalks(by_set, first)
