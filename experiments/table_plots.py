@@ -12,8 +12,8 @@ from table_report import PAPER, paper_change
 from hector_jax.core.console import say
 from hector_jax.core.trajectory import Trajectory, from_start
 from hector_jax.report.motion import motions
+from hector_jax.report.plots import draw_path, draw_tracking, span_of
 from hector_jax.report.plots.style import drawing, label_of, log_axis, looks_of
-from hector_jax.report.plots.walks import draw_path, draw_tracking, span_of
 from hector_jax.report.report import Picture, caption
 from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.robot.model import Robot

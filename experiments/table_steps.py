@@ -59,7 +59,7 @@ def search(
         config,
         tune,
         bench.robot,
-        dict.fromkeys(trajectories, nominal()),
+        nominal(),
         commands={name: named_command(name) for name in trajectories},
         engine=engine,
         folder=bench.folder / f"search-{key}",

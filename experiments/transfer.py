@@ -141,7 +141,7 @@ def phis(
                 "A --data folder of its own gives this one nets"
             )
             return effects, None
-    net, paper = (nets.load_or_train(pool, robot, data, name) for name in (None, "paper"))
+    net, paper = (nets.load_or_train(pool, robot, data, name) for name in ("residual", "paper"))
     default = as_effect(net.params)
     effects |= {
         "linear": as_effect(net.linear),

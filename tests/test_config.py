@@ -4,7 +4,6 @@ import json
 import sys
 from dataclasses import fields
 from pathlib import Path
-from typing import get_args
 
 import pytest
 from hypothesis import given, settings
@@ -13,13 +12,13 @@ from table import Flags as Table
 
 from hector_jax.cli import flags, parse
 from hector_jax.cli import main as cli
-from hector_jax.cli.flags import Command, Configured, Evaluate, Tune
+from hector_jax.cli.flags import COMMANDS, Configured, Evaluate, Tune
 from hector_jax.cli.parse import as_table, from_file, from_line
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import validation_error
 from hector_jax.tuning.difftune import PAPER_ITERATIONS
 
-FILES = [kind for kind in (*get_args(Command), Table) if issubclass(kind, Configured)]
+FILES = [kind for kind in (*COMMANDS.values(), Table) if issubclass(kind, Configured)]
 
 
 def written(folder, text, name="run.toml"):

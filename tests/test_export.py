@@ -38,9 +38,10 @@ from hector_jax.runs.export import (
     export_controller,
     find_weights,
     load_controller,
+    weights_cpp,
+    weights_schema,
 )
-from hector_jax.runs.export_check import Check, check, record
-from hector_jax.runs.export_weights import weights_cpp, weights_schema
+from hector_jax.runs.export_controller import Check, check, record
 
 ROBOT, CONFIG = load_robot(), WalkConfig()
 EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"

@@ -57,7 +57,7 @@ def gather(folder, robot, draw=0, **others):
     )
 
 
-def ground(folder, robot, variant=None):
+def ground(folder, robot, variant="residual"):
     return nets.load_or_train(ThreadPoolExecutor(1), robot, folder, variant)
 
 

@@ -14,8 +14,8 @@ from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.motion import COLOURS, motions
+from hector_jax.report.plots import distances
 from hector_jax.report.plots.style import label_of, looks_of
-from hector_jax.report.plots.walks import distances
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.loss import PAPER_LOSS
 

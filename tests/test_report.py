@@ -13,7 +13,7 @@ from hector_jax.control.weights import expert
 from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
-from hector_jax.report.run import Report, tuning_section, write_report
+from hector_jax.report.run import tuning_section, write_report
 from hector_jax.runs.metrics import Verdict
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -34,7 +34,7 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         name: {"force": x, "moment": x / 200, "stance": [x] * 6, "swing": [x] * 5 + [0.0]}
         for name, x in {"raw": 275.0, "linear": 119.0, "net": 73.0}.items()
     }
-    return Report(
+    return dict(
         trajectory="straight",
         verdict=verdict or pretend_verdict(),
         tunings={"without": tuning, "with": tuning},
@@ -45,6 +45,8 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         config={"traj": "straight", "seeds": 8},
         environment=environment(),
         command="make tune TRAJ=straight",
+        shifts=(),
+        chosen={},
     )
 
 
@@ -93,7 +95,7 @@ def test_legs_that_touch_are_told_where_they_do(tmp_path):
     verdict = verdict._replace(scores=scores)
     line = "The legs touched each other, which is no fall: with 0.030 s in all."
     assert line in _printed(verdict)
-    assert line in write_report(tmp_path, _report(verdict)).read_text()
+    assert line in write_report(tmp_path, **_report(verdict)).read_text()
 
 
 def test_the_table_goes_without_baselines_that_were_not_walked():
@@ -129,7 +131,7 @@ def test_scales_are_powers_of_a_thousand(largest, power):
 
 
 def test_the_report_tells_everything_that_was_promised(tmp_path):
-    path = write_report(tmp_path, _report())
+    path = write_report(tmp_path, **_report())
     text = path.read_text()
     assert path == tmp_path / "report.md"
     for section in ("Verdict", "Tuning", "GRFM-Net on held-out", "Pictures", "What was run"):
@@ -150,20 +152,20 @@ def test_the_report_tells_everything_that_was_promised(tmp_path):
 
 
 def test_the_report_names_the_iteration_that_was_taken_and_the_errors_of_touchdowns(tmp_path):
-    plain, line = write_report(tmp_path, _report()).read_text(), "`with` is iteration 3 of 9"
+    plain, line = write_report(tmp_path, **_report()).read_text(), "`with` is iteration 3 of 9"
     assert line not in plain
     assert "touchdown" not in plain
     report = _report()
-    errors = {name: one | {"touchdown": [9.0, 4.0]} for name, one in report.errors.items()}
-    asked = report._replace(chosen={"with": {"iteration": 3, "of": 9}}, errors=errors)
-    text = write_report(tmp_path, asked).read_text()
+    errors = {name: one | {"touchdown": [9.0, 4.0]} for name, one in report["errors"].items()}
+    asked = report | {"chosen": {"with": {"iteration": 3, "of": 9}}, "errors": errors}
+    text = write_report(tmp_path, **asked).read_text()
     assert text.count(line) == 1
     assert "`without` is iteration" not in text
     assert "| touchdown, sideways [cm^2] | 4 | 4 | 4 |" in text
 
 
 def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_path):
-    plain = write_report(tmp_path, _report()).read_text()
+    plain = write_report(tmp_path, **_report()).read_text()
     assert "efresh" not in plain
     error = lambda x: {"force": x, "moment": x / 100}  # noqa: E731
     shift = {
@@ -172,8 +174,8 @@ def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_
     }
     verdict = pretend_verdict()
     scores = verdict.scores | {"with_refreshed": verdict.scores["with"]}
-    told = _report(verdict._replace(scores=scores))._replace(shifts=[shift])
-    text = write_report(tmp_path, told).read_text()
+    told = _report(verdict._replace(scores=scores)) | {"shifts": [shift]}
+    text = write_report(tmp_path, **told).read_text()
     assert "### Refresh 1" in text
     assert "| new walks, force [N^2] | 220 | 41 | 30 |" in text
     assert "| old walks, moment [(N m)^2] | 1.8 | 0.27 | 0.28 |" in text
@@ -181,7 +183,7 @@ def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_
 
 
 def test_every_table_of_the_report_is_well_formed(tmp_path):
-    text = write_report(tmp_path, _report(pretend_verdict(fallen={("with", 1)}))).read_text()
+    text = write_report(tmp_path, **_report(pretend_verdict(fallen={("with", 1)}))).read_text()
     for block in text.split("\n\n"):
         rows = [row for row in block.splitlines() if row.startswith("|")]
         assert len({row.count("|") for row in rows}) <= 1, block
@@ -193,14 +195,14 @@ def test_the_report_says_below_only_where_the_loss_is_below(tmp_path):
     verdict = pretend_verdict()
     swapped = {"nominal": "with", "with": "nominal"}
     scores = {name: verdict.scores[swapped.get(name, name)] for name in SETS}
-    text = write_report(tmp_path, _report(verdict._replace(scores=scores))).read_text()
+    text = write_report(tmp_path, **_report(verdict._replace(scores=scores))).read_text()
     assert "(`with`), the loss is 176" in text
     assert "% above nominal" in text
 
 
 def test_the_film_is_linked_where_there_is_one(tmp_path):
     text = write_report(
-        tmp_path, _report(film=Picture("film.mp4", "Before and after."))
+        tmp_path, **_report(film=Picture("film.mp4", "Before and after."))
     ).read_text()
     assert "[Before and after.](film.mp4)" in text
 

@@ -36,11 +36,11 @@ def asked(monkeypatch):
     """What the steps that take long were asked for; nothing is walked, tuned or drawn in 3D."""
     told = {"walks": 0, "tunings": []}
 
-    def search(pool, config, tune, robot, starts, *, commands, engine, folder):
+    def search(pool, config, tune, robot, start, *, commands, engine, folder):
         told["search"] = config
         generation = Generation(np.zeros((10, 18)), np.full(10, 2e6))
         one = SearchResult(expert(), 2e6, 7, [generation] * 2, "2 generations")
-        return dict.fromkeys(starts, one)
+        return dict.fromkeys(commands, one)
 
     def side_by_side(pool, config, robot, start, problems, title, on_iteration):
         told["tunings"].append((config.iterations, *problems))

@@ -1,8 +1,10 @@
-"""What flags that several commands share stand for: weights, robots, plants, trajectories."""
+"""What commands share: weights, robots, plants and trajectories of flags, and how they answer."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from hector_jax.cli.flags import View, Walk
 from hector_jax.control import trajectories
@@ -11,6 +13,7 @@ from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
+from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.description import Description
@@ -51,6 +54,21 @@ def short_names(texts: Sequence[str]) -> dict[str, str]:
     return names
 
 
+def print_result(json: bool, result: Any, in_words: Callable[[], None], **form: Any) -> None:
+    """Print the result of a command: as JSON where --json asks for it, else in words."""
+    if json:
+        print(as_json(result, **form))
+    else:
+        in_words()
+
+
+def print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print the errors of nets, as `training.report` gives them."""
+    print("mean square errors on held-out walks")
+    for name, of in errors.items():
+        print(f"{name:9s} force {of['force']:8.2f} N^2   moment {of['moment']:7.4f} (N m)^2")
+
+
 def folder_of(folder: Path, path: Path | None, robot: Robot) -> Path:
     """Another robot than the packaged one, so one with a `path`, has its own folder in there."""
     return folder if path is None else folder / robot.description.name
@@ -78,9 +96,8 @@ def default_of(flag: Path, usual: Path, path: Path | None, robot: Robot) -> Path
 
 def plants(world: str, seeds: range, description: Description) -> list[Imperfections]:
     """One plant of a world for each seed, sized for the robot of a description."""
-    if world == "standin":
-        return [standin(seed, description) for seed in seeds]
-    return [named_world(world, seed, description) for seed in seeds]
+    draw = standin if world == "standin" else partial(named_world, world)
+    return [draw(seed, description) for seed in seeds]
 
 
 def plant_of(path: Path | None, robot: Robot) -> Robot | None:
@@ -121,8 +138,7 @@ def seconds(flag: float, trajectory: NamedCommand) -> float:
     if flag != Walk.seconds:
         raise InputError(
             f"--seconds is for built-in trajectories: {trajectory.name} lasts "
-            f"{trajectory.seconds:g} s, "
-            f"as its file says, got {flag:g}"
+            f"{trajectory.seconds:g} s, as its file says, got {flag:g}"
         )
     return trajectory.seconds
 
@@ -136,27 +152,20 @@ def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
 
 
 def walk_once(
-    args: Walk | View,
-    robot: Robot,
-    trajectory: NamedCommand,
-    weights: Weights,
-    plant: Robot | None = None,
+    args: Walk | View, robot: Robot, course: NamedCommand, weights: Weights, plant: Robot | None
 ) -> Trajectory:
-    """One walk in the world of the flags."""
+    """One walk in the world of the flags; `plant` is another model of the robot."""
     if args.world == "srbm":
-        lasts = seconds(args.seconds, trajectory)
-        return verdicts.walk_rigid_body(robot, weights, trajectory.command, lasts)
-    return walk(walk_config(robot), robot, job_of(args, robot, trajectory, weights, plant))
+        lasts = seconds(args.seconds, course)
+        return verdicts.walk_rigid_body(robot, weights, course.command, lasts)
+    return walk(walk_config(robot), robot, job_of(args, robot, course, weights, plant))
 
 
 def job_of(
-    args: Walk | View,
-    robot: Robot,
-    trajectory: NamedCommand,
-    weights: Weights,
-    plant: Robot | None = None,
+    args: Walk | View, robot: Robot, course: NamedCommand, weights: Weights, plant: Robot | None
 ) -> Job:
     """The walk of the flags in a world of MuJoCo; `plant` is another model of the robot."""
-    lasts, body = seconds(args.seconds, trajectory), robot if plant is None else plant
-    (imperfections,) = plants(args.world, range(args.seed, args.seed + 1), body.description)
-    return Job(weights, trajectory.command, imperfections, lasts, args.seed, plant=plant)
+    body = (plant or robot).description
+    (imperfections,) = plants(args.world, range(args.seed, args.seed + 1), body)
+    lasts = seconds(args.seconds, course)
+    return Job(weights, course.command, imperfections, lasts, args.seed, plant=plant)

@@ -1,9 +1,34 @@
 """What each command of `hector` does with its flags (flags.py)."""
 
-from functools import singledispatch
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial, singledispatch
 from typing import Any
 
-from hector_jax.cli import data, doctor, evaluate, export, robot, search, tune, view
+from hector_jax.cli import arguments, doctor, evaluate, flags, tune, view
+from hector_jax.cli.arguments import print_result
+from hector_jax.control.controller import walk_config
+from hector_jax.control.reference import COMMANDS
+from hector_jax.control.weights import expert
+from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.core.console import Broken, say
+from hector_jax.core.environment import versions
+from hector_jax.core.files import locked, make_folder, write_json
+from hector_jax.core.inputs import InputError
+from hector_jax.core.runtime import workers
+from hector_jax.grfm.training import TrainConfig
+from hector_jax.report.compare import compare_runs, print_comparison
+from hector_jax.report.tensorboard import write_events
+from hector_jax.robot.description import description_of
+from hector_jax.robot.model import Robot, load_robot, robot_of
+from hector_jax.robot.propose import as_toml, propose
+from hector_jax.robot.table import mended, remarks, table_of, table_of_survey
+from hector_jax.runs import export, nets, replay, searches, tunings
+from hector_jax.runs.folder import RESULT, load_run, read_request
+from hector_jax.search.cmaes import SearchConfig
+from hector_jax.sim.engine import choose_engine
+from hector_jax.tuning.loss import alphas, loss_of_robot
 
 
 @singledispatch
@@ -16,20 +41,200 @@ def run(args: Any) -> None:
     raise NotImplementedError(type(args))
 
 
-for _command in (
-    data.collect,
-    data.train,
-    data.grfm,
-    tune.tune,
-    search.search,
-    evaluate.evaluate,
-    evaluate.walk,
-    evaluate.compare,
-    robot.examine_robot,
-    view.view_run,
-    view.replay_dump,
-    view.tensorboard,
-    export.export_controller,
-    doctor.doctor,
-):
+for _command in (doctor.doctor, evaluate.evaluate, evaluate.walk, evaluate.grfm, tune.tune):
     run.register(_command)
+run.register(view.view_run)
+
+
+@run.register
+def collect(args: flags.Collect) -> None:
+    """Walk on the simulator with chance, and keep the walks."""
+    config = nets.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
+    robot = load_robot(args.robot)
+    out = arguments.default_of(args.out, flags.Collect.out, args.robot, robot)
+    with workers(args.processes) as pool:
+        nets.collect(pool, config, robot, out)
+    say(f"the walks are in {out}")
+
+
+@run.register
+def train(args: flags.Train) -> None:
+    """Train a net on walks."""
+    config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
+    robot = load_robot(args.robot)
+    data = arguments.default_of(args.data, flags.Train.data, args.robot, robot)
+    path = args.out or nets.net_path(data.parent, args.variant)
+    errors = nets.train(config, robot, data, path).errors
+    result = {"net": str(path), "errors": errors}
+    print_result(args.json, result, partial(arguments.print_errors, errors))
+    say(f"the net is in {path}")
+
+
+@run.register
+def search(args: flags.Search) -> None:
+    """Search for weights on the simulator, without gradients."""
+    robot = load_robot(args.robot)
+    texts = COMMANDS if args.traj == "all" else (args.traj,)
+    courses = [arguments.course(text, robot) for text in texts]
+    commands = {one.name: one.command for one in courses}
+    config = SearchConfig(args.budget, args.population, args.seed, args.spread)
+    engine = choose_engine(args.engine)
+    tuning = arguments.with_length(tunings.tune_config(robot), courses[0])
+    start = arguments.weights(args.start, robot)
+    out = arguments.default_of(args.out, flags.Search.out, args.robot, robot)
+    make_folder(out)
+    shared: dict[str, Any] = {"commands": commands, "engine": engine}
+    with workers(args.processes) as pool:
+        inputs = pool, config, tuning, robot, start
+        results = searches.search(*inputs, folder=args.record or out, **shared)
+        say("walking with the start, expert and best weights")
+        sets = {name: [start, expert(robot), one.weights] for name, one in results.items()}
+        at_once = config.population * len(commands)
+        compared = searches.losses_on_hfs(pool, tuning, robot, sets, at_once=at_once, **shared)
+    cards = {}
+    for name, one in results.items():
+        at_start, at_expert, again = compared[name].tolist()
+        cards[name] = {
+            "trajectory": name,
+            "L": {"start": at_start, "best": one.loss, "best_again": again, "expert": at_expert},
+            "walks": len(one.history) * config.population,
+            "best_at": one.walk,
+            "stop": one.stop,
+            "search": asdict(config),
+            "start": args.start,
+            "engine": engine.name,
+            "rollout": asdict(tuning.rollout),
+            "loss": alphas(tuning.loss),
+            "versions": versions(),
+        }
+        save_weights(out / f"{name}.json", one.weights)
+        write_json(out / f"{name}-card.json", cards[name])
+    print_result(args.json, {"weights": str(out), "cards": cards}, partial(_print_search, cards))
+    say(f"the weights are in {out}")
+
+
+def _print_search(cards: Mapping[str, Mapping[str, Any]]) -> None:
+    print("L in 1e6 on the high-fidelity simulator")
+    print(f"{'':10s}{'start':>9s}{'best':>9s}{'expert':>9s}{'walks':>8s}{'best at':>9s}")
+    for name, card in cards.items():
+        losses = "".join(f"{card['L'][x] / 1e6:9.3f}" for x in ("start", "best", "expert"))
+        print(f"{name:10s}{losses}{card['walks']:8d}{card['best_at']:9d}")
+
+
+@run.register
+def compare(args: flags.Compare) -> None:
+    """Put finished runs side by side."""
+    finished = [folder for folder in args.runs if (folder / RESULT).exists()]
+    for folder in args.runs:
+        if finished and folder not in finished:
+            say(f"{folder} is left out: it is not a finished run")
+    comparison = compare_runs([load_run(folder) for folder in finished or args.runs])
+    if args.out is not None:
+        write_json(args.out, comparison)
+    print_result(args.json, comparison, partial(print_comparison, comparison))
+
+
+@run.register
+def examine_robot(args: flags.Robot) -> None:
+    """Check a robot's TOML, or propose one for its model.
+
+    Raises:
+        InputError: the robot cannot be used as it is; the one line says what is to be mended.
+    """
+    file, out = args.file, args.out
+    if file.suffix == ".toml":
+        if out is not None:
+            raise InputError(f"--out is for a proposal, and {file} is checked")
+        _print_robot(load_robot(file), [])
+        return
+    if out is not None:
+        if out.suffix != ".toml":
+            raise InputError(f"--out must end in .toml, got {str(out)!r}")
+        if out.exists():
+            raise InputError(f"--out must be a new file, and {out} exists")
+        beside = file.absolute().parent
+        if out.absolute().parent.resolve() != beside.resolve():
+            raise InputError(f"--out must be beside the model, in {beside}, got {str(out)!r}")
+    proposal = propose(file)
+    head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
+    wrong = [f"To be mended: {line}" for line in proposal.wrong]
+    text = as_toml(proposal.table, [head, *wrong])
+    try:
+        robot = robot_of(description_of(out or file.with_suffix(".toml"), proposal.table))
+    except InputError:
+        print("\n".join([*table_of_survey(proposal.survey), *_list("wrong", proposal.wrong)]))
+        raise
+    _print_robot(robot, proposal.wrong)
+    if out is None:
+        print(f"\n{text}", end="")
+        return
+    try:
+        with out.open("x", encoding="utf-8") as opened:
+            opened.write(text)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror}") from None
+    say(f"the proposal is in {out}; walk with it: hector walk --robot {out}")
+
+
+def _print_robot(robot: Robot, wrong: Sequence[str]) -> None:
+    """Print what a robot holds, once the controller and the loss have read what they need of it."""
+    walk_config(robot)
+    loss_of_robot(robot.description)
+    wrong = [*wrong, *remarks(robot)]
+    print("\n".join([*table_of(robot), *_list("mended", mended(robot)), *_list("wrong", wrong)]))
+
+
+def _list(title: str, lines: Sequence[str]) -> list[str]:
+    """Lines under a title."""
+    each = lines or ["nothing"]
+    return [f"{title if i == 0 else '':8s} {line}" for i, line in enumerate(each)]
+
+
+@run.register
+def export_controller(args: flags.Export) -> None:
+    """Export the controller of a run, checked against the live one."""
+    is_run = args.run.is_dir()
+    if is_run and args.robot:
+        raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
+    path, config = export.find_weights(args.run, args.set)
+    begun = read_request(args.run) if is_run else None
+    robot = arguments.robot_of(args.run, begun) if begun else load_robot(args.robot)
+    course = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
+    name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
+    folder = args.out or (args.run if is_run else args.run.parent) / "export"
+    weights, about = load_weights(path, robot), {"name": name, "seconds": args.seconds}
+    say("exporting the controller and comparing it with the live one on a walk")
+    with locked(folder):
+        inputs = config or walk_config(robot), robot, weights, course.command
+        card = export.export(*inputs, folder, **about)
+    print_result(args.json, card, lambda: _print_check(card["check"]))
+    say(f"the export is in {folder}")
+
+
+def _print_check(check: Mapping[str, Any]) -> None:
+    differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
+    print(f"largest difference from the live controller: {differences.format(**check)}")
+    for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
+        times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+        print(f"a call {text} [ms]: {times.format(**check[what])}")
+
+
+@run.register
+def replay_dump(args: flags.Replay) -> None:
+    """Do a dumped iteration again.
+
+    Raises:
+        Broken: it does not come out the same.
+    """
+    replayed = replay.replay(args.dump)
+    print_result(args.json, replayed._asdict(), lambda: print(replay.in_words(replayed)), indent=2)
+    if not replayed.same:
+        raise Broken(f"{args.dump}: {replayed.verdict}")
+
+
+@run.register
+def tensorboard(args: flags.Tensorboard) -> None:
+    """Write the event files of a run."""
+    out = args.out or args.run / "tensorboard"
+    write_events(args.run, out)
+    print(f"tensorboard --logdir {shlex.quote(str(out))}")

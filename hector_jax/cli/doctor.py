@@ -9,13 +9,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Doctor
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import environment
-from hector_jax.core.files import as_json
 from hector_jax.core.inputs import one_line
 from hector_jax.core.runtime import cache_folder
 from hector_jax.core.trajectory import SOLVED, Trajectory
@@ -45,11 +45,8 @@ def doctor(args: Doctor) -> None:
     """
     say("testing this machine: two short walks and a film")
     facts, faults = examine()
-    if args.json:
-        print(as_json({**facts, "faults": faults}))
-    else:
-        for name, text in facts.items():
-            print(f"{name:12s} {text}")
+    lines = "\n".join(f"{name:12s} {text}" for name, text in facts.items())
+    print_result(args.json, {**facts, "faults": faults}, lambda: print(lines))
     if faults:
         raise Broken("; ".join(faults))
 

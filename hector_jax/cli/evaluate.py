@@ -1,29 +1,40 @@
-"""Evaluation of weight sets, walks and runs."""
+"""What weight sets are worth on walks, and nets on the ground forces of walks they never saw."""
 
+from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import jax
 import numpy as np
 
 from hector_jax.cli import arguments
-from hector_jax.cli.flags import Compare, Evaluate, Walk
+from hector_jax.cli.arguments import print_result
+from hector_jax.cli.flags import Evaluate, Grfm, Walk
 from hector_jax.cli.parse import as_table
 from hector_jax.control.controller import walk_config
+from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal
-from hector_jax.core.console import Broken, say
-from hector_jax.core.files import as_json, write_json
+from hector_jax.core.console import Broken, bar, say, say_if_slow
+from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, printable
 from hector_jax.core.runtime import workers
 from hector_jax.core.trajectory import SOLVED
+from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import save_tree
-from hector_jax.report import pictures
-from hector_jax.report.compare import compare_runs, print_comparison
+from hector_jax.grfm import training
+from hector_jax.grfm.collection import Walks
+from hector_jax.grfm.dataset import at_interval, make_dataset
+from hector_jax.grfm.effect import last_command
+from hector_jax.grfm.network import as_effect
+from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import metrics, tunings, verdicts
-from hector_jax.runs.folder import RESULT, load_run
+from hector_jax.runs import metrics, nets, tunings, verdicts
 from hector_jax.sim.diagnosis import StartupFall, startup_fall
+from hector_jax.sim.loop import Job
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss, loss_of_robot
 
 
@@ -36,26 +47,25 @@ def evaluate(args: Evaluate) -> None:
     count = args.seeds if args.world in ("standin", "hfs-varied") else 1
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights(text, robot) for text in args.weights}
-    body = robot if plant is None else plant
-    plants = arguments.plants(args.world, seeds, body.description)
+    plants = arguments.plants(args.world, seeds, (plant or robot).description)
     config = tunings.tune_config(robot)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         inputs = pool, config, robot, sets, course.command, plants, seeds
         walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
-    result = metrics.as_result(verdict, args.world)
+    result, what = (
+        metrics.as_result(verdict, args.world),
+        f"{course.name}, {plural(count, 'plant')}",
+    )
     if plant is not None:
         result["plant"] = plant.description.name
+        what += f" of {plant.description.name}"
     if args.out is not None:
         write_json(args.out, result)
-    if args.json:
-        print(as_json(result))
-    else:
-        names = arguments.short_names(args.weights)
-        named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
-        of = "" if plant is None else f" of {plant.description.name}"
-        print_table(named, f"{course.name}, {plural(count, 'plant')}{of}", args.world)
+    names = arguments.short_names(args.weights)
+    named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
+    print_result(args.json, result, partial(print_table, named, what, args.world))
 
 
 def walk(args: Walk) -> None:
@@ -83,14 +93,24 @@ def walk(args: Walk) -> None:
     unsolved = int(np.sum(~(plans <= SOLVED)))
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
-    # without a plan it is no fall of these weights
-    result = _Walked(score, upright, startup, bool(score.fallen) and not unsolved)
-    if args.json:
-        print(as_json(_as_table(result, plans, unsolved, plant)))
-    else:
-        on = "" if plant is None else f" on {plant.description.name}"
-        what = f"{course.name} in {args.world}{on}, {printable(args.weights)} weights"
-        _print_walk(result, loss, what)
+    what = f"{course.name} in {args.world}"
+    result: dict[str, Any] = {
+        "seconds": upright if startup is None else startup.time,
+        "fell": bool(score.fallen)
+        and not unsolved,  # without a plan it is no fall of these weights
+    }
+    if startup is not None:
+        result["startup"] = startup._asdict()
+    if plant is not None:
+        result["plant"] = plant.description.name
+        what += f" on {plant.description.name}"
+    result |= {part: float(value) for part, value in score.losses.items()}
+    # a walk that falls at once has no errors
+    result |= {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
+    result |= {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
+    what += f", {printable(args.weights)} weights"
+    in_words = partial(_print_walk, what, result, score, loss, startup)
+    print_result(args.json, result, in_words)
     if unsolved:
         raise Broken(
             f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
@@ -100,58 +120,75 @@ def walk(args: Walk) -> None:
         name = Path(args.weights).stem
         beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
         say(f"walking with {beside} weights for the other half of the film")
-        walks = {
-            beside: arguments.walk_once(args, robot, course, other(robot), plant),
-            name: trajectory,
-        }
-        pictures.film(args.video, robot, walks)
+        reference = arguments.walk_once(args, robot, course, other(robot), plant)
+        pictures.film(args.video, robot, {beside: reference, name: trajectory})
 
 
-class _Walked(NamedTuple):
-    """What is told of a walk."""
-
-    score: metrics.Score
-    upright: float  # [s]
-    startup: StartupFall | None
-    fell: bool
-
-
-def _as_table(
-    result: _Walked, plans: np.ndarray, unsolved: int, plant: Robot | None
-) -> dict[str, Any]:
-    score, startup = result.score, result.startup
-    losses = {part: float(value) for part, value in score.losses.items()}
-    errors = {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
-    solved = {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
-    summary = {"seconds": result.upright if startup is None else startup.time, "fell": result.fell}
-    summary |= {} if startup is None else {"startup": startup._asdict()}
-    summary |= {} if plant is None else {"plant": plant.description.name}
-    # a walk that falls at once has no errors
-    return {**summary, **losses, **errors, **solved}
-
-
-def _print_walk(result: _Walked, loss: Loss, what: str) -> None:
-    score, upright, startup, fell = result
-    end = "fell after" if fell else "ended after" if score.fallen else "walked"
-    end = f"{end} {upright:.2f} s" if startup is None else str(startup)
+def _print_walk(
+    what: str, result: dict[str, Any], score: metrics.Score, loss: Loss, startup: StartupFall | None
+) -> None:
+    end = "fell after" if result["fell"] else "ended after" if score.fallen else "walked"
+    end = f"{end} {result['seconds']:.2f} s" if startup is None else str(startup)
     terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in loss)
     print(f"{what}: {end}; L {score.L / 1e6:.3f}e6 ({terms})")
-    cm, degrees = 100 * score.rms_position, np.degrees(score.rms_euler)
-    if upright > 0.0:
-        print("RMS error: x {:.1f}, y {:.1f}, z {:.1f} cm; ".format(*cm), end="")
-        print("roll {:.1f}, pitch {:.1f}, yaw {:.1f} degrees".format(*degrees))
+    if result["seconds"] > 0.0:
+        x, y, z = 100 * score.rms_position
+        roll, pitch, yaw = np.degrees(score.rms_euler)
+        print(f"RMS error: x {x:.1f}, y {y:.1f}, z {z:.1f} cm; ", end="")
+        print(f"roll {roll:.1f}, pitch {pitch:.1f}, yaw {yaw:.1f} degrees")
 
 
-def compare(args: Compare) -> None:
-    """Put finished runs side by side."""
-    finished = [folder for folder in args.runs if (folder / RESULT).exists()]
-    for folder in args.runs:
-        if finished and folder not in finished:
-            say(f"{folder} is left out: it is not a finished run")
-    comparison = compare_runs([load_run(folder) for folder in finished or args.runs])
-    if args.out is not None:
-        write_json(args.out, comparison)
-    if args.json:
-        print(as_json(comparison))
-    else:
-        print_comparison(comparison)
+def grfm(args: Grfm) -> None:
+    """Report on the predictions of each net, with pictures."""
+    robot, config = load_robot(), TuneConfig()
+    make_folder(args.out)
+    with workers(args.processes) as pool:
+        net = nets.load_or_train(pool, robot, args.data)
+        paper = nets.load_or_train(pool, robot, args.data, "paper")
+        with say_if_slow("reading the walks that no training saw"):
+            worlds = {"hfs": nets.held_out_walks(robot, net)}
+        if args.seeds:
+            worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
+    effects = {
+        "raw": last_command,
+        "linear": as_effect(net.linear),
+        "paper": as_effect(paper.params),
+        "residual": as_effect(net.params),
+        "gated": as_effect(net.params.linear),
+    }
+    result, drifts = {}, {}
+    with bar("predicting the ground forces of the walks") as tell:
+        for done, (world, walks) in enumerate(worlds.items()):
+            tell(3 * done, 3 * len(worlds), f"{world}: errors")
+            start, push = walks.job.start_tick, walks.job.push
+            samples, _ = make_dataset(robot, walks.trajectory, start, push=push)
+            errors = training.report(effects, samples)
+            tell(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
+            phases = fidelity.by_phase(effects, samples)
+            tell(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
+            calm = ~np.any(push.force, axis=(1, 2))  # a push from outside is in no model
+            quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
+            drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
+            result[world] = fidelity.as_result(errors, phases, drifts[world])
+    curves = fidelity.curves(robot, worlds["hfs"].trajectory, effects)
+    trainings = {"training": net.course, "training_paper": paper.course}
+    tick = config.rollout.walk.gait.tick
+    drawn = pictures.of_nets(args.out, tick, curves, drifts, trainings)
+    report = fidelity.write_report(args.out, result, drawn)
+    in_words = partial(arguments.print_errors, result["hfs"]["errors"])
+    print_result(args.json, {"report": str(report), "worlds": result}, in_words)
+    say(f"the report is {report}")
+
+
+def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -> Walks:
+    """Walks of the three trajectories with nominal and expert weights, for information only."""
+    jobs = [
+        Job(weights, named_command(name), plant, seed=seed)
+        for weights in (nominal(robot), expert(robot))
+        for name in COMMANDS
+        for seed, plant in enumerate(arguments.plants("standin", range(count), robot.description))
+    ]
+    title = f"walking on {plural(count, 'stand-in plant')}, for information"
+    walks = verdicts.walk_jobs(pool, config, robot, jobs, title)
+    tick = config.rollout.walk.gait.tick
+    return Walks(stack(jobs), stack([at_interval(walk, tick) for walk in walks]))

@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import SEED, Range
+
+T = TypeVar("T")
 
 NAMED_WEIGHTS = ("nominal", "expert")
 
@@ -39,6 +41,16 @@ Run = Annotated[Path, Source.RUN]
 Folder = Annotated[Path, Source.FOLDER]
 
 
+COMMANDS: dict[str, type[Any]] = {}
+"""The flags of each command, by its name."""
+
+
+@dataclass_transform(frozen_default=True)
+def _command(kind: type[T]) -> type[T]:
+    COMMANDS[kind.__name__.lower()] = kind
+    return dataclass(frozen=True)(kind)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Configured:
     """A command whose flags may come from a file."""
@@ -46,7 +58,7 @@ class Configured:
     config: Path | None = None  # TOML file of flags, or a run's config.json; the line overrides it
 
 
-@dataclass(frozen=True)
+@_command
 class Collect(Configured):
     """Walk on the high-fidelity simulator and record the measured ground forces.
 
@@ -62,7 +74,7 @@ class Collect(Configured):
     robot: RobotFile = None  # TOML file of another biped; HECTOR by default
 
 
-@dataclass(frozen=True)
+@_command
 class Train(Configured):
     """Train GRFM-Net on collected walks.
 
@@ -78,7 +90,7 @@ class Train(Configured):
     robot: RobotFile = None  # TOML file of another biped; HECTOR by default
 
 
-@dataclass(frozen=True)
+@_command
 class Grfm(Configured):
     """Report how well the nets predict the ground forces of walks that they never saw.
 
@@ -92,7 +104,7 @@ class Grfm(Configured):
     json: bool = False  # print JSON instead of text
 
 
-@dataclass(frozen=True)
+@_command
 class Tune(Configured):
     """Tune the MPC weights for trajectories, with and without the net, and evaluate them.
 
@@ -120,7 +132,7 @@ class Tune(Configured):
     robot: RobotFile = None  # TOML file of another biped, with its data in DATA/NAME; or HECTOR
 
 
-@dataclass(frozen=True)
+@_command
 class Search(Configured):
     """Search for weights on the high-fidelity simulator without derivatives (CMA-ES).
 
@@ -142,7 +154,7 @@ class Search(Configured):
     robot: RobotFile = None  # TOML file of another biped; HECTOR by default
 
 
-@dataclass(frozen=True)
+@_command
 class Evaluate(Configured):
     """Evaluate weight sets on the plants of a world and print a table.
 
@@ -162,7 +174,7 @@ class Evaluate(Configured):
     plant: RobotFile = None  # TOML file of another model of the robot, of which the plants are
 
 
-@dataclass(frozen=True)
+@_command
 class Walk(Configured):
     """Walk once and report losses and tracking errors.
 
@@ -181,7 +193,7 @@ class Walk(Configured):
     plant: RobotFile = None  # TOML file of another model of the robot, which is walked on
 
 
-@dataclass(frozen=True)
+@_command
 class Robot:
     """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
 
@@ -192,7 +204,7 @@ class Robot:
     out: Path | None = None  # file for the proposal, new and beside the model; else it is printed
 
 
-@dataclass(frozen=True)
+@_command
 class Doctor:
     """Report versions, devices, precision, cache and video of this machine, and test it.
 
@@ -202,7 +214,7 @@ class Doctor:
     json: bool = False  # print JSON instead of text
 
 
-@dataclass(frozen=True)
+@_command
 class Export:
     """Export weights, lines for the open C++ controller, and the compiled controller.
 
@@ -219,7 +231,7 @@ class Export:
     json: bool = False  # print JSON instead of text
 
 
-@dataclass(frozen=True)
+@_command
 class View:
     """Show a run in the browser: walks before and after, ground forces, tuning in progress.
 
@@ -238,7 +250,7 @@ class View:
     out: Path | None = None  # folder for them (implies --headless); by default `view` in the run
 
 
-@dataclass(frozen=True)
+@_command
 class Compare:
     """Compare finished runs: losses, falls, iterations, versions, settings.
 
@@ -250,7 +262,7 @@ class Compare:
     json: bool = False  # print JSON instead of the table
 
 
-@dataclass(frozen=True)
+@_command
 class Tensorboard:
     """Write TensorBoard event files of a run, from its metrics.jsonl.
 
@@ -261,7 +273,7 @@ class Tensorboard:
     out: Path | None = None  # folder for the event files; by default `tensorboard` in the run
 
 
-@dataclass(frozen=True)
+@_command
 class Completion:
     """Print the script that completes `hector` in a shell.
 
@@ -271,7 +283,7 @@ class Completion:
     shell: Literal["bash", "zsh", "fish"]  # shell to write the script for
 
 
-@dataclass(frozen=True)
+@_command
 class Replay:
     """Repeat an evaluation that a tuning refused: exit code 0 if all bytes agree, else 1.
 
@@ -280,30 +292,6 @@ class Replay:
 
     dump: Annotated[Path, Source.FILE]  # file in the folder `dumps` of a run
     json: bool = False  # print JSON instead of the table
-
-
-Command = (
-    Collect
-    | Train
-    | Grfm
-    | Tune
-    | Search
-    | Evaluate
-    | Walk
-    | Robot
-    | Doctor
-    | Export
-    | View
-    | Compare
-    | Tensorboard
-    | Completion
-    | Replay
-)
-
-
-def command_name(kind: type) -> str:
-    """What a command is called on the line."""
-    return kind.__name__.lower()
 
 
 def command(word: str) -> type[Any]:
@@ -316,8 +304,7 @@ def command(word: str) -> type[Any]:
         raise InputError(
             "the table is now made by python experiments/table.py, with the same flags"
         )
-    kinds = {command_name(kind): kind for kind in get_args(Command)}
-    if word not in kinds:
-        hint = did_you_mean(word, kinds) or f"; the commands are {', '.join(kinds)}"
+    if word not in COMMANDS:
+        hint = did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
         raise InputError((f"unknown command {short_repr(word)}" if word else "no command") + hint)
-    return kinds[word]
+    return COMMANDS[word]

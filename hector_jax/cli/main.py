@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from hector_jax.cli.flags import Completion, Doctor, Export
-from hector_jax.cli.parse import check, from_line, print_completion, resolve_latest
+from hector_jax.cli.parse import all_commands, check, from_line, resolve_latest
 from hector_jax.core.console import Broken, exit_code, say, say_if_slow
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import cache_folder, check_jax, home_cache, setup_jax
@@ -27,7 +27,7 @@ def _run(words: Sequence[str]) -> None:
     args = resolve_latest(from_line(words))
     check(args)
     if isinstance(args, Completion):
-        print_completion(args.shell)
+        all_commands("--tyro-print-completion", args.shell)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of its own cache
     try:
         if (cache := cache_folder()) != (usual := home_cache()):

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import NAMED_WEIGHTS, Command, Source, Tune, command, command_name
+from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Source, Tune, command
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import (
     SEED,
@@ -58,7 +58,7 @@ def from_line(words: Sequence[str]) -> Any:
     others = [word for word in words if word not in _HELP]
     helps = list(_HELP[:1] if len(others) < len(words) else ())
     if helps and not others:
-        return _all_commands(["--help"])
+        return all_commands("--help")
     name, *rest = others or [""]
     return read_flags(command(name), [*rest, *helps], f"hector {name}")
 
@@ -79,15 +79,9 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     return _tyro(kind, ["--help"], **options) if wants_help else _quietly(kind, words, **options)
 
 
-def print_completion(shell: str) -> None:
-    """Print the script that completes `hector` in a shell, and leave by SystemExit."""
-    _all_commands(["--tyro-print-completion", shell])
-
-
-def _all_commands(words: Sequence[str]) -> Any:
-    kinds = [
-        Annotated[kind, tyro.conf.subcommand(command_name(kind))] for kind in get_args(Command)
-    ]
+def all_commands(*words: str) -> Any:
+    """Give tyro's own words to all commands, such as --help; leaves by SystemExit."""
+    kinds = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()]
     return _tyro(Union[tuple(kinds)], words, prog="hector", description=_ABOUT)  # noqa: UP007
 
 
@@ -156,8 +150,15 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         InputError: one line naming file and key, for one that is unknown, with the nearest known
             name, of a wrong type or out of range; or the file, where it cannot be read.
     """
+    if path.suffix == ".json":
+        content = read_json(path, "flags as JSON", _MAX_BYTES)
+        flags = content.get("flags") if isinstance(content, dict) else None
+        if not isinstance(flags, dict):
+            raise InputError(f"{path}: no `flags` in it; expected the config.json of a run")
+    else:
+        flags = read_toml(path, "flags as TOML", _MAX_BYTES)
     values: dict[str, Any] = {}
-    for key, value in _flags_in(path).items():
+    for key, value in flags.items():
         name = key.replace("-", "_")
         if name in values:
             raise InputError(f"{path}: {key} is given twice")
@@ -167,16 +168,6 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
     if kind is Tune and isinstance(values.get("traj"), str):
         values["traj"] = [values["traj"]]  # older runs were tuned on one
     return from_table(str(path), kind, values)
-
-
-def _flags_in(path: Path) -> dict[str, Any]:
-    if path.suffix != ".json":
-        return read_toml(path, "flags as TOML", _MAX_BYTES)
-    content = read_json(path, "flags as JSON", _MAX_BYTES)
-    flags = content.get("flags") if isinstance(content, dict) else None
-    if not isinstance(flags, dict):
-        raise InputError(f"{path}: no `flags` in it; expected the config.json of a run")
-    return flags
 
 
 def as_table(flags: Any) -> dict[str, Any]:
@@ -243,20 +234,17 @@ def _source(kind: Any) -> Source | None:
 
 def _check_source(label: str, value: Path | str, source: Source) -> None:
     """Raises InputError where a file or folder is missing that a flag names."""
-    path, hint = Path(value), ""
+    path, hint, fine = Path(value), "", True
     named, is_dir = value in NAMED_WEIGHTS, os.path.isdir(path)
-    match source:
-        case Source.RUN:
-            fine = is_dir
-        case Source.FOLDER:
-            fine = os.path.isdir(next(x for x in (path, *path.parents) if os.path.exists(x)))
-        case Source.ROBOT:
-            fine = path.suffix == ".toml"
-        case Source.WEIGHTS:
-            fine = named or path.suffix or os.path.lexists(path)
-            hint = did_you_mean(str(value), NAMED_WEIGHTS)
-        case _:
-            fine = True
+    if source is Source.RUN:
+        fine = is_dir
+    elif source is Source.FOLDER:
+        fine = os.path.isdir(next(x for x in (path, *path.parents) if os.path.exists(x)))
+    elif source is Source.ROBOT:
+        fine = path.suffix == ".toml"
+    elif source is Source.WEIGHTS:
+        fine = named or path.suffix or os.path.lexists(path)
+        hint = did_you_mean(str(value), NAMED_WEIGHTS)
     if not fine:
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
     if (
@@ -283,11 +271,10 @@ def resolve_latest(flags: Flags) -> Flags:
             raise InputError("latest: there is no run in the folder `runs` of this directory")
         return max(runs, key=lambda file: file.stat().st_mtime).parent
 
-    values = {}
+    values: dict[str, Any] = {}
     for field in fields(flags):  # pyright: ignore[reportArgumentType]
         value = getattr(flags, field.name)
         if value is not None and _source(field.type) in (Source.RUN, Source.EXPORTABLE):
-            values[field.name] = (
-                tuple(map(newest, value)) if isinstance(value, tuple) else newest(value)
-            )
+            several = isinstance(value, tuple)
+            values[field.name] = tuple(map(newest, value)) if several else newest(value)
     return replace(flags, **values)  # pyright: ignore[reportArgumentType]

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from hector_jax.cli import arguments, run_folder
+from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.control.reference import COMMANDS
@@ -27,23 +28,20 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.jobs import PIECES
-from hector_jax.grfm.network import Params, as_effect
+from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import Picture, print_table
-from hector_jax.report.run import Report, write_report
+from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
-from hector_jax.runs.metrics import Verdict
-from hector_jax.runs.nets import TrainedNet
-from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 
 _FOLDERS = ("out", "run", "resume")  # flags that name the run folder
@@ -73,20 +71,18 @@ def tune(args: Tune) -> None:
 
 def _by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
     """The flags of each run by its folder."""
-    texts = tuple(t for text in args.traj for t in (COMMANDS if text == "all" else (text,)))
-    texts = tuple(dict.fromkeys(texts))
+    texts = dict.fromkeys(t for one in args.traj for t in (COMMANDS if one == "all" else (one,)))
     names: dict[str, str] = {}  # texts by name
     for text in texts:
-        name = command_of(text).name
-        if name in names:
-            raise InputError(f"--traj {names[name]} and {text} are both named {name}")
-        names[name] = text
+        other = names.setdefault(name := command_of(text).name, text)
+        if other != text:
+            raise InputError(f"--traj {other} and {text} are both named {name}")
     if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
         raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
     now = f"{datetime.now():{run_folder.TIME}}"
     parent = arguments.folder_of(args.runs, args.robot, robot)
     # beside --resume a trajectory that was not given is that of the run
-    shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=texts)
+    shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=tuple(texts))
     if args.each:
         each = {name: replace(args, traj=(text,)) for name, text in names.items()}
         return {base / n if base else parent / n / now: one for n, one in each.items()}
@@ -101,21 +97,21 @@ def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
             them.
     """
     courses = tuple(arguments.course(text, robot) for text in args.traj)
-    first = courses[0]
+    first, pieces = courses[0], len(courses[0].command.duration)
     if len({one.seconds or Walk.seconds for one in courses}) > 1:
         lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in courses)
         raise InputError(f"--traj expects trajectories of one length, got {lasts}; add --each")
-    if args.refresh and args.net:
+    if not args.refresh:
+        return courses
+    if args.net:
         raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
-    if args.refresh and (args.also or arguments.weights(args.start, robot).others):
+    if args.also or arguments.weights(args.start, robot).others:
         raise InputError("--refresh takes Q and R alone, neither --also nor a start with others")
-    if args.refresh and len(courses) > 1:
+    if len(courses) > 1:
         raise InputError(f"--refresh takes one trajectory, got {len(courses)}; add --each")
-    if args.refresh and len(first.command.duration) > PIECES:
-        raise InputError(
-            f"--refresh takes trajectories of at most {PIECES} segments, {first.name} has "
-            f"{len(first.command.duration)}"
-        )
+    if pieces > PIECES:
+        about = f"at most {PIECES} segments, {first.name} has {pieces}"
+        raise InputError(f"--refresh takes trajectories of {about}")
     return courses
 
 
@@ -129,7 +125,7 @@ class _Run(NamedTuple):
     trajectories: tuple[NamedCommand, ...]
     seconds: float  # of each walk
     config: TuneConfig
-    net: TrainedNet
+    net: nets.TrainedNet
     commit: str
 
     @property
@@ -142,16 +138,18 @@ class _Run(NamedTuple):
         """What is walked."""
         return ", ".join(one.name for one in self.trajectories)
 
-    def problem(self, params: Params | None) -> Problem:
-        """All trajectories, to be tuned through a net."""
+    @property
+    def problems(self) -> dict[str, tunings.Problem]:
+        """All trajectories, to be tuned without and with the net."""
         command, *others = (one.command for one in self.trajectories)
-        return Problem(command, params, tuple(others))
+        params = {"without": None, "with": self.net.params}
+        return {name: tunings.Problem(command, net, tuple(others)) for name, net in params.items()}
 
 
 class _Tuned(NamedTuple):
     """What the tunings of a run came to."""
 
-    tunings: dict[str, Tuned]
+    tunings: dict[str, Tuning]
     shifts: list[dict[str, Any]]  # of each refresh
     sets: dict[str, Weights]
     choices: dict[str, choice.Choice]  # empty where the last iterations are taken
@@ -177,7 +175,11 @@ def _tune_in(folder: Path, args: Tune) -> None:
             _net(pool, args, robot),
             made_with.get("commit", ""),
         )
-        run, norms = _align(pool, run)
+        norms = tunings.gradient_norms(pool, run.config, robot, run.problems)
+        if args.alpha == "auto":
+            loss = aligned(run.config.loss, norms["with"])
+            say("loss weights: " + ", ".join(f"{t.name} {t.weight:g}" for t in loss))
+            run = run._replace(config=replace(run.config, loss=loss))
         settings = _note_settings(run)
         tuned = _tune_sets(pool, run)
         walks = _walk_sets(pool, run, tuned.sets)
@@ -187,27 +189,33 @@ def _tune_in(folder: Path, args: Tune) -> None:
     verdict, (standin, on_hfs) = by_name[run.name], walks[trajectories[0].name]
     report = write_report(
         folder,
-        Report(
-            trajectory=run.name,
-            verdict=verdict,
-            tunings={name: one.tuning for name, one in tuned.tunings.items()},
-            norms=norms,
-            errors=run.net.errors,
-            shifts=tuned.shifts,
-            chosen=result.get("chosen", {}),
-            pictures=_draw(run, tuned, standin, on_hfs),
-            film=_film(run, standin),
-            config=settings,
-            environment=made_with,
-            command=as_command("hector tune", run_folder.as_begun(args)),
-        ),
+        trajectory=run.name,
+        verdict=verdict,
+        tunings=tuned.tunings,
+        norms=norms,
+        errors=run.net.errors,
+        shifts=tuned.shifts,
+        chosen=result.get("chosen", {}),
+        pictures=_draw(run, tuned, standin, on_hfs),
+        film=_film(run, standin),
+        config=settings,
+        environment=made_with,
+        command=as_command("hector tune", run_folder.as_begun(args)),
     )
-    if args.json:
-        print(as_json({"run": str(folder), "traj": run.name, **result}))
-    else:
+
+    def in_words() -> None:
         for name, one in by_name.items():
             print_table(one, f"{name}, {plural(args.seeds, 'plant')}")
+
+    print_result(args.json, {"run": str(folder), "traj": run.name, **result}, in_words)
     say(f"the report is {report}")
+
+
+def _net(pool: Executor, args: Tune, robot: Robot) -> nets.TrainedNet:
+    if args.net is not None:
+        return nets.load_net(args.net, robot, args.variant)[0]
+    data = arguments.folder_of(args.data, args.robot, robot)
+    return nets.load_or_train(pool, robot, data, args.variant)
 
 
 def _say_what_no_weights_mend(
@@ -219,25 +227,6 @@ def _say_what_no_weights_mend(
     inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
     for line in pool.submit(not_the_weights, *inputs).result():
         say(f"before any tuning, {course.name} on hfs with nominal weights: {line}")
-
-
-def _net(pool: Executor, args: Tune, robot: Robot) -> TrainedNet:
-    if args.net is not None:
-        return nets.load_net(args.net, robot, args.variant)[0]
-    return nets.load_or_train(
-        pool, robot, arguments.folder_of(args.data, args.robot, robot), args.variant
-    )
-
-
-def _align(pool: Executor, run: _Run) -> tuple[_Run, dict[str, dict[str, float]]]:
-    """The run with its loss weights, and the norms of the gradients by set."""
-    problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
-    norms = tunings.gradient_norms(pool, run.config, run.robot, problems)
-    loss = run.config.loss
-    if run.args.alpha == "auto":
-        loss = aligned(loss, norms["with"])
-        say("loss weights: " + ", ".join(f"{t.name} {t.weight:g}" for t in loss))
-    return run._replace(config=replace(run.config, loss=loss)), norms
 
 
 def _note_settings(run: _Run) -> dict[str, Any]:
@@ -277,39 +266,27 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         journal=Journal(run.folder / METRICS),
         dumps=run.folder / "dumps",
     )
-    problems = {"without": run.problem(None), "with": run.problem(run.net.params)}
-    tuned = step(problems, title=f"tuning {run.name} without and with GRFM-Net")
+    done = step(run.problems, title=f"tuning {run.name} without and with GRFM-Net")
     net, name, shifts = run.net, "with", []
     for count in range(1, run.args.refresh + 1):
-        net, shift = nets.refresh(
-            pool,
-            replace(nets.REFRESH, seed=count, seconds=run.seconds),
-            run.robot,
-            run.trajectories[0].command,
-            tuned[name].tuning,
-            net=net,
-            folder=run.folder / f"refresh-{count}",
-        )
+        config = replace(nets.REFRESH, seed=count, seconds=run.seconds)
+        folder = run.folder / f"refresh-{count}"
+        walked = run.trajectories[0].command, done[name].tuning
+        net, shift = nets.refresh(pool, config, run.robot, *walked, net=net, folder=folder)
         shifts.append(shift)
         name = "with_refreshed" + (str(count) if count > 1 else "")
-        problem = {name: run.problem(net.params)}
-        tuned |= step(problem, title=f"tuning {run.name} with the net refreshed")
-    choices = choice.choose(
-        pool,
-        run.config,
-        run.robot,
-        {name: one.tuning for name, one in tuned.items()},
-        [one.command for one in run.trajectories],
-        seconds=run.seconds,
-        folder=run.artefacts / "choice",
-        commit=run.commit,
-    )
+        problem = {name: run.problems["with"]._replace(params=net.params)}
+        done |= step(problem, title=f"tuning {run.name} with the net refreshed")
+    tuned = {name: one.tuning for name, one in done.items()}
+    commands = [one.command for one in run.trajectories]
+    notes = {"seconds": run.seconds, "folder": run.artefacts / "choice", "commit": run.commit}
+    choices = choice.choose(pool, run.config, run.robot, tuned, commands, **notes)
     sets = {
         "nominal": nominal(run.robot),
         "expert": expert(run.robot),
         **({} if run.args.start in NAMED_WEIGHTS else {"start": run.start}),
-        **{f"{name}_ten": tuned[name].tuning.ten for name in problems},
-        **{name: one.tuning.converged for name, one in tuned.items()},
+        **{f"{name}_ten": tuned[name].ten for name in run.problems},
+        **{name: one.converged for name, one in tuned.items()},
         **{name: one.weights for name, one in choices.items()},
     }
     for name, weights in sets.items():
@@ -350,16 +327,16 @@ def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
 
 def _result(
     run: _Run, tuned: _Tuned, walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
-) -> tuple[dict[str, Any], dict[str, Verdict]]:
+) -> tuple[dict[str, Any], dict[str, metrics.Verdict]]:
     """Write result.json; its content, and the verdicts: of all walks, and by trajectory."""
 
-    def verdict(names: Sequence[str], world: int) -> Verdict:
+    def verdict(names: Sequence[str], world: int) -> metrics.Verdict:
         each = [walks[name][world] for name in names]
         scores = {n: [s for one in each for s in one.scores[n]] for n in tuned.sets}
         seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
         return metrics.make_verdict(run.config.loss, seeds, scores)
 
-    def content(names: Sequence[str], one: Verdict) -> dict[str, Any]:
+    def content(names: Sequence[str], one: metrics.Verdict) -> dict[str, Any]:
         result = metrics.as_result(one)
         for name, there in metrics.as_result(verdict(names, 1), "hfs")["sets"].items():
             result["sets"][name] |= there
@@ -384,10 +361,8 @@ def _draw(run: _Run, tuned: _Tuned, walks: ScoredWalks, on_hfs: ScoredWalks) -> 
     effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}
     sampled = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
     curves = fidelity.curves(run.robot, sampled, effects)
-    histories = {name: one.tuning for name, one in tuned.tunings.items()}
-    return pictures.of_run(
-        run.folder, run.config, tuned.sets, histories, walks.first, curves, run.net.course
-    )
+    drawn = tuned.sets, tuned.tunings, walks.first, curves, run.net.course
+    return pictures.of_run(run.folder, run.config, *drawn)
 
 
 def _film(run: _Run, walks: ScoredWalks) -> Picture | str:

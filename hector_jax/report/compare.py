@@ -30,23 +30,20 @@ def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
     """
     if not runs:
         raise InputError("expected at least one run folder, got none")
-    versions = [{k: v for k, v in run.made_with.items() if k != "seconds"} for run in runs]
-    return {
-        "runs": [
-            {
-                "run": run.name,
-                "seconds": float(run.made_with["seconds"]) if "seconds" in run.made_with else None,
-                "sets": {name: _verdict(run, name) for name in run.result["sets"]},
-                "tuning": _iterations(run.metrics),
-                "versions": dict(run.made_with),
-            }
-            for run in runs
-        ],
-        "differ": {
-            "settings": _differing([run.settings for run in runs]),
-            "versions": _differing(versions),
-        },
-    }
+    rows = [
+        {
+            "run": run.name,
+            "seconds": float(run.made_with["seconds"]) if "seconds" in run.made_with else None,
+            "sets": {name: _verdict(run, name) for name in run.result["sets"]},
+            "tuning": _iterations(run.metrics),
+            "versions": dict(run.made_with),
+        }
+        for run in runs
+    ]
+    settings = _differing([run.settings for run in runs])
+    versions = _differing([run.made_with for run in runs])
+    versions.pop("seconds", None)
+    return {"runs": rows, "differ": {"settings": settings, "versions": versions}}
 
 
 def _verdict(run: Run, name: str) -> dict[str, Any]:
@@ -71,8 +68,7 @@ def _iterations(metrics: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int
 
 
 def _differing(each: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    names = dict.fromkeys(name for one in each for name in one)
-    columns = {name: [one.get(name) for one in each] for name in names}
+    columns = {name: [one.get(name) for one in each] for some in each for name in some}
     return {name: values for name, values in columns.items() if any(v != values[0] for v in values)}
 
 

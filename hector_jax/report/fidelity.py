@@ -7,6 +7,7 @@ that is left there is not due to the ground, but to a rigid body standing for a 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,6 @@ from jaxtyping import Float, Int
 
 from hector_jax.control import gait
 from hector_jax.control.controller import walk_config
-from hector_jax.control.gait import GaitConfig
 from hector_jax.core.arrays import Array
 from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import InputError
@@ -64,30 +64,27 @@ def by_phase(
         `[phi][phase]["stance" | "swing"]`: F_x F_y F_z [N^2], M_x M_y M_z [(N m)^2]; NaN where no
         sample is in the phase.
     """
-    since, stands = dataset.window.since_switch, np.asarray(dataset.window.contact)
-    errors: dict[str, dict[str, dict[str, list[float]]]] = {}
+    since, stands = dataset.window.since_switch[:, None], np.asarray(dataset.window.contact)
+    errors: dict[str, dict[str, dict[str, list[float]]]] = {name: {} for name in effects}
     for name, effect in effects.items():
         guess = predict(effect, jax.tree.map(jnp.asarray, dataset.window)).wrench
         pairs = zip(guess, dataset.label, strict=True)
         square = np.concatenate([np.square(np.asarray(g) - y) for g, y in pairs], axis=-1)
-        errors[name] = {}
         for phase, (low, high) in PHASES.items():
-            inside = ((since > low - 1e-6) & (since < high - 1e-6))[:, None]
-            errors[name][phase] = {
-                "stance": _mean(square[inside & stands]).tolist(),
-                "swing": _mean(square[inside & ~stands]).tolist(),
-            }
+            inside = (since > low - 1e-6) & (since < high - 1e-6)
+            places = {"stance": inside & stands, "swing": inside & ~stands}
+            errors[name][phase] = {c: _mean(square[rows]).tolist() for c, rows in places.items()}
     return errors
 
 
 def _ahead(
-    config: GaitConfig,
+    config: gait.GaitConfig,
     robot: Robot,
+    ticks: int,
     effect: jax.tree_util.Partial | None,
     walk: Trajectory,
     start_tick: Int[Array, ""],
     first: Int[Array, ""],
-    ticks: int,
 ) -> State:
     """States of the rigid body at the ends of `ticks` ticks from `first` on."""
 
@@ -137,11 +134,7 @@ def drift(
     if not len(starts):
         raise InputError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
 
-    def ahead(
-        effect: jax.tree_util.Partial | None, walk: Trajectory, start_tick: Array, first: Array
-    ) -> State:
-        return _ahead(config, robot, effect, walk, start_tick, first, ticks)
-
+    ahead = partial(_ahead, config, robot, ticks)
     over_starts = jax.vmap(ahead, in_axes=(None, None, None, 0))
     guess = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
         effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
@@ -168,19 +161,16 @@ def drifts(
 
 
 def as_result(
-    whole: Mapping[str, Mapping[str, Any]],
-    phases: Mapping[str, Any],
-    drifts: Mapping[str, Drift],
+    whole: Mapping[str, Mapping[str, Any]], phases: Mapping[str, Any], drifts: Mapping[str, Drift]
 ) -> dict[str, Any]:
     """All errors of one world as JSON values; `whole` is `training.report`."""
+
+    def at(horizon: float, one: Drift) -> dict[str, float]:
+        parts = {"position": one.position, "euler": one.euler}
+        return {name: float(np.interp(horizon, one.time, x)) for name, x in parts.items()}
+
     ahead = {
-        name: {
-            f"{horizon:g} s": {
-                "position": float(np.interp(horizon, one.time, one.position)),
-                "euler": float(np.interp(horizon, one.time, one.euler)),
-            }
-            for horizon in HORIZONS
-        }
+        name: {f"{horizon:g} s": at(horizon, one) for horizon in HORIZONS}
         for name, one in drifts.items()
     }
     return {"errors": dict(whole), "phases": dict(phases), "open_loop": ahead}
@@ -202,12 +192,13 @@ def curves(
     one = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
     samples, _ = make_dataset(robot, one)
     window = jax.tree.map(jnp.asarray, samples.window)
-    names = {"linear": "linear", "paper": "paper", "residual": "predicted"}
     wrenches = {
         "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
         "measured": samples.label,
-        **{names[n]: predict(effect, window).wrench for n, effect in effects.items() if n in names},
     }
+    for name, drawn in (("linear", "linear"), ("paper", "paper"), ("residual", "predicted")):
+        if name in effects:
+            wrenches[drawn] = predict(effects[name], window).wrench
 
     def by_tick(values: Any) -> np.ndarray:
         """NaN at ticks that are no samples: the first, unsolved ones, those after a fall."""
@@ -245,19 +236,11 @@ def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[floa
         errors: of several phis, as `training.report` has them.
     """
     errors = list(errors)
-    return [
-        *(
-            (f"{kind}, all [{unit}]", [one[kind] for one in errors])
-            for kind, unit in _UNITS.items()
-        ),
-        *(
-            (f"{axis}, {contact} [{_UNITS[kind]}]", [one[contact][i] for one in errors])
-            for contact in ("stance", "swing")
-            for i, (axis, kind) in enumerate(_AXES.items())
-        ),
-        *(
-            (f"touchdown, {axis} [cm^2]", [one["touchdown"][i] for one in errors])
-            for i, axis in enumerate(("forward", "sideways"))
-            if all(any(one.get("touchdown", ())) for one in errors)
-        ),
-    ]
+    rows = [(f"{kind}, all [{unit}]", [x[kind] for x in errors]) for kind, unit in _UNITS.items()]
+    for contact in ("stance", "swing"):
+        for i, (axis, kind) in enumerate(_AXES.items()):
+            rows.append((f"{axis}, {contact} [{_UNITS[kind]}]", [x[contact][i] for x in errors]))
+    if all(any(x.get("touchdown", ())) for x in errors):
+        for i, axis in enumerate(("forward", "sideways")):
+            rows.append((f"touchdown, {axis} [cm^2]", [x["touchdown"][i] for x in errors]))
+    return rows

@@ -61,9 +61,8 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
     count, fallen = len(walk.fallen), walk.fallen
     upright = int(np.argmax(fallen)) if fallen.any() else count
     last_seen = np.minimum(np.arange(count), max(upright - 1, 0))
-    state, feet, joints = jax.tree.map(
-        lambda x: np.asarray(x)[last_seen], (walk.state, walk.feet, walk.joints)
-    )
+    seen = walk.state, walk.feet, walk.joints
+    state, feet, joints = jax.tree.map(lambda x: np.asarray(x)[last_seen], seen)
     heading = np.append(walk.initial.euler[2], state.euler[:-1, 2])
     R_yaw = Rotation.from_euler("z", heading[:, None]).as_matrix()
     ahead = R_yaw[:, None, :, 0]

@@ -90,11 +90,7 @@ def of_nets(
 
 
 def of_view(
-    folder: Path,
-    robot: Robot,
-    histories: Histories,
-    loss: Loss,
-    views: Mapping[str, ViewedWalk],
+    folder: Path, robot: Robot, histories: Histories, loss: Loss, views: Mapping[str, ViewedWalk]
 ) -> None:
     """Draw what the page of `view` shows, as a film and pictures.
 
@@ -111,15 +107,14 @@ def of_view(
     walks = {name: one.walk for name, one in views.items()}
     plots.tracking(folder / "tracking.png", walks)
     plots.path_from_above(folder / "path.png", walks)
-    after = list(views.values())[-1]
-    period, ticks = float(after.walk.period), len(after.walk.fallen)
-    first = min(0.4, period * ticks)  # [s], two steps
-    plots.wrenches(folder / "wrenches.png", period, after.ground, seconds=first)
-    courses = {name: histories[name] for name in ("without", "with") if histories.get(name)}
-    if courses:
+    after, ground = list(views.values())[-1]
+    period = float(after.period)
+    first = min(0.4, period * len(after.fallen))  # [s], two steps
+    plots.wrenches(folder / "wrenches.png", period, ground, seconds=first)
+    if courses := {name: histories[name] for name in ("without", "with") if histories.get(name)}:
         plots.losses(folder / "losses.png", loss, courses)
     say("making the film")
-    pair = motions(robot, dict(zip(plots.titles(walks), walks.values(), strict=True)))
+    pair = motions(robot, plots.style.titled(walks))
     write_film(folder / "film.mp4", robot, pair)
     write_strip(folder / "film.png", robot, pair)
 

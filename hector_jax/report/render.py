@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from hector_jax.core.headless import mujoco
 from hector_jax.report.motion import COLOURS, INK
-from hector_jax.report.plots.walks import distances
+from hector_jax.report.plots import distances
 from hector_jax.report.video import Scene
 
 _WINDOW = 4.0  # [s] of the reference that a film keeps in view
@@ -149,11 +149,7 @@ def _encode(file: str, frames: Iterable[Image.Image], size: tuple[int, int], rat
 
 
 def _frame(
-    scene: Scene,
-    plot: np.ndarray,
-    box: tuple[int, int, int, int],
-    halves: list[np.ndarray],
-    k: int,
+    scene: Scene, plot: np.ndarray, box: tuple[int, int, int, int], halves: list[np.ndarray], k: int
 ) -> Image.Image:
     """Join both halves, their labels, and the plot below, pale where time has not come yet."""
     time, last = scene.times[k], max(motion.times[-1] for motion in scene.motions.values())

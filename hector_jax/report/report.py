@@ -95,10 +95,8 @@ def column(part: str, largest: float) -> Column:
 
 def columns(verdict: Verdict) -> dict[str, Column]:
     """How the numbers of each part are written in the tables of a verdict."""
-    sets = summaries(verdict).values()
-    return {
-        part: column(part, max(one.means[part].value for one in sets)) for part in verdict.parts
-    }
+    each = [one.means for one in summaries(verdict).values()]
+    return {part: column(part, max(one[part].value for one in each)) for part in verdict.parts}
 
 
 def summaries(verdict: Verdict) -> dict[str, Summary]:
@@ -159,20 +157,18 @@ def print_table(
 def _terminal_table(verdict: Verdict, padding: int) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, padding, 0, 0), pad_edge=False, show_edge=False)
     table.add_column("set\n", no_wrap=True)
-    formats = columns(verdict)
+    formats, others = columns(verdict), baselines(verdict)
     heads = [f"{part}\n{one.unit}" for part, one in formats.items()]
-    heads += ["falls\n", *(f"against {baseline}\n[%]" for baseline in baselines(verdict))]
-    for head in heads:
+    for head in (*heads, "falls\n", *(f"against {baseline}\n[%]" for baseline in others)):
         table.add_column(head, justify="right", no_wrap=True)
     for name, summary in summaries(verdict).items():
         means = [one.text(summary.means[part].value) for part, one in formats.items()]
         falls = Text(str(summary.falls), style="red" if summary.falls else "")
-        changes = [_terminal_change(summary.against.get(b)) for b in baselines(verdict)]
-        table.add_row(name, *means, falls, *changes)
+        table.add_row(name, *means, falls, *(_change(summary.against.get(one)) for one in others))
     return table
 
 
-def _terminal_change(comparison: Comparison | None) -> Text:
+def _change(comparison: Comparison | None) -> Text:
     if comparison is None:
         return Text("-", style="dim")
     change = comparison.change["L"]

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,42 +11,32 @@ from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import WEIGHT_NAMES, Weights, weights_to_vector
 from hector_jax.core.files import write_file
 from hector_jax.report.fidelity import error_rows
-from hector_jax.report.report import Picture, render
-from hector_jax.runs.metrics import Verdict
+from hector_jax.report.report import render
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning
 from hector_jax.tuning.evaluate import aligned
 
 
-class Report(NamedTuple):
-    """All that report.md contains."""
-
-    trajectory: str
-    verdict: Verdict
-    tunings: Mapping[str, Tuning]  # `without`, `with` and, refreshed, `with_refreshed`
-    # norms of the terms' gradients in log-weights at nominal, by model
-    norms: Mapping[str, Mapping[str, float]]
-    errors: Mapping[str, Mapping[str, Any]]  # held-out, of `raw`, `linear`, `net`: training.report
-    pictures: Sequence[Picture]
-    film: Picture | str  # or why there is none
-    config: Mapping[str, Any]  # resolved, as JSON values
-    environment: Mapping[str, str]
-    command: str  # that makes this run again
-    shifts: Sequence[Mapping[str, Any]] = ()  # of each refresh: nets.refresh
-    chosen: Mapping[str, Mapping[str, int]] = {}  # iteration that was taken, where not the last
-
-
-def write_report(folder: Path, report: Report) -> Path:
+def write_report(folder: Path, **contents: Any) -> Path:
     """Write report.md into the run folder, whole or not at all.
 
     Args:
         folder: where the pictures are.
-        report: its contents.
+        contents: all of these:
+            trajectory, verdict: what was walked, and the walks of all sets on the stand-in.
+            tunings: by set, `without`, `with` and, refreshed, `with_refreshed`.
+            norms: of the terms' gradients in log-weights at nominal, by model.
+            errors: held-out, of `raw`, `linear`, `net`, as `training.report` has them.
+            shifts: of each refresh, by `nets.refresh`.
+            chosen: by set, iteration that was taken, where not the last.
+            pictures, film: `Picture`s; of the film, or why there is none.
+            config, environment: resolved settings, as JSON values, and what it was made with.
+            command: that makes this run again.
 
     Returns:
         The file.
     """
     functions = {"aligned": aligned, "error_rows": error_rows, "tuning_section": tuning_section}
-    write_file(folder / "report.md", render("run.md.j2", **report._asdict(), **functions).encode())
+    write_file(folder / "report.md", render("run.md.j2", **contents, **functions).encode())
     return folder / "report.md"
 
 

@@ -40,18 +40,16 @@ def write_events(folder: Path, out: Path) -> list[Path]:
             old.unlink()
         with SummaryWriter(str(place)) as writer:
             for line in (line for line in lines if line["set"] == name):
-                for room, values in _scalars(line).items():
-                    for key, value in values.items():
-                        if isinstance(value, int | float):  # null was not finite, gains are a list
-                            writer.add_scalar(f"{room}/{key}", float(value), line["iteration"])
+                for key, value in _scalars(line).items():
+                    if isinstance(value, int | float):  # null was not finite, gains are a list
+                        writer.add_scalar(key, float(value), line["iteration"])
     return list(folders.values())
 
 
-def _scalars(line: Mapping[str, Any]) -> dict[str, Mapping[str, float | None]]:
+def _scalars(line: Mapping[str, Any]) -> dict[str, Any]:
     """Numbers of an iteration, by group and name."""
     return {
-        "loss": {name: line[name] for name in line if name == "L" or name.startswith("L_")},
-        "step": {name: line.get(name) for name in ("step", "accepted", "residual")},
-        "weights": line["weights"],
-        "gradient_log": line["gradient_log"],
+        **{f"loss/{name}": line[name] for name in line if name == "L" or name.startswith("L_")},
+        **{f"step/{name}": line.get(name) for name in ("step", "accepted", "residual")},
+        **{f"{of}/{name}": x for of in ("weights", "gradient_log") for name, x in line[of].items()},
     }

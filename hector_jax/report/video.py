@@ -106,14 +106,13 @@ def write_film(
         VideoUnavailable: no back end works here, or there is no encoder.
         InputError: the ending is none of these.
     """
-    config = config or VideoConfig()
     _check_ending(path)
     if path.suffix.lower() == ".mp4":
         try:
             imageio_ffmpeg.get_ffmpeg_exe()
         except RuntimeError as error:
             raise VideoUnavailable(f"no film: no video encoder ({one_line(error)})") from None
-    return _write(make_scene(path, robot, motions, config, strip=False), path)
+    return _write(make_scene(path, robot, motions, config or VideoConfig(), strip=False), path)
 
 
 def write_strip(
@@ -123,8 +122,7 @@ def write_strip(
 
     Args, returns and raises as `write_film`; the path is that of a PNG.
     """
-    config = config or VideoConfig()
-    return _write(make_scene(path, robot, motions, config, strip=True), path)
+    return _write(make_scene(path, robot, motions, config or VideoConfig(), strip=True), path)
 
 
 def make_scene(
@@ -134,6 +132,9 @@ def make_scene(
     if len(motions) != 2:
         raise ValueError(f"a film shows two walks side by side, got {len(motions)}: {[*motions]}")
     seconds = min(float(motion.times[-1]) for motion in motions.values())
+    times = np.arange(0.0, seconds + 1e-9, 1.0 / config.rate)
+    if strip:
+        times = _snapshot_times(next(iter(motions.values())), seconds, config.tiles)
     return Scene(
         file=f"drawn{path.suffix.lower()}",
         strip=strip,
@@ -141,9 +142,7 @@ def make_scene(
         model=compile_model(robot.description),
         top=_TOP * float(robot.standing_height),
         motions={label_of(name): motion for name, motion in motions.items()},
-        times=_snapshot_times(next(iter(motions.values())), seconds, config.tiles)
-        if strip
-        else np.arange(0.0, seconds + 1e-9, 1.0 / config.rate),
+        times=times,
     )
 
 

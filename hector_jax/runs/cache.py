@@ -43,7 +43,7 @@ def content_key(*parts: Any, code: Sequence[str]) -> str:
     def text(part: Any) -> str:
         if isinstance(part, Robot):
             return robot_hash(part)
-        return tree_hash(part) if isinstance(part, tuple) or part is None else repr(part)
+        return tree_hash(part) if isinstance(part, tuple | None) else repr(part)
 
     key = "\n".join([*map(text, parts), code_hash(*code)])
     return hashlib.sha256(key.encode()).hexdigest()[:12]

@@ -19,7 +19,6 @@ from hector_jax.core.console import say
 from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
 from hector_jax.runs import verdicts
-from hector_jax.runs.metrics import Score
 from hector_jax.sim.world import hfs_drawn, truth
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
@@ -69,43 +68,36 @@ def choose(
     if not (count := robot.description.tuning.choice_plants):
         return {}
     paths = {name: [i for i in one.history if i.accepted] for name, one in tunings.items()}
-    points = {
-        name: sorted({round(share * (len(path) - 1)) for share in SHARES})
+    points = {  # of each path, by their labels
+        name: {
+            f"{name}-{i}" if i else "start": path[i]
+            for i in sorted({round(share * (len(path) - 1)) for share in SHARES})
+        }
         for name, path in paths.items()
     }
-    sets = {_label(name, i): paths[name][i].weights for name in paths for i in points[name]}
+    sets = {label: one.weights for each in points.values() for label, one in each.items()}
     title = f"choosing an iteration on {plural(count, 'plant')} drawn around the hfs"
     notes = {"title": title, "seconds": seconds, "folder": folder, "commit": commit}
     noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
-    drawn = [
-        hfs_drawn(_FIRST_SEED + k, 0.4, robot.description)._replace(estimator=noisy)
-        for k in range(count)
-    ]
+    drawn = [hfs_drawn(_FIRST_SEED + k, 0.4, robot.description) for k in range(count)]
+    plants = [plant._replace(estimator=noisy) for plant in drawn], range(count)
     each = [
-        verdicts.judge(pool, config, robot, sets, command, drawn, range(count), **notes).scores
+        verdicts.judge(pool, config, robot, sets, command, *plants, **notes).scores
         for command in commands
     ]
-    ratio = {name: np.mean([_against_start(name, scores) for scores in each]) for name in sets}
-
-    def best(name: str) -> Choice:
-        path, last = paths[name], len(paths[name]) - 1
-        i = min(points[name], key=lambda i: ratio[_label(name, i)])
-        change = [100 * (ratio[_label(name, j)] - 1) for j in (i, last)]
-        chosen = Choice(path[i].weights, int(path[i].iteration), int(path[last].iteration))
+    loss = {
+        label: np.array([[one.L for one in scores[label]] for scores in each]) for label in sets
+    }
+    ratio = {label: float(np.mean(loss[label] / loss["start"])) for label in sets}
+    choices = {}
+    for name, labels in points.items():
+        *_, last = labels
+        best = min(labels, key=ratio.__getitem__)
+        numbers = int(labels[best].iteration), int(labels[last].iteration)
+        choices[name] = Choice(labels[best].weights, *numbers)
+        change = [100 * (ratio[label] - 1) for label in (best, last)]
         say(
-            f"{name}: iteration {chosen.iteration} of {chosen.of} walks best on plants drawn "
-            f"around the hfs: L {change[0]:+.0f} % against the start, the last {change[1]:+.0f} %"
+            f"{name}: iteration {numbers[0]} of {numbers[1]} walks best on plants drawn around "
+            f"the hfs: L {change[0]:+.0f} % against the start, the last {change[1]:+.0f} %"
         )
-        return chosen
-
-    return {name: best(name) for name in paths}
-
-
-def _label(name: str, point: int) -> str:
-    return f"{name}-{point}" if point else "start"
-
-
-def _against_start(name: str, scores: Mapping[str, Sequence[Score]]) -> float:
-    """Loss of a set by that of the start on the same plant, mean over the plants."""
-    pairs = zip(scores[name], scores["start"], strict=True)
-    return float(np.mean([float(one.L) / float(start.L) for one, start in pairs]))
+    return choices

@@ -1,4 +1,4 @@
-"""Export for the robot: the weights, and the controller as one compiled function.
+"""Export for the robot: the weights with their schema, and the controller as a compiled function.
 
 A recorded walk lies beside it, with the outputs of the live controller; nothing is written unless
 the file gives the same outputs (`TOLERANCE`).
@@ -9,27 +9,33 @@ import io
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
+from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights
-from hector_jax.control.weights_file import save_weights, weights_tree
+from hector_jax.control.weights import Weights, nominal
+from hector_jax.control.weights_file import WEIGHTS, save_weights, weights_tree
 from hector_jax.core.console import Broken
 from hector_jax.core.environment import versions
 from hector_jax.core.files import make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
-from hector_jax.core.settings import from_table, read_json, to_table
+from hector_jax.core.settings import Range, from_table, read_json, to_table
+from hector_jax.core.trajectory import Wrench, pack_wrench
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.robot.model import Robot
-from hector_jax.runs.export_check import Check, as_arrays, check, record
 from hector_jax.runs.export_controller import (
+    Check,
+    as_arrays,
+    check,
     controller,
     export_controller,
     load_controller,
+    record,
     signature,
 )
-from hector_jax.runs.export_weights import weights_cpp, weights_schema
 from hector_jax.runs.folder import CONFIG
 from hector_jax.sim.loop import substeps
 
@@ -37,6 +43,19 @@ SCHEMA = "weights.schema.json"
 PLATFORMS = ("cpu", "cuda")
 TOLERANCE = 1e-6
 """Largest difference [N, N m] from the live controller."""
+
+_DESCRIPTIONS = {
+    "Q": "of the squared error of each state, world frame",
+    "euler": "roll, pitch, yaw [1/rad^2]",
+    "position": "x, y, z of the centre of mass [1/m^2]",
+    "ang_velocity": "x, y, z [s^2/rad^2]",
+    "velocity": "x, y, z [s^2/m^2]",
+    "R": "of the squared wrench of the ground on each foot, left then right, world frame",
+    "force": "x, y, z [1/N^2]",
+    "moment": "x, y, z [1/(N m)^2]",
+}
+_STATES = ("roll, pitch, yaw", "x, y, z", "their rates: wx, wy, wz", "vx, vy, vz")
+_INPUTS = ("force, foot 0 (left)", "force, foot 1 (right)", "moment, foot 0", "moment, foot 1")
 
 
 def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
@@ -82,7 +101,7 @@ def _constants(config: WalkConfig, robot: Robot, lead: int) -> dict[str, Any]:
 
 
 def _require_same(result: Check) -> None:
-    if not max(result.force, result.moment, result.torque) <= TOLERANCE:
+    if not max(result[:3]) <= TOLERANCE:
         raise Broken(
             f"the exported controller differs from the live one by {result.force:.1e} N, "
             f"{result.moment:.1e} N m and {result.torque:.1e} N m at the joints, at most "
@@ -120,9 +139,7 @@ def export(
         Broken: it differs from the live controller by more than TOLERANCE; nothing is written.
     """
     make_folder(folder)
-    blobs = {
-        place: export_controller(config, robot, weights, platform=place) for place in PLATFORMS
-    }
+    blobs = {on: export_controller(config, robot, weights, platform=on) for on in PLATFORMS}
     recorded = record(config, robot, weights, command=command, seconds=seconds)
     _, example = controller(config, robot, weights)
     result = check(config, load_controller(blobs["cpu"]), example, recorded)
@@ -132,7 +149,7 @@ def export(
     save_weights(folder / "weights.json", weights, SCHEMA)
     write_json(folder / SCHEMA, weights_schema(robot))
     np.savez(rows := io.BytesIO(), **as_arrays(recorded))
-    contents = {f"controller-{place}.jaxexport": blob for place, blob in blobs.items()}
+    contents = {f"controller-{on}.jaxexport": blob for on, blob in blobs.items()}
     contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
     contents["check.npz"] = rows.getvalue()
     for file, content in contents.items():
@@ -151,3 +168,93 @@ def export(
     }
     write_json(folder / "controller.json", card)
     return card
+
+
+def weights_schema(robot: Robot | None = None) -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of a weights file of a robot, HECTOR by default."""
+    schema = _schema(weights_tree(nominal()))
+    others = {
+        name: _schema(np.zeros(one.shape(robot)).tolist(), Range(one.lower, one.upper))
+        for name, one in TUNABLES.items()
+    }
+    schema["properties"] |= {
+        "$schema": {"type": "string"},
+        "others": {"type": "object", "properties": others, "additionalProperties": False},
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Weights of the walking MPC: diagonals of |x - x_ref|^2_Q + |u|^2_R",
+        **schema,
+    }
+
+
+def _schema(example: Any, range: Range = WEIGHTS) -> dict[str, Any]:
+    """Schema of values in a range that are nested as the example is."""
+    if isinstance(example, dict):
+        properties = {
+            name: {"description": _DESCRIPTIONS[name], **_schema(value)}
+            for name, value in example.items()
+        }
+        names = {"properties": properties, "required": list(example)}
+        return {"type": "object", **names, "additionalProperties": False}
+    if isinstance(example, list):
+        size = {"minItems": len(example), "maxItems": len(example)}
+        return {"type": "array", "items": _schema(example[0], range), **size}
+    return {"type": "number", "minimum": range.low, "maximum": range.high}
+
+
+_HEADER = """\
+// Weights {name!r}, tuned with hector_jax, for DRCL-USC/Hector_Simulation, branch
+// ROS_Simulation: these take the place of Q and Alpha in updateMPCIfNeeded() of
+// hector_control/ConvexMPC/ConvexMPCLocomotion.cpp.
+//
+// Both controllers minimise sum |x - x_ref|^2_Q + |u|^2_Alpha, world frame, in SI; the numbers go
+// over as they are. They were tuned with {mass:.4g} kg, steps of {dt:g} s, {horizon} of them,
+// |F_x| + |F_y| <= {mu:g} F_z <= {limit:g} N, -{toe:.3g} F_z <= M_y <= {heel:.3g} F_z, M_x = 0,
+// friction at toe and heel: {line}. What differs in the C++ controller is in docs/export.md of
+// hector_jax: read it before walking.
+"""
+_ATTENTION = """\
+// ATTENTION: R prices u less the feet's share of the weight here, u itself there: Alpha was not
+// tuned for that.
+"""
+
+
+def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str) -> str:
+    """The weights as the two lines of the open HECTOR C++ controller.
+
+    Args:
+        weights: to write.
+        config: the controller that they were tuned for.
+        robot: its body.
+        name: of the weights, for the first line.
+
+    Source: DRCL-USC/Hector_Simulation, branch ROS_Simulation, ConvexMPCLocomotion.cpp and
+        SolverMPC.cpp at commit 79d545a, read for order and factors.
+    """
+    mpc, numbers = config.mpc, config.parameters(weights).mpc
+    header = _HEADER.format(
+        name=name,
+        mass=float(robot.mass),
+        dt=config.mpc_step,
+        horizon=mpc.horizon,
+        mu=float(numbers.friction),
+        limit=float(numbers.friction * numbers.max_force),
+        toe=float(robot.toe),
+        heel=float(robot.heel),
+        line=LINE_FRICTION in mpc.on("inputs"),
+    )
+    Alpha = pack_wrench(Wrench(*map(jnp.asarray, weights.R)))
+    others = weights_tree(weights).get("others", {}).items()
+    notes = [f"// ATTENTION: tuned with {name} {value}.\n" for name, value in others]
+    blocks = _block("Q", np.concatenate(weights.Q), _STATES), _block("Alpha", Alpha, _INPUTS)
+    return "".join([header, _ATTENTION * bool(numbers.effort_reference), *notes, *blocks])
+
+
+def _block(kind: str, values: Any, names: tuple[str, ...]) -> str:
+    rows = np.asarray(values, float).reshape(4, 3).tolist()
+    lines = [
+        f"    {', '.join(map(repr, row))},  // {name}\n"
+        for row, name in zip(rows, names, strict=True)
+    ]
+    return "".join([f"double {kind}[12] = {{\n", *lines, "};\n"])

@@ -11,32 +11,37 @@ plan; the torques are new every millisecond. The carry is opaque: zeros at milli
 robot stands, and then what came out. The gait's clock starts there, as walks in MuJoCo do.
 
 What is exported is traced on the CPU: the guess by a GPU kernel (`qp`) has no stable custom call,
-and the plain guess leads to the same minimiser.
+and the plain guess leads to the same minimiser. The check of a file is a recorded walk, gone
+through again and timed.
 """
 
+import time
 from collections.abc import Callable
 from functools import partial
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
-from hector_jax.control.reference import Anchor, Command, standing_anchor
+from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
-from hector_jax.core.trajectory import State
+from hector_jax.core.trajectory import State, Wrench
 from hector_jax.qp import Status
 from hector_jax.robot.model import Robot
-from hector_jax.sim.loop import first_tick, substeps
+from hector_jax.sim import sensing
+from hector_jax.sim.loop import Job, first_tick, substeps
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import build_world, ideal, standing_qpos
 
 _STILL = Command(np.ones(2), np.zeros((2, 2)), np.zeros(2))
 
@@ -71,6 +76,7 @@ def controller(
     """
     idle, structure = jax.tree.flatten(_idle(config, robot, weights))
     count, begin, moves = substeps(config), first_tick(config), config.gait.first_tick
+    parameters = config.parameters(weights)
 
     def control(
         carry: tuple[Array, ...],
@@ -85,28 +91,25 @@ def controller(
         measurement = Measurement(State(**base), joints, rates)
         memory, plan = jax.tree.unflatten(structure, carry)
 
-        def planned(max_contacts: int) -> Callable[[], tuple[Memory, Plan]]:
-            return lambda: step_plan(
-                config,
-                robot,
-                config.parameters(weights),
-                command=Command(**command),
-                anchor=Anchor(**anchor),
-                tick=tick,
-                memory=memory,
-                measurement=measurement,
-                max_contacts=max_contacts,
-            )
-
+        planned = partial(
+            step_plan,
+            config,
+            robot,
+            parameters,
+            command=Command(**command),
+            anchor=Anchor(**anchor),
+            tick=tick,
+            memory=memory,
+            measurement=measurement,
+        )
         both = (tick < moves) | config.gait.double_support
         branch = jnp.where(substep > 0, 0, jnp.where(both, 2, 1))
-        memory, plan = lax.switch(branch, [lambda: (memory, plan), planned(1), planned(2)])
-        legs = config.parameters(weights).legs
-        now = {"substep": substep, "measurement": measurement}
+        choices = [partial(planned, max_contacts=count) for count in (1, 2)]
+        memory, plan = lax.switch(branch, [lambda: (memory, plan), *choices])
+        now = {"substep": substep, "measurement": measurement, "plan": plan, "memory": memory}
         out = {
-            "force": plan.wrench.force,
-            "moment": plan.wrench.moment,
-            "torque": actuate(config, robot, legs, plan=plan, memory=memory, **now),
+            **plan.wrench._asdict(),
+            "torque": actuate(config, robot, parameters.legs, **now),
             "contact": plan.contact,
             "status": plan.status,
             "residual": plan.residual,
@@ -116,14 +119,18 @@ def controller(
     return control, (tuple(idle), np.int32(0), *_standing(robot))
 
 
+def _measured(measurement: Measurement) -> dict[str, Any]:
+    """A measurement by the names that the file knows."""
+    state, joints, rates = measurement
+    return state._asdict() | {"joints": joints, "joint_rates": rates}
+
+
 def _standing(robot: Robot) -> tuple[dict[str, Any], ...]:
     """Measurement, command and anchor of a robot that stands."""
     position = np.append(robot.com_offset[:2], robot.standing_height)
     still = State(np.zeros(3), position, np.zeros(3), np.zeros(3))
-    measured = still._asdict() | {
-        "joints": robot.standing_joints,
-        "joint_rates": np.zeros_like(robot.standing_joints),
-    }
+    joints = robot.standing_joints
+    measured = _measured(Measurement(still, joints, np.zeros_like(joints)))
     anchor = jax.tree.map(np.asarray, standing_anchor(robot))
     return measured, _STILL._asdict(), anchor._asdict()
 
@@ -201,3 +208,134 @@ def _with_shapes(texts: Any, values: Any) -> Any:
 def signature(example: tuple) -> dict[str, Any]:
     """What the controller takes and gives: each part in words, with shape and dtype."""
     return _with_shapes(_SIGNATURE, dict(zip(_SIGNATURE, example, strict=False)))
+
+
+class Record(NamedTuple):
+    """Inputs of the controller along a walk, a row each millisecond, and the live one's outputs.
+
+    The first `lead` rows are those before t = 0, where the anchor is `standing`; from then on it is
+    `anchor`.
+    """
+
+    measurement: Measurement  # (T,) rows
+    command: Command
+    standing: Anchor
+    anchor: Anchor
+    lead: int
+    wrench: Wrench  # commanded, rows from t = 0 on
+    torque: Float[np.ndarray, "T joints"]  # [N m]
+
+
+def record(
+    config: WalkConfig, robot: Robot, weights: Weights, *, command: Command, seconds: float
+) -> Record:
+    """Walk in the ideal world and record the inputs and outputs of the controller.
+
+    Raises:
+        InputError: the robot falls.
+    """
+    plant = ideal(robot.description)
+    world = build_world(plant, robot.description)
+    standing = standing_qpos(world, robot.standing_joints, float(robot.trunk_height))
+    rows = [np.concatenate([standing, np.zeros(world.model.nv + 1)])[sensing.coordinates(world)]]
+    torques = []
+
+    def append(world: Any, data: Any) -> None:
+        torques.append(data.ctrl[world.actuator].copy())
+        entries = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
+        rows.append(entries[sensing.coordinates(world)])
+
+    trajectory = walk(config, robot, Job(weights, command, plant, seconds), on_sample=append)
+    if np.asarray(trajectory.fallen).any():
+        raise InputError(
+            f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "
+            "no walk to check the export on"
+        )
+
+    @jax.jit
+    def measurements(rows: Array) -> Measurement:
+        def one(yaw: Array, row: Array) -> tuple[Array, Measurement]:
+            reading = sensing.unpack_reading(row)
+            measurement, yaw = sensing.measure(robot, reading, yaw, sensing.no_error(robot))
+            return yaw, measurement
+
+        return lax.scan(one, jnp.zeros(()), rows)[1]
+
+    lead = -first_tick(config) * substeps(config)
+    host = partial(jax.tree.map, np.asarray)
+    return Record(
+        measurement=host(measurements(np.stack(rows[:-1]))),
+        command=command,
+        standing=host(standing_anchor(robot)),
+        anchor=host(anchor_at(robot, jax.tree.map(jnp.asarray, trajectory.initial), 0)),
+        lead=lead,
+        wrench=host(trajectory.command),
+        torque=np.stack(torques),
+    )
+
+
+class Check(NamedTuple):
+    """Differences and times of an exported controller along a walk."""
+
+    force: float  # [N] largest difference from the live controller
+    moment: float  # [N m]
+    torque: float  # [N m]
+    unsolved: int  # plans whose QP was not solved
+    plan_ms: dict[str, float]  # [ms] of a call that plans: p50, p99, max; cpu_p50, cpu_p99
+    hold_ms: dict[str, float]  # [ms] of one that holds the plan
+
+
+def check(
+    config: WalkConfig, control: Callable[..., tuple], example: tuple, recorded: Record
+) -> Check:
+    """Run an exported controller along a recorded walk, and time it, numpy in, numpy out.
+
+    Args:
+        config: for its times.
+        control: from `load_controller`.
+        example: its arguments, from `controller`.
+        recorded: from `record`.
+    """
+    measured = _measured(recorded.measurement)
+    command, standing, anchor = jax.device_put(
+        [part._asdict() for part in (recorded.command, recorded.standing, recorded.anchor)]
+    )
+    jax.block_until_ready(control(*example))  # the first call is slower
+    carry, answers, spent = example[0], [], []
+    for i in range(len(recorded.torque)):
+        now = {name: rows[i] for name, rows in measured.items()}
+        wall, cpu = time.perf_counter(), time.process_time()
+        carry, out = control(
+            carry, np.int32(i), now, command, standing if i < recorded.lead else anchor
+        )
+        np.asarray(out["torque"])
+        spent.append((time.perf_counter() - wall, time.process_time() - cpu))
+        answers.append(out)
+    out = {name: np.stack([answer[name] for answer in answers]) for name in answers[0]}
+    plans = np.arange(len(recorded.torque)) % substeps(config) == 0
+
+    def spread(times: np.ndarray) -> dict[str, float]:
+        wall, cpu = 1e3 * np.quantile(times, [0.5, 0.99, 1.0], axis=0).T
+        names = ("p50", "p99", "max", "cpu_p50", "cpu_p99")
+        return dict(zip(names, [*wall.tolist(), *cpu[:2].tolist()], strict=True))
+
+    return Check(
+        force=float(np.abs(out["force"][recorded.lead :] - recorded.wrench.force).max()),
+        moment=float(np.abs(out["moment"][recorded.lead :] - recorded.wrench.moment).max()),
+        torque=float(np.abs(out["torque"] - recorded.torque).max()),
+        unsolved=int((~np.isin(out["status"][plans], (Status.SOLVED, Status.NOT_UNIQUE))).sum()),
+        plan_ms=spread(np.array(spent)[plans]),
+        hold_ms=spread(np.array(spent)[~plans]),
+    )
+
+
+def as_arrays(recorded: Record) -> dict[str, Any]:
+    """A record as named arrays, for whoever checks the controller on the robot's computer."""
+    groups = {
+        "measured": _measured(recorded.measurement),
+        "command": recorded.command._asdict(),
+        "standing": recorded.standing._asdict(),
+        "anchor": recorded.anchor._asdict(),
+        "out": {**recorded.wrench._asdict(), "torque": recorded.torque},
+    }
+    return {f"{group}.{name}": row for group, rows in groups.items() for name, row in rows.items()}

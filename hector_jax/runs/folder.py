@@ -7,11 +7,13 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
@@ -24,9 +26,9 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.control.weights_file import load_weights
-from hector_jax.core import inputs, settings
 from hector_jax.core.files import append_file, as_json, write_file
-from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.inputs import InputError, read_text, short_repr
+from hector_jax.core.settings import read_json
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import Iteration
 from hector_jax.tuning.evaluate import Evaluation
@@ -35,6 +37,8 @@ from hector_jax.tuning.status import status_of
 
 CONFIG, METRICS, RESULT, VERSIONS = "config.json", "metrics.jsonl", "result.json", "versions.json"
 _MOST_BYTES = 100_000_000
+# of what a line of metrics.jsonl holds
+_KINDS = {"set": str, "iteration": int, "accepted": bool, "weights": dict, "gradient_log": dict}
 
 Histories = dict[str, list[Iteration]]  # by set
 
@@ -103,28 +107,26 @@ def as_line(name: str, iteration: Iteration) -> str:
     evaluation = iteration.evaluation
     gradient = jax.tree.map(np.multiply, evaluation.gradient, iteration.weights)
 
-    def named(tree: Weights) -> dict[str, float]:
-        return dict(zip(WEIGHT_NAMES, np.asarray(weights_to_vector(tree)).tolist(), strict=True))
-
-    def plain(others: Mapping[str, Any]) -> dict[str, Any]:
-        return {name: np.asarray(value).tolist() for name, value in others.items()}
+    def named(tree: Weights) -> dict[str, Any]:
+        return dict(zip(WEIGHT_NAMES, weights_to_vector(tree), strict=True))
 
     row = {
         "set": name,
-        "iteration": int(iteration.iteration),
-        "accepted": bool(iteration.accepted),
+        "iteration": iteration.iteration,
+        "accepted": iteration.accepted,
         "reason": iteration.reason,
-        "step": float(iteration.step_scale),
-        "L": float(evaluation.loss),
-        **{name: float(term) for name, term in evaluation.terms.items()},
-        "fallen": float(evaluation.fallen),
-        "residual": float(evaluation.residual),
-        "weights": named(iteration.weights) | plain(iteration.weights.others),
+        "step": iteration.step_scale,
+        "L": evaluation.loss,
+        **evaluation.terms,
+        "fallen": evaluation.fallen,
+        "residual": evaluation.residual,
+        "weights": {**named(iteration.weights), **iteration.weights.others},
         "gradient_log": named(gradient),
     }
     if iteration.weights.others:  # they may be zero and have no logarithm
-        row["gradient"] = plain(evaluation.gradient.others)
-    return as_json(row) + "\n"
+        row["gradient"] = dict(evaluation.gradient.others)
+    plain = msgspec.to_builtins(row, enc_hook=lambda x: np.asarray(x).tolist())
+    return as_json(plain) + "\n"
 
 
 class Journal:
@@ -160,14 +162,12 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
         InputError: one line naming the file and, where it is damaged, its line.
     """
     path = folder / METRICS
-    text = inputs.read_text(path, "the iterations of a run of `hector tune`", _MOST_BYTES)
+    text = read_text(path, "the iterations of a run of `hector tune`", _MOST_BYTES)
     rows = []
     for number, line in enumerate(text.rpartition("\n")[0].splitlines(), 1):
         with _line(path, number):
             row = json.loads(line)
-            kinds = {"set": str, "iteration": int, "accepted": bool}
-            kinds |= {"weights": dict, "gradient_log": dict}
-            for name, kind in kinds.items():
+            for name, kind in _KINDS.items():
                 if not isinstance(row[name], kind):
                     raise TypeError(f"{name}: {row[name]!r}")
             rows.append(row)
@@ -201,28 +201,25 @@ def _line(path: Path, number: int) -> Iterator[None]:
 
 def _iteration(row: Mapping[str, Any]) -> Iteration:
     """Read what `as_line` wrote; null, which stands for what is not finite, becomes NaN."""
-
-    def number(x: Any) -> np.ndarray:
-        return np.array(x, float)  # NaN of None
+    number = partial(np.array, dtype=float)  # NaN of None
 
     def vector(table: Mapping[str, Any]) -> np.ndarray:
-        return np.array([number(table[name]) for name in WEIGHT_NAMES])
+        return number([table[name] for name in WEIGHT_NAMES])
 
-    def tree(values: np.ndarray, others: Mapping[str, Any]) -> Weights:
-        weights = vector_to_weights(jnp.asarray(values))._replace(others=others)
-        return jax.tree.map(np.asarray, weights)
+    def tree(values: np.ndarray, table: Mapping[str, Any]) -> Weights:
+        weights = vector_to_weights(jnp.asarray(values))
+        others = {name: number(table[name]) for name in names}
+        return jax.tree.map(np.asarray, weights._replace(others=others))
 
     weights = vector(row["weights"])
     names = row["weights"].keys() - set(WEIGHT_NAMES)
-    others = {name: number(row["weights"][name]) for name in names}
-    slopes = {name: number(row["gradient"][name]) for name in names}
     return Iteration(
         iteration=np.array(row["iteration"]),
-        weights=tree(weights, others),
+        weights=tree(weights, row["weights"]),
         evaluation=Evaluation(
             loss=number(row["L"]),
             terms={name: number(row[name]) for name in row if name.startswith("L_")},
-            gradient=tree(vector(row["gradient_log"]) / weights, slopes),
+            gradient=tree(vector(row["gradient_log"]) / weights, row.get("gradient", {})),
             fallen=number(row["fallen"]),
             residual=number(row["residual"]),
         ),
@@ -237,7 +234,7 @@ def read_object(path: Path) -> dict[str, Any]:
     Raises:
         InputError: one line naming the file that is missing or holds something else.
     """
-    value = settings.read_json(path, "a file of a run of `hector tune`", _MOST_BYTES)
+    value = read_json(path, "a file of a run of `hector tune`", _MOST_BYTES)
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a JSON object, got {short_repr(value)}")
     return value
@@ -263,10 +260,9 @@ def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Wei
     Raises:
         InputError: there is no such set; names those that there are.
     """
-    path = folder / "weights" / f"{name}.json"
+    path, published = folder / "weights" / f"{name}.json", {"nominal": nominal, "expert": expert}
     if path.exists():
         return load_weights(path, robot), name
-    published = {"nominal": nominal, "expert": expert}
     if name in published:
         return published[name](robot), name
     newest = _newest(read_histories(folder))
@@ -284,12 +280,10 @@ def _newest(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Iteration
 
 def loss_curves(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Float[np.ndarray, " n"]]:
     """L in 1e6 by iteration, padded to the longest history; NaN where refused or not there."""
-    count = max((len(history) for history in histories.values()), default=0)
-    curves = {name: np.full(count, np.nan) for name in histories}
+    count, curves = max(map(len, histories.values()), default=0), {}
     for name, history in histories.items():
-        for k, one in enumerate(history):
-            if one.accepted:
-                curves[name][k] = one.evaluation.loss / 1e6
+        losses = [one.evaluation.loss / 1e6 if one.accepted else np.nan for one in history]
+        curves[name] = np.array(losses + [np.nan] * (count - len(losses)))
     return curves
 
 

@@ -104,7 +104,7 @@ def score(loss: Loss, walk: Trajectory) -> Score:
     """
     terms = losses(loss, walk)
     fallen = np.asarray(walk.fallen)
-    named = {**terms} | {"L": total(loss, terms)}
+    named = {**terms, "L": total(loss, terms)}
     return Score(
         losses={part: np.asarray(value, float) for part, value in named.items()},
         switching=np.asarray(switch_loss(walk), float),
@@ -148,8 +148,7 @@ def make_verdict(
         if len(walks) != len(seeds):
             raise ValueError(f"set '{name}' has {len(walks)} walks for {len(seeds)} seeds")
         stacked[name] = stack(walks)
-        wrong = [s for s, L in zip(seeds, stacked[name].L, strict=True) if not np.isfinite(L)]
-        if wrong:
+        if wrong := np.asarray(seeds)[~np.isfinite(stacked[name].L)].tolist():
             raise ValueError(f"set '{name}': the loss on seeds {wrong} is not a finite number")
     return Verdict(np.asarray(seeds, int), stacked, loss)
 
@@ -238,33 +237,34 @@ def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
 
 def _set_result(verdict: Verdict, name: str) -> dict[str, Any]:
     scores, summary = verdict.scores[name], summarize(verdict, name)
-    named_rms = zip(("euler", "position"), rms(verdict, name), strict=True)
+    euler, position = rms(verdict, name)
     return {
-        **{
-            part: dict(zip(("mean", "low", "high"), value, strict=True))
-            for part, value in summary.means.items()
-        },
+        **_intervals("mean", summary.means),
         "falls": summary.falls,
         "seeds": verdict.seeds.tolist(),
         "legs_touch": float(scores.legs_touch.sum()),
         "residual": float(scores.residual.max()),
         "L_ctrl_switching": float(scores.switching.mean()),
-        "rms": {key: values.tolist() for key, values in named_rms},
+        "rms": {"euler": euler.tolist(), "position": position.tolist()},
         "change": {other: change_result(one) for other, one in summary.against.items()},
+    }
+
+
+def _intervals(value: str, parts: Mapping[str, Interval]) -> dict[str, dict[str, float]]:
+    """Intervals by part as JSON values; `value` is the name of their middle."""
+    return {
+        part: dict(zip((value, "low", "high"), one, strict=True)) for part, one in parts.items()
     }
 
 
 def change_result(comparison: Comparison) -> dict[str, Any]:
     """A comparison as JSON values: the change of L, wins, counts, and the changes of the parts."""
-    keys = ("median", "low", "high")
-    rows = {p: dict(zip(keys, c, strict=True)) for p, c in comparison.change.items()}
+    rows = _intervals("median", comparison.change)
     return rows.pop("L") | {"wins": comparison.wins, "counts": comparison.counts, "parts": rows}
 
 
 def rms(verdict: Verdict, name: str) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """RMS error over all seeds: roll, pitch, yaw [rad], and x, y, z [m]."""
-    scores = verdict.scores[name]
     # walks that fell at once have no errors
-    errors = scores.rms_euler, scores.rms_position
-    euler, position = (_rms(x, np.asarray(np.isfinite(x).all(axis=-1))) for x in errors)
-    return euler, position
+    mean = lambda x: _rms(x, np.asarray(np.isfinite(x).all(axis=-1)))  # noqa: E731
+    return mean(verdict.scores[name].rms_euler), mean(verdict.scores[name].rms_position)

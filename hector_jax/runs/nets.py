@@ -21,12 +21,10 @@ from hector_jax.core.settings import POSITIVE, SEED, Range, check, from_table
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings
 from hector_jax.grfm import collection, dataset, network, training
-from hector_jax.grfm.collection import Walks
-from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import HISTORY, last_command
 from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
 from hector_jax.grfm.nets import History
-from hector_jax.grfm.network import Params
+from hector_jax.grfm.network import Params, as_effect
 from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
@@ -43,7 +41,7 @@ COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.walk", "si
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Walks on the hfs to learn the ground from."""
+    """collection.Walks on the hfs to learn the ground from."""
 
     walks: int = 64
     seconds: float = 4.0  # of each
@@ -100,8 +98,7 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
         compile_programs(pool, robot)
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
-        settings = collection_settings(config, robot)
-        _collect(pool, config, robot, jobs, folder, settings)
+        _collect(pool, config, robot, jobs, folder, collection_settings(config, robot))
 
 
 def _collect(
@@ -129,9 +126,9 @@ def _collect(
 class Samples(NamedTuple):
     """The samples of a collection; no walk is in two of the parts."""
 
-    training: Dataset
-    validation: Dataset  # chooses the epoch of a net
-    held_out: Dataset  # is only looked at
+    training: dataset.Dataset
+    validation: dataset.Dataset  # chooses the epoch of a net
+    held_out: dataset.Dataset  # is only looked at
     dropped: int  # by a fall, an unsolved QP or a push
 
 
@@ -141,24 +138,18 @@ def samples(robot: Robot, *folders: Path) -> Samples:
     Each folder is split by itself, so that what was held out stays held out beside other walks;
     walks are numbered by folder.
     """
-    each = [_samples(robot, folder) for folder in folders]
-    *parts, dropped = zip(*each, strict=True)
-    training, validation, held_out = (
-        jax.tree.map(lambda *x: np.concatenate(x), *part) for part in parts
-    )
-    return Samples(training, validation, held_out, sum(dropped))
+    parts, total = [], 0
+    for folder in folders:
+        job, walk = collection.load_walks(folder, robot)
+        data, dropped = dataset.make_dataset(robot, walk, job.start_tick, push=job.push)
+        rest, held_out = dataset.split_by_walk(data)
+        parts.append((*dataset.split_by_walk(rest, seed=1), held_out))
+        total += dropped
+    training, validation, held_out = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return Samples(training, validation, held_out, total)
 
 
-def _samples(robot: Robot, folder: Path) -> Samples:
-    walks = collection.load_walks(folder, robot)
-    data, dropped = dataset.make_dataset(
-        robot, walks.trajectory, walks.job.start_tick, push=walks.job.push
-    )
-    rest, held_out = dataset.split_by_walk(data)
-    return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
-
-
-def held_out_walks(robot: Robot, net: TrainedNet) -> Walks:
+def held_out_walks(robot: Robot, net: TrainedNet) -> collection.Walks:
     """The walks that no training of a net saw, of the folder that it was trained on."""
     walks = collection.load_walks(net.folders[0], robot)
     return jax.tree.map(lambda x: x[net.held_out_walks], walks)
@@ -182,23 +173,14 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
     with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
         parts = samples(robot, *folders)
     made_of = [collection.fingerprint(each) for each in folders]
-    with bar(
-        f"training GRFM-Net ({config.variant}) on {plural(len(parts.training.walk), 'sample')}"
-    ) as tell:
+    count = plural(len(parts.training.walk), "sample")
+    with bar(f"training GRFM-Net ({config.variant}) on {count}") as tell:
         tell(0, config.epochs, "compiling")
-        params, course = training.train(
-            config,
-            parts.training,
-            parts.validation,
-            lambda epoch, _: tell(epoch, config.epochs, ""),
-        )
+        on_epoch = lambda epoch, _: tell(epoch, config.epochs, "")  # noqa: E731
+        params, course = training.train(config, parts.training, parts.validation, on_epoch)
     with say_if_slow("computing the errors on held-out walks"):
         linear = fit_linear(parts.training)
-        effects = {
-            "raw": last_command,
-            "linear": network.as_effect(linear),
-            "net": network.as_effect(params),
-        }
+        effects = {"raw": last_command, "linear": as_effect(linear), "net": as_effect(params)}
         errors = training.report(effects, parts.held_out)
     if parts.held_out.lands.any() and errors["net"]["touchdown"] == errors["raw"]["touchdown"]:
         say(
@@ -223,8 +205,7 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
 
 def net_path(data: Path, variant: str) -> Path:
     """Where the net of a variant is kept: `grfm.npz`, and others than the default by their name."""
-    default = variant == TrainConfig().variant
-    return data / ("grfm.npz" if default else f"grfm-{variant}.npz")
+    return data / ("grfm.npz" if variant == TrainConfig.variant else f"grfm-{variant}.npz")
 
 
 def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[str, Any]]:
@@ -260,7 +241,7 @@ def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:
 
 
 def load_or_train(
-    pool: Executor, robot: Robot, data: Path, variant: str | None = None
+    pool: Executor, robot: Robot, data: Path, variant: str = TrainConfig.variant
 ) -> TrainedNet:
     """A GRFM-Net with its walks under `data`: made now, or from disk where it would be made so.
 
@@ -268,13 +249,13 @@ def load_or_train(
         pool: worker processes.
         robot: the body.
         data: folder of `walks/` and of the net, see `net_path`.
-        variant: of the net; None takes the default one.
+        variant: of the net.
 
     Raises:
         InputError: walks or net in the folder were made with other settings or by other code, the
             net on other walks, or a file is damaged or of another robot or variant.
     """
-    config = TrainConfig() if variant is None else TrainConfig(variant=variant)
+    config = TrainConfig(variant=variant)
     walks, path = data / "walks", net_path(data, config.variant)
     settings = collection_settings(CollectConfig(), robot)
     if not (walks / "card.json").exists():
@@ -319,21 +300,15 @@ def refresh(
     """
     walks = folder / "walks"
     late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
-    path = stack([tuning.ten, *late])
-    jobs = draw_jobs_near(
-        config.seed, config.walks, command, path=path, seconds=config.seconds, robot=robot
-    )
+    how = {"path": stack([tuning.ten, *late]), "seconds": config.seconds, "robot": robot}
+    jobs = draw_jobs_near(config.seed, config.walks, command, **how)
+    settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}  # the jobs say the rest
     with locked(walks):
-        # the jobs say the rest
-        settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}
         _collect(pool, config, robot, jobs, walks, settings)
     oldest, *newer = (*net.folders, walks)
     after = train(net.config, robot, oldest, folder / "refreshed.npz", newer)
-    effects = {
-        "raw": last_command,
-        "before": network.as_effect(net.params),
-        "after": network.as_effect(after.params),
-    }
+    nets = {"before": as_effect(net.params), "after": as_effect(after.params)}
+    effects = {"raw": last_command, **nets}
     places = {"old": net.folders, "new": (walks,)}
     return after, {
         name: training.report(effects, samples(robot, *folders).held_out)

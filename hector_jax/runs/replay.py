@@ -70,9 +70,8 @@ class Replay(NamedTuple):
             return "the same to the last bit"
         then, now = self.recorded["reason"], self.again["reason"]
         what = "the same reason, other numbers" if then == now else f"now {now or 'not refused'}"
-        changes = (f"{name} {a or '-'} -> {b or '-'}" for name, (a, b) in self.changed.items())
-        made = ", ".join(changes)
-        made = f"changed since: {made}" if made else "same versions, same machine"
+        changes = [f"{name} {a or '-'} -> {b or '-'}" for name, (a, b) in self.changed.items()]
+        made = f"changed since: {', '.join(changes)}" if changes else "same versions, same machine"
         return f"not reproduced: {what}; {made}"
 
 
@@ -105,14 +104,14 @@ def keep(
     if code is StepStatus.ACCEPTED or len(list(folder.glob(f"{name}-*-{kind}.npz"))) >= MOST:
         return None
     path = folder / f"{name}-{iteration.iteration:03d}-{kind}.npz"
-    anchor = standing_anchor(robot)
-    dump = Dump(robot, iteration.weights, command, anchor, net, iteration.evaluation)
+    weights, anchor = iteration.weights, standing_anchor(robot)
+    dump = Dump(robot, weights, command, anchor, net, iteration.evaluation)
     variant = None if net is None else variant_of(net)
     about = {
         "name": name,
         "iteration": int(iteration.iteration),
         "reason": iteration.reason,
-        "others": list(iteration.weights.others),
+        "others": list(weights.others),
         "net": variant and {"variant": variant.name, "hidden": variant.widths(net)},
         "config": config.as_table(),
         "description": to_table(robot.description),
@@ -172,6 +171,7 @@ def replay(path: Path) -> Replay:
         trajectory = jax.device_get(jax.jit(rollout, static_argnums=0)(config.rollout, *inputs))
     same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, evaluation)
     then, now = about["environment"], environment()
+    machines = {name: [then.get(name), now.get(name)] for name in sorted(then.keys() | now.keys())}
     return Replay(
         name=about["name"],
         iteration=about["iteration"],
@@ -179,11 +179,7 @@ def replay(path: Path) -> Replay:
         again=_summary(rejection_reason(config, evaluation), evaluation),
         first=_first(config, trajectory),
         same=all(jax.tree.leaves(same)),
-        changed={
-            name: [then.get(name), now.get(name)]
-            for name in sorted(then.keys() | now.keys())
-            if then.get(name) != now.get(name)
-        },
+        changed={name: [a, b] for name, (a, b) in machines.items() if a != b},
     )
 
 
@@ -202,7 +198,7 @@ def _first(config: TuneConfig, trajectory: Trajectory) -> dict[str, int | None]:
     series = *trajectory.state, *trajectory.command
     rows = [np.reshape(x, (len(trajectory.fallen), -1)) for x in series]
     wrong = {
-        "not finite": ~np.isfinite(np.concatenate(rows, axis=1)).all(axis=1),
+        "not finite": ~np.isfinite(np.hstack(rows)).all(axis=1),
         "fallen": trajectory.fallen,
         "unsolved": ~(trajectory.residual <= config.residual),
     }

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,13 +47,10 @@ def losses_on_hfs(
         engine: of the walks.
         at_once: walks that a program is compiled for; fewer are filled up to it.
     """
-    walk = config.rollout.walk
-    seconds, plant = config.rollout.ticks * walk.gait.tick, hfs(robot.description)
-    jobs = [
-        Job(weights, commands[name], plant, seconds)
-        for name, each in sets.items()
-        for weights in each
-    ]
+    walk, plant = config.rollout.walk, hfs(robot.description)
+    seconds = config.rollout.ticks * walk.gait.tick
+    cases = [(weights, commands[name]) for name, each in sets.items() for weights in each]
+    jobs = [Job(*case, plant, seconds) for case in cases]
     walks = engine.walk(pool, walk, robot, jobs, batch=at_once)
     rows = [(float(loss_of(config.loss, one)), np.max(one.residual) <= SOLVED) for one in walks]
     ends = np.cumsum([len(each) for each in sets.values()])
@@ -68,7 +66,7 @@ def search(
     config: SearchConfig,
     tune: TuneConfig,
     robot: Robot,
-    starts: Mapping[str, Weights],
+    start: Weights,
     *,
     commands: Mapping[str, Command],
     engine: Engine,
@@ -81,8 +79,8 @@ def search(
         config: of the search.
         tune: controller, length of the walks and loss, the same as those of tunings.
         robot: the body.
-        starts: where to start, by the name of the trajectory; all go in lock-step.
-        commands: by trajectory.
+        start: where to start.
+        commands: by trajectory; the searches go in lock-step.
         engine: of the walks.
         folder: of the records.
 
@@ -90,7 +88,7 @@ def search(
         InputError: the folder cannot be written, and see `search.cmaes.search`; before anything is
             walked.
     """
-    size = config.population * len(starts)
+    size = config.population * len(commands)
     every = {name: named_command(name) for name in COMMANDS} | dict(commands)
     about = {  # not the engine: both give a loss to seven digits
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
@@ -101,24 +99,18 @@ def search(
         "commands": {name: tree_hash(command) for name, command in every.items()},
     }
 
-    def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        return losses_on_hfs(
-            pool, tune, robot, sets, commands=commands, engine=engine, at_once=size
-        )
-
-    title = f"searching on the high-fidelity simulator, engine {engine.name}"
-    with locked(folder), bar(title) as tell:
+    on_hfs = {"commands": commands, "engine": engine, "at_once": size}
+    walk = partial(losses_on_hfs, pool, tune, robot, **on_hfs)
+    with (
+        locked(folder),
+        bar(f"searching on the high-fidelity simulator, engine {engine.name}") as tell,
+    ):
 
         def on_generation(histories: Mapping[str, list[Generation]]) -> None:
-            done = sum(len(history) for history in histories.values()) * config.population
-            lowest = (
-                f"{name} {best(history)[1] / 1e6:.3f}e6"
-                for name, history in histories.items()
-                if history
-            )
+            done = sum(map(len, histories.values())) * config.population
+            lowest = [f"{n} {best(one)[1] / 1e6:.3f}e6" for n, one in histories.items() if one]
             remark = "lowest L: " + ", ".join(lowest) if done else "compiling"
             tell(done, config.generations * size, remark)
 
-        return searching.search(
-            config, starts, walk, folder=folder, about=about, on_generation=on_generation
-        )
+        starts, notes = dict.fromkeys(commands, start), {"folder": folder, "about": about}
+        return searching.search(config, starts, walk, **notes, on_generation=on_generation)

@@ -19,7 +19,6 @@ from hector_jax.core.console import bar
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
-from hector_jax.grfm.network import Params
 from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
 from hector_jax.runs.cache import content_key, load_or_make
@@ -29,7 +28,6 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
-from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import rollout_config
 
@@ -41,7 +39,7 @@ class Problem(NamedTuple):
     """What weights are tuned for."""
 
     command: Command
-    params: Params | None  # of the net to tune through; None: the plain rigid body
+    params: network.Params | None  # of the net to tune through; None: the plain rigid body
     others: tuple[Command, ...] = ()  # commands that the same weights are to walk as well
 
     @property
@@ -57,29 +55,11 @@ class Tuned(NamedTuple):
     commit: str  # at which it was made; empty where that is not known
 
 
-def _stored(tuned: Tuned) -> Any:
-    """A tuning as arrays, iterations stacked, as `_stored_like`."""
-    history = stack(tuned.tuning.history)
-    return Tuned(tuned.tuning._replace(history=history), tuned.commit)
-
-
-def _stored_like(config: TuneConfig, start: Weights, _: Any) -> Any:
-    none, text = np.zeros(0), np.array("")
-    weights = difftune.init(config, start).best  # with the other numbers that are tuned
-    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
-    seen = Evaluation(none, {term.name: none for term in config.loss}, rows, none, none)
-    history: Any = Iteration(none, rows, seen, none, none)
-    return Tuned(Tuning(history, weights, weights, text), text)  # pyright: ignore
-
-
 def _restored(stored: Any) -> Tuned:
-    """What `_stored` was given."""
-    tuning, rows = stored.tuning, stored.tuning.history
-    history = [
-        jax.tree.map(lambda x, i=i: np.asarray(x[i]), rows) for i in range(len(rows.iteration))
-    ]
-    tuning = Tuning(history, tuning.ten, tuning.converged, str(tuning.stop))
-    return Tuned(tuning, str(stored.commit))
+    """A tuning from a file, where the iterations are stacked and texts are arrays."""
+    tuning, count = stored.tuning, len(stored.tuning.history.iteration)
+    history = [jax.tree.map(lambda x, i=i: np.asarray(x[i]), tuning.history) for i in range(count)]
+    return Tuned(tuning._replace(history=history, stop=str(tuning.stop)), str(stored.commit))
 
 
 def load_or_tune(
@@ -90,24 +70,31 @@ def load_or_tune(
     make: Callable[[list[str], Mapping[str, Tuned]], Iterator[tuple[str, Tuned]]],
 ) -> dict[str, Tuned]:
     """Tunings by name; see `load_or_make`, of which `paths` and `make` are arguments."""
+    none, text = np.zeros(0), np.array("")
+    weights = difftune.init(config, start).best  # with the other numbers that are tuned
+    rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
+    seen = evaluate.Evaluation(none, {term.name: none for term in config.loss}, rows, none, none)
+    history: Any = Iteration(none, rows, seen, none, none)  # iterations are stacked in the file
+    like: Any = Tuned(Tuning(history, weights, weights, text), text)  # pyright: ignore
+
+    def restored(stored: Mapping[str, Any]) -> dict[str, Tuned]:
+        return {name: _restored(one) for name, one in stored.items()}
 
     def make_stored(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-        for name, tuned in make(missing, {n: _restored(one) for n, one in stored.items()}):
-            yield name, _stored(tuned)
+        for name, (tuning, commit) in make(missing, restored(stored)):
+            yield name, Tuned(tuning._replace(history=stack(tuning.history)), commit)
 
-    like = partial(_stored_like, config, start)
-    stored = load_or_make(paths, make_stored, like=like, kind="tuning", robot=robot)
-    return {name: _restored(one) for name, one in stored.items()}
+    return restored(
+        load_or_make(paths, make_stored, like=lambda _: like, kind="tuning", robot=robot)
+    )
 
 
 def _tune_job(
     config: TuneConfig, robot: Robot, start: Weights, problem: Problem, name: str, messages: Any
 ) -> Tuning:
     """One tuning in a worker; the queue `messages` gets each iteration."""
-    step = partial(difftune.tune_step, config, robot)
-    evaluations = [
-        lambda weights, m=model: step(weights, *m) for model in _models(config, robot, problem)
-    ]
+    step, models = partial(difftune.tune_step, config, robot), _models(config, robot, problem)
+    evaluations = [lambda weights, m=model: step(weights, *m) for model in models]
     start = difftune.init(config, start).best  # with the other numbers that are tuned
     mean = evaluate.mean_over_commands(evaluations, start)
     return difftune.descend(config, start, mean, lambda one: messages.put((name, one)))
@@ -191,14 +178,13 @@ def tune(
             journal.add(name, iteration)
         command, net, others = problems[name]
         if dumps is not None and not others:
-            replay.keep(
-                dumps, name, iteration, config=config, robot=robot, command=command, net=net
-            )
+            of = {"config": config, "robot": robot, "command": command, "net": net}
+            replay.keep(dumps, name, iteration, **of)
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
-        if journal is not None:
-            there = {name: one.tuning.history for name, one in stored.items()}
-            journal.write({name: there.get(name, ()) for name in problems})  # in their order
+        if journal is not None:  # in the order of the problems
+            there = {n: stored[n].tuning.history if n in stored else () for n in problems}
+            journal.write(there)
         wanted = {name: problems[name] for name in missing}
         for name, tuning in _tunings(pool, config, robot, start, wanted, title, on_iteration):
             yield name, Tuned(tuning, commit)
@@ -211,25 +197,17 @@ def tune(
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     norms = partial(evaluate.gradient_norms, config.rollout, robot, nominal(robot))
-    each = [
-        norms(command, anchor, effect, config.loss)
-        for command, anchor, effect in _models(config, robot, problem)
-    ]
+    models = _models(config, robot, problem)
+    each = [norms(command, anchor, phi, config.loss) for command, anchor, phi in models]
     return jax.tree.map(lambda *x: float(np.mean(x)), *each)
 
 
 def gradient_norms(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
-    problems: Mapping[str, Problem],
+    pool: Executor, config: TuneConfig, robot: Robot, problems: Mapping[str, Problem]
 ) -> dict[str, dict[str, float]]:
     """Norms of the gradients of the loss's parts at nominal weights, means over the commands."""
     with bar("norms of the gradients") as tell:
-        running = {
-            name: pool.submit(_norms_job, config, robot, problem)
-            for name, problem in problems.items()
-        }
+        running = {n: pool.submit(_norms_job, config, robot, one) for n, one in problems.items()}
         tell(0, len(problems), "compiling")
         return {name: future.result() for name, future in running.items()}
 
@@ -269,11 +247,9 @@ def compile_programs(pool: Executor, robot: Robot) -> None:
     controller, straight = config.rollout.walk, named_command("straight")
     tick = Job(nominal(robot), straight, hfs(robot.description), controller.gait.tick)
     with bar("compiling, once on a machine") as tell:
-        jobs = [
-            pool.submit(_compile_tuning, config, robot, straight),
-            pool.submit(walk, controller, robot, tick),
-        ]
-        for done, job in enumerate(jobs):
-            tell(done, len(jobs), "")
+        tuned = pool.submit(_compile_tuning, config, robot, straight)
+        walked = pool.submit(walk, controller, robot, tick)
+        for done, job in enumerate((tuned, walked)):
+            tell(done, 2, "")
             job.result()
-        tell(len(jobs), len(jobs), "")
+        tell(2, 2, "")

@@ -15,14 +15,12 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar, say
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import SOLVED, State, Trajectory
-from hector_jax.core.tree import stack
-from hector_jax.grfm.collection import Walks, walks_like
+from hector_jax.grfm.collection import walks_like
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
 from hector_jax.runs.cache import content_key, load_or_make
-from hector_jax.runs.metrics import Score
 from hector_jax.sim.diagnosis import startup_fall
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
@@ -32,11 +30,8 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import rollout, rollout_config
 
-_CODE = (
-    "sim.walk",
-    "sim.diagnosis",
-    "runs.metrics",
-)  # modules that decide the numbers, for `content_key`
+# modules that decide the numbers, for `content_key`
+_CODE = ("sim.walk", "sim.diagnosis", "runs.metrics")
 
 Case = tuple[str, int]
 """A set and a seed."""
@@ -45,7 +40,7 @@ Case = tuple[str, int]
 class ScoredWalk(NamedTuple):
     """What is kept of one walk."""
 
-    score: Score
+    score: metrics.Score
     upright: Float[np.ndarray, ""]  # [s] until a fall, below zero in the start-up; or all of it
     last: State  # the last one upright, or of the walk
     commit: str  # at which it was walked; empty where that is not known
@@ -59,7 +54,7 @@ class ScoredWalks(NamedTuple):
     first: dict[str, Trajectory]  # by set, the walk on the first plant; empty where none is kept
 
     @property
-    def scores(self) -> dict[str, list[Score]]:
+    def scores(self) -> dict[str, list[metrics.Score]]:
         """Scores by set, in the order of the plants."""
         return {name: [walk.score for walk in walks] for name, walks in self.walks.items()}
 
@@ -75,15 +70,6 @@ def walk_jobs(
             tell(done, len(jobs), "")
 
 
-def walk_all(
-    pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
-) -> Walks:
-    """Walks of jobs whose commands are alike, at the plan interval."""
-    trajectories = walk_jobs(pool, config, robot, jobs, title)
-    walks = [at_interval(walk, config.rollout.walk.gait.tick) for walk in trajectories]
-    return Walks(stack(jobs), stack(walks))
-
-
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
     """A walk on the plain single rigid body, `seconds` long, begun as a rollout of a tuning."""
     config = rollout_config(robot, round(seconds / walk_config(robot).gait.tick))
@@ -95,14 +81,15 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
 def _score_walk(
     pool: Executor, config: TuneConfig, robot: Robot, job: Job, walk: Trajectory, commit: str
 ) -> ScoredWalk:
-    up, startup = int(np.sum(~np.asarray(walk.fallen))), None
+    up, text = int(np.sum(~np.asarray(walk.fallen))), ""
+    upright = up * float(walk.period)
     if not up:
         inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-        startup = pool.submit(startup_fall, *inputs).result()
+        if startup := pool.submit(startup_fall, *inputs).result():
+            upright, text = startup.time, str(startup)
     last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
-    upright = np.asarray(up * float(walk.period) if startup is None else startup.time)
-    text = "" if startup is None else str(startup)
-    return ScoredWalk(metrics.score(config.loss, walk), upright, last, commit, text)
+    score = metrics.score(config.loss, walk)
+    return ScoredWalk(score, np.asarray(upright), last, commit, text)
 
 
 def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
@@ -119,22 +106,19 @@ def _file_name(config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk
     return f"{stem}-{name}-{seed}-{content_key(*parts, code=_CODE)}.npz"
 
 
-def _restored(one: ScoredWalk) -> ScoredWalk:
-    """A walk from a file, where texts are arrays."""
-    return one._replace(commit=str(one.commit), startup=str(one.startup))
-
-
-def _say_unsolved(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
+def _say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
+    """Say which sets have walks with an unsolved QP or a fall in the start-up."""
     for name, each in walks.items():
         worst = np.max([walk.score.residual for walk in each])
         if not worst <= SOLVED:
             say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
-
-
-def _say_startup_falls(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
-    for name, each in walks.items():
         if falls := [walk.startup for walk in each if walk.startup]:
             say(f"{name}: {len(falls)} of {plural(len(each), 'walk')} {falls[0]}")
+
+
+def _restored(one: ScoredWalk) -> ScoredWalk:
+    """A walk from a file, where texts are arrays."""
+    return one._replace(commit=str(one.commit), startup=str(one.startup))
 
 
 def judge(
@@ -193,7 +177,6 @@ def judge(
         like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
         results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
     by_set = {name: [_restored(results[name, seed][0]) for seed in seeds] for name in sets}
-    _say_unsolved(by_set)
-    _say_startup_falls(by_set)
+    _say_faults(by_set)
     first = {name: results[name, seeds[0]][1] for name in sets if folder is not None}
     return ScoredWalks(by_set, first)

@@ -145,8 +145,7 @@ def search(
 
 def best(history: Sequence[Generation]) -> tuple[Float[np.ndarray, "18"], float, int]:
     """Steps, loss and number of the best walk; the number counts from 1."""
-    losses = np.concatenate([generation.losses for generation in history])
-    steps = np.concatenate([generation.steps for generation in history])
+    steps, losses = map(np.concatenate, zip(*history, strict=True))
     which = int(np.argmin(losses))
     return steps[which], float(losses[which]), which + 1
 
@@ -197,13 +196,12 @@ class CmaSearch:
 
     def parse(self, row: Mapping[str, Any]) -> Generation:
         """Generation of a row of the journal; ValueError where its size is another."""
-        generation = to_generation(row["steps"], row["losses"])
-        shapes = generation.steps.shape, generation.losses.shape
-        size = self.config.population
-        if shapes != ((size, len(DIRECTION_NAMES)), (size,)):
+        generation, size = to_generation(row["steps"], row["losses"]), self.config.population
+        steps, losses = (x.shape for x in generation)
+        wanted = (size, len(DIRECTION_NAMES)), (size,)
+        if (steps, losses) != wanted:
             raise ValueError(
-                f"steps {shapes[0]} and losses {shapes[1]}, "
-                f"expected {(size, len(DIRECTION_NAMES))} and {(size,)}"
+                f"steps {steps} and losses {losses}, expected {wanted[0]} and {wanted[1]}"
             )
         return generation
 
@@ -254,11 +252,10 @@ def read_journal(
         InputError: it is no journal, one of other settings, or damaged.
         WriteError: it cannot be written.
     """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
+    if not path.exists():
         write_file(path, (json.dumps(head, allow_nan=False) + "\n").encode())
         return []
+    data = path.read_bytes()
     end = data.rfind(b"\n") + 1
     first, *lines = data[:end].splitlines() or [b""]
     try:
@@ -268,9 +265,10 @@ def read_journal(
         raise InputError(f"{path}: not the record of a {what}: {error}") from error
     if differs:
         name = differs[0]
+        before, now = (str(of.get(name))[:80] for of in (written, head))
         raise InputError(
-            f"{path}: record of another {what}: its {name} is {str(written.get(name))[:80]}, "
-            f"expected {str(head.get(name))[:80]}; choose another folder"
+            f"{path}: record of another {what}: its {name} is {before}, expected {now}; "
+            "choose another folder"
         )
     rows = []
     for number, line in enumerate(lines, 2):

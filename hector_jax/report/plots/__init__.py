@@ -1,4 +1,4 @@
-"""The pictures of a run; matplotlib is imported nowhere else in the package.
+"""The pictures of a run; matplotlib is imported in this package and nowhere else.
 
 Each function draws one picture to a file (the ending of its name decides the format) and returns
 its caption. Weight sets keep their colour, line and marker through all pictures, so that they can
@@ -6,18 +6,267 @@ be told apart in grey too. Figures are made without pyplot: no display, no globa
 draw pictures of their own with `style`.
 """
 
-from hector_jax.report.plots.grfm import open_loop, training, wrenches
-from hector_jax.report.plots.style import titles
-from hector_jax.report.plots.tuning import losses, weights
-from hector_jax.report.plots.walks import path_from_above, tracking
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-__all__ = [
-    "losses",
-    "open_loop",
-    "path_from_above",
-    "titles",
-    "tracking",
-    "training",
-    "weights",
-    "wrenches",
-]
+import numpy as np
+from jaxtyping import Float
+from matplotlib.artist import setp
+from matplotlib.axes import Axes
+from scipy.spatial.transform import Rotation
+
+from hector_jax.core.trajectory import Trajectory, Wrench, from_start
+from hector_jax.grfm.nets import History
+from hector_jax.report.fidelity import Drift
+from hector_jax.report.motion import COLOURS, Motion
+from hector_jax.report.plots import style
+from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
+from hector_jax.report.report import caption
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
+from hector_jax.tuning.loss import Loss
+
+
+def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
+    """Draw the errors of position and attitude along each walk.
+
+    Args:
+        path: file to write.
+        walks: by weight set, on the same plant and command.
+    """
+    with drawing(path, 10.0, 4.2) as figure:
+        draw_tracking(figure.subplots(2, 3, sharex=True), walks)
+    return caption("tracking")
+
+
+def _errors(walk: Trajectory) -> dict[str, Float[np.ndarray, " T"]]:
+    """Errors of the six coordinates, along the heading of the reference; NaN after a fall."""
+    R = Rotation.from_euler("z", np.asarray(walk.reference.euler)[:, 2:])
+    away = R.apply(np.asarray(walk.state.position) - walk.reference.position, inverse=True)
+    angles = np.rad2deg(np.asarray(walk.state.euler) - walk.reference.euler)
+    labels = [f"error {way} [cm]" for way in ("ahead", "left", "up")]
+    labels += [f"error in {angle} [deg]" for angle in ("roll", "pitch", "yaw")]
+    values = np.where(walk.fallen[:, None], np.nan, np.hstack([100 * away, angles]))
+    return dict(zip(labels, values.T, strict=True))
+
+
+def draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
+    """Draw the errors of position and attitude along each walk into 2 x 3 panels."""
+    for name, look in looks_of(walks).items():
+        times = float(walks[name].period) * np.arange(1, len(walks[name].fallen) + 1)
+        for panel, (label, values) in zip(panels.flat, _errors(walks[name]).items(), strict=True):
+            panel.plot(times, values, **look.line, label=label_of(name))
+            panel.set_ylabel(label)
+    for panel in panels.flat:
+        panel.axhline(0.0, color="black", linewidth=0.8)
+        style.widen(panel, 1.0)
+    setp(panels[-1], xlabel="time [s]")
+
+
+def distances(
+    path: Path, motions: Mapping[str, Motion], width: int, height: int
+) -> tuple[int, int, int, int]:
+    """Draw the distance from the reference in the plane by time, to stand below a film.
+
+    Args:
+        path: file to write.
+        motions: two, by the words for them, before and after.
+        width: of the picture [pixel].
+        height: of the picture [pixel].
+
+    Returns:
+        Left, top, right and bottom of the axes in the picture [pixel].
+    """
+    dpi = height / 1.2  # a figure of 1.2 inches, however many pixels
+    last = max(motion.times[-1] for motion in motions.values())
+    with drawing(path, width / dpi, height / dpi, dpi=dpi, legend_columns=0) as figure:
+        axes = figure.subplots()
+        looks = zip(COLOURS, ((0, (5, 1.5)), "-"), strict=True)
+        for (name, motion), (colour, line) in zip(motions.items(), looks, strict=True):
+            upright = motion.times <= motion.fall_time
+            away = np.where(upright, 100 * motion.distance, np.nan)
+            mean = np.sqrt(np.mean(away[upright] ** 2)) if upright.any() else np.nan
+            rms = f"{mean:.1f} cm RMS" if upright.any() else "fell at once"
+            label = f"{label_of(name)}: {rms}"
+            axes.plot(motion.times, away, color=np.divide(colour, 255), ls=line, label=label)
+        axes.set_title("distance from the reference [cm]", loc="left")
+        axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderaxespad=0.1)
+        figure.draw_without_rendering()
+        box = axes.get_window_extent()
+    return round(box.x0), round(height - box.y1), round(box.x1), round(height - box.y0)
+
+
+def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
+    """Draw the path of the centre of mass from above, with the footprints of the last set.
+
+    Args:
+        path: file to write.
+        walks: by weight set, on the same plant and command.
+    """
+    walks = {name: from_start(walk) for name, walk in walks.items()}
+    span, width = span_of(walks), 7.0
+    height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9
+    with drawing(path, width, height, legend_columns=4) as figure:
+        draw_path(figure.subplots(), walks)
+    return caption("path_from_above", last=list(walks)[-1])
+
+
+def span_of(walks: Mapping[str, Trajectory]) -> Float[np.ndarray, "2"]:
+    """Extent of all paths in x and y [m], with room for the feet."""
+    reference = next(iter(walks.values())).reference.position
+    points = np.concatenate([walk.state.position[~walk.fallen, :2] for walk in walks.values()])
+    return np.ptp(np.concatenate([points, reference[:, :2]]), axis=0) + 0.25
+
+
+def draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
+    """Draw the paths of walks in the frame of their start."""
+    for name, look in looks_of(walks).items():
+        fallen, position = walks[name].fallen, walks[name].state.position
+        x, y = np.where(fallen[:, None], np.nan, position)[:, :2].T
+        axes.plot(x, y, **look.line, label=label_of(name))
+    last = list(walks.values())[-1]
+    axes.plot(*last.reference.position[:, :2].T, **CURVES["reference"], label="reference")
+    touchdowns = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
+    mark = {"linestyle": "none", "color": "0.6", "markersize": 6, "zorder": 1}
+    for foot, (side, marker) in enumerate((("left", 4), ("right", 5))):
+        spots = last.feet[touchdowns[:, foot] & ~last.fallen, foot]
+        axes.plot(*spots[:, :2].T, **mark, marker=marker, label=f"{side} foot set down")
+    axes.set(xlabel="x, ahead [m]", ylabel="y, left [m]", aspect="equal")
+    axes.margins(0.05, 0.1)
+
+
+def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]]) -> str:
+    """Draw the loss on the model by iteration, whole and by part.
+
+    Args:
+        path: file to write.
+        loss: terms, which are multiplied by their weights.
+        histories: of the tunings, by weight set: `without` and `with`.
+    """
+    parts = {"$L$": lambda evaluation: evaluation.loss}
+    for i, term in enumerate(loss, 1):
+        alpha = "" if term.weight == 1.0 else rf"\alpha_{i} "
+        title = rf"${alpha}L_\mathrm{{{term.name.removeprefix('L_')}}}$"
+        parts[title] = lambda evaluation, term=term: term.weight * evaluation.terms[term.name]
+    accepted = {n: np.array([i.accepted for i in history]) for n, history in histories.items()}
+    cross = {"linestyle": "none", "marker": "x", "color": "black", "markersize": 4.5}
+    with drawing(path, 2.5 * len(parts), 2.7) as figure:
+        panels = figure.subplots(1, len(parts))
+        for panel, (title, part) in zip(panels, parts.items(), strict=True):
+            panel.axvline(PAPER_ITERATIONS, **style.MARK)
+            for name, look in looks_of(histories).items():
+                values = np.array([float(part(i.evaluation)) for i in histories[name]]) / 1e6
+                good, bad = np.flatnonzero(accepted[name]), np.flatnonzero(~accepted[name])
+                # a marker at each iteration would hide how the line is dashed
+                marks = {"marker": look.marker, "markersize": 3.2, "markevery": 10}
+                panel.plot(good, values[good], **look.line, **marks, label=label_of(name))
+                if title == "$L$":
+                    top = 1.1 * values[good].max()  # a rejected step need not have a finite loss
+                    panel.plot(bad, np.where(values < top, values, top)[bad], **cross)
+            panel.set(title=title, xlabel="iteration", ylim=(0, 1.12 * panel.get_ylim()[1]))
+            panel.xaxis.get_major_locator().set_params(integer=True)
+        panels[0].set_ylabel("loss on the model [10$^6$]")
+        if not all(flags.all() for flags in accepted.values()):
+            panels[0].plot([], [], **cross, label="refused step")
+    return caption("losses", ten=PAPER_ITERATIONS)
+
+
+def weights(
+    path: Path, names: Sequence[str], sets: Mapping[str, Float[np.ndarray, " weights"]]
+) -> str:
+    """Draw tuned weights as ratios to the nominal ones.
+
+    Args:
+        path: file to write.
+        names: of the weights, such as `WEIGHT_NAMES`.
+        sets: `nominal`, `expert` and the tuned `without`, `with`, flat in the order of `names`.
+    """
+    ratio = {name: np.divide(values, sets["nominal"]) for name, values in sets.items()}
+    bars = [name for name in ("without", "with") if name in sets]
+    with drawing(path, 10.0, 3.4) as figure:
+        axes = figure.subplots()
+        for i, name in enumerate(bars):
+            x = np.arange(len(names)) + 0.38 * (i - (len(bars) - 1) / 2)
+            look = {"color": SETS[name]["color"], "hatch": "////" if name == "without" else None}
+            look |= {"edgecolor": "white", "linewidth": 0.0}
+            axes.bar(x, ratio[name] - 1.0, 0.36, bottom=1.0, **look, label=label_of(name))
+        if "expert" in sets:
+            look = looks_of(["expert"])["expert"].dot
+            axes.plot(ratio["expert"], **look, markerfacecolor="white", label="expert")
+        axes.axhline(1.0, color="black", linewidth=0.8)
+        style.log_axis(axes, "y")
+        labels = {"rotation": 60, "ha": "right", "va": "center", "rotation_mode": "anchor"}
+        style.category_axis(axes, [style.weight_label(name) for name in names], 3, **labels)
+        axes.set_ylabel("weight / nominal")
+    return caption("weights")
+
+
+def wrenches(
+    path: Path, period: float, curves: Mapping[str, Wrench], *, seconds: float = 0.4
+) -> str:
+    """Draw the commanded, predicted and measured wrench of the left foot over the first steps.
+
+    Args:
+        path: file to write.
+        period: [s] between samples.
+        curves: `commanded`, `predicted`, `paper`, `linear`, `measured`, or some of them, one per
+            period, (T, 2, 3) each; held over the period.
+        seconds: of the walk's beginning; two steps by default.
+    """
+    count = round(seconds / period)
+    labels = ["$F_x$ [N]", "$F_y$ [N]", "$F_z$ [N]", "$M_x$ [N m]", "$M_y$ [N m]", "$M_z$ [N m]"]
+    order = ("measured", "commanded", "linear", "paper", "predicted")
+    with drawing(path, 10.0, 4.4) as figure:
+        panels = figure.subplots(2, 3, sharex=True)
+        for name in (name for name in order if name in curves):
+            both = np.concatenate([np.asarray(part)[:count, 0] for part in curves[name]], axis=1)
+            look = {"baseline": None, "label": label_of(name), **CURVES[name]}
+            for panel, values in zip(panels.flat, both.T, strict=True):
+                panel.stairs(values, period * np.arange(count + 1), **look)
+        for panel, label in zip(panels.flat, labels, strict=True):
+            panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
+            panel.set_ylabel(label)
+            style.widen(panel, 5.0 if "[N]" in label else 0.5)
+        setp(panels[-1], xlabel="time [s]")
+    return caption("wrenches", side="left")
+
+
+def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
+    """Draw how far the rigid body strays from the robot, by time ahead.
+
+    Args:
+        path: file to write.
+        worlds: by the name of a world and of a phi.
+    """
+    with drawing(path, 7.0, 2.6 * len(worlds) + 0.3, legend_columns=3) as figure:
+        panels = figure.subplots(len(worlds), 2, squeeze=False, sharex=True)
+        for row, (world, drifts) in zip(panels, worlds.items(), strict=True):
+            for name, look in looks_of(drifts, CURVES).items():
+                time, position, euler = drifts[name]
+                row[0].plot(time, 100 * position, label=label_of(name), **look.line)
+                row[1].plot(time, np.rad2deg(euler), **look.line)
+            row[0].set(title=world, ylabel="error of the CoM [cm]", ylim=(0, None))
+            row[1].set(title=world, ylabel="error of the angles [deg]", ylim=(0, None))
+        setp(panels[-1], xlabel="time ahead [s]")
+    return caption("open_loop")
+
+
+def training(path: Path, history: History) -> str:
+    """Draw the errors of the net by epoch, on the training and on the validation walks.
+
+    Args:
+        path: file to write.
+        history: mean square errors in physical units.
+    """
+    kinds = {"force": "mean square error [N$^2$]", "moment": "mean square error [(N m)$^2$]"}
+    with drawing(path, 7.0, 2.7) as figure:
+        for panel, (kind, label) in zip(figure.subplots(1, 2), kinds.items(), strict=True):
+            train, valid = (np.asarray(getattr(history, f"{p}_{kind}")) for p in ("train", "valid"))
+            epochs, best = np.arange(1, len(train) + 1), int(np.argmin(valid))
+            panel.plot(epochs, train, **SETS["expert"], label="training walks")
+            panel.plot(epochs, valid, color=ORANGE, label="validation walks")
+            panel.plot(epochs[best], valid[best], "o", color=ORANGE, label="least")
+            # the first epochs of a fresh net may be far off: they need not be seen whole
+            top = 1.6 * np.percentile(np.concatenate([train, valid]), 90)
+            panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
+    return caption("training")

@@ -4,13 +4,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
+
+T = TypeVar("T")
 
 # from dark to light in grey: green, purple, blue, grey, orange
 GREEN, PURPLE, BLUE, GREY, ORANGE = "#00563f", "#7a3e9d", "#1480c4", "0.55", "#e07c24"
@@ -96,11 +98,11 @@ def label_of(name: str) -> str:
     return _NAMES.get(name, name)
 
 
-def titles(names: Iterable[str]) -> list[str]:
-    """Words that stand above two walks, before and after."""
-    return [
-        f"{when}: {label_of(name)}" for when, name in zip(("before", "after"), names, strict=True)
-    ]
+def titled(walks: Mapping[str, T]) -> dict[str, T]:
+    """Two walks by the words that stand above them, before and after."""
+    names = zip(("before", "after"), walks, strict=True)
+    titles = [f"{when}: {label_of(name)}" for when, name in names]
+    return dict(zip(titles, walks.values(), strict=True))
 
 
 @contextmanager
