@@ -37,6 +37,7 @@ from hector_jax.tuning.rollout import RolloutConfig
 ROBOT = load_robot()
 ANCHOR = standing_anchor(ROBOT)
 STRAIGHT = named_command("straight")
+OTHERS = ("footstep_feedback", "friction", "turn_lead")  # tuned beside Q and R
 propagate = jax.jit(sensitivity.propagate, static_argnums=0)
 
 
@@ -289,24 +290,34 @@ def test_a_start_whose_feet_differ_is_tied_and_stays_tied():
     np.testing.assert_array_equal(vector(free.trial), vector(start))
 
 
-def test_gradient_norms_are_those_of_the_parts():
-    arguments = SHORT.rollout, ROBOT, nominal(), STRAIGHT, ANCHOR, PLAIN
+@pytest.fixture(scope="module")
+def start():
+    """Nominal weights with other numbers, so that all tests below share one program."""
+    return init(replace(SHORT, others=OTHERS), nominal()).trial
+
+
+@pytest.fixture(scope="module")
+def recursion(start):
+    """The walk from there and its sensitivities."""
+    return propagate(SHORT.rollout, ROBOT, start, STRAIGHT, ANCHOR, PLAIN)
+
+
+def test_gradient_norms_are_those_of_the_parts(start, recursion):
+    arguments = SHORT.rollout, ROBOT, start, STRAIGHT, ANCHOR, PLAIN
     norms = list(gradient_norms(*arguments, SHORT.loss).values())
-    trajectory, columns = jax.jit(propagate, static_argnums=0)(*arguments)
 
     def gradient(euler, position):
-        _, found = sensitivity.gradient(
-            with_alphas({"L_Eul": euler, "L_pos": position}), trajectory, columns, nominal()
-        )
-        return vector(found) * vector(nominal())
+        loss = with_alphas({"L_Eul": euler, "L_pos": position})
+        _, found = sensitivity.gradient(loss, *recursion, start)
+        return vector(found) * vector(start)
 
     control = gradient(0.0, 0.0)
     expected = gradient(1e6, 0.0) - control, gradient(0.0, 1e6) - control, 1e6 * control
     np.testing.assert_allclose(norms, 1e-6 * np.linalg.norm(expected, axis=1), rtol=1e-6)
 
 
-def test_the_loss_is_that_of_its_parts():
-    found = tune_step(SHORT, ROBOT, nominal(), STRAIGHT, ANCHOR, PLAIN)
+def test_the_loss_is_that_of_its_parts(start):
+    found = tune_step(SHORT, ROBOT, start, STRAIGHT, ANCHOR, PLAIN)
     expected = 1e5 * found.terms["L_Eul"] + 2e5 * found.terms["L_pos"] + found.terms["L_ctrl"]
     assert found.loss == pytest.approx(float(expected))
     assert rejection_reason(SHORT, jax.tree.map(np.asarray, found)) == ""
@@ -347,7 +358,6 @@ def test_ten_iterations_from_nominal_go_down_inside_the_box(name, least):
 
 # Numbers of the controller beside Q and R
 
-OTHERS = ("footstep_feedback", "friction", "turn_lead")
 PAPERS = RolloutConfig(WalkConfig(footstep=FootstepConfig(rule="paper")))
 SLIPPERY = RolloutConfig(WalkConfig(mpc=MpcConfig(friction=0.05)))
 
@@ -397,8 +407,9 @@ def test_what_cannot_be_tuned_is_named(wrong, fault):
         TuneConfig(**wrong)
 
 
-def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursion():
-    start = init(replace(SHORT, others=OTHERS), nominal()).trial
+def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursion(
+    start, recursion
+):
     found = tune_step(SHORT, ROBOT, start, STRAIGHT, ANCHOR, PLAIN)
 
     def loss(name, shift):
@@ -409,13 +420,13 @@ def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursi
     for name in OTHERS:
         expected = (loss(name, 1e-6) - loss(name, -1e-6)) / 2e-6
         assert float(found.gradient.others[name]) == pytest.approx(expected, rel=1e-5, abs=1e-3)
-    trajectory, columns = propagate(SHORT.rollout, ROBOT, start, STRAIGHT, ANCHOR, PLAIN)
-    _, forward = sensitivity.gradient(SHORT.loss, trajectory, columns, start)
+    _, forward = sensitivity.gradient(SHORT.loss, *recursion, start)
     np.testing.assert_allclose(vector(forward), vector(found.gradient), rtol=1e-8)
     for name in OTHERS:
         np.testing.assert_allclose(
             forward.others[name], found.gradient.others[name], rtol=1e-8, atol=1e-9
         )
-    result = tune(replace(SHORT, others=OTHERS), ROBOT, nominal(), STRAIGHT, ANCHOR, PLAIN)
+    config = replace(SHORT, others=OTHERS, iterations=5)
+    result = tune(config, ROBOT, nominal(), STRAIGHT, ANCHOR, PLAIN)
     assert result.history[-1].evaluation.loss < found.loss
     assert set(result.converged.others) == set(OTHERS)

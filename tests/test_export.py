@@ -284,7 +284,7 @@ def loaded():
 def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
     walked = record(CONFIG, ROBOT, TUNED, command=named_command("s"), seconds=0.4)
     found = check(CONFIG, *loaded, walked)
-    other = record(CONFIG, ROBOT, expert(), command=named_command("s"), seconds=0.4)
+    other = record(CONFIG, ROBOT, expert(), command=named_command("s"), seconds=0.1)
     assert check(CONFIG, *loaded, other).torque > 0.1
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0

@@ -6,6 +6,7 @@ processes) call `setup_jax` once, before the first array.
 
 import gc
 import os
+import pickle
 import resource
 import signal
 import subprocess
@@ -20,7 +21,7 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.managers import SyncManager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from hector_jax.core.inputs import InputError, one_line
 
@@ -168,13 +169,28 @@ def _leave_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+class _Messages(NamedTuple):
+    """A queue whose own process sees bytes only: it would load JAX to know what they are."""
+
+    queue: Any
+
+    def put(self, message: Any) -> None:
+        self.queue.put(pickle.dumps(message))
+
+    def get(self) -> Any:
+        return pickle.loads(self.queue.get())
+
+    def empty(self) -> bool:
+        return self.queue.empty()
+
+
 @contextmanager
 def message_queue() -> Iterator[Any]:
     """A queue that can be an argument of jobs in worker processes."""
     manager = SyncManager(ctx=_Spawn())
     manager.start(_leave_with_parent)
     with manager:
-        yield manager.Queue()
+        yield _Messages(manager.Queue())
 
 
 def start_worker(cores: Any) -> None:

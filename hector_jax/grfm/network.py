@@ -4,7 +4,7 @@
 32 bits has exact derivatives in a rollout of 64, and new parameters need no new compilation.
 """
 
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -120,5 +120,11 @@ def _is_in_file(path: Any, arrays: Any) -> bool:
 
 def layout(variant: str, hidden: tuple[int, ...]) -> Params:
     """Zeros of the shapes of the parameters, as `load_tree` wants them; an axis 0 is of ticks."""
-    shapes = jax.eval_shape(partial(VARIANTS[variant].init, hidden=hidden), jax.random.key(0))
+    shapes = _shapes(VARIANTS[variant], hidden)
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+
+
+@lru_cache(maxsize=64)
+def _shapes(variant: Phi, hidden: tuple[int, ...]) -> Any:
+    """Shapes of the parameters of a variant; to find them takes longer than to read a file."""
+    return jax.eval_shape(partial(variant.init, hidden=hidden), jax.random.key(0))
