@@ -61,7 +61,6 @@ def evaluate(
 
     Source: Eq. 9, 11.
     """
-
     return evaluation(
         lambda w: rollout(config, robot, w, command, anchor, effect, variation), weights, loss
     )
