@@ -37,6 +37,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.verdicts import ScoredWalks
+from hector_jax.runs.walks import tune_on_walks
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
@@ -244,6 +245,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
         "seconds": run.seconds,
         "start": weights_tree(run.start),
         "choice_plants": run.robot.description.tuning.choice_plants,
+        "walk_rounds": run.robot.description.tuning.walk_rounds,
     }
     here = json.loads(as_json(now))
     run_folder.check_agreement(run.folder, begun, here)
@@ -255,6 +257,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
 
 def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     """Tune without and with the net, and again with it refreshed; writes the weights."""
+    journal = Journal(run.folder / METRICS)
     step = partial(
         tunings.tune,
         pool,
@@ -263,7 +266,7 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         folder=run.artefacts,
         start=run.start,
         commit=run.commit,
-        journal=Journal(run.folder / METRICS),
+        journal=journal,
         dumps=run.folder / "dumps",
     )
     done = step(run.problems, title=f"tuning {run.name} without and with GRFM-Net")
@@ -271,8 +274,8 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     for count in range(1, run.args.refresh + 1):
         config = replace(nets.REFRESH, seed=count, seconds=run.seconds)
         folder = run.folder / f"refresh-{count}"
-        walked = run.trajectories[0].command, done[name].tuning
-        net, shift = nets.refresh(pool, config, run.robot, *walked, net=net, folder=folder)
+        seen = run.trajectories[0].command, done[name].tuning
+        net, shift = nets.refresh(pool, config, run.robot, *seen, net=net, folder=folder)
         shifts.append(shift)
         name = "with_refreshed" + (str(count) if count > 1 else "")
         problem = {name: run.problems["with"]._replace(params=net.params)}
@@ -281,6 +284,21 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     commands = [one.command for one in run.trajectories]
     notes = {"seconds": run.seconds, "folder": run.artefacts / "choice", "commit": run.commit}
     choices = choice.choose(pool, run.config, run.robot, tuned, commands, **notes)
+    if rounds := run.robot.description.tuning.walk_rounds:
+        walked = tune_on_walks(
+            pool,
+            run.config,
+            run.robot,
+            choices[name].weights,
+            run.problems["with"]._replace(params=net.params),
+            choice.drawn_plants(run.robot),
+            run.artefacts,
+            rounds=rounds,
+            seconds=run.seconds,
+            commit=run.commit,
+        )
+        tuned["with_walks"] = walked.tuning
+        journal.write({"with_walks": walked.tuning.history})
     sets = {
         "nominal": nominal(run.robot),
         "expert": expert(run.robot),
@@ -317,8 +335,8 @@ def _walk_sets(
 def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
     """Say where what was tuned walks worse than what it was tuned from."""
     L = {each: float(scores[0].L) for each, scores in on_hfs.scores.items()}
-    for each in ("without", "with"):
-        if L[each] > L["nominal"]:
+    for each in ("without", "with", "with_walks"):
+        if L.get(each, 0.0) > L["nominal"]:
             say(
                 f"{name}: on the high-fidelity simulator `{each}` walks with L {L[each] / 1e6:.3g}"
                 f"e6, nominal with {L['nominal'] / 1e6:.3g}e6: its model is wrong about this robot"
@@ -369,7 +387,8 @@ def _film(run: _Run, walks: ScoredWalks) -> Picture | str:
     """The film of a run, or why there is none."""
     if not run.args.video:
         return "left out (--no-video)"
-    pair = {name: walks.first[name] for name in ("nominal", "with")}
+    tuned = "with_walks" if "with_walks" in walks.first else "with"
+    pair = {name: walks.first[name] for name in ("nominal", tuned)}
     film = run.folder / "film.mp4"
     reason = pictures.film(film, run.robot, pair, run.folder / "film.png")
     return reason or Picture(film.name, "Nominal and tuned weights on the first stand-in plant.")

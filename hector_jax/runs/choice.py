@@ -19,7 +19,7 @@ from hector_jax.core.console import say
 from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
 from hector_jax.runs import verdicts
-from hector_jax.sim.world import hfs_drawn, truth
+from hector_jax.sim.world import Imperfections, hfs_drawn, truth
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 # of the accepted iterations: where a path is walked
@@ -42,6 +42,14 @@ class Choice(NamedTuple):
     weights: Weights
     iteration: int  # its number
     of: int  # number of the last
+
+
+def drawn_plants(robot: Robot) -> list[Imperfections]:
+    """The plants on which weights of this robot are chosen and tuned on."""
+    noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
+    seeds = range(_FIRST_SEED, _FIRST_SEED + robot.description.tuning.choice_plants)
+    drawn = [hfs_drawn(seed, 0.4, robot.description) for seed in seeds]
+    return [plant._replace(estimator=noisy) for plant in drawn]
 
 
 def choose(
@@ -78,9 +86,7 @@ def choose(
     sets = {label: one.weights for each in points.values() for label, one in each.items()}
     title = f"choosing an iteration on {plural(count, 'plant')} drawn around the hfs"
     notes = {"title": title, "seconds": seconds, "folder": folder, "commit": commit}
-    noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
-    drawn = [hfs_drawn(_FIRST_SEED + k, 0.4, robot.description) for k in range(count)]
-    plants = [plant._replace(estimator=noisy) for plant in drawn], range(count)
+    plants = drawn_plants(robot), range(count)
     each = [
         verdicts.judge(pool, config, robot, sets, command, *plants, **notes).scores
         for command in commands

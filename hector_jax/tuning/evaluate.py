@@ -71,6 +71,16 @@ evaluate_jit = jax.jit(evaluate, static_argnums=0)
 need no compilation."""
 
 
+def mean_of(evaluations: Sequence[Evaluation], scales: Float[np.ndarray, " n"]) -> Evaluation:
+    """The mean of evaluations, each divided by its scale, with the worst fall and residual."""
+    each = jax.device_get(evaluations)
+    whole = jax.tree.map(
+        lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
+    )
+    worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
+    return whole._replace(**worst)
+
+
 def mean_over_commands(
     evaluations: Sequence[Callable[[Weights], Evaluation]], start: Weights
 ) -> Callable[[Weights], Evaluation]:
@@ -83,15 +93,7 @@ def mean_over_commands(
         losses = np.array([evaluate(start).loss for evaluate in evaluations])
         scales = losses / losses.mean()
 
-    def evaluate_mean(weights: Weights) -> Evaluation:
-        each = jax.device_get([evaluate(weights) for evaluate in evaluations])
-        whole = jax.tree.map(
-            lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
-        )
-        worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
-        return whole._replace(**worst)
-
-    return evaluate_mean
+    return lambda weights: mean_of([evaluate(weights) for evaluate in evaluations], scales)
 
 
 def gradient_norms(

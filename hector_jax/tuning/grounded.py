@@ -60,25 +60,20 @@ def ground(
         robot: nominal body.
         weights, command: that were walked.
         effect: phi.
-        walk: nobody fell in it; sampled at the plan interval or finer.
+        walk: sampled at the plan interval.
         start_tick: gait tick of t = 0.
 
     Raises:
-        ValueError: the walk's samples do not fill the ticks.
+        ValueError: the walk has another number of ticks.
     """
-    samples, ticks = len(walk.fallen), config.ticks
-    if samples % ticks:
-        raise ValueError(
-            f"a measured walk must have a whole number of samples in each of its {ticks} ticks, "
-            f"got {samples} samples"
-        )
-    ends = slice(samples // ticks - 1, None, samples // ticks)
+    ticks = config.ticks
+    if len(walk.fallen) != ticks:
+        raise ValueError(f"a walk of {ticks} ticks has {len(walk.fallen)} samples")
 
     def feet_of(state: State, joints: Array) -> Feet:
         return measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints)))
 
-    states = jax.tree.map(lambda x: x[ends], walk.state)
-    measured = Missed(states, jax.vmap(feet_of)(states, walk.joints[ends]))
+    measured = Missed(walk.state, jax.vmap(feet_of)(walk.state, walk.joints))
     held = jax.tree.map(lambda w: jnp.broadcast_to(w[0], (HISTORY, *w.shape[1:])), walk.command)
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
 

@@ -1,0 +1,155 @@
+"""The step `tune_on_walks`: on from a tuned set, on the model grounded on walks (grounded.py).
+
+A round walks the best weights on some plants, grounds the model on each of these walks, descends
+for some steps on the mean over them and walks what comes out. Where the walks lost, the next round
+takes half as many steps; where they gained, twice as many.
+"""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+from itertools import product, repeat
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from hector_jax.control.weights import Weights
+from hector_jax.core.console import bar
+from hector_jax.core.inputs import plural
+from hector_jax.core.trajectory import SOLVED
+from hector_jax.grfm import network
+from hector_jax.grfm.dataset import at_interval
+from hector_jax.robot.model import Robot
+from hector_jax.runs import tunings
+from hector_jax.runs.cache import content_key
+from hector_jax.runs.tunings import TUNING_CODE, Problem, Tuned
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import Imperfections
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend
+from hector_jax.tuning.evaluate import Evaluation, mean_of
+from hector_jax.tuning.grounded import Ground, evaluate_grounded, ground
+from hector_jax.tuning.loss import losses, total
+from hector_jax.tuning.status import StepStatus
+
+FIRST, MOST = 8, 16  # steps of a round
+_CODE = (*TUNING_CODE, "tuning.grounded", "sim.walk", "runs.walks")
+
+Walked = tuple[Evaluation, Ground]
+"""Loss of a walk with its gradient along it, and the model grounded on it."""
+
+
+def _walk_job(config: TuneConfig, robot: Robot, problem: Problem, job: Job) -> Walked:
+    controller = config.rollout.walk
+    walked = walk(controller, robot, job)
+    samples = at_interval(walked, controller.gait.tick)
+    effect = network.effect_of(problem.params, controller.gait)
+    missed = ground(config.rollout, robot, job.weights, job.command, effect, samples)
+    along = _evaluate_job(config, robot, problem, job.weights, job, missed)
+    terms = losses(config.loss, walked)
+    evaluation = along._replace(
+        loss=total(config.loss, terms),
+        terms=terms,
+        fallen=np.mean(1.0 * walked.fallen),
+        residual=np.max(walked.residual),
+    )
+    return jax.device_get((evaluation, missed))
+
+
+def _evaluate_job(
+    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights, job: Job, ground: Ground
+) -> Evaluation:
+    effect = network.effect_of(problem.params, config.rollout.walk.gait)
+    inputs = config.rollout, robot, weights, job.command, effect, ground, config.loss
+    return jax.device_get(evaluate_grounded(*inputs))
+
+
+def _status(evaluation: Evaluation, low: float) -> StepStatus:
+    if evaluation.fallen > 0:
+        return StepStatus.FELL
+    if not evaluation.residual <= SOLVED:
+        return StepStatus.UNSOLVED
+    return StepStatus.ACCEPTED if evaluation.loss < low else StepStatus.ROSE
+
+
+def tune_on_walks(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    start: Weights,
+    problem: Problem,
+    plants: Sequence[Imperfections],
+    folder: Path,
+    *,
+    rounds: int,
+    seconds: float,
+    commit: str = "",
+) -> Tuned:
+    """Tune on with walks on plants; the history holds the start and the trial of each round.
+
+    All plants and commands count alike: the loss of each is divided by its share at the start.
+
+    Args:
+        pool: worker processes.
+        config, robot: how, with rollouts as long as the walks; nominal body.
+        start: weights to go on from.
+        problem: commands, and the net of the model that is grounded.
+        plants: to walk on.
+        folder: of the tuning; one that is there is not made again.
+        rounds: most of them. It ends before where a single step loses.
+        seconds: length of a walk.
+        commit: to note with what is tuned now.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    cases = list(enumerate(product(plants, problem.commands)))
+    step = partial(_evaluate_job, config, robot, problem)
+
+    def jobs(weights: Weights) -> list[Job]:
+        return [Job(weights, command, plant, seconds, seed) for seed, (plant, command) in cases]
+
+    def walk_all(weights: Weights) -> list[Walked]:
+        return list(pool.map(partial(_walk_job, config, robot, problem), jobs(weights)))
+
+    def descent(best: Weights, walks: Sequence[Walked], scales: np.ndarray, steps: int) -> Weights:
+        grounds = [one for _, one in walks]
+
+        def mean(weights: Weights) -> Evaluation:
+            each = pool.map(step, repeat(weights), jobs(weights), grounds)
+            return mean_of(list(each), scales)
+
+        far = replace(config, iterations=PAPER_ITERATIONS + steps)
+        return descend(far, best, mean, first=PAPER_ITERATIONS).converged
+
+    def make(*_: Any) -> Iterator[tuple[str, Tuned]]:
+        with bar(f"tuning on with walks on {plural(len(plants), 'plant')}") as tell:
+            tell(0, rounds, "compiling")
+            best, walks, steps, low = start, walk_all(start), FIRST, np.inf
+            scales = np.array([one.loss for one, _ in walks])
+            scales, trial, tried = scales / scales.mean(), best, walks
+            history: list[Iteration] = []
+            while True:
+                seen = mean_of([one for one, _ in tried], scales)
+                status, number = _status(seen, low), np.asarray(PAPER_ITERATIONS + len(history))
+                share = np.asarray(steps / FIRST if history else 0.0)
+                history.append(Iteration(number, trial, seen, np.asarray(status), share))
+                tell(len(history) - 1, rounds, f"L {float(seen.loss) / 1e6:.3f}e6")
+                if history[-1].accepted:
+                    best, walks, low = trial, tried, float(seen.loss)
+                    steps = min(2 * steps, MOST) if len(history) > 1 else steps
+                else:
+                    steps = steps // 2 if len(history) > 1 else 0
+                if not steps or len(history) > rounds:
+                    break
+                trial = descent(best, walks, scales, steps)
+                tried = walk_all(trial)
+            stop = f"{rounds} rounds" if steps else f"refused: {history[-1].reason}"
+            yield "walks", Tuned(Tuning(history, start, best, stop), commit)
+
+    inputs = config, robot, start, *problem, *plants, rounds, seconds
+    path = folder / f"tuning-walks-{content_key(*inputs, code=_CODE)}.npz"
+    return tunings.load_or_tune(config, robot, start, {"walks": path}, make)["walks"]

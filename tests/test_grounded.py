@@ -1,0 +1,143 @@
+"""Rollouts grounded on measured walks, and tuning on with walks."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import nominal, weights_to_vector
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import walks
+from hector_jax.runs.tunings import Problem
+from hector_jax.sim.world import hfs, hfs_drawn
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
+from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.grounded import Ground, evaluate_grounded, ground, grounded_rollout
+from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.tuning.measured import evaluate_walk
+from hector_jax.tuning.rollout import RolloutConfig, rollout
+
+CONFIG = RolloutConfig(ticks=6)
+WALKED = named_command("s"), last_command
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot()
+
+
+@pytest.fixture(scope="module")
+def measured(robot):
+    """A walk that the model does not explain: joints of a stance, and a drift and a shake."""
+    anchor = standing_anchor(robot)
+    roll_out = jax.jit(rollout, static_argnums=0)
+    command, effect = WALKED
+    walk = jax.device_get(roll_out(CONFIG, robot, nominal(), command, anchor, effect))
+    shake = 1e-3 * np.random.default_rng(0).standard_normal((6, 3))
+    state = jax.tree.map(lambda x: x + shake, walk.state)
+    return walk._replace(state=state, joints=np.broadcast_to(robot.standing_joints, (6, 10)))
+
+
+def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(robot, measured):
+    missed = ground(CONFIG, robot, nominal(), *WALKED, measured)
+    again = jax.jit(grounded_rollout, static_argnums=0)(CONFIG, robot, nominal(), *WALKED, missed)
+    for found, there in zip(again.state, measured.state, strict=True):
+        np.testing.assert_allclose(found, there[1:], atol=1e-12)
+    assert not again.fallen.any()
+
+
+def test_its_gradient_is_that_along_the_walk_by_forward_recursion(robot, measured):
+    missed = ground(CONFIG, robot, nominal(), *WALKED, measured)
+    # that one prices the change from the command before its first tick too
+    tracking = tuple(t._replace(weight=t.weight * (t.name != "L_ctrl")) for t in PAPER_LOSS)
+    found = evaluate_grounded(CONFIG, robot, nominal(), *WALKED, missed, tracking)
+    config = TuneConfig(rollout=CONFIG, loss=tracking)
+    along = evaluate_walk(config, robot, nominal(), *WALKED, measured)
+    gradients = [weights_to_vector(one.gradient) for one in (found, along)]
+    np.testing.assert_allclose(*gradients, rtol=1e-7, atol=1e-7 * np.abs(gradients[1]).max())
+
+
+def test_a_walk_of_another_length_is_refused(robot, measured):
+    with pytest.raises(ValueError, match="a walk of 5 ticks has 6 samples"):
+        ground(RolloutConfig(ticks=5), robot, nominal(), *WALKED, measured)
+
+
+def _loss(weights, imperfections):
+    """A quadratic in the log-weights, larger on a heavier plant, and its gradient."""
+    away = jax.tree.map(lambda w, n: np.log(w / n) - 1.0, weights, nominal())
+    size = float(imperfections.mass) * 1e6
+    loss = size * (1.0 + sum(float(np.sum(a**2)) for a in jax.tree.leaves(away)))
+    gradient = jax.tree.map(lambda a, w: 2.0 * size * a / w, away, weights)
+    terms = {term.name: np.asarray(loss) for term in PAPER_LOSS}
+    return Evaluation(np.asarray(loss), terms, gradient, np.zeros(()), np.asarray(1e-12))
+
+
+def _tune(monkeypatch, robot, folder, truth, rounds=6):
+    """Tune where the model is `_loss` and a walk costs `truth` of it; how often it was walked."""
+    count = []
+
+    def walk_job(config, robot, problem, job):
+        count.append(job)
+        return truth(_loss(job.weights, job.imperfections), job.weights), Ground(*[None] * 3)
+
+    def evaluate_job(config, robot, problem, weights, job, ground):
+        return _loss(weights, job.imperfections)
+
+    monkeypatch.setattr(walks, "_walk_job", walk_job)
+    monkeypatch.setattr(walks, "_evaluate_job", evaluate_job)
+    plants = [hfs()._replace(mass=np.asarray(m)) for m in (1.0, 5.0)]
+    with ThreadPoolExecutor(1) as pool:
+        config, problem = TuneConfig(), Problem(named_command("s"), None)
+        inputs = pool, config, robot, nominal(), problem, plants, folder
+        return walks.tune_on_walks(*inputs, rounds=rounds, seconds=4.0).tuning, count
+
+
+def test_walks_that_gain_lead_on_and_what_is_there_is_not_walked_again(
+    monkeypatch, robot, tmp_path
+):
+    tuning, count = _tune(monkeypatch, robot, tmp_path, lambda seen, weights: seen, 2)
+    assert [int(i.iteration) for i in tuning.history] == [PAPER_ITERATIONS + k for k in range(3)]
+    losses = [float(i.evaluation.loss) for i in tuning.history]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[-1] < 0.9 * losses[0]
+    assert all(i.accepted for i in tuning.history)
+    assert (tuning.stop, len(count)) == ("2 rounds", 6)
+    again, count = _tune(monkeypatch, robot, tmp_path, lambda seen, weights: seen, 2)
+    assert not count
+    np.testing.assert_array_equal(again.converged.Q.euler, tuning.converged.Q.euler)
+
+
+def test_where_walks_lose_steps_are_halved_until_none_is_left(monkeypatch, robot, tmp_path):
+    def worse(seen, weights):
+        moved = float(np.abs(np.log(weights.Q.euler / nominal().Q.euler)).max())
+        return seen._replace(loss=seen.loss * (1.0 + 10.0 * moved))
+
+    tuning, count = _tune(monkeypatch, robot, tmp_path, worse)
+    assert [bool(i.accepted) for i in tuning.history] == [True, False, False, False, False]
+    assert [float(i.step_scale) for i in tuning.history[1:]] == [1.0, 0.5, 0.25, 0.125]
+    np.testing.assert_array_equal(tuning.converged.Q.euler, nominal().Q.euler)
+    assert len(count) == 10
+
+
+def test_a_start_that_falls_is_walked_once(monkeypatch, robot, tmp_path):
+    fell = lambda seen, weights: seen._replace(fallen=np.asarray(0.2))  # noqa: E731
+    tuning, count = _tune(monkeypatch, robot, tmp_path, fell)
+    assert len(tuning.history) == 1
+    assert "fell" in tuning.stop
+    assert len(count) == 2
+    assert tuning.converged.Q.euler.tolist() == nominal().Q.euler.tolist()
+
+
+@pytest.mark.slow
+def test_a_round_of_walks_gains_on_the_simulator(robot, tmp_path):
+    config = TuneConfig(rollout=RolloutConfig(ticks=100))
+    problem = Problem(named_command("straight"), None)
+    plants = [hfs_drawn(7000 + seed, 0.4) for seed in range(2)]
+    with ThreadPoolExecutor(1) as pool:
+        inputs = pool, config, robot, nominal(), problem, plants, tmp_path
+        tuning = walks.tune_on_walks(*inputs, rounds=1, seconds=1.0).tuning
+    first, last = (float(i.evaluation.loss) for i in tuning.history)
+    assert last < first
