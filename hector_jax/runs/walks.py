@@ -128,26 +128,29 @@ def tune_on_walks(
     def make(*_: Any) -> Iterator[tuple[str, Tuned]]:
         with bar(f"tuning on with walks on {plural(len(plants), 'plant')}") as tell:
             tell(0, rounds, "compiling")
-            best, walks, steps, low = start, walk_all(start), FIRST, np.inf
-            scales = np.array([one.loss for one, _ in walks])
-            scales, trial, tried = scales / scales.mean(), best, walks
             history: list[Iteration] = []
+            best = trial = start
+            walks = tried = walk_all(start)
+            scales = np.array([one.loss for one, _ in walks])
+            scales, steps, low = scales / scales.mean(), FIRST // 2, np.inf
             while True:
                 seen = mean_of([one for one, _ in tried], scales)
-                status, number = _status(seen, low), np.asarray(PAPER_ITERATIONS + len(history))
-                share = np.asarray(steps / FIRST if history else 0.0)
-                history.append(Iteration(number, trial, seen, np.asarray(status), share))
+                number, status = PAPER_ITERATIONS + len(history), _status(seen, low)
+                share = steps / FIRST if history else 0.0
+                row = map(np.asarray, (status, share))
+                history.append(Iteration(np.asarray(number), trial, seen, *row))
                 tell(len(history) - 1, rounds, f"L {float(seen.loss) / 1e6:.3f}e6")
-                if history[-1].accepted:
+                if status == StepStatus.ACCEPTED:
                     best, walks, low = trial, tried, float(seen.loss)
-                    steps = min(2 * steps, MOST) if len(history) > 1 else steps
+                    steps = min(2 * steps, MOST)
                 else:
-                    steps = steps // 2 if len(history) > 1 else 0
-                if not steps or len(history) > rounds:
+                    steps //= 2
+                if not steps or np.isinf(low) or len(history) > rounds:
                     break
                 trial = descent(best, walks, scales, steps)
                 tried = walk_all(trial)
-            stop = f"{rounds} rounds" if steps else f"refused: {history[-1].reason}"
+            ended = len(history) > rounds
+            stop = f"{rounds} rounds" if ended else f"the last was refused: {history[-1].reason}"
             yield "walks", Tuned(Tuning(history, start, best, stop), commit)
 
     inputs = config, robot, start, *problem, *plants, rounds, seconds
