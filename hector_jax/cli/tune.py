@@ -289,8 +289,8 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
             pool,
             run.config,
             run.robot,
-            choices[name].weights,
-            run.problems["with"]._replace(params=net.params),
+            run.start,
+            run.problems["without"],  # grounding tells what the net would
             choice.drawn_plants(run.robot),
             run.artefacts,
             rounds=rounds,

@@ -1,4 +1,4 @@
-"""The step `tune_on_walks`: on from a tuned set, on the model grounded on walks (grounded.py).
+"""The step `tune_on_walks`: a tuning on the model grounded on walks (grounded.py).
 
 A round walks the best weights on some plants, grounds the model on each of these walks, descends
 for some steps on the mean over them and walks what comes out. Where the walks lost, the next round
@@ -88,15 +88,15 @@ def tune_on_walks(
     seconds: float,
     commit: str = "",
 ) -> Tuned:
-    """Tune on with walks on plants; the history holds the start and the trial of each round.
+    """Tune with walks on plants; the history holds the start and the trial of each round.
 
     All plants and commands count alike: the loss of each is divided by its share at the start.
 
     Args:
         pool: worker processes.
         config, robot: how, with rollouts as long as the walks; nominal body.
-        start: weights to go on from.
-        problem: commands, and the net of the model that is grounded.
+        start: where to start.
+        problem: commands, and the net of the model that is grounded, if any.
         plants: to walk on.
         folder: of the tuning; one that is there is not made again.
         rounds: most of them. It ends before where a single step loses.
@@ -126,7 +126,7 @@ def tune_on_walks(
         return descend(far, best, mean, first=PAPER_ITERATIONS).converged
 
     def make(*_: Any) -> Iterator[tuple[str, Tuned]]:
-        with bar(f"tuning on with walks on {plural(len(plants), 'plant')}") as tell:
+        with bar(f"tuning with walks on {plural(len(plants), 'plant')}") as tell:
             tell(0, rounds, "compiling")
             history: list[Iteration] = []
             best = trial = start
