@@ -9,6 +9,7 @@ import pytest
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.grfm.effect import last_command
+from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import walks
 from hector_jax.runs.tunings import Problem
@@ -67,15 +68,18 @@ def test_a_walk_of_another_length_is_refused(robot, measured):
 
 def _loss(weights, imperfections):
     """A quadratic in the log-weights, larger on a heavier plant, and its gradient."""
+    others = weights.others
+    weights = weights._replace(others={})
     away = jax.tree.map(lambda w, n: np.log(w / n) - 1.0, weights, nominal())
     size = float(imperfections.mass) * 1e6
     loss = size * (1.0 + sum(float(np.sum(a**2)) for a in jax.tree.leaves(away)))
     gradient = jax.tree.map(lambda a, w: 2.0 * size * a / w, away, weights)
+    gradient = gradient._replace(others=jax.tree.map(np.zeros_like, others))
     terms = {term.name: np.asarray(loss) for term in PAPER_LOSS}
     return Evaluation(np.asarray(loss), terms, gradient, np.zeros(()), np.asarray(1e-12))
 
 
-def _tune(monkeypatch, robot, folder, truth, rounds=6):
+def _tune(monkeypatch, robot, folder, truth, rounds=6, others=(), start=None):
     """Tune where the model is `_loss` and a walk costs `truth` of it; how often it was walked."""
     count = []
 
@@ -90,8 +94,8 @@ def _tune(monkeypatch, robot, folder, truth, rounds=6):
     monkeypatch.setattr(walks, "_evaluate_job", evaluate_job)
     plants = [hfs()._replace(mass=np.asarray(m)) for m in (1.0, 5.0)]
     with ThreadPoolExecutor(1) as pool:
-        config, problem = TuneConfig(), Problem(named_command("s"), None)
-        inputs = pool, config, robot, nominal(), problem, plants, folder
+        problem = Problem(named_command("s"), None)
+        inputs = pool, TuneConfig(others=others), robot, start or nominal(), problem, plants, folder
         return walks.tune_on_walks(*inputs, rounds=rounds, seconds=4.0).tuning, count
 
 
@@ -129,6 +133,18 @@ def test_a_start_that_falls_is_walked_once(monkeypatch, robot, tmp_path):
     assert "fell" in tuning.stop
     assert len(count) == 2
     assert tuning.converged.Q.euler.tolist() == nominal().Q.euler.tolist()
+    # the report of such a tuning can be written
+    assert "1 refused: " in tuning_section("with_walks", tuning)
+
+
+def test_what_is_walked_first_has_equal_feet_and_the_other_numbers(monkeypatch, robot, tmp_path):
+    force = np.array([[1e-4] * 3, [4e-4] * 3])
+    start = nominal()._replace(R=nominal().R._replace(force=force))
+    same = lambda seen, weights: seen  # noqa: E731
+    tuning, _ = _tune(monkeypatch, robot, tmp_path, same, 1, ("footstep_feedback",), start)
+    for one in (i.weights for i in tuning.history):
+        np.testing.assert_array_equal(one.R.force[0], one.R.force[1])
+        assert set(one.others) == {"footstep_feedback"}
 
 
 @pytest.mark.slow

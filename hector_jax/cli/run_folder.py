@@ -20,7 +20,7 @@ from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
 
 TIME = "%Y%m%d-%H%M%S"  # names a run
-_CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice")
+_CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice", "runs.walks")
 # flags of a call, not of the run that it begins or resumes
 _OF_A_CALL = ("config", "each", "out", "resume", "run", "runs")
 _FREE = ("data", "json", "processes", "video")  # may be others when a run is resumed

@@ -61,8 +61,8 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
 def _iterations(metrics: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
     counts: dict[str, dict[str, int]] = {}
     for line in metrics:
-        one = counts.setdefault(line["set"], {"iterations": 0, "refused": 0})
-        one["iterations"] = max(one["iterations"], int(line["iteration"]))
+        one = counts.setdefault(line["set"], {"iterations": -1, "refused": 0})
+        one["iterations"] += 1  # the start is none
         one["refused"] += not line["accepted"]
     return counts
 

@@ -41,7 +41,7 @@ COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.walk", "si
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """collection.Walks on the hfs to learn the ground from."""
+    """Walks on the hfs to learn the ground from."""
 
     walks: int = 64
     seconds: float = 4.0  # of each

@@ -19,7 +19,6 @@ import numpy as np
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar
 from hector_jax.core.inputs import plural
-from hector_jax.core.trajectory import SOLVED
 from hector_jax.grfm import network
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.model import Robot
@@ -29,7 +28,15 @@ from hector_jax.runs.tunings import TUNING_CODE, Problem, Tuned
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend
+from hector_jax.tuning.difftune import (
+    PAPER_ITERATIONS,
+    Iteration,
+    TuneConfig,
+    Tuning,
+    descend,
+    init,
+    step_status,
+)
 from hector_jax.tuning.evaluate import Evaluation, mean_of
 from hector_jax.tuning.grounded import Ground, evaluate_grounded, ground
 from hector_jax.tuning.loss import losses, total
@@ -47,32 +54,31 @@ def _walk_job(config: TuneConfig, robot: Robot, problem: Problem, job: Job) -> W
     walked = walk(controller, robot, job)
     samples = at_interval(walked, controller.gait.tick)
     effect = network.effect_of(problem.params, controller.gait)
-    missed = ground(config.rollout, robot, job.weights, job.command, effect, samples)
+    grounded = ground(config.rollout, robot, job.weights, job.command, effect, samples)
+    missed = jax.device_get(grounded)  # typed as in later evaluations
     along = _evaluate_job(config, robot, problem, job.weights, job, missed)
     terms = losses(config.loss, walked)
     evaluation = along._replace(
         loss=total(config.loss, terms),
         terms=terms,
-        fallen=np.mean(1.0 * walked.fallen),
-        residual=np.max(walked.residual),
+        fallen=np.maximum(along.fallen, np.mean(1.0 * walked.fallen)),
+        residual=np.maximum(along.residual, np.max(walked.residual)),
     )
     return jax.device_get((evaluation, missed))
 
 
 def _evaluate_job(
-    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights, job: Job, ground: Ground
+    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights, job: Job, missed: Ground
 ) -> Evaluation:
     effect = network.effect_of(problem.params, config.rollout.walk.gait)
-    inputs = config.rollout, robot, weights, job.command, effect, ground, config.loss
+    inputs = config.rollout, robot, weights, job.command, effect, missed, config.loss
     return jax.device_get(evaluate_grounded(*inputs))
 
 
-def _status(evaluation: Evaluation, low: float) -> StepStatus:
-    if evaluation.fallen > 0:
-        return StepStatus.FELL
-    if not evaluation.residual <= SOLVED:
-        return StepStatus.UNSOLVED
-    return StepStatus.ACCEPTED if evaluation.loss < low else StepStatus.ROSE
+def _status(config: TuneConfig, evaluation: Evaluation, low: float) -> StepStatus:
+    status = StepStatus(int(step_status(config, evaluation)))
+    rose = status == StepStatus.ACCEPTED and not evaluation.loss < low
+    return StepStatus.ROSE if rose else status
 
 
 def tune_on_walks(
@@ -94,7 +100,7 @@ def tune_on_walks(
 
     Args:
         pool: worker processes.
-        config, robot: how, with rollouts as long as the walks; nominal body.
+        config, robot: how; nominal body.
         start: where to start.
         problem: commands, and the net of the model that is grounded, if any.
         plants: to walk on.
@@ -106,6 +112,9 @@ def tune_on_walks(
     Raises:
         InputError: the folder cannot be written.
     """
+    ticks = round(seconds / config.rollout.walk.gait.tick)
+    config = replace(config, rollout=replace(config.rollout, ticks=ticks))
+    start = jax.tree.map(np.asarray, init(config, start).best)  # with the other numbers, feet tied
     cases = list(enumerate(product(plants, problem.commands)))
     step = partial(_evaluate_job, config, robot, problem)
 
@@ -135,7 +144,7 @@ def tune_on_walks(
             scales, steps, low = scales / scales.mean(), FIRST // 2, np.inf
             while True:
                 seen = mean_of([one for one, _ in tried], scales)
-                number, status = PAPER_ITERATIONS + len(history), _status(seen, low)
+                number, status = PAPER_ITERATIONS + len(history), _status(config, seen, low)
                 share = steps / FIRST if history else 0.0
                 row = map(np.asarray, (status, share))
                 history.append(Iteration(np.asarray(number), trial, seen, *row))

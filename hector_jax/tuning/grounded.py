@@ -2,8 +2,7 @@
 
 With the weights that were walked such a rollout is the walk itself, so its errors are the measured
 ones and its gradient is that along the walk (Eq. 9, 10). With weights nearby it is what the model
-says that they change. Tuning on the model alone ends where the model errs; from there this goes on
-for some steps with every walk.
+says that they change: good for some steps, and then for another walk.
 """
 
 from functools import partial
