@@ -20,7 +20,6 @@ of mass m and height h:
     lead                     one gait cycle in place before the command of a rollout
     touchdown_error          true: heavy legs miss the planned touchdown by some centimetres
     choice_plants            4: a tuning can gain on the model and lose on the robot
-    walk_rounds              8: what a model misses is measured in walks
     joint_friction, _damping times m h / (m0 h0); push, payload: m / m0; trunk_com: h / h0
     min_height               0.55 h
 """
@@ -161,7 +160,6 @@ def sections(size: Size) -> dict[str, Any]:
             "lead": 2 * ticks,
             "touchdown_error": True,
             "choice_plants": 4,
-            "walk_rounds": 8,
         },
         "plants": {
             "joint_friction": torque,

@@ -5,7 +5,7 @@ for some steps on the mean over them and walks what comes out. Where the walks l
 takes half as many steps; where they gained, twice as many.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from hector_jax.control.weights import Weights
-from hector_jax.core.console import bar
+from hector_jax.core.console import Tell, bar
 from hector_jax.core.inputs import plural
 from hector_jax.grfm import network
 from hector_jax.grfm.dataset import at_interval
@@ -81,6 +81,41 @@ def _status(config: TuneConfig, evaluation: Evaluation, low: float) -> StepStatu
     return StepStatus.ROSE if rose else status
 
 
+def _alternate(
+    config: TuneConfig,
+    start: Weights,
+    rounds: int,
+    walk_all: Callable[[Weights], list[Walked]],
+    descent: Callable[[Weights, Sequence[Walked], np.ndarray, int], Weights],
+    tell: Tell,
+) -> Tuning:
+    """Walk and descend in turn, from a start on; the number of steps follows what the walks say."""
+    history: list[Iteration] = []
+    best = trial = start
+    walks = tried = walk_all(start)
+    scales = np.array([one.loss for one, _ in walks])
+    scales, steps, low = scales / scales.mean(), FIRST // 2, np.inf
+    while True:
+        seen = mean_of([one for one, _ in tried], scales)
+        number, status = PAPER_ITERATIONS + len(history), _status(config, seen, low)
+        share = steps / FIRST if history else 0.0
+        row = map(np.asarray, (status, share))
+        history.append(Iteration(np.asarray(number), trial, seen, *row))
+        tell(len(history) - 1, rounds, f"L {float(seen.loss) / 1e6:.3f}e6")
+        if status == StepStatus.ACCEPTED:
+            best, walks, low = trial, tried, float(seen.loss)
+            steps = min(2 * steps, MOST)
+        else:
+            steps //= 2
+        if not steps or np.isinf(low) or len(history) > rounds:
+            break
+        trial = descent(best, walks, scales, steps)
+        tried = walk_all(trial)
+    ended = len(history) > rounds
+    stop = f"{rounds} rounds" if ended else f"the last was refused: {history[-1].reason}"
+    return Tuning(history, start, best, stop)
+
+
 def tune_on_walks(
     pool: Executor,
     config: TuneConfig,
@@ -125,10 +160,8 @@ def tune_on_walks(
         return list(pool.map(partial(_walk_job, config, robot, problem), jobs(weights)))
 
     def descent(best: Weights, walks: Sequence[Walked], scales: np.ndarray, steps: int) -> Weights:
-        grounds = [one for _, one in walks]
-
         def mean(weights: Weights) -> Evaluation:
-            each = pool.map(step, repeat(weights), jobs(weights), grounds)
+            each = pool.map(step, repeat(weights), jobs(weights), [one for _, one in walks])
             return mean_of(list(each), scales)
 
         far = replace(config, iterations=PAPER_ITERATIONS + steps)
@@ -137,30 +170,8 @@ def tune_on_walks(
     def make(*_: Any) -> Iterator[tuple[str, Tuned]]:
         with bar(f"tuning with walks on {plural(len(plants), 'plant')}") as tell:
             tell(0, rounds, "compiling")
-            history: list[Iteration] = []
-            best = trial = start
-            walks = tried = walk_all(start)
-            scales = np.array([one.loss for one, _ in walks])
-            scales, steps, low = scales / scales.mean(), FIRST // 2, np.inf
-            while True:
-                seen = mean_of([one for one, _ in tried], scales)
-                number, status = PAPER_ITERATIONS + len(history), _status(config, seen, low)
-                share = steps / FIRST if history else 0.0
-                row = map(np.asarray, (status, share))
-                history.append(Iteration(np.asarray(number), trial, seen, *row))
-                tell(len(history) - 1, rounds, f"L {float(seen.loss) / 1e6:.3f}e6")
-                if status == StepStatus.ACCEPTED:
-                    best, walks, low = trial, tried, float(seen.loss)
-                    steps = min(2 * steps, MOST)
-                else:
-                    steps //= 2
-                if not steps or np.isinf(low) or len(history) > rounds:
-                    break
-                trial = descent(best, walks, scales, steps)
-                tried = walk_all(trial)
-            ended = len(history) > rounds
-            stop = f"{rounds} rounds" if ended else f"the last was refused: {history[-1].reason}"
-            yield "walks", Tuned(Tuning(history, start, best, stop), commit)
+            tuning = _alternate(config, start, rounds, walk_all, descent, tell)
+            yield "walks", Tuned(tuning, commit)
 
     inputs = config, robot, start, *problem, *plants, rounds, seconds
     path = folder / f"tuning-walks-{content_key(*inputs, code=_CODE)}.npz"
