@@ -13,7 +13,7 @@ from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import walks
 from hector_jax.runs.tunings import Problem
-from hector_jax.sim.world import hfs, hfs_drawn
+from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Ground, evaluate_grounded, ground, grounded_rollout
@@ -145,15 +145,3 @@ def test_what_is_walked_first_has_equal_feet_and_the_other_numbers(monkeypatch, 
     for one in (i.weights for i in tuning.history):
         np.testing.assert_array_equal(one.R.force[0], one.R.force[1])
         assert set(one.others) == {"footstep_feedback"}
-
-
-@pytest.mark.slow
-def test_a_round_of_walks_gains_on_the_simulator(robot, tmp_path):
-    config = TuneConfig(rollout=RolloutConfig(ticks=100))
-    problem = Problem(named_command("straight"), None)
-    plants = [hfs_drawn(7000 + seed, 0.4) for seed in range(2)]
-    with ThreadPoolExecutor(1) as pool:
-        inputs = pool, config, robot, nominal(), problem, plants, tmp_path
-        tuning = walks.tune_on_walks(*inputs, rounds=1, seconds=1.0).tuning
-    first, last = (float(i.evaluation.loss) for i in tuning.history)
-    assert last < first
