@@ -1,22 +1,31 @@
 """Rollouts grounded on measured walks, and tuning on with walks."""
 
-from concurrent.futures import ThreadPoolExecutor
+import json
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
+from pretend import pretend_history
 
+from hector_jax.cli import tune as command
+from hector_jax.cli.flags import Tune
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import nominal, weights_to_vector
+from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.core.inputs import InputError
 from hector_jax.grfm.effect import last_command
 from hector_jax.report.run import tuning_section
+from hector_jax.robot.description import TuningSettings
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import walks
-from hector_jax.runs.tunings import Problem
-from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
+from hector_jax.runs.tunings import Problem, Tuned
+from hector_jax.sim.world import hfs, hfs_drawn
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig, Tuning
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.grounded import Ground, evaluate_grounded, ground, grounded_rollout
+from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.measured import evaluate_walk
 from hector_jax.tuning.rollout import RolloutConfig, rollout
@@ -43,7 +52,7 @@ def measured(robot):
 
 
 def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(robot, measured):
-    missed = ground(CONFIG, robot, nominal(), *WALKED, measured)
+    missed = fit_grounding(CONFIG, robot, nominal(), *WALKED, measured)
     again = jax.jit(grounded_rollout, static_argnums=0)(CONFIG, robot, nominal(), *WALKED, missed)
     for found, there in zip(again.state, measured.state, strict=True):
         np.testing.assert_allclose(found, there[1:], atol=1e-12)
@@ -51,7 +60,7 @@ def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(robot,
 
 
 def test_its_gradient_is_that_along_the_walk_by_forward_recursion(robot, measured):
-    missed = ground(CONFIG, robot, nominal(), *WALKED, measured)
+    missed = fit_grounding(CONFIG, robot, nominal(), *WALKED, measured)
     # that one prices the change from the command before its first tick too
     tracking = tuple(t._replace(weight=t.weight * (t.name != "L_ctrl")) for t in PAPER_LOSS)
     found = evaluate_grounded(CONFIG, robot, nominal(), *WALKED, missed, tracking)
@@ -63,7 +72,7 @@ def test_its_gradient_is_that_along_the_walk_by_forward_recursion(robot, measure
 
 def test_a_walk_of_another_length_is_refused(robot, measured):
     with pytest.raises(ValueError, match="a walk of 5 ticks has 6 samples"):
-        ground(RolloutConfig(ticks=5), robot, nominal(), *WALKED, measured)
+        fit_grounding(RolloutConfig(ticks=5), robot, nominal(), *WALKED, measured)
 
 
 def _loss(weights, imperfections):
@@ -85,7 +94,7 @@ def _tune(monkeypatch, robot, folder, truth, rounds=6, others=(), start=None):
 
     def walk_job(config, robot, problem, job):
         count.append(job)
-        return truth(_loss(job.weights, job.imperfections), job.weights), Ground(*[None] * 3)
+        return truth(_loss(job.weights, job.imperfections), job.weights), Grounding(*[None] * 3)
 
     def evaluate_job(config, robot, problem, weights, job, ground):
         return _loss(weights, job.imperfections)
@@ -145,3 +154,58 @@ def test_what_is_walked_first_has_equal_feet_and_the_other_numbers(monkeypatch, 
     for one in (i.weights for i in tuning.history):
         np.testing.assert_array_equal(one.R.force[0], one.R.force[1])
         assert set(one.others) == {"footstep_feedback"}
+
+
+def test_where_the_model_gains_nothing_no_walk_is_repeated(monkeypatch, robot, tmp_path):
+    model = _loss
+    monkeypatch.setitem(globals(), "_loss", lambda w, plant: _flat(model(w, plant)))
+    tuning, count = _tune(monkeypatch, robot, tmp_path, lambda seen, weights: seen)
+    assert len(tuning.history) == 1
+    assert tuning.stop == "no step gains on the grounded model"
+    assert len(count) == 2
+
+
+def _flat(evaluation):
+    return evaluation._replace(loss=np.asarray(1e6))
+
+
+def test_a_run_has_the_row_and_its_journal_where_the_robot_asks_for_it(
+    monkeypatch, robot, tmp_path
+):
+    asked = TuningSettings(choice_plants=2, walk_rounds=3)
+    robot = robot._replace(description=replace(robot.description, tuning=asked))
+    there = Tuned(Tuning(pretend_history(3), nominal(), expert(), "done"), "")
+    seen = {}
+
+    def on_walks(pool, config, robot, start, problem, plants, folder, **notes):
+        seen.update(notes, plants=len(plants), params=problem.params, start=start)
+        return there
+
+    monkeypatch.setattr(command.tunings, "tune", lambda *_, **__: {"without": there, "with": there})
+    monkeypatch.setattr(command.choice, "choose", lambda *_, **__: {})
+    monkeypatch.setattr(command, "tune_on_walks", on_walks)
+    net = SimpleNamespace(params="a net")
+    course = NamedCommand("straight", named_command("straight"))
+    notes = {"seconds": 4.0, "config": TuneConfig(), "net": net, "commit": ""}
+    run = command._Run(tmp_path, Tune(), robot, nominal(), (course,), **notes)
+    tuned = command._tune_sets(Executor(), run)
+    assert list(tuned.tunings) == ["without", "with", "with_walks"]
+    assert (seen["rounds"], seen["plants"], seen["params"]) == (3, 2, None)
+    assert (tmp_path / "weights" / "with_walks.json").exists()
+    sets = [json.loads(line)["set"] for line in (tmp_path / "metrics.jsonl").open()]
+    assert sets == ["with_walks"] * len(there.tuning.history)
+
+
+def test_rounds_of_walks_need_plants():
+    with pytest.raises(InputError, match="walk_rounds needs plants to walk on"):
+        TuningSettings(walk_rounds=2)
+
+
+def test_a_round_on_the_simulator_gains_there(robot, tmp_path):
+    config, problem = TuneConfig(rollout=CONFIG), Problem(named_command("s"), None)
+    with ThreadPoolExecutor(1) as pool:
+        inputs = pool, config, robot, nominal(), problem, [hfs_drawn(7000, 0.4)], tmp_path
+        tuning = walks.tune_on_walks(*inputs, rounds=1, seconds=0.06).tuning
+    first, last = (float(one.evaluation.loss) for one in tuning.history)
+    assert last < 0.99 * first
+    assert tuning.history[-1].accepted

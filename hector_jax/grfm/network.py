@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hector_jax.control.gait import GaitConfig
@@ -120,11 +121,12 @@ def _is_in_file(path: Any, arrays: Any) -> bool:
 
 def layout(variant: str, hidden: tuple[int, ...]) -> Params:
     """Zeros of the shapes of the parameters, as `load_tree` wants them; an axis 0 is of ticks."""
-    shapes = _shapes(VARIANTS[variant], hidden)
+    shapes = _shapes(VARIANTS[variant], hidden, jnp.result_type(float))
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 @lru_cache(maxsize=64)
-def _shapes(variant: Phi, hidden: tuple[int, ...]) -> Any:
-    """Shapes of the parameters of a variant; to find them takes longer than to read a file."""
+def _shapes(variant: Phi, hidden: tuple[int, ...], number: Any) -> Any:
+    """Shapes of the parameters where `number` is JAX's; it takes longer than to read a file."""
+    del number  # what it is decides what is found
     return jax.eval_shape(partial(variant.init, hidden=hidden), jax.random.key(0))

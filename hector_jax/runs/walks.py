@@ -1,8 +1,8 @@
 """The step `tune_on_walks`: a tuning on the model grounded on walks (grounded.py).
 
-A round walks the best weights on some plants, grounds the model on each of these walks, descends
-for some steps on the mean over them and walks what comes out. Where the walks lost, the next round
-takes half as many steps; where they gained, twice as many.
+The best weights have walked on some plants. A round takes some steps down the mean over the models
+grounded on these walks, and walks where they end. Where the walks gain, the next round begins there
+and takes up to twice as many steps; where they lose, it walks half as far along the same path.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import Tell, bar
@@ -24,7 +25,7 @@ from hector_jax.grfm.dataset import at_interval
 from hector_jax.robot.model import Robot
 from hector_jax.runs import tunings
 from hector_jax.runs.cache import content_key
-from hector_jax.runs.tunings import TUNING_CODE, Problem, Tuned
+from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections
@@ -38,15 +39,18 @@ from hector_jax.tuning.difftune import (
     step_status,
 )
 from hector_jax.tuning.evaluate import Evaluation, mean_of
-from hector_jax.tuning.grounded import Ground, evaluate_grounded, ground
+from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding
 from hector_jax.tuning.loss import losses, total
 from hector_jax.tuning.status import StepStatus
 
 FIRST, MOST = 8, 16  # steps of a round
-_CODE = (*TUNING_CODE, "tuning.grounded", "sim.walk", "runs.walks")
+_CODE = ("grfm.network", "runs.walks")  # they import all that decides the numbers
 
-Walked = tuple[Evaluation, Ground]
-"""Loss of a walk with its gradient along it, and the model grounded on it."""
+Walked = tuple[Evaluation, Grounding]
+"""Loss of a walk with its gradient along it, and what grounds the model on it."""
+
+Descent = Callable[[Weights, Sequence[Walked], Float[np.ndarray, " n"], int], list[Weights]]
+"""The path of some steps down the mean of losses by their scales, its start first."""
 
 
 def _walk_job(config: TuneConfig, robot: Robot, problem: Problem, job: Job) -> Walked:
@@ -54,9 +58,9 @@ def _walk_job(config: TuneConfig, robot: Robot, problem: Problem, job: Job) -> W
     walked = walk(controller, robot, job)
     samples = at_interval(walked, controller.gait.tick)
     effect = network.effect_of(problem.params, controller.gait)
-    grounded = ground(config.rollout, robot, job.weights, job.command, effect, samples)
-    missed = jax.device_get(grounded)  # typed as in later evaluations
-    along = _evaluate_job(config, robot, problem, job.weights, job, missed)
+    found = fit_grounding(config.rollout, robot, job.weights, job.command, effect, samples)
+    grounding = jax.device_get(found)  # of the types of later evaluations: no second program
+    along = _evaluate_job(config, robot, problem, job.weights, job, grounding)
     terms = losses(config.loss, walked)
     evaluation = along._replace(
         loss=total(config.loss, terms),
@@ -64,14 +68,19 @@ def _walk_job(config: TuneConfig, robot: Robot, problem: Problem, job: Job) -> W
         fallen=np.maximum(along.fallen, np.mean(1.0 * walked.fallen)),
         residual=np.maximum(along.residual, np.max(walked.residual)),
     )
-    return jax.device_get((evaluation, missed))
+    return jax.device_get((evaluation, grounding))
 
 
 def _evaluate_job(
-    config: TuneConfig, robot: Robot, problem: Problem, weights: Weights, job: Job, missed: Ground
+    config: TuneConfig,
+    robot: Robot,
+    problem: Problem,
+    weights: Weights,
+    job: Job,
+    grounding: Grounding,
 ) -> Evaluation:
     effect = network.effect_of(problem.params, config.rollout.walk.gait)
-    inputs = config.rollout, robot, weights, job.command, effect, missed, config.loss
+    inputs = config.rollout, robot, weights, job.command, effect, grounding, config.loss
     return jax.device_get(evaluate_grounded(*inputs))
 
 
@@ -86,33 +95,41 @@ def _alternate(
     start: Weights,
     rounds: int,
     walk_all: Callable[[Weights], list[Walked]],
-    descent: Callable[[Weights, Sequence[Walked], np.ndarray, int], Weights],
+    descent: Descent,
     tell: Tell,
 ) -> Tuning:
-    """Walk and descend in turn, from a start on; the number of steps follows what the walks say."""
+    """Walk and descend in turn; see the module's docstring."""
     history: list[Iteration] = []
     best = trial = start
-    walks = tried = walk_all(start)
-    scales = np.array([one.loss for one, _ in walks])
+    tried = walk_all(start)
+    scales = np.array([one.loss for one, _ in tried])
     scales, steps, low = scales / scales.mean(), FIRST // 2, np.inf
-    while True:
+    path, stop = [start], ""
+    while not stop:
         seen = mean_of([one for one, _ in tried], scales)
         number, status = PAPER_ITERATIONS + len(history), _status(config, seen, low)
         share = steps / FIRST if history else 0.0
         row = map(np.asarray, (status, share))
         history.append(Iteration(np.asarray(number), trial, seen, *row))
         tell(len(history) - 1, rounds, f"L {float(seen.loss) / 1e6:.3f}e6")
-        if status == StepStatus.ACCEPTED:
-            best, walks, low = trial, tried, float(seen.loss)
-            steps = min(2 * steps, MOST)
+        if accepted := status == StepStatus.ACCEPTED:
+            best, low, steps = trial, float(seen.loss), min(2 * steps, MOST)
         else:
             steps //= 2
-        if not steps or np.isinf(low) or len(history) > rounds:
-            break
-        trial = descent(best, walks, scales, steps)
-        tried = walk_all(trial)
-    ended = len(history) > rounds
-    stop = f"{rounds} rounds" if ended else f"the last was refused: {history[-1].reason}"
+        if np.isinf(low):
+            stop = f"the start was refused: {history[-1].reason}"
+        elif len(history) > rounds:
+            stop = plural(rounds, "round")
+        elif not steps:
+            stop = f"the walks of a single step were refused: {history[-1].reason}"
+        else:
+            path = descent(best, tried, scales, steps) if accepted else path
+            steps = min(steps, len(path) - 1)
+            if steps:
+                trial = path[steps]
+                tried = walk_all(trial)
+            else:
+                stop = "no step gains on the grounded model"
     return Tuning(history, start, best, stop)
 
 
@@ -135,8 +152,7 @@ def tune_on_walks(
 
     Args:
         pool: worker processes.
-        config, robot: how; nominal body.
-        start: where to start.
+        config, robot, start: how; nominal body; where to start.
         problem: commands, and the net of the model that is grounded, if any.
         plants: to walk on.
         folder: of the tuning; one that is there is not made again.
@@ -159,13 +175,14 @@ def tune_on_walks(
     def walk_all(weights: Weights) -> list[Walked]:
         return list(pool.map(partial(_walk_job, config, robot, problem), jobs(weights)))
 
-    def descent(best: Weights, walks: Sequence[Walked], scales: np.ndarray, steps: int) -> Weights:
+    def descent(best: Weights, walks: Sequence[Walked], scales: Any, steps: int) -> list[Weights]:
         def mean(weights: Weights) -> Evaluation:
             each = pool.map(step, repeat(weights), jobs(weights), [one for _, one in walks])
             return mean_of(list(each), scales)
 
         far = replace(config, iterations=PAPER_ITERATIONS + steps)
-        return descend(far, best, mean, first=PAPER_ITERATIONS).converged
+        history = descend(far, best, mean, first=PAPER_ITERATIONS).history
+        return [one.weights for one in history if one.accepted]
 
     def make(*_: Any) -> Iterator[tuple[str, Tuned]]:
         with bar(f"tuning with walks on {plural(len(plants), 'plant')}") as tell:

@@ -34,8 +34,11 @@ class Missed(NamedTuple):
     feet: Feet
 
 
-class Ground(NamedTuple):
-    """A measured walk of T ticks, as rollouts need it; its first tick holds the first command."""
+class Grounding(NamedTuple):
+    """What grounds rollouts on a measured walk of T ticks.
+
+    Estimates play no part: commands are planned anew, from the true states of the walk.
+    """
 
     start: Carry  # at the end of the first tick
     tick: Int[Array, ""]  # gait tick there
@@ -43,7 +46,7 @@ class Ground(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def ground(
+def fit_grounding(
     config: RolloutConfig,
     robot: Robot,
     weights: Weights,
@@ -51,19 +54,21 @@ def ground(
     effect: jax.tree_util.Partial,
     walk: Trajectory,
     start_tick: Int[Array, ""] | int = 0,
-) -> Ground:
-    """What the model missed of a walk.
+) -> Grounding:
+    """Find what the model missed of a walk.
 
     Args:
         config: controller, and the T ticks of the walk.
         robot: nominal body.
         weights, command: that were walked.
         effect: phi.
-        walk: sampled at the plan interval.
+        walk: true states, joints and commands, sampled at the plan interval: T samples.
         start_tick: gait tick of t = 0.
 
     Raises:
         ValueError: the walk has another number of ticks.
+
+    Source: Eq. 12, 13 at the measured states.
     """
     ticks = config.ticks
     if len(walk.fallen) != ticks:
@@ -87,7 +92,7 @@ def ground(
 
     now, then = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
     _, missed = jax.lax.scan(one, held, (now, then, tick + jnp.arange(ticks - 1)))
-    return Ground(at(jax.tree.map(lambda x: x[0], measured), held), tick, missed)
+    return Grounding(at(jax.tree.map(lambda x: x[0], measured), held), tick, missed)
 
 
 def grounded_rollout(
@@ -96,12 +101,19 @@ def grounded_rollout(
     weights: Weights,
     command: Command,
     effect: jax.tree_util.Partial,
-    ground: Ground,
+    grounding: Grounding,
 ) -> Trajectory:
     """Walk on the model from the end of a walk's first tick, adding what it missed of the walk.
 
+    Args:
+        config, robot, command, effect: those of the grounding.
+        weights: any; the gradient is taken with respect to these.
+        grounding: see `fit_grounding`.
+
     Returns:
         Trajectory of T - 1 samples. Nothing raises: read `fallen` and `residual`.
+
+    Source: Eq. 12, 13 and the measured remainder.
     """
 
     @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
@@ -113,9 +125,9 @@ def grounded_rollout(
         after = after._replace(state=state, feet=feet, fallen=fallen)
         return after, sample._replace(state=state, feet=feet.position, fallen=fallen)
 
-    ticks = ground.tick + jnp.arange(len(ground.missed.feet.yaw))
-    _, samples = jax.lax.scan(one, ground.start, (ground.missed, ticks))
-    initial = ground.start.state
+    ticks = grounding.tick + jnp.arange(len(grounding.missed.feet.yaw))
+    _, samples = jax.lax.scan(one, grounding.start, (grounding.missed, ticks))
+    initial = grounding.start.state
     return samples._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
 
 
@@ -126,10 +138,17 @@ def evaluate_grounded(
     weights: Weights,
     command: Command,
     effect: jax.tree_util.Partial,
-    ground: Ground,
+    grounding: Grounding,
     loss: Loss,
 ) -> Evaluation:
-    """Loss of a grounded rollout and its gradient by the weights, as `evaluate` of one."""
+    """Loss of a grounded rollout and its gradient by the weights, as `evaluate` of a plain one.
+
+    Args:
+        config, robot, weights, command, effect, grounding: see `grounded_rollout`.
+        loss: terms and their weights; the changes of the command are those after the first tick.
+
+    Source: Eq. 9, 11.
+    """
     return evaluation(
-        lambda w: grounded_rollout(config, robot, w, command, effect, ground), weights, loss
+        lambda w: grounded_rollout(config, robot, w, command, effect, grounding), weights, loss
     )
