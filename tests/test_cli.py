@@ -560,6 +560,16 @@ def test_a_reader_that_has_enough_is_no_error():
     assert shown.stderr == ""
 
 
+def test_what_a_parser_printed_before_it_exits_needs_no_reader(monkeypatch):
+    """The little that --help prints waits in a buffer until the program ends."""
+    monkeypatch.setenv("PYTHONUNBUFFERED", "")
+    work = "lambda: (time.sleep(0.5), print(1), sys.exit(0))"
+    program = f"import sys, time, hector_jax.core.console as c; sys.exit(c.exit_code('x', {work}))"
+    line = f'{sys.executable} -c "{program}" | true; exit ${{PIPESTATUS[0]}}'
+    shown = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
+    assert (shown.returncode, shown.stderr) == (141, "")
+
+
 @pytest.mark.parametrize(("name", "beside"), [("nominal", "expert"), ("mine", "nominal")])
 def test_the_halves_of_a_film_have_names_of_their_own(monkeypatch, tmp_path, name, beside):
     films = []

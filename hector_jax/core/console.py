@@ -166,7 +166,11 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
     _open_streams()
     try:
         with _stoppable(name):
-            work()
+            try:
+                work()
+            except SystemExit:  # of a parser that has printed its help
+                sys.stdout.flush()
+                raise
             sys.stdout.flush()
     except BrokenPipeError:
         _drop(sys.stdout)
