@@ -14,15 +14,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import spearmanr
 
-from hector_jax.control.weights import DIRECTION_NAMES as NAMES
-from hector_jax.control.weights import Weights, directions, weights_to_vector
+from hector_jax.control.weights import Weights, direction_names, directions, weights_to_vector
 from hector_jax.report.report import markdown_table
 from hector_jax.runs.metrics import Interval, bootstrap
 
 SAG = ("Q_z", "Q_vz", "R_Fz")
 """The weights that a rigid body that sinks, or a robot that floats, depends on most."""
 
-BEYOND_SAG = np.array([name not in SAG for name in NAMES])
+BEYOND_SAG = np.array([name not in SAG for name in direction_names()])
 STEP = float(np.log(1.05))  # of the central differences, in log-weights
 
 
@@ -91,7 +90,7 @@ def compare(
         return agreement(m, s) - agreement(b, s)
 
     cosines, gains = [], []
-    for chosen in (np.ones(len(NAMES), bool), BEYOND_SAG):
+    for chosen in (np.ones(len(direction_names()), bool), BEYOND_SAG):
         m, b, s = model[:, chosen], base[:, chosen], simulator[:, chosen]
         cosines.append(bootstrap(agreement, m, s))
         gains.append(None if command is None else bootstrap(gain, m, b, s))
@@ -103,7 +102,7 @@ def compare(
     return Row(
         *cosines,
         *gains,
-        wrong=NAMES[worst],
+        wrong=direction_names()[worst],
         share=float(apart[worst] / max(apart.sum(), 1e-12)),
         entries=(float(a[worst]), float(b[worst])),
         sizes=sizes,

@@ -33,7 +33,7 @@ from lib import check_names, write_report
 from plots import ARMS
 
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import WEIGHT_NAMES, Weights, expert, nominal, weights_to_vector
+from hector_jax.control.weights import Weights, expert, nominal, weight_names, weights_to_vector
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
@@ -175,7 +175,7 @@ def _walk_case(
         height=np.array([error[:middle].mean(), error[middle:].mean()]),
         fallen=np.asarray(trajectory.fallen.any()),
         residual=np.asarray(trajectory.residual.max()),
-        weights=np.array(weights).reshape(-1, len(WEIGHT_NAMES)),
+        weights=np.array(weights).reshape(-1, len(weight_names())),
         refused=np.array([not s.accepted for s in steps], bool),
         seconds=np.array(spent),
     )
@@ -382,7 +382,7 @@ def report(flags: Flags, walks: Mapping[Case, Walked]) -> Path:
     ]
     numbers = {
         "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
-        "weights": WEIGHT_NAMES,
+        "weights": weight_names(),
         "residual": residual,
         "walks": {
             " / ".join(case): {name: value.tolist() for name, value in row._asdict().items()}
@@ -426,7 +426,7 @@ def _draw(
         ends = window * np.arange(1, 1 + max(map(len, histories.values())))
         file = f"weights-{which}.png"
         caption = plots.weight_histories(
-            flags.out / file, flags.change, ends, WEIGHT_NAMES, histories
+            flags.out / file, flags.change, ends, weight_names(), histories
         )
         captions[file] = f"Start: {which}, plant {names[0]}. {caption}"
     return captions

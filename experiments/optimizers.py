@@ -22,8 +22,8 @@ from scipy.stats import norm
 
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import (
-    DIRECTION_NAMES,
     Weights,
+    direction_names,
     directions,
     vector_to_weights,
     weights_to_vector,
@@ -33,7 +33,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.search.cmaes import CmaSearch, Generation, SearchConfig, log_bounds, project
 from hector_jax.tuning.difftune import Iteration, TuneConfig, step_status, step_weights, tune_step
 
-DIM = len(DIRECTION_NAMES)
+DIM = len(direction_names())
 Steps = Float[np.ndarray, "walks 18"]  # log-weights, less those of the start
 
 

@@ -37,8 +37,8 @@ from hector_jax.control.legs import LegConfig
 from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import (
-    DIRECTION_NAMES,
     Weights,
+    direction_names,
     expert,
     nominal,
     sample_weights,
@@ -203,7 +203,7 @@ def walk_groups(
 
 def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
     """Walks whose losses make the gradients at a weight set: phases, directions, both sides."""
-    steps = alignment.STEP * np.eye(len(DIRECTION_NAMES))
+    steps = alignment.STEP * np.eye(len(direction_names()))
     return [
         Job(scale_weights(point.weights, side * step), point.command, hfs(), start_tick=phase)
         for phase in phases
@@ -359,7 +359,7 @@ def report(flags: Flags, result: Result) -> Path:
     numbers = {
         "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
         "engine": result.engine,
-        "weights": DIRECTION_NAMES,
+        "weights": direction_names(),
         "rows": {
             which: {": ".join(key): alignment.as_result(row) for key, row in of_set.items()}
             for which, of_set in rows.items()
@@ -421,7 +421,9 @@ def _draw(
         if finite.any():
             file = f"gradients-{name}.png"
             models = {kind: rows[finite] for kind, rows in models.items()}
-            caption = plots.gradients(flags.out / file, DIRECTION_NAMES, simulator[finite], models)
+            caption = plots.gradients(
+                flags.out / file, direction_names(), simulator[finite], models
+            )
             captions[file] = f"{name}, {flags.sets[0]} weights. {caption}"
     if ranks:
         keys = [(name, f"{factor:g}") for name in flags.trajectories for factor in FACTORS]

@@ -20,7 +20,7 @@ from hector_jax.cli import arguments, doctor, evaluate
 from hector_jax.cli.flags import COMMANDS, Tune
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
-from hector_jax.control.weights import WEIGHT_NAMES, expert, nominal, weights_to_vector
+from hector_jax.control.weights import expert, nominal, weight_names, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import exit_code
 from hector_jax.core.tree_file import read_card
@@ -384,7 +384,9 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     assert result["sets"]["with"]["standin"]["L"]["mean"] == pytest.approx(np.mean(means))
     assert result["sets"]["with"]["hfs"]["L"]["mean"] > 0.0
     lines = [json.loads(line) for line in Path("both/metrics.jsonl").read_text().splitlines()]
-    at_start = dict(zip(WEIGHT_NAMES, weights_to_vector(load_weights(start)).tolist(), strict=True))
+    at_start = dict(
+        zip(weight_names(), weights_to_vector(load_weights(start)).tolist(), strict=True)
+    )
     assert lines[0]["weights"] == pytest.approx(at_start | {"turn_lead": 0.5})
     assert load_weights(Path("both/weights/with.json")).others["turn_lead"] != 0.5
     assert "- turn_lead: 0.5 at the start" in Path("both/report.md").read_text()

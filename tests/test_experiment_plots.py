@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import plots
 
-from hector_jax.control.weights import DIRECTION_NAMES, WEIGHT_NAMES
+from hector_jax.control.weights import direction_names, weight_names
 
 RNG = np.random.default_rng(1)
 TRUTH = RNG.normal(size=18) + 0.1 * RNG.normal(size=(4, 18))
@@ -33,9 +33,9 @@ def test_tuning_while_walking_is_drawn_with_walks_that_ended_early(tmp_path, dra
     plots.while_walking(tmp_path / "loss.png", 4.0, times, curves)
     assert set(lines(drawn[0].axes[0])["weights stay"][:, 1]) == {3.0}
     assert drawn[0].axes[0].get_ylabel() == "L of 0.4 s [10$^6$]"
-    ratios = np.exp(np.linspace(0.0, 1.0, 20)[:, None] * np.linspace(-1, 1, len(WEIGHT_NAMES)))
+    ratios = np.exp(np.linspace(0.0, 1.0, 20)[:, None] * np.linspace(-1, 1, len(weight_names())))
     plots.weight_histories(
-        tmp_path / "weights.png", 4.0, times, WEIGHT_NAMES, {"straight": ratios, "c": ratios[:7]}
+        tmp_path / "weights.png", 4.0, times, weight_names(), {"straight": ratios, "c": ratios[:7]}
     )
     straight, c = (lines(axes) for axes in drawn[1].axes)
     np.testing.assert_allclose(straight["Q roll"][:, 1], ratios[:, 0])  # it moved most
@@ -111,7 +111,7 @@ def test_pictures_show_survival_ratio_and_newtons_of_sets_of_any_name(tmp_path, 
 
 
 def test_pictures_show_gradients_of_unit_length_and_the_losses_of_both(tmp_path, drawn):
-    plots.gradients(tmp_path / "a.png", DIRECTION_NAMES, TRUTH, {"command": -TRUTH, "net": TRUTH})
+    plots.gradients(tmp_path / "a.png", direction_names(), TRUTH, {"command": -TRUTH, "net": TRUTH})
     bars = {bars.get_label().split(",")[0]: bars for bars in drawn[0].axes[0].containers}
     unit = TRUTH.mean(axis=0) / np.linalg.norm(TRUTH.mean(axis=0))
     for name, sign in (("hfs", 1), ("command", -1), ("net", 1)):

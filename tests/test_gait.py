@@ -60,7 +60,7 @@ def test_time_since_switch_restarts_at_every_switch():
     np.testing.assert_allclose(since, 0.01 * (np.arange(60) % 20))
 
 
-@pytest.mark.parametrize("wrong", [{"tick": 0.0}, {"swing": 0}, {"stance": 10}, {"stance": 21}])
+@pytest.mark.parametrize("wrong", [{"tick": 0.0}, {"swing": -1}, {"stance": 10}, {"stance": 21}])
 def test_impossible_gaits_are_refused(wrong):
     with pytest.raises(ValueError, match="GaitConfig"):
         GaitConfig(**wrong)

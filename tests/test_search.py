@@ -8,7 +8,7 @@ import pytest
 
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
-    DIRECTION_NAMES,
+    direction_names,
     expert,
     nominal,
     scale_weights,
@@ -133,7 +133,7 @@ def test_numbers_beside_the_weights_stay_and_belong_to_the_record(tmp_path):
 
 def test_what_is_asked_lies_in_the_box_and_treats_both_feet_alike(tmp_path):
     step = np.zeros(18)
-    step[DIRECTION_NAMES.index("Q_x")] = np.log(1e4 / 50.0)  # at the upper edge
+    step[direction_names().index("Q_x")] = np.log(1e4 / 50.0)  # at the upper edge
     start = jax.tree.map(np.clip, scale_weights(nominal(), step), *bounds())
     low, high = (np.asarray(weights_to_vector(w)) for w in bounds())
     seen = []

@@ -169,7 +169,7 @@ class Share(NamedTuple):
     share: jax.Array  # (2,) of the force and of the moment
 
 
-def init_share(key, hidden=()):
+def init_share(key, feet=2, hidden=()):
     return Share(jnp.ones(2))
 
 

@@ -93,8 +93,8 @@ class Step(NamedTuple):
 
     state: State  # rows (3, 12) that read each part of the state
     reference: State  # where it should be
-    contact: Bool[Array, "2"]  # which feet stood in the step
-    lever: Float[Array, "2 3"]  # foot points from the centre of mass as planned [m]
+    contact: Bool[Array, " feet"]  # which stood in the step
+    lever: Float[Array, "feet 3"]  # foot points from the centre of mass as planned [m]
 
 
 class Rows(NamedTuple):

@@ -23,7 +23,7 @@ from hector_jax.control.footstep import (
     feet_where,
     touchdown_points,
 )
-from hector_jax.control.gait import GaitConfig
+from hector_jax.control.gait import PATTERNS, GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
 from hector_jax.control.parameters import TUNABLES, Parameters
@@ -31,7 +31,7 @@ from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import check, from_table
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_poses
@@ -92,6 +92,13 @@ def walk_config(robot: Robot) -> WalkConfig:
     given = {name: dict(section) for name, section in robot.description.control}
     given["mpc"] = {"contact": robot.structure.contact, **given.get("mpc", {})}
     config = from_table(path, WalkConfig, given)
+    feet = len(robot.foot_point)
+    if len(config.gait.offsets) != feet:
+        fitting = [name for name, offsets in PATTERNS.items() if len(offsets) == feet]
+        raise InputError(
+            f"{path}: gait.pattern must be one of {feet} feet ({', '.join(fitting)}, or {feet} "
+            f"numbers), got {short_repr(config.gait.pattern)}"
+        )
     try:
         config.legs.check_joints(robot.description.leg_joints)
     except InputError as error:
@@ -109,9 +116,9 @@ class Plan(NamedTuple):
     """What holds over a tick."""
 
     wrench: Wrench  # commanded, world frame
-    contact: Bool[Array, "*batch 2"]
+    contact: Bool[Array, "*batch feet"]
     touchdown: Feet  # where each foot next comes down
-    swing_ticks: Int[Array, "*batch 2"]  # since lift-off
+    swing_ticks: Int[Array, "*batch feet"]  # since lift-off
     residual: Float[Array, "*batch"]  # worst relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
 
@@ -125,8 +132,9 @@ class Retune(NamedTuple):
 
 
 def contacts_needed(config: WalkConfig, tick: int) -> int:
-    """Feet that may stand at once in a plan: 2 before the gait starts or with double support."""
-    return 2 if tick < config.gait.first_tick or config.gait.double_support else 1
+    """Feet that may stand at once in a plan: all of them before the gait starts."""
+    gait = config.gait
+    return len(gait.offsets) if tick < gait.first_tick else gait.most_contacts
 
 
 def plan_horizon(
@@ -299,7 +307,7 @@ def actuate(
         start=memory.liftoff,
         end=plan.touchdown,
         elapsed=plan.swing_ticks * config.gait.tick + TIME_STEP * substep,
-        swing=config.gait.tick * config.gait.swing,
+        swing=config.gait.tick * max(config.gait.swing, 1),
     )
     return legs.joint_torques(
         robot,

@@ -8,6 +8,7 @@ a velocity feedback and the lean of a turn (Raibert's rule with the capture-poin
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
@@ -21,11 +22,11 @@ from hector_jax.robot.model import Robot
 class Feet(NamedTuple):
     """Foot points in the world and where they point."""
 
-    position: Float[Array, "*batch 2 3"]  # [m]
-    yaw: Float[Array, "*batch 2"]  # [rad]
+    position: Float[Array, "*batch feet 3"]  # [m]
+    yaw: Float[Array, "*batch feet"]  # [rad]
 
 
-def feet_where(stands: Bool[Array, "2"], yes: Feet, no: Feet) -> Feet:
+def feet_where(stands: Bool[Array, " feet"], yes: Feet, no: Feet) -> Feet:
     """`yes` for the feet that stand, `no` for the others."""
     position = jnp.where(stands[:, None], yes.position, no.position)
     return Feet(position, jnp.where(stands, yes.yaw, no.yaw))
@@ -64,7 +65,7 @@ def touchdown_points(
     *,
     state: State,
     reference: State,
-    remaining: Float[Array, "2"],
+    remaining: Float[Array, " feet"],
     stance: float,
     swing: float,
 ) -> Feet:
@@ -72,7 +73,7 @@ def touchdown_points(
 
     Args:
         config: the rule.
-        robot: gravity, for the lean in a turn.
+        robot: places of the feet along the trunk, and gravity for the lean in a turn.
         parameters: its numbers.
         state: base now.
         reference: where the base should be now, for the commanded velocity and yaw rate.
@@ -84,11 +85,12 @@ def touchdown_points(
     """
     if config.rule == "paper":
         point = state.position + state.velocity * swing / 2
-        points = jnp.stack([point, point])
-        return Feet(points.at[:, 2].set(0.0), jnp.full(2, state.euler[2]))
+        points = jnp.broadcast_to(point, (len(remaining), 3))
+        return Feet(points.at[:, 2].set(0.0), jnp.full(len(remaining), state.euler[2]))
     yaw = state.euler[2] + reference.ang_velocity[2] * (remaining + stance / 2)
-    side = parameters.width * jnp.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-    hips = jnp.stack([rot_z(yaw[0]) @ side[0], rot_z(yaw[1]) @ side[1]])
+    outwards = parameters.width * jnp.tile(jnp.array([1.0, -1.0]), len(yaw) // 2)
+    hips = jnp.stack([jnp.asarray(robot.foot_ahead), outwards, jnp.zeros(len(yaw))], axis=1)
+    hips = jnp.einsum("fxy,fy->fx", jax.vmap(rot_z)(yaw), hips)
     lean = jnp.cross(state.velocity, reference.ang_velocity) * state.position[2] / robot.gravity[2]
     # Far ahead (a foot that still stands) the sway of this moment says nothing: the commanded
     # velocity carries on from the next step.

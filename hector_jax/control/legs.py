@@ -95,10 +95,10 @@ def stance_torques(
 
 def swing_path(
     parameters: LegParameters,
-    start: Float[Array, "2 3"],
-    end: Float[Array, "2 3"],
-    s: Float[Array, "2"],
-) -> Float[Array, "2 3"]:
+    start: Float[Array, "feet 3"],
+    end: Float[Array, "feet 3"],
+    s: Float[Array, " feet"],
+) -> Float[Array, "feet 3"]:
     """Foot points [m] at share s of the swing: smooth in the plane, up and down to `landing`."""
     smooth = (s * s * (3.0 - 2.0 * s))[:, None]
     point = start + smooth * (end - start)
@@ -116,7 +116,7 @@ def swing_joints(
     *,
     start: Feet,
     end: Feet,
-    elapsed: Float[Array, "2"],
+    elapsed: Float[Array, " feet"],
     swing: float,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
     """Joint angles [rad] and rates [rad/s] that carry the feet along their swing paths.
@@ -134,7 +134,7 @@ def swing_joints(
         local = (target - trunk) @ R_wb
         turn = wrap_angle(end.yaw - start.yaw)
         yaw = wrap_angle(start.yaw + s * s * (3.0 - 2.0 * s) * turn - state.euler[2])
-        up = jnp.stack([R_wb[2], R_wb[2]])  # the soles are level
+        up = jnp.broadcast_to(R_wb[2], local.shape)  # the soles are level
         return inverse_legs(robot, local, yaw, up, measurement.joints)
 
     return jax.jvp(angles, (jnp.zeros(()),), (jnp.ones(()),))
@@ -145,7 +145,7 @@ def joint_torques(
     parameters: LegParameters,
     measurement: Measurement,
     *,
-    contact: Bool[Array, "2"],
+    contact: Bool[Array, " feet"],
     wrench: Wrench,
     target: Float[Array, " joints"],
     target_rates: Float[Array, " joints"],
@@ -153,7 +153,9 @@ def joint_torques(
     """Torque commands [N m] within the limits: stance legs push, swing legs follow their target."""
     state, joints, joint_rates = measurement
     weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
-    kp, kd = (jnp.tile(jnp.asarray(gains), 2) for gains in (parameters.kp, parameters.kd))
+    kp, kd = (
+        jnp.tile(jnp.asarray(gains), len(contact)) for gains in (parameters.kp, parameters.kd)
+    )
     swing = kp * (target - joints) + kd * (target_rates - joint_rates) + weight
     stance = stance_torques(robot, state, joints, wrench)
     stance = stance + parameters.gravity_compensation * weight

@@ -108,9 +108,9 @@ class Horizon(NamedTuple):
 
     reference: State  # (N, 3) each, at the end of each step
     euler: Float[Array, "N 3"]  # to linearise about [rad]
-    lever: Float[Array, "N 2 3"]  # centre of mass to foot points [m]
-    foot_yaw: Float[Array, "N 2"]  # [rad]
-    contact: Bool[Array, "N 2"]
+    lever: Float[Array, "N feet 3"]  # centre of mass to foot points [m]
+    foot_yaw: Float[Array, "N feet"]  # [rad]
+    contact: Bool[Array, "N feet"]
 
 
 class MpcProblem(NamedTuple):
@@ -125,8 +125,8 @@ class MpcProblem(NamedTuple):
 class Condensed(NamedTuple):
     """The states as functions of the inputs v: x = free + map v."""
 
-    feet: Float[Array, "N contacts 2"]  # which foot takes each contact
-    inputs: Float[Array, "N 12 b"]  # G_k with u_k = G_k v_k
+    feet: Float[Array, "N contacts feet"]  # which foot takes each contact
+    inputs: Float[Array, "N u b"]  # G_k with u_k = G_k v_k
     turn: Float[Array, "N 3 b"]  # angular velocity gained in a step by its inputs
     push: Float[Array, "N 3 b"]  # velocity gained
     angles: Float[Array, "N N 3 3"]  # after step k by an angular velocity gained in step j
@@ -135,11 +135,17 @@ class Condensed(NamedTuple):
     free: State  # (N, 3) each, without inputs
 
 
-def _feet_of_contacts(contact: Float[Array, "2"], max_contacts: int) -> Float[Array, "contacts 2"]:
-    """Which foot takes each contact, as rows of a selection matrix; zero where there is none."""
-    if max_contacts == 2:
+def _feet_of_contacts(
+    contact: Float[Array, " feet"], max_contacts: int
+) -> Float[Array, "contacts feet"]:
+    """Which foot takes each contact, as rows of a selection matrix; zero where there is none.
+
+    Contact c is that of the c-th foot that stands; where all may stand, each has its own.
+    """
+    if max_contacts == len(contact):
         return jnp.diag(contact)
-    return jnp.stack([contact[0], contact[1] * (1.0 - contact[0])])[None]
+    before = jnp.cumsum(contact) - contact  # feet that stand, of those with a lower number
+    return contact * (before == jnp.arange(max_contacts)[:, None])
 
 
 def _double_integrator(N: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
@@ -149,12 +155,12 @@ def _double_integrator(N: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _input_map(
-    model: ContactModel, feet: Float[Array, "contacts 2"], foot_yaw: Float[Array, "2"]
-) -> Float[Array, "12 b"]:
+    model: ContactModel, feet: Float[Array, "contacts feet"], foot_yaw: Float[Array, " feet"]
+) -> Float[Array, "u b"]:
     """G with u = G v: the inputs of the contacts to the paper's u."""
-    force, moment = jax.vmap(model.wrench)(foot_yaw)  # (2, 3, inputs)
+    force, moment = jax.vmap(model.wrench)(foot_yaw)  # (feet, 3, inputs)
     parts = [jnp.einsum("sf,fxi->fxsi", feet, part) for part in (force, moment)]
-    return jnp.stack(parts).reshape(12, -1)
+    return jnp.stack(parts).reshape(6 * len(foot_yaw), -1)
 
 
 def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int) -> Condensed:
@@ -183,6 +189,12 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     return Condensed(feet, G, turn, push, angles, later, travel, free)
 
 
+def _input_weights(weights: Weights) -> Float[Array, " u"]:
+    """R of the paper's u; feet that exert no moment have no weights of one."""
+    force, moment = weights.R
+    return pack_wrench(Wrench(force, moment if moment.size else jnp.zeros_like(force)))
+
+
 def cost(
     config: MpcConfig, problem: MpcProblem, condensed: Condensed
 ) -> tuple[Float[Array, "n n"], Float[Array, "N b"]]:
@@ -190,7 +202,7 @@ def cost(
     robot, parameters, _, horizon = problem
     feet, G, turn, push, angles, later, travel, free = condensed
     N, b, dtype = config.horizon, G.shape[-1], later.dtype
-    Q, R = parameters.weights.Q, pack_wrench(Wrench(*parameters.weights.R))
+    Q, R = parameters.weights.Q, _input_weights(parameters.weights)
     error = jax.tree.map(lambda x, target, w: w * (x - target), free, horizon.reference, Q)
     effort = jnp.einsum("kui,u,kuj->kij", G, R, G)
     empty = jnp.repeat(1.0 - feet.sum(-1), config.contact_model.inputs, axis=-1)
@@ -208,7 +220,9 @@ def cost(
     force = travel.T @ error.position + later.T @ error.velocity
     q = jnp.einsum("jxb,jx->jb", turn, torque) + jnp.einsum("jxb,jx->jb", push, force)
     share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
-    weight = jnp.zeros((N, 12), dtype).at[:, 2].set(share).at[:, 5].set(share)
+    up = np.zeros((2, horizon.contact.shape[1], 3))  # of forces and moments
+    up[0, :, 2] = 1.0
+    weight = share[:, None] * jnp.asarray(up.ravel(), dtype)
     q = q - parameters.effort_reference * jnp.einsum("kui,u,ku->ki", G, R, weight)
     return P, q
 
@@ -259,7 +273,7 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 
 def build_qp(
     config: MpcConfig, problem: MpcProblem, *, dt: float, max_contacts: int
-) -> tuple[QP, Float[Array, "12 b"]]:
+) -> tuple[QP, Float[Array, "u b"]]:
     """The MPC as a condensed QP, and the map from the first step's inputs to u_0.
 
     Args:

@@ -79,14 +79,16 @@ TUNABLES = {
 """What can be tuned beside Q and R, by the names that `Weights.others` has for them."""
 
 
-def bounds(others: Iterable[str] = ()) -> tuple[Weights, Weights]:
+def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Weights, Weights]:
     """Box Theta of feasible weights, lower and upper, with that of `others`.
+
+    The weights are shaped as those of `like`, by default HECTOR's.
 
     >>> lower, upper = bounds(["turn_lead"])
     >>> lower.Q.euler.tolist(), upper.others
     ([0.01, 0.01, 0.01], {'turn_lead': 2.0})
     """
-    like, others = nominal(), tuple(others)
+    like, others = like or nominal(), tuple(others)
 
     def side(name: str) -> Weights:
         return Weights(

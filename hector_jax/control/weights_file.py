@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from hector_jax.control.parameters import TUNABLES
-from hector_jax.control.weights import Weights
+from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.settings import Range, read_json, validation_error
-from hector_jax.core.trajectory import State, Wrench
+from hector_jax.core.trajectory import State
 from hector_jax.robot.model import Robot
 
 WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
@@ -26,7 +26,7 @@ def weights_tree(weights: Weights) -> dict[str, Any]:
     """
     parts = {"Q": weights.Q._asdict(), "R": weights.R._asdict(), "others": weights.others}
     return {
-        part: {name: np.asarray(value).tolist() for name, value in tree.items()}
+        part: {name: np.asarray(value).tolist() for name, value in tree.items() if np.size(value)}
         for part, tree in parts.items()
         if tree
     }
@@ -49,7 +49,9 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
 
     Args:
         path: JSON file.
-        robot: that they are for, HECTOR by default; gains have a number for each joint of its legs.
+        robot: that they are for, HECTOR by default: R has a row for each of its feet, no moment of
+            point feet (one that is there is not read), and gains have a number for each joint of a
+            leg.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, unknown, of the wrong
@@ -59,10 +61,13 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
     tree = read_json(path, "weights", _MOST_WEIGHTS, object_pairs_hook=_no_twins)
     if isinstance(tree, dict):
         tree.pop("$schema", None)  # for editors; what is in a file is checked here
+    like = nominal(robot)
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
-        "Q": dict.fromkeys(State._fields, (3,)),
-        "R": dict.fromkeys(Wrench._fields, (2, 3)),
+        part: {name: w.shape for name, w in getattr(like, part)._asdict().items() if w.size}
+        for part in ("Q", "R")
     }
+    if "moment" not in shapes["R"] and isinstance(tree, dict) and isinstance(tree.get("R"), dict):
+        tree["R"].pop("moment", None)
     others = tree.pop("others", {}) if isinstance(tree, dict) else {}
     _check_keys(path, tree, shapes.keys(), "")
     values = {}
@@ -72,7 +77,8 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
             name: _numbers(path, f"{part}.{name}", tree[part][name], shape, WEIGHTS)
             for name, shape in entries.items()
         }
-    return Weights(State(**values["Q"]), Wrench(**values["R"]), _others(path, others, robot))
+    Q, R = State(**values["Q"]), like.R._replace(**values["R"])
+    return Weights(Q, R, _others(path, others, robot))
 
 
 def _others(path: Path, others: Any, robot: Robot | None) -> dict[str, np.ndarray]:

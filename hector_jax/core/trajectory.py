@@ -1,9 +1,9 @@
 """What is walked: state, wrench and trajectory, and the one place that packs them into x and u.
 
 Frames: everything is in the world frame. A wrench is that of the ground on the robot, at the foot
-point (on the sole, under the ankle axis), left foot then right. The paper's state is x = [e; p;
-omega; v; g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3). Arrays are
-of the host (numpy) or of a device.
+point (on the sole, under the ankle axis), in the order of `FEET`. The paper's state is x = [e; p;
+omega; v; g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3); f feet have
+6 f. Arrays are of the host (numpy) or of a device.
 """
 
 from typing import Any, NamedTuple
@@ -15,6 +15,12 @@ from jaxtyping import Bool, Float
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
+
+FEET = {
+    2: ("left", "right"),
+    4: ("front_left", "front_right", "hind_left", "hind_right"),
+}
+"""Feet of a robot by their number: pairs, the left one first."""
 
 MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen
 SOLVED = 1e-6  # worst relative KKT residual of a plan that counts: is learned from, is a result
@@ -33,8 +39,8 @@ class State(NamedTuple):
 class Wrench(NamedTuple):
     """Force and moment of the ground on each foot at its foot point, world frame."""
 
-    force: Float[Any, "*batch 2 3"]  # [N], left then right
-    moment: Float[Any, "*batch 2 3"]  # [N m]
+    force: Float[Any, "*batch feet 3"]  # [N]
+    moment: Float[Any, "*batch feet 3"]  # [N m]
 
 
 class Load(NamedTuple):
@@ -56,21 +62,21 @@ class Trajectory(NamedTuple):
     initial: State  # true state at t = 0, batch axes only
     state: State  # (T, 3) each
     reference: State  # (T, 3) each
-    command: Wrench  # (T, 2, 3) each, what the MPC asked for
-    effect: Wrench  # (T, 2, 3) each, what the ground returned
-    contact: Bool[Any, "*batch T 2"]  # planned stance
-    feet: Float[Any, "*batch T 2 3"]  # foot points [m]
-    joints: Float[Any, "*batch T joints"]  # [rad] left leg, then right, from the trunk down
+    command: Wrench  # (T, feet, 3) each, what the MPC asked for
+    effect: Wrench  # (T, feet, 3) each, what the ground returned
+    contact: Bool[Any, "*batch T feet"]  # planned stance
+    feet: Float[Any, "*batch T feet 3"]  # foot points [m]
+    joints: Float[Any, "*batch T joints"]  # [rad] leg by leg, from the trunk down
     fallen: Bool[Any, "*batch T"]  # true from the sample of the fall on
     legs_touch: Bool[Any, "*batch T"]  # one leg touched the other, which is no fall
     residual: Float[Any, "*batch T"]  # worst relative KKT residual of the plan in force
 
 
-def no_samples(joints: int, *batch: int) -> Trajectory:
+def no_samples(joints: int, feet: int, *batch: int) -> Trajectory:
     """Walks of no samples (numpy), with leading axes `batch`: the layout of walks in a file."""
     zeros = lambda *shape: np.zeros((*batch, *shape))  # noqa: E731
     state = State(*[zeros(0, 3)] * 4)
-    wrench = Wrench(zeros(0, 2, 3), zeros(0, 2, 3))
+    wrench = Wrench(zeros(0, feet, 3), zeros(0, feet, 3))
     return Trajectory(
         period=zeros(),
         initial=State(*[zeros(3)] * 4),
@@ -78,8 +84,8 @@ def no_samples(joints: int, *batch: int) -> Trajectory:
         reference=state,
         command=wrench,
         effect=wrench,
-        contact=zeros(0, 2),
-        feet=zeros(0, 2, 3),
+        contact=zeros(0, feet),
+        feet=zeros(0, feet, 3),
         joints=zeros(0, joints),
         fallen=zeros(0),
         legs_touch=zeros(0),
@@ -123,21 +129,21 @@ def has_fallen(
     return low | tilted | ~finite
 
 
-def pack_wrench(wrench: Wrench) -> Float[Array, "12"]:
-    """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3).
+def pack_wrench(wrench: Wrench) -> Float[Array, " inputs"]:
+    """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3), likewise of more feet.
 
     >>> left = Wrench(jnp.array([[1.0, 2, 3], [0, 0, 0]]), jnp.array([[4.0, 5, 6], [0, 0, 0]]))
     >>> pack_wrench(left).tolist()
     [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 4.0, 5.0, 6.0, 0.0, 0.0, 0.0]
     """
-    return jnp.concatenate([wrench.force.reshape(6), wrench.moment.reshape(6)])
+    return jnp.concatenate([wrench.force.reshape(-1), wrench.moment.reshape(-1)])
 
 
-def unpack_wrench(u: Float[Array, "12"]) -> Wrench:
-    """Wrench of u = [F_0; F_1; M_0; M_1]."""
-    return Wrench(u[:6].reshape(2, 3), u[6:].reshape(2, 3))
+def unpack_wrench(u: Float[Array, " inputs"]) -> Wrench:
+    """Wrench of u = [F_0; F_1; M_0; M_1], likewise of more feet."""
+    return Wrench(*u.reshape(2, -1, 3))
 
 
-def zero_wrench() -> Wrench:
-    """No wrench on either foot."""
-    return Wrench(jnp.zeros((2, 3)), jnp.zeros((2, 3)))
+def zero_wrench(feet: int = 2) -> Wrench:
+    """No wrench on any foot."""
+    return Wrench(jnp.zeros((feet, 3)), jnp.zeros((feet, 3)))

@@ -77,7 +77,7 @@ def collect(
     made_with = json.loads(json.dumps({"interval": interval, **(settings or {})}))
     facts = {
         "units": _UNITS,
-        "frames": "world; wrench of the ground on the foot at its foot point, left then right",
+        "frames": "world; wrench of the ground on each foot at its foot point, left feet first",
         "settings": made_with,
         **(about or {}),
     }
@@ -174,5 +174,5 @@ def _load_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) ->
 def walks_like(robot: Robot) -> Walks:
     """Shapes in a file of a robot; axes of length 0 are walks and ticks."""
     (job,) = draw_jobs(0, 1, robot=robot)
-    samples = no_samples(len(robot.joint_lower), 0)
+    samples = no_samples(len(robot.joint_lower), len(robot.foot_point), 0)
     return Walks(jax.tree.map(lambda x: np.zeros((0, *np.shape(x))), job), samples)

@@ -31,14 +31,21 @@ ALONG = np.array([1.0, -1.0, 1.0])  # mirror, left for right: of positions, velo
 ACROSS = -ALONG  # and of angles, angular velocities, moments
 
 
+def partners(feet: int) -> Int[np.ndarray, " feet"]:
+    """The other foot of each foot's pair, which is its mirror image."""
+    return np.arange(feet) ^ 1
+
+
 class Dataset(NamedTuple):
     """Samples of phi, n of them; those of one walk follow one another in time."""
 
     window: Window  # what phi may look at, yaw frame
-    label: Wrench  # (n, 2, 3) each, mean effect over the tick, yaw frame
+    label: Wrench  # (n, feet, 3) each, mean effect over the tick, yaw frame
     legs: Load  # (n, 3) each, what moved the rigid body beside the effect, yaw frame
-    touchdown_error: Float[Array, "n 2 3"]  # [m] from planned touchdown to where it is, yaw frame
-    lands: Bool[Array, "n 2"]  # whether the foot touches down at the end of the tick
+    touchdown_error: Float[
+        Array, "n feet 3"
+    ]  # [m] from planned touchdown to where it is, yaw frame
+    lands: Bool[Array, "n feet"]  # whether the foot touches down at the end of the tick
     state: State  # (n, 3) each, true state at the start of the tick, world frame
     walk: Int[Array, " n"]  # which walk
     tick: Int[Array, " n"]  # which tick of it
@@ -180,12 +187,12 @@ def _samples(
 
 def _planned_touchdowns(
     config: WalkConfig, robot: Robot, state: State, reference: State, tick: Int[Array, " n"]
-) -> Float[Array, "n 2 3"]:
+) -> Float[Array, "n feet 3"]:
     """Where the controller would have had the feet touch down, by the true state at each tick."""
     period = config.gait.tick
     times = {"stance": period * config.gait.stance, "swing": period * config.gait.swing}
 
-    def at(state: State, reference: State, tick: Int[Array, ""]) -> Float[Array, "2 3"]:
+    def at(state: State, reference: State, tick: Int[Array, ""]) -> Float[Array, "feet 3"]:
         remaining = period * gait.ticks_to_touchdown(config.gait, tick)
         rule = partial(touchdown_points, config.footstep, robot, config.footstep.parameters)
         return rule(state=state, reference=reference, remaining=remaining, **times).position
@@ -199,9 +206,11 @@ def with_mirror(dataset: Dataset) -> Dataset:
     The image of a sample belongs to the same walk, so that a split by walk stays one. What a plant
     has on one side only, such as the gain of a motor, it then has on the other.
     """
+    other = partners(dataset.lands.shape[1])
 
     def flip(wrench: Wrench) -> Wrench:
-        return Wrench(wrench.force[..., ::-1, :] * ALONG, wrench.moment[..., ::-1, :] * ACROSS)
+        force, moment = (part[..., other, :] for part in wrench)
+        return Wrench(force * ALONG, moment * ACROSS)
 
     def flip_state(state: State) -> State:
         return State(
@@ -215,13 +224,13 @@ def with_mirror(dataset: Dataset) -> Dataset:
     image = dataset._replace(
         window=window._replace(
             commands=flip(window.commands),
-            contact=window.contact[:, ::-1],
+            contact=window.contact[:, other],
             base=flip_state(window.base),
         ),
         label=flip(dataset.label),
         legs=Load(dataset.legs.force * ALONG, dataset.legs.torque * ACROSS),
-        touchdown_error=dataset.touchdown_error[:, ::-1] * ALONG,
-        lands=dataset.lands[:, ::-1],
+        touchdown_error=dataset.touchdown_error[:, other] * ALONG,
+        lands=dataset.lands[:, other],
         state=flip_state(dataset.state),
     )
     return jax.tree.map(lambda *both: np.concatenate(both), dataset, image)

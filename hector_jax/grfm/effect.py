@@ -23,8 +23,8 @@ HISTORY = 3  # commands in a window: the current one and two before it
 class Window(NamedTuple):
     """What phi may look at, in the robot's yaw frame at the tick."""
 
-    commands: Wrench  # (HISTORY, 2, 3) each, newest first
-    contact: Bool[Array, "*batch 2"]  # planned stance
+    commands: Wrench  # (HISTORY, feet, 3) each, newest first
+    contact: Bool[Array, "*batch feet"]  # planned stance
     since_switch: Float[Array, "*batch"]  # [s] since the last planned change of contact
     base: State  # at the start of the tick, see `from_yaw_frame`
 
@@ -34,7 +34,7 @@ class Effect(NamedTuple):
 
     wrench: Wrench  # of the ground on each foot
     legs: Load  # of the moving legs on the trunk; zero where phi does not model it
-    touchdown_error: Float[Array, "*batch 2 3"]  # [m] from planned touchdown to true one
+    touchdown_error: Float[Array, "*batch feet 3"]  # [m] from planned touchdown to true one
 
 
 class Phi(NamedTuple):
@@ -46,7 +46,7 @@ class Phi(NamedTuple):
 
     name: str  # in flags; a file of its parameters is of the kind `grfm-<name>`
     params: type  # of the parameters, a NamedTuple that no other variant uses
-    init: Callable[..., Any]  # (key, hidden=widths of the layers) -> params
+    init: Callable[..., Any]  # (key, feet, hidden=widths of the layers) -> params
     # (nets.FitConfig, training, validation Dataset, progress) -> (params, nets.History)
     fit: Callable[..., tuple[Any, Any]]
     apply: Callable[[Any, Window], Effect]

@@ -7,7 +7,7 @@ Three maps, each fitted to what the high-fidelity simulator shows:
 - **legs**: the push that the moving legs give the trunk, which a rigid body cannot know: a bias of
   the tick, and terms in the motion of the base and in the latest changes of the commands.
 - **touchdown**: how far from its planned touchdown a foot lands: a bias, and terms in the motion of
-  the base and in the horizontal force commanded on the other foot, which accelerates the base and
+  the base and in the horizontal force commanded on the other feet, which accelerates the base and
   so moves the planned point. A swinging leg sags and lags, so the lever of its force is not the
   planned one. The fit is robust, because a robot that is about to fall lands anywhere.
 
@@ -17,7 +17,8 @@ wrench is that which walking needs, whatever was commanded. A regression on the 
 this as a ground that hardly answers, and the body of the rollout cannot hold itself on such ground.
 Changes of the command within 20 ms are too quick for that loop.
 
-Each foot sees the walk as if it were the left one, so a mirrored window has the mirrored effect.
+Each foot sees the walk as if it were a left one, so a mirrored window has the mirrored effect. Each
+pair of feet has maps of its own.
 """
 
 from typing import NamedTuple
@@ -25,84 +26,95 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Key
+from jaxtyping import Bool, Float, Int, Key
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Load, Wrench
-from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset
+from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset, partners
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, in_dtype_of
 from hector_jax.grfm.nets import NO_EPOCHS
 
-CHANGES = 12 * (HISTORY - 1)  # of the commands of both feet from tick to tick
 MOTION = 3  # of the base: yaw rate, forward and sideways velocity
-TOUCHDOWN = MOTION + 2  # and the force on the other foot, forward and sideways
+TOUCHDOWN = 1 + MOTION + 2  # and one; and the force on the other feet, forward and sideways
 GATES = (0.0, 0.01, 0.03, 0.08, 0.19)  # [s] after a switch, where the terms of the legs may differ
 RIDGE, RIDGE_MOTION = 0.03, 1e-3  # penalty on standardised terms, relative to the number of samples
 HUBER, HUBER_ROUNDS = 2.0, 20  # where errors count linearly, in medians of the error
-_SIGNS = np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])])  # of force and moment, by foot
 _FLOOR = 0.05  # least scale of a change, relative to the largest of its kind
 
 
+def changes_seen(feet: int) -> int:
+    """Changes from tick to tick of the commands of all feet."""
+    return 6 * feet * (HISTORY - 1)
+
+
+def signs(feet: int) -> Float[np.ndarray, "feet 6"]:
+    """Of force and moment as each foot sees them: those of right feet are mirrored."""
+    return np.tile(np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])]), (feet // 2, 1))
+
+
 class View(NamedTuple):
-    """What a foot sees of a window; the right one sees the mirror image."""
+    """What a foot sees of a window; a right one sees the mirror image."""
 
     command: Float[Array, "*batch 6"]  # force and moment on it, newest
-    changes: Float[Array, "*batch changes"]  # of the commands, newest first; its own, the other's
+    others: Float[Array, "*batch 2"]  # force on the other feet together, forward and sideways
+    changes: Float[Array, "*batch changes"]  # of commands, newest first: its own, its partner's, ..
     motion: Float[Array, "*batch 3"]  # of the base
     stands: Bool[Array, "*batch"]  # planned
-    alone: Bool[Array, "*batch"]  # it stands and the other foot swings
+    alone: Bool[Array, "*batch"]  # it stands and its partner swings
+    kind: Int[Array, "*batch"]  # swing and stance of the first pair, then of the next
 
 
 class GatedMap(NamedTuple):
-    """The three maps; the axis of 2 is swing, stance, that of 6 force and moment (torque)."""
+    """The three maps; a kind is that of a `View`, 6 are force and moment (torque)."""
 
     ticks: Float[Array, " ticks"]  # [s] after a switch, where a bias is given
     gates: Float[Array, " gates"]  # [s] after a switch, where terms of the legs are given
-    bias: Float[Array, "2 ticks 6"]
-    changes: Float[Array, "2 changes 6"]
-    legs_bias: Float[Array, "ticks 6"]
-    legs: Float[Array, "gates terms 6"]  # of motion, then changes
-    touchdown: Float[Array, "terms 3"]  # [m] of 1, motion, force on the other foot
+    bias: Float[Array, "kinds ticks 6"]
+    changes: Float[Array, "kinds changes 6"]
+    legs_bias: Float[Array, "ticks pushes"]  # 6 of each pair
+    legs: Float[Array, "gates terms pushes"]  # of motion, then changes; likewise
+    touchdown: Float[Array, "terms shifts"]  # 3 of each pair [m]; of 1, motion, force on others
 
 
-def init(key: Key[Array, ""], hidden: tuple[int, ...] = ()) -> GatedMap:
+def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()) -> GatedMap:
     """A map to nothing; the axis of ticks has length 0."""
     del key, hidden
+    pairs, changes = feet // 2, changes_seen(feet)
     return GatedMap(
         ticks=jnp.zeros(0),
         gates=jnp.zeros(len(GATES)),
-        bias=jnp.zeros((2, 0, 6)),
-        changes=jnp.zeros((2, CHANGES, 6)),
-        legs_bias=jnp.zeros((0, 6)),
-        legs=jnp.zeros((len(GATES), CHANGES + MOTION, 6)),
-        touchdown=jnp.zeros((1 + TOUCHDOWN, 3)),
+        bias=jnp.zeros((feet, 0, 6)),
+        changes=jnp.zeros((feet, changes, 6)),
+        legs_bias=jnp.zeros((0, pairs * 6)),
+        legs=jnp.zeros((len(GATES), changes + MOTION, pairs * 6)),
+        touchdown=jnp.zeros((TOUCHDOWN, pairs * 3)),
     )
 
 
 def views(window: Window) -> View:
-    """What the left and the right foot see (leading axis 2) of one window."""
-    dtype = window.commands.force.dtype
+    """What each foot sees of one window; the feet are the leading axis."""
+    dtype, feet = window.commands.force.dtype, len(window.contact)
+    both = jnp.concatenate(window.commands, axis=-1)  # (HISTORY, feet, 6)
 
     def own(foot: int) -> View:
-        along, across = (jnp.asarray(s if foot else np.ones(3), dtype) for s in (ALONG, ACROSS))
-        both = [
-            jnp.concatenate(
-                [window.commands.force[:, f] * along, window.commands.moment[:, f] * across], axis=1
-            )
-            for f in (foot, 1 - foot)
-        ]
-        base = window.base
-        motion = (base.ang_velocity * across)[2:], (base.velocity * along)[:2]
+        sign = jnp.asarray(signs(feet)[foot], dtype)
+        # its own pair first, and of each pair first the foot on its own side
+        order = (np.arange(feet) ^ foot % 2).reshape(-1, 2)
+        order = np.roll(order, -(foot // 2), axis=0).ravel()
+        seen, base = both[:, order] * sign, window.base
+        motion = (base.ang_velocity * sign[3:])[2:], (base.velocity * sign[:3])[:2]
         stands = window.contact[foot]
         return View(
-            command=both[0][0],
-            changes=jnp.concatenate([(w[:-1] - w[1:]).ravel() for w in both]),
+            command=seen[0, 0],
+            others=seen[0, 1:, :2].sum(axis=0),
+            changes=jnp.swapaxes(seen[:-1] - seen[1:], 0, 1).ravel(),
             motion=jnp.concatenate(motion),
             stands=stands,
-            alone=stands & ~window.contact[1 - foot],
+            alone=stands & ~window.contact[partners(feet)[foot]],
+            kind=foot // 2 * 2 + stands.astype(int),
         )
 
-    return jax.tree.map(lambda *feet: jnp.stack(feet), own(0), own(1))
+    return jax.tree.map(lambda *of_feet: jnp.stack(of_feet), *map(own, range(feet)))
 
 
 def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[Array, "... knots"]:
@@ -114,15 +126,21 @@ def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[A
     return jnp.clip(jnp.minimum(*sides), 0.0, 1.0)
 
 
-def from_views(values: Float[Array, "2 6"]) -> Wrench:
+def from_views(values: Float[Array, "feet 6"]) -> Wrench:
     """Forces and moments as each foot sees them, back in the yaw frame."""
-    back = values * jnp.asarray(_SIGNS, values.dtype)
+    back = values * jnp.asarray(signs(len(values)), values.dtype)
     return Wrench(back[:, :3], back[:, 3:])
+
+
+def _by_foot(table: Float[Array, "*terms columns"], feet: int) -> Float[Array, "feet *terms each"]:
+    """The columns of each foot's pair."""
+    of_pairs = jnp.split(table, feet // 2, axis=-1)
+    return jnp.stack([of_pairs[foot // 2] for foot in range(feet)])
 
 
 def apply_gated(
     gated: GatedMap, window: Window, view: View
-) -> tuple[Float[Array, "2 6"], Load, Float[Array, "2 3"]]:
+) -> tuple[Float[Array, "feet 6"], Load, Float[Array, "feet 3"]]:
     """Ground wrench as each foot sees it; load of the legs, error of the touchdown [m], yaw frame.
 
     Args:
@@ -130,18 +148,22 @@ def apply_gated(
         window: one window.
         view: what the feet see of it, `views(window)`.
     """
-    stands = view.stands.astype(int)
+    feet = len(view.stands)
     tick, gate = hats(window.since_switch, gated.ticks), hats(window.since_switch, gated.gates)
     ground = (
         view.stands[:, None] * view.command
-        + jnp.einsum("k,fko->fo", tick, gated.bias[stands])
-        + jnp.einsum("fi,fio->fo", view.changes, gated.changes[stands])
+        + jnp.einsum("k,fko->fo", tick, gated.bias[view.kind])
+        + jnp.einsum("fi,fio->fo", view.changes, gated.changes[view.kind])
     )
     terms = jnp.concatenate([view.motion, view.changes], axis=-1)
-    push = tick @ gated.legs_bias + jnp.einsum("g,fi,gio->fo", gate, terms, gated.legs)
+    legs_bias, legs, touchdown = (
+        _by_foot(table, feet) for table in (gated.legs_bias, gated.legs, gated.touchdown)
+    )
+    push = jnp.einsum("k,fko->fo", tick, legs_bias)
+    push = push + jnp.einsum("g,fi,fgio->fo", gate, terms, legs)
     back = from_views(push * view.alone[:, None])
-    shift = gated.touchdown[0] + _touchdown_terms(view) @ gated.touchdown[1:]
-    shift = shift * jnp.asarray(_SIGNS[:, :3], shift.dtype)
+    shift = touchdown[:, 0] + jnp.einsum("fi,fio->fo", _touchdown_terms(view), touchdown[:, 1:])
+    shift = shift * jnp.asarray(signs(feet)[:, :3], shift.dtype)
     return ground, Load(back.force.sum(axis=0), back.moment.sum(axis=0)), shift
 
 
@@ -152,65 +174,93 @@ def apply(gated: GatedMap, window: Window) -> Effect:
     return Effect(from_views(ground), legs, shift)
 
 
-def labels_in_view(dataset: Dataset) -> tuple[np.ndarray, np.ndarray]:
-    """Wrench of the ground and load of the legs (n, 2, 6) each, as each foot sees them."""
+def labels_in_view(dataset: Dataset) -> Float[np.ndarray, "n feet 6"]:
+    """Wrench of the ground as each foot sees it."""
     ground = np.concatenate([dataset.label.force, dataset.label.moment], axis=-1)
-    legs = np.concatenate([dataset.legs.force, dataset.legs.torque], axis=-1)
-    return ground * _SIGNS, legs[:, None] * _SIGNS
+    return ground * signs(ground.shape[1])
 
 
 def fit_gated(dataset: Dataset) -> GatedMap:
-    """Ridge regression of the maps; every sample is seen by both feet."""
+    """Ridge regression of the maps; every sample is seen by all feet."""
     window = jax.tree.map(jnp.asarray, dataset.window)
     view = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
-    tick, gate = (
-        np.repeat(np.asarray(jax.jit(hats)(window.since_switch, knots))[:, None], 2, axis=1)
-        for knots in (ticks, gates)
-    )
-    ground, legs = labels_in_view(dataset)
-    residual = ground - view.stands[..., None] * view.command
+    tick, gate = (np.asarray(jax.jit(hats)(window.since_switch, knots)) for knots in (ticks, gates))
+    feet = view.stands.shape[1]
+    residual = labels_in_view(dataset) - view.stands[..., None] * view.command
     scale = _scale(view.changes)
     changes = view.changes / scale
+    by_foot = np.repeat(tick[:, None], feet, axis=1)
     bias, slope = zip(
         *(
-            _ridge(RIDGE, tick[rows], changes[rows], residual[rows])
-            for rows in (~view.stands, view.stands)
+            _ridge(RIDGE, by_foot[rows], changes[rows], residual[rows])
+            for rows in (view.kind == kind for kind in range(feet))
         ),
         strict=True,
     )
-    alone = view.alone
-    term_scale = np.concatenate([_spread(view.motion[alone]), scale])
-    terms = np.concatenate([view.motion, view.changes], axis=-1)[alone] / term_scale
-    gated = (gate[alone][:, :, None] * terms[:, None]).reshape(len(terms), -1)
-    legs_bias, legs_slope = _ridge(RIDGE_MOTION, tick[alone], gated, legs[alone])
     maps = GatedMap(
         ticks=ticks,
         gates=gates,
         bias=np.stack(bias),
         changes=np.stack(slope) / scale[:, None],
-        legs_bias=legs_bias,
-        legs=legs_slope.reshape(len(gates), -1, 6) / term_scale[:, None],
+        **_fit_legs(view, dataset, tick, gate, scale),
         touchdown=_fit_touchdown(view, dataset),
     )
     return jax.tree.map(jnp.asarray, maps)
 
 
+def _fit_legs(
+    view: View, dataset: Dataset, tick: np.ndarray, gate: np.ndarray, scale: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Maps of the legs' push, by their names: a sum over the feet whose partner swings.
+
+    Of what right feet see, three of the six axes are mirrored, so these are fitted apart.
+    """
+    rows, feet = view.alone.any(axis=1), view.alone.shape[1]
+    load = np.concatenate([dataset.legs.force, dataset.legs.torque], axis=-1)[rows]
+    term_scale = np.concatenate([_spread(view.motion[view.alone]), scale])
+    terms = np.concatenate([view.motion, view.changes], axis=-1)[rows] / term_scale
+    gated = gate[rows][:, None, :, None] * terms[:, :, None]  # (n, feet, gates, terms)
+    one = np.repeat(tick[rows][:, None], feet, axis=1)
+    pairs = feet // 2
+    legs_bias = np.zeros((tick.shape[1], pairs, 6))
+    legs = np.zeros((gate.shape[1], terms.shape[-1], pairs, 6))
+    for axes in (signs(2)[1] > 0.0, signs(2)[1] < 0.0):
+        share = (view.alone[rows] * signs(feet)[:, axes][:, 0]).reshape(-1, pairs, 2)
+
+        def by_pair(x: np.ndarray, share: np.ndarray = share) -> np.ndarray:
+            both = x.reshape(*share.shape, -1)
+            return np.einsum("nps,npsi->nip", share, both).reshape(len(x), -1)
+
+        free, slope = _ridge(RIDGE_MOTION, by_pair(one), by_pair(gated), load[:, axes])
+        legs_bias[..., axes] = free.reshape(*legs_bias.shape[:2], -1)
+        legs[..., axes] = slope.reshape(*legs.shape[:3], -1)
+    legs /= term_scale[:, None, None]
+    flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
+    return {"legs_bias": flat(legs_bias), "legs": flat(legs)}
+
+
 def _touchdown_terms(view: View) -> Float[Array, "*batch terms"]:
-    """Motion of the base and horizontal force on the other foot, as a foot sees them."""
-    across = view.command[..., ::-1, :2] * jnp.array([1.0, -1.0], view.command.dtype)
-    return jnp.concatenate([view.motion, across], axis=-1)
+    """Motion of the base and horizontal force on the other feet, as a foot sees them."""
+    return jnp.concatenate([view.motion, view.others], axis=-1)
 
 
-def _fit_touchdown(view: View, dataset: Dataset) -> Float[np.ndarray, "terms 3"]:
+def _fit_touchdown(view: View, dataset: Dataset) -> Float[np.ndarray, "terms shifts"]:
     """The map of the errors of touchdowns, of the samples in which a foot lands."""
-    lands = dataset.lands
-    if not lands.any():
-        return np.zeros((1 + TOUCHDOWN, 3))
-    terms = np.asarray(_touchdown_terms(view))[lands]
-    y, scale = np.asarray(dataset.touchdown_error * _SIGNS[:, :3])[lands], _spread(terms)
-    bias, slope = np.split(_huber_ridge(terms / scale, y), [1])
-    return np.concatenate([bias, slope / scale[:, None]])
+    feet = dataset.lands.shape[1]
+    all_terms, error = np.asarray(_touchdown_terms(view)), dataset.touchdown_error
+    maps = []
+    for first in range(0, feet, 2):
+        pair = slice(first, first + 2)
+        lands = dataset.lands[:, pair]
+        if not lands.any():
+            maps.append(np.zeros((TOUCHDOWN, 3)))
+            continue
+        terms = all_terms[:, pair][lands]
+        y, scale = np.asarray(error[:, pair] * signs(2)[:, :3])[lands], _spread(terms)
+        bias, slope = np.split(_huber_ridge(terms / scale, y), [1])
+        maps.append(np.concatenate([bias, slope / scale[:, None]]))
+    return np.concatenate(maps, axis=1)
 
 
 def _huber_ridge(terms: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -241,7 +291,7 @@ def _spread(x: np.ndarray) -> np.ndarray:
 
 def _scale(changes: np.ndarray) -> np.ndarray:
     """Spread of each change; one that hardly moves is no signal to be blown up."""
-    spread = changes.reshape(-1, 2 * (HISTORY - 1), 2, 3).std(axis=0)
+    spread = changes.reshape(-1, changes.shape[-1] // 6, 2, 3).std(axis=0)
     largest = spread.max(axis=(0, 2), keepdims=True)
     largest = np.where(largest > 0.0, largest, 1.0)
     return np.maximum(spread, _FLOOR * largest).ravel()

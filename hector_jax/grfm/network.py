@@ -96,7 +96,7 @@ def load_net(
             with a number that is not finite.
     """
     name, card = read_net_card(path, variant)
-    zeros = layout(name, tuple(card["about"]["hidden"]))
+    zeros = layout(name, tuple(card["about"]["hidden"]), len(robot.foot_point))
     arrays = card.get("arrays")
     arrays = arrays if isinstance(arrays, dict) else {}
     like = jax.tree_util.tree_map_with_path(
@@ -119,14 +119,14 @@ def _is_in_file(path: Any, arrays: Any) -> bool:
     return not name.endswith("touchdown") or name in arrays
 
 
-def layout(variant: str, hidden: tuple[int, ...]) -> Params:
+def layout(variant: str, hidden: tuple[int, ...], feet: int = 2) -> Params:
     """Zeros of the shapes of the parameters, as `load_tree` wants them; an axis 0 is of ticks."""
-    shapes = _shapes(VARIANTS[variant], hidden, jnp.result_type(float))
+    shapes = _shapes(VARIANTS[variant], hidden, feet, jnp.result_type(float))
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 @lru_cache(maxsize=64)
-def _shapes(variant: Phi, hidden: tuple[int, ...], number: Any) -> Any:
+def _shapes(variant: Phi, hidden: tuple[int, ...], feet: int, number: Any) -> Any:
     """Shapes of the parameters where `number` is JAX's; it takes longer than to read a file."""
     del number  # what it is decides what is found
-    return jax.eval_shape(partial(variant.init, hidden=hidden), jax.random.key(0))
+    return jax.eval_shape(partial(variant.init, feet=feet, hidden=hidden), jax.random.key(0))

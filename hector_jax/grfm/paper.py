@@ -1,10 +1,10 @@
 """The paper's GRFM-Net, and the linear map beside it.
 
 Each of two nets, one for forces and one for moments, reads the current and the two past commands of
-both feet (18 numbers), passes them through three layers (linear, layer normalisation, softsign; 64
-wide) and returns what the ground returns at both feet (6). Inputs and outputs are standardised by
-statistics of the training samples. The best affine map of the same inputs is what a net has to
-beat.
+all feet (18 numbers of two), passes them through three layers (linear, layer normalisation,
+softsign; 64 wide) and returns what the ground returns at all feet (6). Inputs and outputs are
+standardised by statistics of the training samples. The best affine map of the same inputs is what a
+net has to beat.
 
 Mirror images of the samples are our addition: with 51 training walks they lowered the held-out
 force error by 5 to 10 % and the moment error by 4 to 6 %.
@@ -24,7 +24,6 @@ from hector_jax.grfm.dataset import Dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, ground_effect, in_dtype_of
 from hector_jax.grfm.nets import NO_EPOCHS, FitConfig, History, Pair, Progress, Samples
 
-_INPUTS = 6 * HISTORY
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
 
 
@@ -47,8 +46,8 @@ class PaperParams(NamedTuple):
 class LinearMap(NamedTuple):
     """The best affine map of a net's standardised inputs to its standardised outputs."""
 
-    force: Float[Array, "n 6"]  # last row: bias
-    moment: Float[Array, "n 6"]
+    force: Float[Array, "n outputs"]  # last row: bias
+    moment: Float[Array, "n outputs"]
     inputs: Scaling
     outputs: Scaling
 
@@ -61,12 +60,12 @@ def fit_scaling(wrench: Wrench) -> Scaling:
     """
 
     def scale(w: np.ndarray) -> np.ndarray:
-        spread = w.reshape(-1, 2, 3).std(axis=0)
+        spread = w.reshape(-1, *w.shape[-2:]).std(axis=0)
         largest = spread.max()
         return np.maximum(spread, _FLOOR * largest) if largest > 0.0 else np.ones_like(spread)
 
     return Scaling(
-        mean=Wrench(*(np.mean(w.reshape(-1, 2, 3), axis=0) for w in wrench)),
+        mean=Wrench(*(np.mean(w.reshape(-1, *w.shape[-2:]), axis=0) for w in wrench)),
         scale=Wrench(*(scale(w) for w in wrench)),
     )
 
@@ -76,20 +75,20 @@ def _standardised(scaling: Scaling, wrench: Wrench) -> Wrench:
 
 
 def _features(scaling: Scaling, commands: Wrench) -> Wrench:
-    """Inputs of force net and moment net, (*batch, 18) each, from the commands of windows."""
-    flat = lambda w: w.reshape(*w.shape[:-3], _INPUTS)  # noqa: E731
+    """Inputs of force net and moment net, (*batch, inputs) each, from the commands of windows."""
+    flat = lambda w: w.reshape(*w.shape[:-3], -1)  # noqa: E731
     return jax.tree.map(flat, _standardised(scaling, commands))
 
 
 def _effect(scaling: Scaling, flat: Wrench) -> Effect:
-    physical = lambda w, m, s: w.reshape(*w.shape[:-1], 2, 3) * s + m  # noqa: E731
+    physical = lambda w, m, s: w.reshape(*w.shape[:-1], *m.shape) * s + m  # noqa: E731
     return ground_effect(jax.tree.map(physical, flat, scaling.mean, scaling.scale))
 
 
-def init(key: Key[Array, ""], hidden: tuple[int, ...] = (64, 64, 64)) -> PaperParams:
+def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = (64, 64, 64)) -> PaperParams:
     """Fresh networks without statistics, in 32 bits."""
-    fresh = nets.init_nets(key, hidden, _INPUTS, outputs=6, members=1)
-    scaling = Scaling(zero_wrench(), zero_wrench())
+    fresh = nets.init_nets(key, hidden, 3 * feet * HISTORY, outputs=3 * feet, members=1)
+    scaling = Scaling(zero_wrench(feet), zero_wrench(feet))
     force, moment = jax.tree.map(lambda p: p[0], fresh)
     params = PaperParams(force, moment, scaling, scaling)
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
@@ -106,7 +105,7 @@ def _samples(params: PaperParams, dataset: Dataset) -> Samples:
     label = _standardised(params.outputs, dataset.label)
     samples = Samples(
         x=Pair(*_features(params.inputs, dataset.window.commands)),
-        y=Pair(*(w.reshape(-1, 6) for w in label)),
+        y=Pair(*(w.reshape(len(w), -1) for w in label)),
         trust=np.ones((len(dataset.walk), 1)),
     )
     return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
@@ -123,14 +122,14 @@ def fit(
     """Train both nets; see `nets.fit_nets`."""
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
     training = with_mirror(training) if config.mirror else training
-    params = with_statistics(init(key_init), training)
+    params = with_statistics(init(key_init, training.lands.shape[1]), training)
     best, history = nets.fit_nets(
         config,
         key_shuffle,
         jax.tree.map(lambda p: p[None], Pair(params.force, params.moment)),
         training=_samples(params, training),
         validation=_samples(params, validation),
-        scale=Pair(*(w.reshape(6) for w in params.outputs.scale)),
+        scale=Pair(*(w.reshape(-1) for w in params.outputs.scale)),
         output=_output,
         progress=progress,
     )
@@ -149,10 +148,11 @@ def apply(params: PaperParams, window: Window) -> Effect:
 PAPER = Phi("paper", PaperParams, init, fit, apply, lambda p: nets.widths(p.force))
 
 
-def init_linear(key: Key[Array, ""], hidden: tuple[int, ...] = ()) -> LinearMap:
+def init_linear(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()) -> LinearMap:
     """A map to zero."""
     del key, hidden
-    zeros, scaling = jnp.zeros((_INPUTS + 1, 6)), Scaling(zero_wrench(), zero_wrench())
+    zeros = jnp.zeros((3 * feet * HISTORY + 1, 3 * feet))
+    scaling = Scaling(zero_wrench(feet), zero_wrench(feet))
     return LinearMap(zeros, zeros, scaling, scaling)
 
 
@@ -164,7 +164,7 @@ def fit_linear(dataset: Dataset) -> LinearMap:
 
     def solve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         with_bias = np.concatenate([x, np.ones((len(x), 1))], axis=1)
-        return np.linalg.lstsq(with_bias, y.reshape(len(y), 6), rcond=1e-6)[0]
+        return np.linalg.lstsq(with_bias, y.reshape(len(y), -1), rcond=1e-6)[0]
 
     return LinearMap(solve(x.force, y.force), solve(x.moment, y.moment), inputs, outputs)
 

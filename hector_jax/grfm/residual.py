@@ -7,6 +7,7 @@ are trained side by side and their mean is added. The statistics of the training
 the parameters: a net cannot be used with another's.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,21 +20,20 @@ from hector_jax.core.arrays import Array
 from hector_jax.grfm import gated, nets
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import Effect, Phi, Window, in_dtype_of
-from hector_jax.grfm.gated import CHANGES, GATES, MOTION, GatedMap, View, hats, views
+from hector_jax.grfm.gated import GATES, MOTION, GatedMap, View, changes_seen, hats, views
 from hector_jax.grfm.nets import FitConfig, History, Pair, Progress, Samples
 
 HIDDEN = (32, 32)
 MEMBERS = 4  # nets of each kind
 BOUND = 0.5  # most that a net adds, in units of the residual's RMS
 FAMILIAR = 0.99  # share of the training samples that are nearer than where trust is halved
-_TERMS = CHANGES + MOTION
 
 
 class FeatureStats(NamedTuple):
-    """Statistics of what a net reads, by the tick since the switch; axes of 2: swing, stance."""
+    """Statistics of what a net reads, by the tick since the switch; a kind is that of a `View`."""
 
-    mean: Float[Array, "2 ticks terms"]
-    scale: Float[Array, "2 ticks terms"]
+    mean: Float[Array, "kinds ticks terms"]
+    scale: Float[Array, "kinds ticks terms"]
     reach: Float[Array, ""]  # mean square of the standardised terms at which trust is one half
 
 
@@ -47,13 +47,14 @@ class ResidualParams(NamedTuple):
     residual_rms: Float[Array, "6"]  # [N], [N m] of what the linear part leaves
 
 
-def init(key: Key[Array, ""], hidden: tuple[int, ...] = HIDDEN) -> ResidualParams:
+def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = HIDDEN) -> ResidualParams:
     """Fresh networks without statistics, in 32 bits; the axis of ticks has length 0."""
-    inputs = _TERMS + len(GATES) + 1
+    terms = changes_seen(feet) + MOTION
+    inputs = terms + len(GATES) + feet - 1
     force, moment = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS)
-    table = jnp.zeros((2, 0, _TERMS))
+    table = jnp.zeros((feet, 0, terms))
     stats = FeatureStats(table, table, jnp.zeros(()))
-    params = ResidualParams(gated.init(key), force, moment, stats, jnp.zeros(6))
+    params = ResidualParams(gated.init(key, feet), force, moment, stats, jnp.zeros(6))
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 
@@ -75,19 +76,20 @@ def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.nda
 
     window = jax.tree.map(jnp.asarray, dataset.window)
     view, tick, ground = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(window))
-    terms, tick = _terms(view), np.repeat(tick[:, None], 2, axis=1)
-    mean, scale = (np.zeros((2, len(linear.ticks), terms.shape[-1])) for _ in range(2))
-    for stands in (0, 1):
-        rows = view.stands == stands
+    feet = view.stands.shape[1]
+    terms, tick = _terms(view), np.repeat(tick[:, None], feet, axis=1)
+    mean, scale = (np.zeros((feet, len(linear.ticks), terms.shape[-1])) for _ in range(2))
+    for kind in range(feet):  # as many as feet: two of each pair
+        rows = view.kind == kind
         weight = tick[rows] / np.maximum(tick[rows].sum(axis=0), 1e-9)
-        mean[stands] = weight.T @ terms[rows]
-        scale[stands] = np.sqrt(np.maximum(weight.T @ terms[rows] ** 2 - mean[stands] ** 2, 0.0))
+        mean[kind] = weight.T @ terms[rows]
+        scale[kind] = np.sqrt(np.maximum(weight.T @ terms[rows] ** 2 - mean[kind] ** 2, 0.0))
     # a term that rests at some ticks only, such as the change of a swinging foot's command
     scale = np.maximum(scale, 0.05 * np.maximum(scale.max(axis=(0, 1)), 1e-6))
     stats = FeatureStats(mean, scale, np.asarray(1.0))
-    z = np.asarray(_standard_terms(stats, terms, view.stands.astype(int), tick))
+    z = np.asarray(_standard_terms(stats, terms, view.kind, tick))
     reach = np.quantile(np.mean(z**2, axis=-1), FAMILIAR)
-    rms = np.sqrt(np.mean((gated.labels_in_view(dataset)[0] - ground) ** 2, axis=(0, 1)))
+    rms = np.sqrt(np.mean((gated.labels_in_view(dataset) - ground) ** 2, axis=(0, 1)))
     return stats._replace(reach=np.maximum(reach, 1e-6)), np.where(rms > 0.0, rms, 1.0)
 
 
@@ -95,18 +97,19 @@ def _terms(view: View) -> Float[Array, "*batch terms"]:
     return jnp.concatenate([view.changes, view.motion], axis=-1)
 
 
-def _standard_terms(stats: FeatureStats, terms: Any, stands: Any, tick: Any) -> Array:
-    at = lambda table: jnp.einsum("...k,...ki->...i", tick, table[stands])  # noqa: E731
+def _standard_terms(stats: FeatureStats, terms: Any, kind: Any, tick: Any) -> Array:
+    at = lambda table: jnp.einsum("...k,...ki->...i", tick, table[kind])  # noqa: E731
     return (terms - at(stats.mean)) / at(stats.scale)
 
 
 def _inputs(params: ResidualParams, window: Window, view: View) -> tuple[Array, Array]:
-    """What the nets read for each foot of one window (2, n), and how far they are trusted (2,)."""
-    stands, stats = view.stands.astype(int), params.stats
+    """What the nets read of one window (feet, n), and how far they are trusted (feet,)."""
+    stats, feet = params.stats, len(view.stands)
     tick, gate = (hats(window.since_switch, k) for k in (params.linear.ticks, params.linear.gates))
-    z = _standard_terms(stats, _terms(view), stands, jnp.stack([tick, tick]))
+    z = _standard_terms(stats, _terms(view), view.kind, jnp.stack([tick] * feet))
     trust = 1.0 / (1.0 + (jnp.mean(z**2, axis=-1) / stats.reach) ** 4)
-    return jnp.concatenate([z, jnp.stack([gate, gate]), view.stands[:, None]], axis=-1), trust
+    kind = view.kind[:, None] == jnp.arange(1, feet)
+    return jnp.concatenate([z, jnp.stack([gate] * feet), kind], axis=-1), trust
 
 
 def _bounded(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
@@ -126,7 +129,7 @@ def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
 
     window = jax.tree.map(jnp.asarray, dataset.window)
     ground, z, trust = jax.jit(jax.vmap(one))(window)
-    residual = (gated.labels_in_view(dataset)[0] - ground) / params.residual_rms
+    residual = (gated.labels_in_view(dataset) - ground) / params.residual_rms
     y = Pair(residual[..., :3], residual[..., 3:])
     samples = Samples(Pair(z, z), y, trust[..., None])
     return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
@@ -137,7 +140,7 @@ def fit(
 ) -> tuple[ResidualParams, History]:
     """Fit the linear part, then train the nets on what it leaves; see `nets.fit_nets`."""
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
-    params = with_statistics(init(key_init), training)
+    params = with_statistics(init(key_init, training.lands.shape[1]), training)
     best, history = nets.fit_nets(
         config,
         key_shuffle,
@@ -172,8 +175,12 @@ def plain_net(gait: GaitConfig) -> ResidualParams:
     Its parameters have the shapes of a net that was trained on walks of `gait`.
     """
     ticks = np.unique(np.asarray(since_switch(gait, jnp.arange(gait.cycle))))
-    zeros = lambda x: np.zeros([len(ticks) if n == 0 else n for n in x.shape], np.float32)  # noqa: E731
-    net = jax.tree.map(zeros, jax.eval_shape(init, jax.random.key(0)))
+    feet = len(gait.offsets)
+
+    def zeros(x: Any) -> np.ndarray:
+        return np.zeros([len(ticks) if n == 0 else n for n in x.shape], np.float32)
+
+    net = jax.tree.map(zeros, jax.eval_shape(partial(init, feet=feet), jax.random.key(0)))
     knots = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
     one = np.ones((), np.float32)
     return net._replace(linear=knots, stats=FeatureStats(net.stats.mean, net.stats.scale + 1, one))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hector_jax.control.weights import WEIGHT_NAMES, Weights, weights_to_vector
+from hector_jax.control.weights import Weights, weight_names, weights_to_vector
 from hector_jax.core.console import say
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.grfm.nets import History
@@ -53,7 +53,7 @@ def of_run(
         "tracking": plots.tracking(path / "tracking.png", four),
         "path": plots.path_from_above(path / "path.png", four),
         "losses": plots.losses(path / "losses.png", config.loss, histories),
-        "weights": plots.weights(path / "weights.png", WEIGHT_NAMES, flat),
+        "weights": plots.weights(path / "weights.png", weight_names(sets["nominal"]), flat),
         "wrenches": plots.wrenches(path / "wrenches.png", tick, ground),
         "training": plots.training(path / "training.png", training),
     }

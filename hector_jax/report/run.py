@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hector_jax.control.parameters import bounds
-from hector_jax.control.weights import WEIGHT_NAMES, Weights, weights_to_vector
+from hector_jax.control.weights import Weights, weight_names, weights_to_vector
 from hector_jax.core.files import write_file
 from hector_jax.report.fidelity import error_rows
 from hector_jax.report.report import render
@@ -67,7 +67,10 @@ def _at_bounds(weights: Weights) -> str:
     others = [name for name, value in weights.others.items() if np.ndim(value) == 0]
     values, *box = (
         np.append(weights_to_vector(tree), [tree.others[name] for name in others])
-        for tree in (weights, *bounds(others))
+        for tree in (weights, *bounds(others, weights))
     )
     close = np.any([np.isclose(values, bound, rtol=1e-9) for bound in box], axis=0)
-    return ", ".join(f"`{name}`" for name in np.array([*WEIGHT_NAMES, *others])[close]) or "none"
+    return (
+        ", ".join(f"`{name}`" for name in np.array([*weight_names(weights), *others])[close])
+        or "none"
+    )

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean
+from hector_jax.core.trajectory import FEET
 from hector_jax.robot.description import Description
 
 _SAME = 1e-6  # [m], [-]: numbers in a description that should agree
@@ -43,8 +44,8 @@ def check_model(description: Description, model: mujoco.MjModel) -> None:
     _check_standing(description, model)
 
 
-def check_soles(path: Path, contacts: Float[np.ndarray, "2 c 3"]) -> None:
-    """Check that the contacts of a foot are about its point, on one sole, and alike in both feet.
+def check_soles(path: Path, contacts: Float[np.ndarray, "feet c 3"]) -> None:
+    """Check that the contacts of a foot are about its point, on one sole, and alike in all feet.
 
     Args:
         path: of the model.
@@ -53,7 +54,7 @@ def check_soles(path: Path, contacts: Float[np.ndarray, "2 c 3"]) -> None:
     Raises:
         InputError: one line saying what came and what was expected.
     """
-    for side, of_foot in zip(("left", "right"), contacts, strict=True):
+    for side, of_foot in zip(legs := FEET[len(contacts)], contacts, strict=True):
         text = f"contacts of the {side} foot are at {of_foot.round(4).tolist()} from its point"
         expect(path, np.abs(of_foot[:, 2]).max() <= 1e-3, f"{text}, expected them on one sole")
         x, y = of_foot[:, 0], of_foot[:, 1]
@@ -66,9 +67,10 @@ def check_soles(path: Path, contacts: Float[np.ndarray, "2 c 3"]) -> None:
             corners = {(a > 0.0, b > 0.0) for a, b in zip(x, y, strict=True)}
             right, expected = len(corners) == 4, "one at each corner around it"
         expect(path, right, f"{text}, expected {expected}")
-    left, right = (np.sort(of_foot[:, 0]) for of_foot in contacts)
-    text = f"contacts are at x = {left} of the left foot and {right} of the right one"
-    expect(path, np.allclose(left, right, rtol=0, atol=_SAME), f"{text}, expected the same")
+    first, *others = (np.sort(of_foot[:, 0]) for of_foot in contacts)
+    for side, other in zip(legs[1:], others, strict=True):
+        text = f"contacts are at x = {first} of the {legs[0]} foot and {other} of the {side} one"
+        expect(path, np.allclose(first, other, rtol=0, atol=_SAME), f"{text}, expected the same")
 
 
 def _check_standing(description: Description, model: mujoco.MjModel) -> None:
@@ -87,9 +89,14 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
         height = place[2] - model.geom(name).size[0]
         text = f"{this} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
         expect(path, abs(height) <= ON_FLOOR, text)
-    left, right = (data.site(foot.point).xpos[1] for foot in feet)
-    text = f"{this} has the left foot at y = {left:.4g}, expected it left of the right one, at"
-    expect(path, left > right, f"{text} {right:.4g}")
+    x, y, _ = np.array([data.site(foot.point).xpos for foot in feet]).T
+    legs = description.legs
+    for one, other in zip(range(0, len(feet), 2), range(1, len(feet), 2), strict=True):
+        text = f"{this} has the {legs[one]} foot at y = {y[one]:.4g}, expected it left of the "
+        expect(path, y[one] > y[other], f"{text}{legs[other]} one, at {y[other]:.4g}")
+    for one, other in zip(range(len(feet) - 2), range(2, len(feet)), strict=True):
+        text = f"{this} has the {legs[one]} foot at x = {x[one]:.4g}, expected it ahead of the "
+        expect(path, x[one] > x[other], f"{text}{legs[other]} one, at {x[other]:.4g}")
     com = data.subtree_com[trunk_body(model)]
     low, high = (side([place[:2] for _, place in ends], axis=0) for side in (np.min, np.max))
     right = np.all(low <= com[:2]) and np.all(com[:2] <= high)
@@ -101,13 +108,14 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
 def _check_load(description: Description, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Each motor can hold its joint in the standing pose, the feet sharing the weight."""
     com, torques = data.subtree_com[trunk_body(model)], data.qfrc_bias.copy()
-    force = -0.5 * model.opt.gravity * model.body_subtreemass[trunk_body(model)]
-    for foot in description.named_feet:
+    feet = description.named_feet
+    force = -model.opt.gravity * model.body_subtreemass[trunk_body(model)] / len(feet)
+    for foot in feet:
         site = data.site(foot.point)
         J_v, J_w, place = np.zeros((3, model.nv)), np.zeros((3, model.nv)), site.xpos
         mujoco.mj_jacSite(model, data, J_v, J_w, site.id)
-        # the pressure is under the centre of mass along the foot and under the foot across it
-        ahead = np.array([com[0] - place[0], 0.0, 0.0])
+        # of two feet the pressure is under the centre of mass along the foot
+        ahead = np.array([com[0] - place[0] if len(feet) == 2 else 0.0, 0.0, 0.0])
         torques -= J_v.T @ force + J_w.T @ np.cross(ahead, force)
     for index, name in enumerate(description.joints):
         torque, limit = torques[model.joint(name).dofadr[0]], model.actuator(index).ctrlrange[1]

@@ -4,11 +4,11 @@
     model = "strider.xml"              # MJCF or URDF, beside this file
     standing = "home"                  # keyframe of the standing pose, or angles: { knee = 0.5 }
     [joints]                           # of each leg, from the trunk down
-    left, right = three to seven names each
+    left, right = three to seven names each; of four legs: front_left, front_right, hind_left, ..
     linkage = [5, 4]                   # the fifth joint's motor turns the fourth too; or none
     weld = ["waist"]                   # hinges that are fixed in the standing pose
     armature = a number each           # [kg m^2] of a leg's motors, which a URDF cannot state
-    [feet]                             # by names in the model, or by places in a body's frame
+    [feet]                             # likewise; names in the model, or places in a body's frame
     left, right = { point = site on the sole, toe = geom, heel = geom }
     left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # 1, 2 or 4 contacts
     [limits]
@@ -33,7 +33,7 @@ import jax
 
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, check, from_table, read_toml
-from hector_jax.core.trajectory import MAX_TILT, MIN_HEIGHT
+from hector_jax.core.trajectory import FEET, MAX_TILT, MIN_HEIGHT
 
 _PACKAGE = Path(__file__).parents[1]
 _INSTALLED = _PACKAGE / "assets"  # where a wheel puts them
@@ -118,7 +118,7 @@ class Description:
     linkage: tuple[int, int] | None = (5, 4)  # of a leg, counted from 1: whose motor turns which
     weld: tuple[str, ...] = ()  # joints
     armature: tuple[float, ...] = ()  # [kg m^2] of the joints of a leg; else the model's
-    feet: tuple[Foot, Foot] = (_named_foot("left"), _named_foot("right"))
+    feet: tuple[Foot, ...] = (_named_foot("left"), _named_foot("right"))
     min_height: float = MIN_HEIGHT  # [m] of the centre of mass; below it the robot has fallen
     max_tilt: float = MAX_TILT  # [rad] of roll or pitch; beyond it too
     control: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()  # sections as they came
@@ -143,36 +143,66 @@ class Description:
         return self.standing if isinstance(self.standing, str) else "standing"
 
     @property
-    def named_feet(self) -> tuple["NamedFoot", "NamedFoot"]:
+    def legs(self) -> tuple[str, ...]:
+        """Names of the legs."""
+        return FEET[len(self.feet)]
+
+    @property
+    def named_feet(self) -> tuple["NamedFoot", ...]:
         """Site and spheres of each foot in the compiled model."""
-        left, right = (
-            NamedFoot(f"{side}_point", tuple(f"{side}_contact_{i}" for i in range(len(contacts))))
+        return tuple(
+            NamedFoot(f"{leg}_point", tuple(f"{leg}_contact_{i}" for i in range(len(contacts))))
             if body is not None
             else NamedFoot(str(point), tuple(map(str, contacts)))
-            for side, (point, contacts, body) in zip(("left", "right"), self.feet, strict=True)
+            for leg, (point, contacts, body) in zip(self.legs, self.feet, strict=True)
         )
-        return left, right
 
     @property
     def leg_joints(self) -> int:
         """Joints of a leg."""
-        return len(self.joints) // 2
+        return len(self.joints) // len(self.feet)
+
+
+def _legs(of_leg: Any, nothing: Any) -> dict[str, Any]:
+    """What a section has of each leg, by name, in the order of FEET.
+
+    Raises:
+        InputError: legs are missing, or too many.
+    """
+    known = [leg for names in FEET.values() for leg in names]
+    given = {leg: value for leg in known if (value := getattr(of_leg, leg)) != nothing}
+    if tuple(given) not in FEET.values():
+        expected = "; or ".join(", ".join(names) for names in FEET.values())
+        raise InputError(f"must have {expected}, got {', '.join(given) or 'none of them'}")
+    return given
 
 
 @dataclass(frozen=True)
 class _Joints:
-    left: tuple[str, ...] = _leg("left")
-    right: tuple[str, ...] = _leg("right")
+    left: tuple[str, ...] = ()
+    right: tuple[str, ...] = ()
+    front_left: tuple[str, ...] = ()
+    front_right: tuple[str, ...] = ()
+    hind_left: tuple[str, ...] = ()
+    hind_right: tuple[str, ...] = ()
     linkage: tuple[int, int] | None = None
     weld: tuple[str, ...] = ()
     armature: Annotated[tuple[float, ...], NOT_NEGATIVE] = ()
 
+    @property
+    def legs(self) -> dict[str, tuple[str, ...]]:
+        """Joints by leg."""
+        return _legs(self, ())
+
     def __post_init__(self) -> None:
-        names, count = self.left + self.right + self.weld, len(self.left)
-        if not FEWEST_JOINTS <= count <= MOST_JOINTS or count != len(self.right):
+        names, counts = sum(self.legs.values(), self.weld), [*map(len, self.legs.values())]
+        count = counts[0]
+        if not FEWEST_JOINTS <= count <= MOST_JOINTS or set(counts) != {count}:
+            *first, last = map(str, counts)
             raise InputError(
-                f"left and right must be {FEWEST_JOINTS} to {MOST_JOINTS} names each and as many "
-                f"in both, got {count} and {len(self.right)}"
+                f"{' and '.join(self.legs)} must be {FEWEST_JOINTS} to {MOST_JOINTS} names each "
+                f"and as many in {'both' if len(counts) == 2 else 'all'}, got {', '.join(first)} "
+                f"and {last}"
             )
         if len(set(names)) < len(names):
             twin = next(name for name in names if names.count(name) > 1)
@@ -223,13 +253,22 @@ class _Foot:
 
 @dataclass(frozen=True)
 class _Feet:
-    left: _Foot
-    right: _Foot
+    left: _Foot | None = None
+    right: _Foot | None = None
+    front_left: _Foot | None = None
+    front_right: _Foot | None = None
+    hind_left: _Foot | None = None
+    hind_right: _Foot | None = None
+
+    @property
+    def feet(self) -> dict[str, Foot]:
+        """Feet by leg."""
+        return {leg: one.foot for leg, one in _legs(self, None).items()}
 
     def __post_init__(self) -> None:
-        count = [len(one.foot.contacts) for one in (self.left, self.right)]
-        if count[0] != count[1]:
-            raise InputError(f"left and right must have as many contacts, got {count}")
+        count = [len(foot.contacts) for foot in self.feet.values()]
+        if len(set(count)) > 1:
+            raise InputError(f"{' and '.join(self.feet)} must have as many contacts, got {count}")
 
 
 @dataclass(frozen=True)
@@ -267,7 +306,7 @@ class _File:
     name: str | None = None
     model: str = MODEL_PATH.name
     standing: str | dict[str, float] = "standing"
-    joints: _Joints = _Joints()
+    joints: _Joints = _Joints(left=_leg("left"), right=_leg("right"))
     feet: _Feet | None = None
     limits: _Limits = _Limits()
     gait: dict | None = None
@@ -280,6 +319,12 @@ class _File:
     plants: PlantSizes = PlantSizes()
 
     def __post_init__(self) -> None:
+        legs, feet = tuple(self.joints.legs), self.feet and tuple(self.feet.feet)
+        if legs != (feet or FEET[2]):
+            got = f"{', '.join(feet)} in feet" if feet else "no [feet]"
+            raise InputError(
+                f"joints has the legs {', '.join(legs)}, expected them in feet, got {got}"
+            )
         angles = self.standing.values() if isinstance(self.standing, dict) else ()
         if not all(map(math.isfinite, angles)):
             raise InputError(f"standing must be finite angles, got {short_repr(self.standing)}")
@@ -317,13 +362,13 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         )
     weights, standing, feet = file.weights, file.standing, Description.feet
     if file.feet is not None:
-        feet = (file.feet.left.foot, file.feet.right.foot)
+        feet = tuple(file.feet.feet.values())
     return Description(
         model=path.parent / file.model,
         path=path,
         name=name,
         standing=standing if isinstance(standing, str) else tuple(standing.items()),
-        joints=file.joints.left + file.joints.right,
+        joints=sum(file.joints.legs.values(), ()),
         linkage=file.joints.linkage,
         weld=file.joints.weld,
         armature=file.joints.armature,

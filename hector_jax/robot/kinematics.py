@@ -34,10 +34,10 @@ _DAMPING = 0.1  # times the squared error
 
 
 class FootPoses(NamedTuple):
-    """Both feet in the trunk frame, left then right."""
+    """The feet in the trunk frame."""
 
-    position: Float[Array, "2 3"]  # foot points [m]
-    rotation: Float[Array, "2 3 3"]  # takes foot vectors to the trunk frame
+    position: Float[Array, "feet 3"]  # foot points [m]
+    rotation: Float[Array, "feet 3 3"]  # takes foot vectors to the trunk frame
 
 
 def foot_poses(robot: Robot, joints: Float[Array, " joints"]) -> FootPoses:
@@ -48,7 +48,7 @@ def foot_poses(robot: Robot, joints: Float[Array, " joints"]) -> FootPoses:
 
 def foot_jacobians(
     robot: Robot, joints: Float[Array, " joints"]
-) -> tuple[Float[Array, "2 3 j"], Float[Array, "2 3 j"]]:
+) -> tuple[Float[Array, "feet 3 j"], Float[Array, "feet 3 j"]]:
     """Jacobians of each foot point by its own leg's joints: velocity [m] and angular velocity [-].
 
     Trunk axes, trunk at rest: for a foot at rest on the ground, add the trunk's own motion.
@@ -60,9 +60,9 @@ def foot_jacobians(
 
 def inverse_legs(
     robot: Robot,
-    position: Float[Array, "2 3"],
-    yaw: Float[Array, "2"],
-    up: Float[Array, "2 3"],
+    position: Float[Array, "feet 3"],
+    yaw: Float[Array, " feet"],
+    up: Float[Array, "feet 3"],
     start: Float[Array, " joints"],
     steps: int = NEWTON_STEPS,
 ) -> Float[Array, " joints"]:
@@ -83,7 +83,7 @@ def inverse_legs(
     leg = _leg_constants(robot)
     if robot.structure.closed_form:
         yaw = jnp.clip(yaw, leg.lower[:, 0], leg.upper[:, 0])
-        in_leg = jnp.stack([up[0] @ rot_z(yaw[0]), up[1] @ rot_z(yaw[1])])
+        in_leg = jnp.stack([n @ rot_z(psi) for n, psi in zip(up, yaw, strict=True)])
         pitch = jnp.arctan2(in_leg[:, 0], in_leg[:, 2])
         return jax.vmap(_inverse_leg)(leg, position, yaw, pitch).reshape(-1)
     search = jax.vmap(partial(_searched_leg, robot.structure.placed, steps))
@@ -104,7 +104,7 @@ def leg_gravity(
     com = chain.origin + jnp.sum(chain.frames * jnp.asarray(robot.link_com)[:, :, None, :], axis=-1)
     link_mass, count = jnp.asarray(robot.link_mass), robot.description.leg_joints
     # a joint carries the links from its own outwards: row of the joint, column of the link
-    mass = jnp.triu(jnp.broadcast_to(link_mass[:, None, :], (2, count, count)))
+    mass = jnp.triu(jnp.broadcast_to(link_mass[:, None, :], (len(link_mass), count, count)))
     lever = jnp.sum(mass[..., None] * (com[:, None] - chain.origin[:, :, None]), axis=2)
     moment = jnp.cross(lever, up)
     return jnp.sum(chain.axis * moment, axis=-1).reshape(-1)
@@ -120,8 +120,8 @@ def knee_joints(robot: Robot) -> tuple[int, int, int]:
     standing = robot.standing_joints[:count]
 
     def length(joints: np.ndarray) -> float:
-        both = jnp.asarray(np.concatenate([joints, robot.standing_joints[count:]]))
-        foot = foot_poses(robot, both).position[0]
+        of_all = jnp.asarray(np.concatenate([joints, robot.standing_joints[count:]]))
+        foot = foot_poses(robot, of_all).position[0]
         return float(np.linalg.norm(foot - robot.joint_origin[0, 0]))
 
     slopes = [abs(length(standing + 1e-4 * e) - length(standing - 1e-4 * e)) for e in np.eye(count)]
@@ -145,25 +145,28 @@ class _Leg(NamedTuple):
 
 
 class _Chain(NamedTuple):
-    """Both legs unrolled in the trunk frame."""
+    """All legs unrolled in the trunk frame."""
 
-    foot: Float[Array, "2 3"]
-    rotation: Float[Array, "2 3 3"]
-    origin: Float[Array, "2 j 3"]
-    axis: Float[Array, "2 j 3"]
-    frames: Float[Array, "2 j 3 3"]  # links' axes; computed only where they are used
+    foot: Float[Array, "feet 3"]
+    rotation: Float[Array, "feet 3 3"]
+    origin: Float[Array, "feet j 3"]
+    axis: Float[Array, "feet j 3"]
+    frames: Float[Array, "feet j 3 3"]  # links' axes; computed only where they are used
 
 
 def _leg_constants(robot: Robot) -> _Leg:
-    """Those of both legs."""
+    """Those of all legs."""
     parts = (robot.joint_origin, robot.joint_axis, robot.foot_point, robot.sole)
     limits = (robot.joint_lower, robot.joint_upper, robot.standing_joints)
-    return _Leg(*map(jnp.asarray, parts), *(jnp.asarray(x).reshape(2, -1) for x in limits))
+    return _Leg(
+        *map(jnp.asarray, parts),
+        *(jnp.asarray(x).reshape(len(robot.foot_point), -1) for x in limits),
+    )
 
 
 def _chain(robot: Robot, joints: Float[Array, " joints"]) -> _Chain:
     chain = _leg_chain if robot.structure.closed_form else _any_chain
-    return jax.vmap(chain)(_leg_constants(robot), joints.reshape(2, -1))
+    return jax.vmap(chain)(_leg_constants(robot), joints.reshape(len(robot.foot_point), -1))
 
 
 def _leg_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:

@@ -55,8 +55,8 @@ class Structure:
 class Robot(NamedTuple):
     """The robot's constants: a pytree of 64-bit host arrays, an argument of jitted functions.
 
-    Legs are left then right, each of j joints from the trunk down. A link's frame sits in the joint
-    that moves it, parallel to the trunk's when all joints are zero.
+    Legs are in the order of `trajectory.FEET`, each of j joints from the trunk down. A link's frame
+    sits in the joint that moves it, parallel to the trunk's when all joints are zero.
     """
 
     mass: Float[np.ndarray, ""]  # whole robot [kg]
@@ -65,18 +65,19 @@ class Robot(NamedTuple):
     ]  # composite, about the CoM in the standing pose, trunk axes [kg m^2]
     com_offset: Float[np.ndarray, "3"]  # CoM in the trunk frame, standing pose [m]
     gravity: Float[np.ndarray, "3"]  # pointing up as in the paper [m/s^2]
-    joint_origin: Float[np.ndarray, "2 j 3"]  # joint in the frame of the link above [m]
-    joint_axis: Float[np.ndarray, "2 j 3"]  # in its own link's frame
+    joint_origin: Float[np.ndarray, "feet j 3"]  # joint in the frame of the link above [m]
+    joint_axis: Float[np.ndarray, "feet j 3"]  # in its own link's frame
     foot_point: Float[
-        np.ndarray, "2 3"
+        np.ndarray, "feet 3"
     ]  # on the sole under the ankle, in the frame of the last link [m]
-    sole: Float[np.ndarray, "2 3 3"]  # takes vectors of a sole (x ahead, z up) to the last link
-    link_mass: Float[np.ndarray, "2 j"]  # of the link that each joint moves [kg]
-    link_com: Float[np.ndarray, "2 j 3"]  # its CoM in its own frame [m]
+    sole: Float[np.ndarray, "feet 3 3"]  # takes vectors of a sole (x ahead, z up) to the last link
+    link_mass: Float[np.ndarray, "feet j"]  # of the link that each joint moves [kg]
+    link_com: Float[np.ndarray, "feet j 3"]  # its CoM in its own frame [m]
     toe: Float[np.ndarray, ""]  # contact length ahead of the foot point [m]
     heel: Float[np.ndarray, ""]  # contact length behind it [m]
     half_width: Float[np.ndarray, ""]  # contact width to either side of it [m]
-    joint_lower: Float[np.ndarray, " joints"]  # [rad], left leg then right
+    foot_ahead: Float[np.ndarray, " feet"]  # of the middle of all foot points, standing [m]
+    joint_lower: Float[np.ndarray, " joints"]  # [rad], leg by leg
     joint_upper: Float[np.ndarray, " joints"]  # [rad]
     torque_limit: Float[np.ndarray, " joints"]  # [N m]
     standing_joints: Float[np.ndarray, " joints"]  # [rad]
@@ -132,7 +133,8 @@ def robot_of(description: Description) -> Robot:
     parts = model.body_mass, model.body_inertia, data.ximat.reshape(-1, 3, 3)
     legs = _legs(description, model)
     frames = [
-        _turned(axes, q) for axes, q in zip(legs.axis, standing_joints.reshape(2, -1), strict=True)
+        _turned(axes, q)
+        for axes, q in zip(legs.axis, standing_joints.reshape(len(legs.axis), -1), strict=True)
     ]
     sole = np.stack([(R_wb @ R).T for R in frames])
     sole = np.where(np.abs(sole - np.eye(3)).max() <= _SAME, np.eye(3), sole)  # rounding
@@ -154,6 +156,7 @@ def robot_of(description: Description) -> Robot:
         toe=toe,
         heel=heel,
         half_width=half_width,
+        foot_ahead=_ahead(description, R_wb, data),
         joint_lower=ranges[:, 0],
         joint_upper=ranges[:, 1],
         torque_limit=model.actuator_ctrlrange[:, 1].copy(),
@@ -180,7 +183,7 @@ def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel
 
     Raises:
         InputError: one line saying what came, what was expected and what there is. The file must be
-            one that `source.build_spec` takes and that compiles to the biped of `checks`.
+            one that `source.build_spec` takes and that compiles to the robot of `checks`.
     """
     spec = build_spec(description).spec
     model = compile_spec(description, spec)
@@ -189,15 +192,15 @@ def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel
 
 
 class _Legs(NamedTuple):
-    """Both legs, everything in the frame of its link."""
+    """All legs, everything in the frame of its link."""
 
-    origin: Float[np.ndarray, "2 j 3"]  # joint in the frame of the link above [m]
-    axis: Float[np.ndarray, "2 j 3"]
-    mass: Float[np.ndarray, "2 j"]  # [kg]
-    com: Float[np.ndarray, "2 j 3"]  # [m]
-    foot_point: Float[np.ndarray, "2 3"]  # [m]
-    contacts: Float[np.ndarray, "2 c 3"]  # centres of their spheres [m]
-    radius: Float[np.ndarray, "2 c"]  # [m]
+    origin: Float[np.ndarray, "feet j 3"]  # joint in the frame of the link above [m]
+    axis: Float[np.ndarray, "feet j 3"]
+    mass: Float[np.ndarray, "feet j"]  # [kg]
+    com: Float[np.ndarray, "feet j 3"]  # [m]
+    foot_point: Float[np.ndarray, "feet 3"]  # [m]
+    contacts: Float[np.ndarray, "feet c 3"]  # centres of their spheres [m]
+    radius: Float[np.ndarray, "feet c"]  # [m]
 
 
 def _ids(model: mujoco.MjModel, description: Description) -> np.ndarray:
@@ -213,16 +216,17 @@ def _legs(description: Description, model: mujoco.MjModel) -> _Legs:
     mujoco.mj_kinematics(model, data)
     joint = _ids(model, description)
     link = model.jnt_bodyid[joint]
-    anchor = data.xanchor[joint].reshape(2, -1, 3)
-    above = np.concatenate([np.zeros((2, 1, 3)), anchor[:, :-1]], axis=1)
+    feet = len(description.feet)
+    anchor = data.xanchor[joint].reshape(feet, -1, 3)
+    above = np.concatenate([np.zeros((feet, 1, 3)), anchor[:, :-1]], axis=1)
     foot = anchor[:, -1]
     points = np.array([data.site(foot.point).xpos for foot in description.named_feet])
     spheres = [[model.geom(name).id for name in foot.contacts] for foot in description.named_feet]
     return _Legs(
         origin=anchor - above,
-        axis=data.xaxis[joint].reshape(2, -1, 3).copy(),
-        mass=model.body_mass[link].reshape(2, -1),
-        com=data.xipos[link].reshape(2, -1, 3) - anchor,
+        axis=data.xaxis[joint].reshape(feet, -1, 3).copy(),
+        mass=model.body_mass[link].reshape(feet, -1),
+        com=data.xipos[link].reshape(feet, -1, 3) - anchor,
         foot_point=points - foot,
         contacts=data.geom_xpos[spheres] - foot[:, None],
         radius=model.geom_size[spheres, 0],
@@ -237,13 +241,22 @@ def _turned(axes: Float[np.ndarray, "j 3"], joints: Float[np.ndarray, " j"]) -> 
     return R
 
 
-def _sole_lengths(contacts: Float[np.ndarray, "2 c 3"]) -> list[np.ndarray]:
+def _sole_lengths(contacts: Float[np.ndarray, "feet c 3"]) -> list[np.ndarray]:
     """Toe, heel and half width [m] of the largest rectangle about the foot points."""
     ahead = np.sort(contacts[..., 0], axis=1)
     half = max(contacts.shape[1] // 2, 1)
     toe, heel = ahead[:, half:].min(initial=np.inf), -ahead[:, :half].max()
     width = np.abs(contacts[..., 1]).min() if contacts.shape[1] == 4 else 0.0
     return [np.asarray(x) for x in ((toe, heel, width) if contacts.shape[1] > 1 else (0.0,) * 3)]
+
+
+def _ahead(
+    description: Description, R_wb: Float[np.ndarray, "3 3"], data: mujoco.MjData
+) -> Float[np.ndarray, " feet"]:
+    """How far each foot point is ahead of the middle of all, a pair by its mean [m]."""
+    points = np.array([data.site(foot.point).xpos for foot in description.named_feet]) @ R_wb
+    of_pair = np.repeat(points[:, 0].reshape(-1, 2).mean(axis=1), 2)
+    return of_pair - of_pair.mean()
 
 
 def _closed_form(legs: _Legs, sole: np.ndarray, ranges: Float[np.ndarray, "joints 2"]) -> bool:
@@ -253,7 +266,7 @@ def _closed_form(legs: _Legs, sole: np.ndarray, ranges: Float[np.ndarray, "joint
     """
     if legs.axis.shape[1] != len(_CLOSED_AXES):
         return False
-    low, high = ranges.reshape(2, -1, 2)[:, 3].T
+    low, high = ranges.reshape(len(legs.axis), -1, 2)[:, 3].T
     one_way = np.all((high < 0.0) & (low > -np.pi)) or np.all((low > 0.0) & (high < np.pi))
     down = legs.origin[:, 3:]
     return bool(
@@ -266,14 +279,14 @@ def _closed_form(legs: _Legs, sole: np.ndarray, ranges: Float[np.ndarray, "joint
 
 
 def _placed(
-    legs: _Legs, standing: Float[np.ndarray, " joints"], sole: Float[np.ndarray, "2 3 3"]
+    legs: _Legs, standing: Float[np.ndarray, " joints"], sole: Float[np.ndarray, "feet 3 3"]
 ) -> tuple[int, ...]:
     """Rows of a foot's twist that the legs can place in the standing pose.
 
     First the position, then the pitch of the sole, its yaw and its roll, as far as the joints go.
     """
     rows: list[int] = []
-    joints, axes, origin = standing.reshape(2, -1)[0], legs.axis[0], legs.origin[0]
+    joints, axes, origin = standing.reshape(len(legs.axis), -1)[0], legs.axis[0], legs.origin[0]
     frames = [_turned(axes[:i], joints[:i]) for i in range(len(joints) + 1)]
     anchors = np.cumsum([R @ step for R, step in zip(frames, origin, strict=False)], axis=0)
     foot = anchors[-1] + frames[-1] @ legs.foot_point[0]

@@ -1,12 +1,12 @@
 """A robot written anew from its links: the form that all later code reads.
 
-A trunk with a free joint, one body a leg joint, left leg first; torque motors in that order; a
+A trunk with a free joint, one body a leg joint, left legs first; torque motors in that order; a
 floor; small spheres where a sole touches and a site where its wrench acts; a keyframe that stands.
 
-Contact bits: 1 floor, 2 left leg, 4 right leg. Soles touch the floor with their spheres only; the
-trunk and the legs touch it too, so that a fall is felt, and the legs each other. The floor alone
-decides friction and stiffness. A sphere, a cylinder or an ellipsoid that collides becomes a
-capsule of its length and radius. A body of which nothing is drawn is drawn as a stick.
+Contact bits: 1 floor, 2 first leg, 4 second leg, and so on. Soles touch the floor with their
+spheres only; the trunk and the legs touch it too, so that a fall is felt, and the legs each other.
+The floor alone decides friction and stiffness. A sphere, a cylinder or an ellipsoid that collides
+becomes a capsule of its length and radius. A body of which nothing is drawn is drawn as a stick.
 """
 
 from collections.abc import Sequence
@@ -51,12 +51,9 @@ _SCENE = """<mujoco>
           conaffinity="0" friction="0.8 0.005 0.0001" solref="0.01 1" solmix="1"/>
   </worldbody>
 </mujoco>"""
-_SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _ROBOT_GEOM = {"friction": [0.1, 0.005, 0.0001], "solmix": 0.0, "priority": 0}
-BITS = {None: (0, 1), 0: (2, 5), 1: (4, 3)}  # contype, conaffinity of trunk and legs
 _SITE = {"size": [0.005] * 3, "group": 4}
-_SOLE_BITS = ((2, 4), (4, 2))
 _FLOOR_BITS = {"contype": 0, "conaffinity": 1, "condim": 3}
 _GREY, _DARK = [0.75, 0.78, 0.82, 1.0], [0.1, 0.1, 0.1, 1.0]
 _STICK = 0.02  # [m] radius
@@ -67,7 +64,7 @@ class Pieces(NamedTuple):
     """What a robot is written from."""
 
     model: mujoco.MjModel  # as the file has it
-    links: list[Link]  # trunk, left leg, right leg
+    links: list[Link]  # trunk, then leg by leg
     limits: Sequence[float]  # [N m] of the motors
     angles: Sequence[float]  # [rad] of the legs' joints, standing
     trunk_quat: Float[np.ndarray, "4"]  # standing
@@ -88,14 +85,14 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
     bodies = []
     for link in pieces.links:
         bodies.append(_add_link(bodies[link.parent] if bodies else spec.worldbody, pieces, link))
-        _add_geoms(pieces, len(bodies) - 1, bodies[-1], named)
+        _add_geoms(description, pieces, len(bodies) - 1, bodies[-1], named)
     for joint, limit in zip(description.joints, pieces.limits, strict=True):
         span = [-limit, limit]
         limits = {"ctrllimited": True, "ctrlrange": span, "forcelimited": True, "forcerange": span}
         spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, **limits)
     _add_sticks(pieces, bodies)
-    for side in (0, 1):
-        _add_foot(spec, description, pieces, side)
+    for leg in range(len(description.feet)):
+        _add_foot(spec, description, pieces, leg)
     _add_standing(spec, description, pieces)
     return spec
 
@@ -134,12 +131,22 @@ def _add_link(parent: mujoco.MjsBody, pieces: Pieces, link: Link) -> mujoco.MjsB
     return body
 
 
-def _add_geoms(pieces: Pieces, index: int, body: mujoco.MjsBody, named: set[str]) -> None:
+def contact_bits(legs: int, leg: int | None, *, on_floor: bool = True) -> tuple[int, int]:
+    """Contype and conaffinity of a leg, or of the trunk (None), of a robot with so many legs."""
+    if leg is None:
+        return 0, 1
+    others = sum(2 << i for i in range(legs) if i != leg)
+    return 2 << leg, others + on_floor
+
+
+def _add_geoms(
+    description: Description, pieces: Pieces, index: int, body: mujoco.MjsBody, named: set[str]
+) -> None:
     """The primitives of a link: what is looked at as it is, what collides as a box or capsule."""
     model, link = pieces.model, pieces.links[index]
-    count = (len(pieces.links) - 1) // 2
+    count = description.leg_joints
     leg = None if index == 0 else (index - 1) // count
-    bits = BITS[leg] if leg is None or index % count else _SOLE_BITS[leg]
+    bits = contact_bits(len(description.feet), leg, on_floor=index % count > 0 or index == 0)
     geoms = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in link.bodies]
     geoms = [g for g in geoms if model.geom_type[g] in SHAPES]
     touch = [bool(model.geom_contype[g] | model.geom_conaffinity[g]) for g in geoms]
@@ -214,17 +221,17 @@ def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> tuple[mujoco.MjModel,
     return model, data
 
 
-def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, side: int) -> None:
+def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, leg: int) -> None:
     """Site and contact spheres of a foot."""
-    foot, path, model = description.feet[side], description.model, pieces.model
-    last, names = (side + 1) * description.leg_joints, description.named_feet[side]
+    foot, path, model = description.feet[leg], description.model, pieces.model
+    last, names = (leg + 1) * description.leg_joints, description.named_feet[leg]
     link = pieces.links[last]
     if foot.body is not None:
         named = {model.body(b).name: pose for b, pose in link.bodies.items()}
         if foot.body not in named:
             raise InputError(
-                f"{path}: feet.{_SIDES[side]}.body is {foot.body!r}, expected one that joint "
-                f"{description.joints[last - 1]!r} moves: {', '.join(named)}"
+                f"{path}: feet.{description.legs[leg]}.body is {foot.body!r}, expected one that "
+                f"joint {description.joints[last - 1]!r} moves: {', '.join(named)}"
             )
         _place_foot(spec, foot, names, pieces, link, named[foot.body])
         return

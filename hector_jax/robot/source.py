@@ -21,7 +21,7 @@ from hector_jax.robot.description import Description
 from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import MASSLESS, Link, links_of
 from hector_jax.robot.mjcf import read_mjcf, refusal
-from hector_jax.robot.rebuild import BITS, SHAPES, SOLVER, Pieces, lowest, rebuild
+from hector_jax.robot.rebuild import SHAPES, SOLVER, Pieces, contact_bits, lowest, rebuild
 
 _JOINT = mujoco.mjtJoint
 _MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
@@ -122,7 +122,7 @@ def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSp
     first = int(model.jnt_bodyid[joints[0]])
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first])
     if description.armature:
-        model.dof_armature[model.jnt_dofadr[joints]] = 2 * description.armature
+        model.dof_armature[model.jnt_dofadr[joints]] = len(description.feet) * description.armature
     file = _File(description, spec, model, trunk, joints, free[0] if free else -1)
     _check_joints(file)
     _check_world(file)
@@ -282,17 +282,17 @@ def _motors_right(file: _File, limits: Sequence[float]) -> bool:
 
 
 def _contacts_right(file: _File) -> bool:
-    """Whether the geoms of the robot touch the floor and the other leg as they should."""
-    model, count = file.model, len(file.joints) // 2
-    roots = [int(model.jnt_bodyid[file.joints[side * count]]) for side in (0, 1)]
-    ends = {name for foot in file.description.feet for name in foot.contacts}
+    """Whether the geoms of the robot touch the floor and the other legs as they should."""
+    model, feet = file.model, file.description.feet
+    roots = [int(model.jnt_bodyid[j]) for j in file.joints[:: file.description.leg_joints]]
+    ends = {name for foot in feet for name in foot.contacts}
     for g in map(int, np.flatnonzero(model.geom_contype | model.geom_conaffinity)):
         body = above = int(model.geom_bodyid[g])
         if model.body_rootid[body] != file.trunk:
             continue
         while above and above not in roots:
             above = int(model.body_parentid[above])
-        contype, conaffinity = BITS[roots.index(above) if above else None]
+        contype, conaffinity = contact_bits(len(feet), roots.index(above) if above else None)
         more = model.geom_contype[g] & ~contype or model.geom_conaffinity[g] & ~conaffinity
         more = more or model.geom_solmix[g] or model.geom_priority[g]
         right = model.geom_condim[g] == (3 if model.geom(g).name in ends else 1)
@@ -323,7 +323,7 @@ def _lower(file: _File) -> list[str]:
 
 def _check_links(description: Description, links: Sequence[Link]) -> None:
     """Legs hang together from the trunk down, and each link has a mass."""
-    path, count = description.model, len(description.joints) // 2
+    path, count = description.model, description.leg_joints
     for index, link in enumerate(links):
         text = f"body {link.name!r} moves and has no mass: give it an <inertial>"
         expect(path, link.mass > 0.0, text)

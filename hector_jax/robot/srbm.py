@@ -18,7 +18,7 @@ from hector_jax.robot.model import Robot
 
 
 def centroidal_rates(
-    robot: Robot, wrench: Wrench, lever: Float[Array, "2 3"]
+    robot: Robot, wrench: Wrench, lever: Float[Array, "feet 3"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Linear acceleration [m/s^2] and rate of angular momentum [N m], world frame.
 
@@ -35,7 +35,11 @@ def centroidal_rates(
 
 @jax.jit  # traced once for the four stages of a step
 def rates(
-    robot: Robot, state: State, wrench: Wrench, feet: Float[Array, "2 3"], load: Load | None = None
+    robot: Robot,
+    state: State,
+    wrench: Wrench,
+    feet: Float[Array, "feet 3"],
+    load: Load | None = None,
 ) -> State:
     """Time derivative of the state; `feet` are the foot points in the world [m]. Source: Eq. 2."""
     acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
@@ -57,7 +61,7 @@ def step(
     robot: Robot,
     state: State,
     wrench: Wrench,
-    feet: Float[Array, "2 3"],
+    feet: Float[Array, "feet 3"],
     dt: float,
     load: Load | None = None,
 ) -> State:
@@ -76,7 +80,12 @@ def step(
 
 
 def unexplained(
-    robot: Robot, before: State, after: State, wrench: Wrench, feet: Float[Array, "2 3"], dt: float
+    robot: Robot,
+    before: State,
+    after: State,
+    wrench: Wrench,
+    feet: Float[Array, "feet 3"],
+    dt: float,
 ) -> Load:
     """The load that the motion from one state to the next owes to something beside the wrench.
 
@@ -105,8 +114,8 @@ def unexplained(
 
 @partial(jax.jit, static_argnums=3)  # traced once for all that ask
 def linearise(
-    robot: Robot, euler: Float[Array, "3"], lever: Float[Array, "2 3"], dt: float
-) -> tuple[Float[Array, "15 15"], Float[Array, "15 12"]]:
+    robot: Robot, euler: Float[Array, "3"], lever: Float[Array, "feet 3"], dt: float
+) -> tuple[Float[Array, "15 15"], Float[Array, "15 u"]]:
     """A and B of x' = A x + B u, with x = [e; p; omega; v; g] and u = [F_0; F_1; M_0; M_1].
 
     Args:
@@ -131,13 +140,14 @@ def linearise(
     )
     turn = dt * inverse_inertia
     push = dt / robot.mass * eye
+    feet = len(lever)
     B = jnp.block(
         [
-            [none, none, none, none],
-            [none, none, none, none],
-            [turn @ skew(lever[0]), turn @ skew(lever[1]), turn, turn],
-            [push, push, none, none],
-            [none, none, none, none],
+            [none] * (2 * feet),
+            [none] * (2 * feet),
+            [turn @ skew(arm) for arm in lever] + [turn] * feet,
+            [push] * feet + [none] * feet,
+            [none] * (2 * feet),
         ]
     )
     return A, B

@@ -50,7 +50,7 @@ _DESCRIPTIONS = {
     "position": "x, y, z of the centre of mass [1/m^2]",
     "ang_velocity": "x, y, z [s^2/rad^2]",
     "velocity": "x, y, z [s^2/m^2]",
-    "R": "of the squared wrench of the ground on each foot, left then right, world frame",
+    "R": "of the squared wrench of the ground on each foot, left ones first, world frame",
     "force": "x, y, z [1/N^2]",
     "moment": "x, y, z [1/(N m)^2]",
 }
@@ -172,7 +172,7 @@ def export(
 
 def weights_schema(robot: Robot | None = None) -> dict[str, Any]:
     """JSON schema (draft 2020-12) of a weights file of a robot, HECTOR by default."""
-    schema = _schema(weights_tree(nominal()))
+    schema = _schema(weights_tree(nominal(robot)))
     others = {
         name: _schema(np.zeros(one.shape(robot)).tolist(), Range(one.lower, one.upper))
         for name, one in TUNABLES.items()

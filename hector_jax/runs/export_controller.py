@@ -28,7 +28,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
-from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
+from hector_jax.control.controller import (
+    Memory,
+    Plan,
+    WalkConfig,
+    actuate,
+    contacts_needed,
+    step_plan,
+)
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
@@ -48,7 +55,7 @@ _STILL = Command(np.ones(2), np.zeros((2, 2)), np.zeros(2))
 
 def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, Plan]:
     """Memory and plan of zeros, with the shapes and dtypes of the real ones."""
-    joints = np.zeros_like(robot.standing_joints)
+    joints, feet = np.zeros_like(robot.standing_joints), len(robot.foot_point)
     shapes = jax.eval_shape(
         partial(step_plan, config),
         robot,
@@ -56,7 +63,7 @@ def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, P
         command=_STILL,
         anchor=standing_anchor(robot),
         tick=np.int32(0),
-        memory=Memory(Feet(np.zeros((2, 3)), np.zeros(2))),
+        memory=Memory(Feet(np.zeros((feet, 3)), np.zeros(feet))),
         measurement=Measurement(State(*np.zeros((4, 3))), joints, joints),
     )
     return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes)
@@ -102,9 +109,11 @@ def controller(
             memory=memory,
             measurement=measurement,
         )
-        both = (tick < moves) | config.gait.double_support
-        branch = jnp.where(substep > 0, 0, jnp.where(both, 2, 1))
-        choices = [partial(planned, max_contacts=count) for count in (1, 2)]
+        branch = jnp.where(substep > 0, 0, jnp.where(tick < moves, 2, 1))
+        choices = [
+            partial(planned, max_contacts=contacts_needed(config, when))
+            for when in (moves, moves - 1)
+        ]
         memory, plan = lax.switch(branch, [lambda: (memory, plan), *choices])
         now = {"substep": substep, "measurement": measurement, "plan": plan, "memory": memory}
         out = {
@@ -137,7 +146,7 @@ def _standing(robot: Robot) -> tuple[dict[str, Any], ...]:
 
 _SIGNATURE = {
     "carry": "opaque: zeros at millisecond 0, then the carry that came out",
-    "millisecond": "since the start; the robot stands on both feet then",
+    "millisecond": "since the start; the robot stands on all feet then",
     "measured": {
         "euler": "roll, pitch, yaw of the trunk [rad], R = Rz Ry Rx; yaw continuous, not wrapped",
         "position": "centre of mass [m], world: trunk origin + R com_offset; the floor is z = 0",
@@ -157,7 +166,7 @@ _SIGNATURE = {
         "tick": "when: gait tick from which on the command is walked; before, it steps in place",
     },
     "out": {
-        "force": "of the ground on each foot as commanded, left then right, world frame [N]",
+        "force": "of the ground on each foot as commanded, left ones first, world frame [N]",
         "moment": "the same, at the foot point [N m]",
         "torque": "of the joints [N m], within the limits: this goes to the motors",
         "contact": "planned stance",

@@ -18,11 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.weights import (
-    WEIGHT_NAMES,
     Weights,
     expert,
+    named_like,
     nominal,
     vector_to_weights,
+    weight_names,
     weights_to_vector,
 )
 from hector_jax.control.weights_file import load_weights
@@ -108,7 +109,7 @@ def as_line(name: str, iteration: Iteration) -> str:
     gradient = jax.tree.map(np.multiply, evaluation.gradient, iteration.weights)
 
     def named(tree: Weights) -> dict[str, Any]:
-        return dict(zip(WEIGHT_NAMES, weights_to_vector(tree), strict=True))
+        return dict(zip(weight_names(tree), weights_to_vector(tree), strict=True))
 
     row = {
         "set": name,
@@ -204,15 +205,16 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
     number = partial(np.array, dtype=float)  # NaN of None
 
     def vector(table: Mapping[str, Any]) -> np.ndarray:
-        return number([table[name] for name in WEIGHT_NAMES])
+        return number([table[name] for name in weight_names(like)])
 
     def tree(values: np.ndarray, table: Mapping[str, Any]) -> Weights:
-        weights = vector_to_weights(jnp.asarray(values))
+        weights = vector_to_weights(jnp.asarray(values), like)
         others = {name: number(table[name]) for name in names}
         return jax.tree.map(np.asarray, weights._replace(others=others))
 
+    like = named_like(row["weights"])
     weights = vector(row["weights"])
-    names = row["weights"].keys() - set(WEIGHT_NAMES)
+    names = row["weights"].keys() - set(weight_names(like))
     return Iteration(
         iteration=np.array(row["iteration"]),
         weights=tree(weights, row["weights"]),

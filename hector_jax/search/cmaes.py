@@ -1,4 +1,4 @@
-"""Search without derivatives: CMA-ES in the logarithms of 18 weights, the two feet sharing one R.
+"""Search without derivatives: CMA-ES in the logarithms of the weights, all feet sharing one R.
 
 What a gradient has to be measured against. The objective is whatever `walk` says a weight set
 costs; several searches go in lock-step, so that a whole generation of all is walked at once.
@@ -25,8 +25,8 @@ from jaxtyping import Float
 
 from hector_jax.control.parameters import Q, R, bounds
 from hector_jax.control.weights import (
-    DIRECTION_NAMES,
     Weights,
+    direction_names,
     directions,
     scale_weights,
     weights_to_vector,
@@ -66,7 +66,7 @@ class SearchConfig:
 class Generation(NamedTuple):
     """Steps that were walked at once, and their losses."""
 
-    steps: Float[np.ndarray, "population 18"]  # log-weights, less those of the start
+    steps: Float[np.ndarray, "population directions"]  # log-weights, less those of the start
     losses: Float[np.ndarray, " population"]  # infinite where there is no number
 
 
@@ -119,7 +119,7 @@ def search(
             "seed": config.seed,
             "spread": config.spread,
             "start": np.asarray(weights_to_vector(one.start), float).tolist(),
-            "directions": list(DIRECTION_NAMES),
+            "directions": list(direction_names(one.start)),
             **({"others": weights_tree(one.start)["others"]} if one.start.others else {}),
             **about,
         }
@@ -143,7 +143,7 @@ def search(
     return results
 
 
-def best(history: Sequence[Generation]) -> tuple[Float[np.ndarray, "18"], float, int]:
+def best(history: Sequence[Generation]) -> tuple[Float[np.ndarray, " directions"], float, int]:
     """Steps, loss and number of the best walk; the number counts from 1."""
     steps, losses = map(np.concatenate, zip(*history, strict=True))
     which = int(np.argmin(losses))
@@ -165,7 +165,7 @@ class CmaSearch:
         self.config, self.start = config, start
         self.history: list[Generation] = []
         self.optimizer = CMA(
-            mean=np.zeros(len(DIRECTION_NAMES)),
+            mean=np.zeros(len(direction_names(start))),
             sigma=config.spread,
             bounds=log_bounds(start),
             seed=config.seed,
@@ -179,7 +179,7 @@ class CmaSearch:
             return "the budget is spent"
         return "CMA-ES has converged" if self.optimizer.should_stop() else ""
 
-    def ask(self) -> Float[np.ndarray, "population 18"]:
+    def ask(self) -> Float[np.ndarray, "population directions"]:
         """Draw the next generation."""
         return np.stack([self.optimizer.ask() for _ in range(self.config.population)])
 
@@ -198,7 +198,7 @@ class CmaSearch:
         """Generation of a row of the journal; ValueError where its size is another."""
         generation, size = to_generation(row["steps"], row["losses"]), self.config.population
         steps, losses = (x.shape for x in generation)
-        wanted = (size, len(DIRECTION_NAMES)), (size,)
+        wanted = (size, len(direction_names(self.start))), (size,)
         if (steps, losses) != wanted:
             raise ValueError(
                 f"steps {steps} and losses {losses}, expected {wanted[0]} and {wanted[1]}"
@@ -212,20 +212,21 @@ def to_generation(steps: Any, losses: Any) -> Generation:
     return Generation(np.array(steps, float), np.where(np.isfinite(numbers), numbers, np.inf))
 
 
-def project(start: Weights, steps: Float[np.ndarray, "18"]) -> Weights:
+def project(start: Weights, steps: Float[np.ndarray, " directions"]) -> Weights:
     """Weights after steps, inside the box to the last digit, whatever the logarithm rounds to."""
-    return jax.tree.map(np.clip, scale_weights(start, steps), *bounds(start.others))
+    return jax.tree.map(np.clip, scale_weights(start, steps), *bounds(start.others, start))
 
 
-def log_bounds(start: Weights) -> Float[np.ndarray, "18 2"]:
+def log_bounds(start: Weights) -> Float[np.ndarray, "directions 2"]:
     """Largest steps from a start that stay in the box, down and up.
 
     Raises:
         InputError: it lies outside the box, or its feet differ.
     """
-    tied = directions().argmax(axis=1)  # of the left foot, where there are two
-    at, low, high = (np.asarray(weights_to_vector(w), float) for w in (start, *bounds()))
-    if any(np.any(part[0] != part[1]) for part in start.R):
+    tied = directions(start).argmax(axis=1)  # of the first foot, where there are several
+    box = (start, *bounds(like=start))
+    at, low, high = (np.asarray(weights_to_vector(w), float) for w in box)
+    if any(np.any(part != part[:1]) for part in start.R):
         raise InputError("a search needs a start whose feet share one R; these differ")
     if not ((low <= at) & (at <= high)).all():
         box = ", ".join(

@@ -73,7 +73,7 @@ class Sample(NamedTuple):
     state: State
     reference: State
     effect: Wrench
-    feet: Float[Array, "*batch 2 3"]
+    feet: Float[Array, "*batch feet 3"]
     joints: Float[Array, "*batch joints"]
     fallen: Bool[Array, "*batch"]
     legs_touch: Bool[Array, "*batch"]

@@ -17,7 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from hector_jax.control.controller import Memory, Plan, WalkConfig, init_memory
+from hector_jax.control.controller import (
+    Memory,
+    Plan,
+    WalkConfig,
+    contacts_needed,
+    init_memory,
+)
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -163,7 +169,8 @@ def _millisecond(
 def _sample(
     program: _Program, walk: _Walk, carry: _Carry, when: tuple[Array, Array]
 ) -> tuple[_Carry, Sample]:
-    carry = carry._replace(effect=zero_wrench(), legs=jnp.zeros((), bool))
+    none = zero_wrench(len(walk.robot.foot_point))
+    carry = carry._replace(effect=none, legs=jnp.zeros((), bool))
     carry, _ = jax.lax.scan(partial(_millisecond, program, walk), carry, when)
     time = when[0][-1] + (when[1][-1] + 1) / program.substeps
     after = _read(program, walk, carry.physics)
@@ -188,16 +195,18 @@ def _plan(
 def _tick(
     program: _Program, walk: _Walk, carry: _Carry, tick: Int[Array, ""]
 ) -> tuple[_Carry, tuple[Plan, Sample]]:
-    gait, start_tick, count = program.config.gait, walk.job.start_tick, program.substeps
+    config, start_tick, count = program.config, walk.job.start_tick, program.substeps
+    moves = config.gait.first_tick
     anchor = anchor_at(walk.robot, carry.last.state, start_tick)
     carry = carry._replace(anchor=where(tick == start_tick, anchor, carry.anchor))
-    plan_both, plan_one = (
-        partial(_plan, program, walk, tick, max_contacts=max_contacts) for max_contacts in (2, 1)
+    standing, walking = (
+        partial(_plan, program, walk, tick, max_contacts=contacts_needed(config, when))
+        for when in (moves - 1, moves)
     )
-    if gait.double_support:
-        memory, plan = plan_both(carry)
+    if contacts_needed(config, moves) == contacts_needed(config, moves - 1):
+        memory, plan = standing(carry)
     else:
-        memory, plan = jax.lax.cond(tick < gait.first_tick, plan_both, plan_one, carry)
+        memory, plan = jax.lax.cond(tick < moves, standing, walking, carry)
     carry = where(carry.fallen, carry, carry._replace(memory=memory, plan=plan))
     when = jnp.full(count, tick), jnp.arange(count)
     when = jax.tree.map(lambda x: x.reshape(-1, program.period), when)
@@ -213,12 +222,12 @@ def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     anchor = standing_anchor(robot)._replace(tick=job.start_tick)
     memory = init_memory(robot, loop.measure(robot, reading, yaw, walk.error))
     inputs = anchor, tick, memory, yaw, reading, walk.error
-    shapes = jax.eval_shape(
-        lambda: loop.plan_tick(config, robot, job.weights, job.command, *inputs, max_contacts=2)[1]
-    )
+    feet = len(robot.foot_point)
+    plan = partial(loop.plan_tick, config, robot, job.weights, job.command, *inputs)
+    shapes = jax.eval_shape(lambda: plan(max_contacts=feet)[1])
     truth = robot, job.command, anchor, 1.0 * tick, yaw, reading
     touches = Touches(never, never)
-    now = loop.sample(config, *truth, effect=zero_wrench(), touches=touches)
+    now = loop.sample(config, *truth, effect=zero_wrench(feet), touches=touches)
     return _Carry(
         memory=memory,
         plan=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
@@ -227,7 +236,7 @@ def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
         yaw=yaw,
         physics=mjx_model.to_single(physics) if program.single else physics,
         fallen=never,
-        effect=zero_wrench(),
+        effect=zero_wrench(feet),
         legs=never,
         last=now,
     )

@@ -85,7 +85,7 @@ def base_state(robot: Robot, reading: Reading, yaw_before: Float[Array, ""]) -> 
     )
 
 
-def foot_points(robot: Robot, reading: Reading) -> Float[Array, "2 3"]:
+def foot_points(robot: Robot, reading: Reading) -> Float[Array, "feet 3"]:
     """True foot points in the world [m]."""
     R_wb = rotation_from_quaternion(reading.pose[3:])
     local = foot_poses(robot, reading.joints + reading.slack).position
@@ -108,7 +108,10 @@ def foot_contacts(
 
 
 def ground_wrench(
-    contacts: Contacts, foot: Int[Array, " n"], floor: Int[Array, ""], points: Float[Array, "2 3"]
+    contacts: Contacts,
+    foot: Int[Array, " n"],
+    floor: Int[Array, ""],
+    points: Float[Array, "feet 3"],
 ) -> Wrench:
     """Force [N] and moment [N m] of the ground on each foot at its foot point, world frame.
 
@@ -125,7 +128,7 @@ def ground_wrench(
     # MuJoCo's contact force acts on the second geom.
     sign = jnp.where(contacts.geoms[:, 1] == floor, -1.0, 1.0)
     force = sign[:, None] * jnp.einsum("nij,ni->nj", contacts.frame, local)
-    mine = (foot[None, :] == jnp.arange(2)[:, None])[..., None]  # (2, n, 1)
+    mine = (foot[None, :] == jnp.arange(len(points))[:, None])[..., None]  # (feet, n, 1)
     lever = contacts.position - points[:, None]
     at_foot = jnp.where(mine, force, 0.0)
     return Wrench(at_foot.sum(axis=1), jnp.cross(lever, at_foot).sum(axis=1))

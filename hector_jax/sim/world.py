@@ -179,12 +179,12 @@ class World:
     """A MuJoCo model and where the robot's parts are in it."""
 
     model: mujoco.MjModel
-    joint_qpos: np.ndarray  # (joints,) motor side, left leg then right
+    joint_qpos: np.ndarray  # (joints,) motor side, leg by leg
     joint_dof: np.ndarray  # (joints,)
     slack: np.ndarray  # (joints,) backlash joints; empty where there are none
     slack_qpos: np.ndarray  # (joints,) likewise
     actuator: np.ndarray  # (joints,)
-    foot_of_geom: np.ndarray  # (ngeom,) 0 left, 1 right, -1 no foot
+    foot_of_geom: np.ndarray  # (ngeom,) its foot; -1: none
     floor: int  # geom
     trunk: int  # body
 
@@ -244,7 +244,8 @@ def _compile(description: Description, slack: bool) -> World:
     joints = [model.joint(name) for name in names]
     slacks = [model.joint(name + SLACK) for name in names] if slack else []
     of_joint = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
-    feet = [joints[description.leg_joints - 1].bodyid[0], joints[-1].bodyid[0]]
+    each = description.leg_joints
+    feet = [joint.bodyid[0] for joint in joints[each - 1 :: each]]
     return World(
         model=model,
         joint_qpos=np.array([joint.qposadr[0] for joint in joints]),

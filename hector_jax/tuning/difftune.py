@@ -54,7 +54,7 @@ class TuneConfig:
     others: tuple[str, ...] = ()  # of `parameters.TUNABLES`, tuned beside Q and R
     beta_others: float = 0.02  # largest step of one, as a share of its box
     update: str = "relative"  # or "literal": the paper's theta - beta dL/dtheta
-    tie_feet: bool = True  # one R for both feet, as the robot is its own mirror image
+    tie_feet: bool = True  # one R for all feet, as the robot is its own mirror image
     iterations: int = 100  # at most
     patience: int = 10  # iterations over which the loss must fall
     gain: float = 5e-3  # by this share at least, or the tuning has converged
@@ -187,7 +187,9 @@ def relative_step(
         if not jax.tree.leaves(tree):
             return tree
         products = jax.tree.map(jnp.multiply, tree, sizes)
-        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(x)) for x in jax.tree.leaves(products)]))
+        largest = jnp.max(
+            jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in jax.tree.leaves(products)])
+        )
         by = beta / jnp.where(largest > 0.0, largest, 1.0)
         return jax.tree.map(lambda x, size: -by * x * size, products, sizes)
 
@@ -225,7 +227,7 @@ def step_weights(
     optimiser = _optimiser(config)
     updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
     moved = optax.apply_updates(weights, jax.tree.map(lambda u: step_scale * u, updates))
-    return optax.projections.projection_box(moved, *bounds(weights.others))
+    return optax.projections.projection_box(moved, *bounds(weights.others, weights))
 
 
 def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
@@ -242,12 +244,12 @@ def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
 def init(config: TuneConfig, weights: Weights, first: int = 0) -> TuneState:
     """A tuning before its first rollout, which is iteration `first`.
 
-    With `tie_feet` both feet start from the geometric mean of their weights in R.
+    With `tie_feet` all feet start from the geometric mean of their weights in R.
     """
     weights = config.rollout.walk.with_others(weights, config.others)
     weights = jax.tree.map(lambda w: jnp.asarray(w, float), weights)
     if config.tie_feet:
-        equal = jnp.all(jnp.stack([jnp.array_equal(*w) for w in weights.R]))
+        equal = jnp.all(jnp.stack([jnp.all(w == w[:1]) for w in weights.R]))
         tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights.R)))
         # weights that are equal stay so to the last bit
         weights = weights._replace(R=where(equal, weights.R, tied))

@@ -90,7 +90,7 @@ class Carry(NamedTuple):
 
     state: State
     feet: Feet
-    commands: Wrench  # (HISTORY, 2, 3) each, world frame, newest first
+    commands: Wrench  # (HISTORY, feet, 3) each, world frame, newest first
     anchor: Anchor  # taken anew at t = 0
     fallen: Bool[Array, ""]
     before: Effect | None = None  # of the last tick, world frame; where there is a variation
@@ -101,11 +101,11 @@ def init_carry(robot: Robot, anchor: Anchor) -> Carry:
     zero = jnp.zeros(3)
     trunk = anchor.position - robot.com_offset
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
-    half = 0.5 * robot.mass * jnp.asarray(robot.gravity)
-    standing = jnp.broadcast_to(half, (HISTORY, 2, 3))
+    share = robot.mass / len(local) * jnp.asarray(robot.gravity)
+    standing = jnp.broadcast_to(share, (HISTORY, *local.shape))
     return Carry(
         state=State(zero, anchor.position, zero, zero),
-        feet=Feet(trunk + local, jnp.zeros(2)),
+        feet=Feet(trunk + local, jnp.zeros(len(local))),
         commands=Wrench(standing, jnp.zeros_like(standing)),
         anchor=anchor,
         fallen=jnp.asarray(False),
@@ -133,9 +133,9 @@ def _moved_by(
     robot: Robot,
     state: State,
     now: Effect,
-    feet: Float[Array, "2 3"],
+    feet: Float[Array, "feet 3"],
     before: Effect,
-    feet_before: Float[Array, "2 3"],
+    feet_before: Float[Array, "feet 3"],
     dt: float,
 ) -> State:
     """`srbm.step` of the body as it is; what is delayed acts where the feet were."""
@@ -160,7 +160,7 @@ def _respond(
     effect: jax.tree_util.Partial,
     state: State,
     commands: Wrench,
-    contact: Bool[Array, "2"],
+    contact: Bool[Array, " feet"],
     since_switch: Float[Array, ""],
 ) -> Effect:
     """What acts on the body by phi, which sees and answers in the yaw frame."""
@@ -179,7 +179,7 @@ def _move(
     robot: Robot,
     carry: Carry,
     acting: Effect,
-    feet: Float[Array, "2 3"],
+    feet: Float[Array, "feet 3"],
     dt: float,
     variation: Variation | None,
 ) -> State:

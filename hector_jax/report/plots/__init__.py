@@ -178,7 +178,7 @@ def weights(
 
     Args:
         path: file to write.
-        names: of the weights, such as `WEIGHT_NAMES`.
+        names: of the weights, `weight_names`.
         sets: `nominal`, `expert` and the tuned `without`, `with`, flat in the order of `names`.
     """
     ratio = {name: np.divide(values, sets["nominal"]) for name, values in sets.items()}
