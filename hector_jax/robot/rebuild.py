@@ -266,7 +266,7 @@ def _place_foot(
     if foot.point is None:
         level = places @ R.T  # axes of the world, origin in the last joint
         middle = 0.5 * (level.min(axis=0) + level.max(axis=0))
-        point = R.T @ np.array([0.0, middle[1], middle[2]])
+        point = R.T @ np.array([0.0 if len(places) > 1 else middle[0], *middle[1:]])
     else:
         point = pose.p + pose.R @ np.array(foot.point)
     body.add_site(name=names.point, pos=point, **_SITE)
