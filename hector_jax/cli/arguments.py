@@ -9,12 +9,14 @@ from typing import Any
 from hector_jax.cli.flags import View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
+from hector_jax.control.gait import gait_named
 from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import load_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError
+from hector_jax.core.settings import to_table
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.description import Description
 from hector_jax.robot.model import Robot, load_robot
@@ -111,6 +113,23 @@ def plant_of(path: Path | None, robot: Robot) -> Robot | None:
     plant = load_robot(path)
     check_plant(robot.description, plant.description)
     return plant
+
+
+def with_gait(robot: Robot, name: str) -> Robot:
+    """The robot with a gait; `own` is that of its file.
+
+    Raises:
+        InputError: it has other feet than the gait.
+    """
+    if name == "own":
+        return robot
+    description = robot.description
+    try:
+        gait = gait_named(walk_config(robot).gait, name)
+    except InputError as error:
+        raise InputError(f"--gait: {error}") from None
+    control = dict(description.control) | {"gait": to_table(gait)}
+    return robot._replace(description=replace(description, control=control))
 
 
 def course(text: str, robot: Robot) -> NamedCommand:

@@ -40,7 +40,7 @@ from hector_jax.tuning.loss import Loss, loss_of_robot
 
 def evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
-    robot = load_robot(args.robot)
+    robot = arguments.with_gait(load_robot(args.robot), args.gait)
     plant, course = arguments.plant_of(args.plant, robot), arguments.course(args.traj, robot)
     seconds = arguments.seconds(args.seconds, course)
     # ideal and hfs are one plant each, without chance
@@ -76,7 +76,7 @@ def walk(args: Walk) -> None:
     """
     if args.video is not None:
         check_film(args.video)
-    robot = load_robot(args.robot)
+    robot = arguments.with_gait(load_robot(args.robot), args.gait)
     plant = arguments.plant_of(args.plant, robot)
     if args.world == "srbm" and plant is not None:
         raise InputError("--plant needs a world of MuJoCo, got --world srbm")

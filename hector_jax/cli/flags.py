@@ -33,6 +33,7 @@ Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Number = Literal["footstep_feedback", "footstep_width", "turn_lead", "effort_reference", "friction"]
 Variant = Literal["residual", "paper"]
 Engine = Literal["auto", "c", "mjx"]
+Gait = Literal["own", "walk", "trot", "pace", "crawl", "stand"]
 RobotFile = Annotated[Path | None, Source.ROBOT]
 Weights = Annotated[str, Source.WEIGHTS]
 Trajectory = Annotated[str, Source.TRAJECTORY]
@@ -71,7 +72,7 @@ class Collect(Configured):
     seed: Seed = 0  # seed of all random numbers: commands, weights, plants, pushes
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     processes: Processes = 2  # worker processes, one core each
-    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
@@ -87,7 +88,7 @@ class Train(Configured):
     epochs: Annotated[int, Range(1, 100_000)] = 200  # passes over the samples
     seed: Seed = 0  # seed of the initial parameters and of the order of the samples
     json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
@@ -129,7 +130,7 @@ class Tune(Configured):
     video: bool = True  # make a film of the nominal and the tuned weights
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
-    robot: RobotFile = None  # TOML file of another biped, with its data in DATA/NAME; or HECTOR
+    robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
 
 
 @_command
@@ -151,7 +152,7 @@ class Search(Configured):
     record: Path | None = None  # folder of the record that a search resumes from; by default OUT
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
 
 
 @_command
@@ -170,8 +171,9 @@ class Evaluate(Configured):
     out: Path | None = None  # file for the result as JSON
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table
-    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
     plant: RobotFile = None  # TOML file of another model of the robot, of which the plants are
+    gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
 
 
 @_command
@@ -189,8 +191,9 @@ class Walk(Configured):
     out: Path | None = None  # file for the trajectory (.npz)
     video: Path | None = None  # file for a film beside nominal weights (.mp4; .webp for a page)
     json: bool = False  # print JSON instead of text
-    robot: RobotFile = None  # TOML file of another biped; HECTOR by default
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
     plant: RobotFile = None  # TOML file of another model of the robot, which is walked on
+    gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
 
 
 @_command
@@ -227,7 +230,7 @@ class Export:
     # trajectory to check on; by default that of the run, or straight
     traj: Annotated[str | None, Source.TRAJECTORY] = None
     seconds: Seconds = 1.0  # length of that walk after the start-up [s]
-    robot: RobotFile = None  # TOML file of the biped of a weights file; HECTOR by default
+    robot: RobotFile = None  # TOML file of the robot of a weights file; HECTOR by default
     json: bool = False  # print JSON instead of text
 
 

@@ -57,7 +57,7 @@ def _leg(side: str) -> tuple[str, ...]:
 class Foot(NamedTuple):
     """A foot in the model: names in it, or places in the frame of a body."""
 
-    point: str | Triple | None  # site; or where wrenches act [m]; else below the ankle or at the contact
+    point: str | Triple | None  # site; or where wrenches act [m]; else under the last joint
     contacts: tuple[str | Triple, ...]  # spheres; or where the sole touches [m]
     body: str | None = None  # of places
 
