@@ -8,7 +8,8 @@ of mass m and height h:
     max_force                2.5 m g
     effort_reference         "gravity": else the plan jumps before single stance
     sole_width               0.6 of a flat foot, or it rolls over its edge
-    width                    0.85 of half the distance of the foot points, standing
+    pattern                  of four feet "trot"
+    width                    of half the distance of the foot points, standing, 0.85; of four 0.7
     feedback                 0.12 s sqrt(h / h0)
     height                   0.06 m h / 0.69 m of a swinging foot; landing -0.005 m
     kp                       I w^2, w = 30 rad/s and I what hangs at the joint, its motor included;
@@ -36,10 +37,11 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import FEET
 from hector_jax.robot.description import Description, description_of
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot, compile_model, robot_of
-from hector_jax.robot.soles import SIDES, Sole, find_soles
+from hector_jax.robot.soles import Sole, find_soles
 from hector_jax.robot.stand import standing_pose
 from hector_jax.robot.survey import Survey, survey_file
 
@@ -53,7 +55,7 @@ class Proposal(NamedTuple):
     """A TOML for a file."""
 
     survey: Survey
-    soles: tuple[Sole, Sole]
+    soles: tuple[Sole, ...]
     table: dict[str, Any]
     wrong: tuple[str, ...]  # what is to be mended by hand, a line each
 
@@ -76,13 +78,15 @@ def propose(path: Path) -> Proposal:
     survey = survey_file(path)
     soles = find_soles(survey)
     angles, balanced = standing_pose(survey, soles)
+    if len(soles[0].contacts) == 1:  # round: it touches elsewhere where the leg is bent
+        soles = find_soles(survey, angles)
     table = names(survey, soles, angles)
     wrong = []
     if soles[0].guessed:
         wrong.append(
             f"no box, sphere, capsule or cylinder of body {soles[0].section['body']!r} collides: "
-            "its contacts are guessed from its inertia: measure the sole and correct feet.left and "
-            "feet.right"
+            "its contacts are guessed from its inertia: measure the sole and correct "
+            f"{' and '.join(f'feet.{leg}' for leg in FEET[len(soles)])}"
         )
     if not balanced:
         wrong.append(
@@ -101,11 +105,11 @@ def propose(path: Path) -> Proposal:
 def names(survey: Survey, soles: Sequence[Sole], angles: dict[str, float]) -> dict[str, Any]:
     """What the TOML says by names."""
     stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in survey.path.stem)
-    left, right = ([survey.model.joint(j).name for j in leg] for leg in survey.legs)
-    joints: dict[str, Any] = {"left": left, "right": right}
+    legs = ([survey.model.joint(j).name for j in leg] for leg in survey.legs)
+    joints: dict[str, Any] = dict(zip(FEET[len(survey.legs)], legs, strict=True))
     if survey.weld:
         joints["weld"] = list(survey.weld)
-    feet = {side: sole.section for side, sole in zip(SIDES, soles, strict=True)}
+    feet = {leg: sole.section for leg, sole in zip(FEET[len(soles)], soles, strict=True)}
     return {
         "name": stem,
         "model": survey.path.name,
@@ -133,11 +137,12 @@ def sections(size: Size) -> dict[str, Any]:
     robot, mass, root = size.robot, size.mass, math.sqrt(size.height)
     height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
     ticks, torque = round(20 * root), _short(mass * size.height)
-    left, right = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
+    across = foot_poses(robot, jnp.asarray(robot.standing_joints)).position[:, 1]
+    four = len(across) == 4
     flat = {"sole_width": 0.6} if robot.structure.contact == "flat" else {}
     return {
         "limits": {"min_height": round(0.55 * height, 2)},
-        "gait": {"stance": ticks, "swing": ticks},
+        "gait": ({"pattern": "trot"} if four else {}) | {"stance": ticks, "swing": ticks},
         "mpc": {
             "step_ticks": max(3, math.ceil(0.15 * ticks)),
             "max_force": float(f"{2.5 * weight:.2g}"),
@@ -145,7 +150,7 @@ def sections(size: Size) -> dict[str, Any]:
             **flat,
         },
         "footstep": {
-            "width": round(0.85 * 0.5 * float(left[1] - right[1]), 3),
+            "width": round((0.7 if four else 0.85) * float(np.abs(across).mean()), 3),
             "feedback": round(0.12 * root, 3),
         },
         "legs": {
@@ -172,9 +177,10 @@ def sections(size: Size) -> dict[str, Any]:
 
 
 def _gains(size: Size) -> dict[str, list[float]]:
-    """Gains of the joints of a leg, by the mean of both legs."""
-    inertia = size.inertia.reshape(2, -1).mean(axis=0)
-    limit = size.robot.torque_limit.reshape(2, -1).min(axis=0)
+    """Gains of the joints of a leg, by the mean of all legs."""
+    legs = len(size.robot.foot_point)
+    inertia = size.inertia.reshape(legs, -1).mean(axis=0)
+    limit = size.robot.torque_limit.reshape(legs, -1).min(axis=0)
     kp = np.minimum(inertia * _W**2, _KP_PER_LIMIT * limit)
     return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
 

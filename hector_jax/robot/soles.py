@@ -4,10 +4,10 @@ Of the primitive geoms of a foot that collide with the floor, those points count
 5 mm of the lowest one when all joints are zero. Where the lowest box of a foot is tilted then, its
 lower face is the sole, else what is level. A sole that is wider than 2 cm at its front and at
 its back, under a leg of six joints or more, is flat: four corners. One that is longer than 2 cm is
-a line from heel to toe, any other a point. Both feet get the same lengths.
+a line from heel to toe, any other a point. Both feet of a pair get the same lengths.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,11 +15,11 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import FEET
 from hector_jax.robot.links import at_zero, subtree
 from hector_jax.robot.rebuild import SHAPES
 from hector_jax.robot.survey import Survey
 
-SIDES = ("left", "right")
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _SAME_SOLE = 5e-3  # [m] above the lowest point
 _WIDE = 0.02  # [m]
@@ -40,13 +40,20 @@ class Sole(NamedTuple):
     guessed: bool  # from the foot's inertia: the file has no geoms
 
 
-def find_soles(survey: Survey) -> tuple[Sole, Sole]:
-    """Both feet of a robot.
+def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tuple[Sole, ...]:
+    """All feet of a robot.
+
+    Args:
+        survey: the robot.
+        angles: pose [rad] by joint in which they are looked at; the others are zero, as is what a
+            `Sole` says beside its section.
 
     Raises:
         InputError: one line: the feet differ.
     """
-    data = at_zero(survey.model)
+    model = survey.model
+    pose = {int(model.joint(name).qposadr[0]): angle for name, angle in (angles or {}).items()}
+    data = at_zero(model, pose)
     axes = [_axes(survey, data, leg) for leg in survey.legs]
     touch = [_floor_points(survey, data, leg, R) for leg, R in zip(survey.legs, axes, strict=True)]
     guessed = any(len(points) == 0 for points in touch)
@@ -55,18 +62,20 @@ def find_soles(survey: Survey) -> tuple[Sole, Sole]:
     elif named := _named(survey, data):
         return named
     outlines = [_outline(points, len(survey.legs[0])) for points in touch]
-    left, right = outlines[0], _mirrored(outlines[1])
-    near = _ALIKE_GUESSES if guessed else _ALIKE
-    if len(left) != len(right) or np.abs(left - right).max() > near:
-        raise InputError(
-            f"{survey.path}: the left foot touches at {np.round(left, 4).tolist()} from its last "
-            f"joint and the mirrored right one at {np.round(right, 4).tolist()}, expected the same"
-        )
-    mean = np.round(0.5 * (left + right), 4)
-    return (
-        _placed(survey, data, 0, mean, axes[0], guessed),
-        _placed(survey, data, 1, _mirrored(mean), axes[1], guessed),
-    )
+    near, soles = _ALIKE_GUESSES if guessed else _ALIKE, []
+    names = FEET[len(survey.legs)]
+    for first in range(0, len(outlines), 2):
+        left, right = outlines[first], _mirrored(outlines[first + 1])
+        if len(left) != len(right) or np.abs(left - right).max() > near:
+            raise InputError(
+                f"{survey.path}: the {names[first]} foot touches at {np.round(left, 4).tolist()} "
+                f"from its last joint and the mirrored {names[first + 1]} one at "
+                f"{np.round(right, 4).tolist()}, expected the same"
+            )
+        mean = np.round(0.5 * (left + right), 4)
+        for leg, contacts in ((first, mean), (first + 1, _mirrored(mean))):
+            soles.append(_placed(survey, data, leg, contacts, axes[leg], guessed))
+    return tuple(soles)
 
 
 def _mirrored(contacts: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 3"]:
@@ -204,7 +213,7 @@ def _numbers(place: Float[np.ndarray, "3"], digits: int) -> list[float]:
     return [round(float(x), digits) + 0.0 for x in place]
 
 
-def _named(survey: Survey, data: mujoco.MjData) -> tuple[Sole, Sole] | None:
+def _named(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:
     """Feet of two named spheres and a named site each, as HECTOR's."""
     model, soles = survey.model, []
     for leg in survey.legs:
@@ -227,4 +236,4 @@ def _named(survey: Survey, data: mujoco.MjData) -> tuple[Sole, Sole] | None:
         names = {"point": model.site(sites[0]).name}
         names |= {"toe": model.geom(toe).name, "heel": model.geom(heel).name}
         soles.append(Sole(names, contacts, point, np.eye(3), guessed=False))
-    return soles[0], soles[1]
+    return tuple(soles)

@@ -2,8 +2,9 @@
 
 The knees are bent by 1 rad, or as far as their range allows, because a stretched knee is a
 singularity and heavy legs lift the trunk by 2 to 3 cm. Trunk upright, soles level, centre of mass
-above the foot points, all other angles as small as they can be: a least-squares problem in the
-angles of both legs, solved on MuJoCo's kinematics, whatever the order and the turns of the axes.
+above the foot points, of four legs each pair of feet under its hips instead, all other angles as
+small as they can be: a least-squares problem in the angles of all legs, solved on MuJoCo's
+kinematics, whatever the order and the turns of the axes.
 Where another joint then reaches its limit, the knees are bent less.
 """
 
@@ -31,13 +32,13 @@ _ROUND, _NOTHING = 4, 2e-4  # digits, [rad]
 def standing_pose(survey: Survey, soles: Sequence[Sole]) -> tuple[dict[str, float], bool]:
     """Angle [rad] by joint, those at zero left out, and whether soles and balance are right."""
     model, legs = survey.model, [list(leg) for leg in survey.legs]
-    bend, angles, right = KNEE, np.zeros(2 * len(legs[0])), False
+    bend, angles, right = KNEE, np.zeros(len(legs) * len(legs[0])), False
     for _ in range(_TRIALS):
         angles, right = _solve(survey, soles, bend)
         if right:
             break
         bend *= _LESS
-    names = [model.joint(j).name for j in legs[0] + legs[1]]
+    names = [model.joint(j).name for j in sum(legs, [])]
     rounded = {name: round(float(q), _ROUND) for name, q in zip(names, angles, strict=True)}
     return {name: q for name, q in rounded.items() if abs(q) > _NOTHING}, right
 
@@ -45,9 +46,9 @@ def standing_pose(survey: Survey, soles: Sequence[Sole]) -> tuple[dict[str, floa
 def _solve(
     survey: Survey, soles: Sequence[Sole], bend: float
 ) -> tuple[Float[np.ndarray, " joints"], bool]:
-    """Angles of both legs with the knees at a bend [rad]."""
+    """Angles of all legs with the knees at a bend [rad]."""
     model, data = survey.model, at_zero(survey.model)
-    joints = [*survey.legs[0], *survey.legs[1]]
+    joints = list(sum(survey.legs, ()))
     address, count = model.jnt_qposadr[joints], len(survey.legs[0])
     bodies = [int(model.jnt_bodyid[leg[-1]]) for leg in survey.legs]
     zero = [data.xmat[b].reshape(3, 3).copy() for b in bodies]
@@ -60,30 +61,33 @@ def _solve(
         for R, anchor, sole in zip(zero, anchors, soles, strict=True)
     ]
     flat = len(soles[0].contacts) > 1
-    knees = [survey.knee, count + survey.knee]
+    knees = list(range(survey.knee, len(joints), count))
     low, high = _ranges(model, joints)
-    start = np.clip(np.zeros(2 * count), low, high)
+    start = np.clip(np.zeros(len(joints)), low, high)
     for knee in knees:
         sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if survey.forwards else -1.0)
         start[knee] = np.clip(sign * bend, low[knee], high[knee])
-    free = [i for i in range(2 * count) if i not in knees]
+    free = [i for i in range(len(joints)) if i not in knees]
 
-    def errors(x: Float[np.ndarray, " free"]) -> tuple[np.ndarray, float]:
+    def errors(x: Float[np.ndarray, " free"]) -> tuple[np.ndarray, np.ndarray]:
         q = start.copy()
         q[free] = x
         data.qpos[address] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        turns, ahead = [], 0.0
+        turns, ahead = [], []
         for body, own, point in zip(bodies, local, points, strict=True):
             R = data.xmat[body].reshape(3, 3)
             turns.append(Rotation.from_matrix(R @ own).as_rotvec())
-            ahead += 0.5 * (data.xpos[body] + R @ point)[0]
-        return np.concatenate(turns) * flat, float(data.subtree_com[survey.trunk][0] - ahead)
+            ahead.append((data.xpos[body] + R @ point)[0])
+        pairs = np.reshape(ahead, (-1, 2)).mean(axis=1)
+        hips = data.xanchor[[leg[0] for leg in survey.legs[::2]], 0]
+        above = data.subtree_com[survey.trunk][:1] if len(pairs) == 1 else hips
+        return np.concatenate(turns) * flat, above - pairs
 
     def residuals(x: Float[np.ndarray, " free"]) -> np.ndarray:
         turn, ahead = errors(x)
-        return np.concatenate([turn, [5.0 * ahead], _SMALL * x])
+        return np.concatenate([turn, 5.0 * ahead, _SMALL * x])
 
     fine = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-13)
     solved = least_squares(residuals, start[free], bounds=(low[free], high[free]), **fine)
@@ -91,7 +95,7 @@ def _solve(
     q = start.copy()
     q[free] = solved.x
     bent = all(abs(abs(q[k]) - bend) < 1e-9 for k in knees) or bend <= 0.5
-    return q, bool(np.abs(turn).max() <= _SOLVED[0] and abs(ahead) <= _SOLVED[1] and bent)
+    return q, bool(np.abs(turn).max() <= _SOLVED[0] and np.abs(ahead).max() <= _SOLVED[1] and bent)
 
 
 def _ranges(model: mujoco.MjModel, joints: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

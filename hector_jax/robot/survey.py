@@ -3,8 +3,9 @@
 All is read in the pose in which the trunk is at the origin and all joints are zero. A leg is a
 chain of three to seven hinges from where the two legs part down to the last hinge. The legs are the
 two such chains that mirror each other and end lowest; the left one is that whose first joint has
-the larger y or, where both have the same, whose name says so. What turns about y swings a leg
-forwards: the knee is the one of these joints, but the first, that is farthest from hip and sole.
+the larger y or, where both have the same, whose name says so. A second such pair of as many joints
+that ends as low makes it a robot with four legs. What turns about y swings a leg forwards: the knee
+is the one of these joints, but the first, that is farthest from hip and sole.
 """
 
 import re
@@ -26,6 +27,7 @@ from hector_jax.robot.source import compile_bare
 
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 _MIRRORED = 0.03  # [m] between a joint and the mirror image of the other leg's
+_AS_LOW = 0.05  # [m] between the ends of two pairs of legs
 _BENDS = 0.7  # least share of y in the axis of a joint that swings the leg forwards
 _DIRECTIONS = ("roll", "pitch", "yaw")
 
@@ -36,7 +38,7 @@ class Survey(NamedTuple):
     path: Path
     model: mujoco.MjModel  # without motors, keyframes and meshes
     trunk: int  # body
-    legs: tuple[tuple[int, ...], tuple[int, ...]]  # joints, left then right, from the trunk down
+    legs: tuple[tuple[int, ...], ...]  # joints, in the order of `FEET`, from the trunk down
     weld: tuple[str, ...]  # joints of no leg
     knee: int  # of a leg, counted from 0
     forwards: bool  # whether the knees point ahead
@@ -59,7 +61,7 @@ def survey_file(path: Path) -> Survey:
     legs = _legs(path, model, free)
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[_body(model, legs[0][0])])
     data = at_zero(model)
-    others = [j for j in range(model.njnt) if j not in (*free, *legs[0], *legs[1])]
+    others = [j for j in range(model.njnt) if j not in sum(legs, (*free,))]
     if unnamed := [model.body(_body(model, j)).name for j in others if not model.joint(j).name]:
         raise InputError(
             f"{path}: a joint of body {unnamed[0]!r} has no name, expected one: it is to be welded"
@@ -110,8 +112,8 @@ def _chains(model: mujoco.MjModel, free: Sequence[int]) -> list[tuple[int, ...]]
 
 def _legs(
     path: Path, model: mujoco.MjModel, free: Sequence[int]
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Joints of the left and the right leg."""
+) -> tuple[tuple[int, ...], ...]:
+    """Joints of the legs, pair by pair from the front, the left one first."""
     data, pairs = at_zero(model), []
     for one, other in combinations(_chains(model, free), 2):
         common = sum(a == b for a, b in zip(one, other, strict=False))
@@ -131,10 +133,18 @@ def _legs(
             "hinges that mirror each other; chains by their last joint: "
             f"{', '.join(ends) or 'none'}"
         )
-    *_, one, other = min(pairs)
-    if _is_right(model, data, one, other):
-        one, other = other, one
-    return one, other
+    low, _, *legs = min(pairs)
+    found = [legs]
+    for lowest, _, *more in sorted(pairs):
+        new = not {*legs[0], *legs[1]} & {*more[0], *more[1]}
+        if new and len(more[0]) == len(legs[0]) and lowest - low <= _AS_LOW:
+            found.append(more)
+            break
+    found.sort(key=lambda pair: -data.xanchor[pair[0][0]][0])
+    for pair in found:
+        if _is_right(model, data, *pair):
+            pair.reverse()
+    return tuple(leg for pair in found for leg in pair)
 
 
 def _is_right(

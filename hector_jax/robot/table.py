@@ -3,6 +3,7 @@
 import textwrap
 from collections.abc import Iterable, Sequence
 
+from hector_jax.core.trajectory import FEET
 from hector_jax.robot.checks import trunk_body
 from hector_jax.robot.kinematics import knee_joints
 from hector_jax.robot.links import at_zero
@@ -39,7 +40,7 @@ def table_of(robot: Robot) -> list[str]:
         f"robot    {description.name}: {robot.mass:.4g} kg, trunk {trunk!r}; standing, its centre "
         f"of mass is {robot.standing_height:.3g} m high",
         f"legs     {count} joints each, {100 * share:.0f} % of the mass; knees bend "
-        f"{_WAYS[forwards]}; axes and numbers of the left leg:",
+        f"{_WAYS[forwards]}; axes and numbers of the {_words_of(description.legs[0])} leg:",
         *_columns([_HEADER, *rows]),
         f"feet     {robot.structure.contact}: {_sole(robot)}",
         *_words("fixed", description.weld),
@@ -57,13 +58,13 @@ def table_of_survey(survey: Survey) -> list[str]:
             if model.jnt_limited[left]
             else "none",
         )
-        for left, right in zip(*survey.legs, strict=True)
+        for left, right in zip(*survey.legs[:2], strict=True)
     ]
     mass = float(model.body_subtreemass[survey.trunk])
     return [
         f"robot    {mass:.4g} kg, trunk {model.body(survey.trunk).name!r}",
         f"legs     {len(rows)} joints each; knees bend {_WAYS[survey.forwards]}; axes and numbers "
-        "of the left leg:",
+        f"of the {_words_of(FEET[len(survey.legs)][0])} leg:",
         *_columns([_HEADER[:3], *rows]),
         *_words("fixed", survey.weld),
     ]
@@ -106,6 +107,10 @@ def _sole(robot: Robot) -> str:
     if robot.structure.contact == "flat":
         text += f", {100 * robot.half_width:.1f} cm to either side"
     return text
+
+
+def _words_of(leg: str) -> str:
+    return leg.replace("_", " ")
 
 
 def _words(title: str, words: Sequence[str]) -> list[str]:
