@@ -64,8 +64,8 @@ def _solve(
     knees = list(range(survey.knee, len(joints), count))
     low, high = _ranges(model, joints)
     start = np.clip(np.zeros(len(joints)), low, high)
-    for knee in knees:
-        sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if survey.forwards else -1.0)
+    for knee, ahead in zip(knees, np.repeat(survey.forwards, 2), strict=True):
+        sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if ahead else -1.0)
         start[knee] = np.clip(sign * bend, low[knee], high[knee])
     free = [i for i in range(len(joints)) if i not in knees]
 
