@@ -1,6 +1,6 @@
 """A robot written anew from its links: the form that all later code reads.
 
-A trunk with a free joint, one body a leg joint, left legs first; torque motors in that order; a
+A trunk with a free joint, one body a leg joint, leg by leg; torque motors in that order; a
 floor; small spheres where a sole touches and a site where its wrench acts; a keyframe that stands.
 
 Contact bits: 1 floor, 2 first leg, 4 second leg, and so on. Soles touch the floor with their

@@ -110,9 +110,7 @@ def _chains(model: mujoco.MjModel, free: Sequence[int]) -> list[tuple[int, ...]]
     return sorted({way for way in ways.values() if way and way[-1] not in inner})
 
 
-def _legs(
-    path: Path, model: mujoco.MjModel, free: Sequence[int]
-) -> tuple[tuple[int, ...], ...]:
+def _legs(path: Path, model: mujoco.MjModel, free: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """Joints of the legs, pair by pair from the front, the left one first."""
     data, pairs = at_zero(model), []
     for one, other in combinations(_chains(model, free), 2):
@@ -133,13 +131,18 @@ def _legs(
             "hinges that mirror each other; chains by their last joint: "
             f"{', '.join(ends) or 'none'}"
         )
-    low, _, *legs = min(pairs)
-    found = [legs]
-    for lowest, _, *more in sorted(pairs):
-        new = not {*legs[0], *legs[1]} & {*more[0], *more[1]}
-        if new and len(more[0]) == len(legs[0]) and lowest - low <= _AS_LOW:
-            found.append(more)
-            break
+    low, found = min(pairs)[0], []
+    for lowest, _, *pair in sorted(pairs):
+        new = not {*pair[0], *pair[1]} & set(sum((*sum(found, []),), ()))
+        if new and lowest - low <= _AS_LOW:
+            found.append(pair)
+    counts = [len(pair[0]) for pair in found]
+    if len(found) > 2 or len(set(counts)) > 1:
+        ends = ", ".join(model.joint(leg[-1]).name for pair in found for leg in pair)
+        raise InputError(
+            f"{path}: {len(found)} pairs of chains of {counts} hinges end as low as legs: {ends}; "
+            "expected one pair, or two of as many hinges"
+        )
     found.sort(key=lambda pair: -data.xanchor[pair[0][0]][0])
     for pair in found:
         if _is_right(model, data, *pair):
