@@ -82,6 +82,7 @@ def propose(path: Path) -> Proposal:
     angles, balanced = standing_pose(survey, soles)
     if len(soles[0].contacts) == 1:  # round: it touches elsewhere where the leg is bent
         soles = find_soles(survey, angles)
+        angles, balanced = standing_pose(survey, soles, angles)
     table = names(survey, soles, angles)
     wrong = []
     if soles[0].guessed:

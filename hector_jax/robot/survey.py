@@ -28,7 +28,7 @@ from hector_jax.robot.source import compile_bare
 
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 _MIRRORED = 0.03  # [m] between a joint and the mirror image of the other leg's
-_AS_LOW = 0.05  # [m] between the ends of two pairs of legs
+_AS_LOW = 0.25  # of a leg's height, between the ends of two pairs of legs
 _BENDS = 0.7  # least share of y in the axis of a joint that swings the leg forwards
 _DIRECTIONS = ("roll", "pitch", "yaw")
 
@@ -131,10 +131,11 @@ def _legs(path: Path, model: mujoco.MjModel, free: Sequence[int]) -> tuple[tuple
             "hinges that mirror each other; chains by their last joint: "
             f"{', '.join(ends) or 'none'}"
         )
-    low, found = min(pairs)[0], []
+    low, _, lowest_leg, _ = min(pairs)
+    near, found = _AS_LOW * (data.xanchor[lowest_leg[0]][2] - low), []
     for lowest, _, *pair in sorted(pairs):
         new = not {*pair[0], *pair[1]} & set(sum((*sum(found, []),), ()))
-        if new and lowest - low <= _AS_LOW:
+        if new and lowest - low <= near:
             found.append(pair)
     counts = [len(pair[0]) for pair in found]
     if len(found) > 2 or len(set(counts)) > 1:
