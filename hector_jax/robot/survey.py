@@ -110,9 +110,7 @@ def _chains(model: mujoco.MjModel, free: Sequence[int]) -> list[tuple[int, ...]]
     return sorted({way for way in ways.values() if way and way[-1] not in inner})
 
 
-def _legs(
-    path: Path, model: mujoco.MjModel, free: Sequence[int]
-) -> tuple[tuple[int, ...], ...]:
+def _legs(path: Path, model: mujoco.MjModel, free: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """Joints of the legs, pair by pair from the front, the left one first."""
     data, pairs = at_zero(model), []
     for one, other in combinations(_chains(model, free), 2):
