@@ -26,8 +26,8 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
-tune: $(STAMP) ## tune a trajectory and evaluate it: make tune TRAJ=straight|c|s|all, TRAJ="c s"
-	@$(BIN)/hector tune --traj $(TRAJ)
+tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
+	@$(BIN)/hector tune --traj $(TRAJ) $(if $(ROBOT),--robot $(ROBOT))
 
 table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a trial
 	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)

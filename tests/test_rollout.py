@@ -125,18 +125,17 @@ def random_weights(seed):
     return vector_to_weights(weights_to_vector(nominal()) * np.exp(draws))
 
 
-def loss_of(config, robot, vector, *model):
+def loss_of(config, robot, weights, *model):
     """The loss by the program that has the gradient too, so that no other one is compiled."""
-    return float(tune_step(config, robot, vector_to_weights(jnp.asarray(vector)), *model).loss)
+    return float(tune_step(config, robot, weights, *model).loss)
 
 
 def differences(config, robot, weights, *model, step, directions):
     """Central differences of the loss along directions (n, 24) in log-weights."""
     theta, found = np.asarray(weights_to_vector(weights)), []
     for direction in step * directions:
-        up, down = (
-            loss_of(config, robot, theta * np.exp(side * direction), *model) for side in (1, -1)
-        )
+        vectors = (jnp.asarray(theta * np.exp(side * direction)) for side in (1, -1))
+        up, down = (loss_of(config, robot, vector_to_weights(v, weights), *model) for v in vectors)
         found.append((up - down) / (2 * step))
     return np.array(found)
 

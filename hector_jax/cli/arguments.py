@@ -128,8 +128,8 @@ def with_gait(robot: Robot, name: str) -> Robot:
         gait = gait_named(walk_config(robot).gait, name)
     except InputError as error:
         raise InputError(f"--gait: {error}") from None
-    control = dict(description.control) | {"gait": to_table(gait)}
-    return robot._replace(description=replace(description, control=control))
+    control = dict(description.control) | {"gait": tuple(to_table(gait).items())}
+    return robot._replace(description=replace(description, control=tuple(control.items())))
 
 
 def course(text: str, robot: Robot) -> NamedCommand:

@@ -30,7 +30,7 @@ from hector_jax.core.settings import (
 )
 
 _ABOUT = (
-    "Gradient tuning of a walking biped's model predictive controller. "
+    "Gradient tuning of a walking robot's model predictive controller. "
     "The whole way, from data to evaluation: hector tune --traj straight. "
     "Exit codes: 0 done, 1 something is broken, 2 bad input, 130 interrupted."
 )

@@ -189,7 +189,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     return Condensed(feet, G, turn, push, angles, later, travel, free)
 
 
-def _input_weights(weights: Weights) -> Float[Array, " u"]:
+def input_weights(weights: Weights) -> Float[Array, " u"]:
     """R of the paper's u; feet that exert no moment have no weights of one."""
     force, moment = weights.R
     return pack_wrench(Wrench(force, moment if moment.size else jnp.zeros_like(force)))
@@ -202,7 +202,7 @@ def cost(
     robot, parameters, _, horizon = problem
     feet, G, turn, push, angles, later, travel, free = condensed
     N, b, dtype = config.horizon, G.shape[-1], later.dtype
-    Q, R = parameters.weights.Q, _input_weights(parameters.weights)
+    Q, R = parameters.weights.Q, input_weights(parameters.weights)
     error = jax.tree.map(lambda x, target, w: w * (x - target), free, horizon.reference, Q)
     effort = jnp.einsum("kui,u,kuj->kij", G, R, G)
     empty = jnp.repeat(1.0 - feet.sum(-1), config.contact_model.inputs, axis=-1)

@@ -5,7 +5,7 @@ tries on the QPs of walking, exact to rounding where it settles. On a GPU a kern
 makes the first guess and one try proves it.
 """
 
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -14,6 +14,7 @@ from jax import lax
 from jax.scipy.linalg import cho_solve
 
 from hector_jax.core.arrays import Array
+from hector_jax.core.console import say
 from hector_jax.core.tree import where
 from hector_jax.qp import gpu_kernel
 from hector_jax.qp.linear import (
@@ -173,7 +174,17 @@ def first_guess(qp: Normal, unconstrained: Point) -> tuple[Point, Array]:
         usable = (settled > 0) & jnp.isfinite(jnp.sum(x) + jnp.sum(y))
         return where(usable, (Point(x, z), jnp.stack([side > 0, side < 0])), violated(qp))
 
-    fits = qp.A.ndim == 3 and gpu_kernel.fits(len(qp.q), len(qp.row))
-    if jax.default_backend() == "gpu" and fits:
-        return lax.platform_dependent(qp, cuda=pivoted, default=violated)
-    return violated(qp)
+    if jax.default_backend() != "gpu":
+        return violated(qp)
+    if qp.A.ndim != 3 or not gpu_kernel.fits(len(qp.q), len(qp.row)):
+        _say_slower(len(qp.q), len(qp.row))
+        return violated(qp)
+    return lax.platform_dependent(qp, cuda=pivoted, default=violated)
+
+
+@cache  # once for each size
+def _say_slower(variables: int, rows: int) -> None:
+    say(
+        f"on a GPU a QP of {variables} variables and {rows} rows takes the slower path: the kernel "
+        f"holds block-diagonal ones of up to {gpu_kernel.VARIABLES} and {gpu_kernel.ROWS}"
+    )

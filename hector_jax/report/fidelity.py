@@ -187,7 +187,7 @@ def curves(
         effects: phis by name; drawn are `linear`, `paper` and `residual`, the last as `predicted`.
 
     Returns:
-        Wrenches (ticks, 2, 3) in the yaw frame, from t = 0; NaN at ticks that are no samples.
+        Wrenches (ticks, feet, 3) in the yaw frame, from t = 0; NaN at ticks that are no samples.
     """
     one = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
     samples, _ = make_dataset(robot, one)

@@ -13,6 +13,7 @@ from hector_jax.robot.model import Robot
 
 COLOURS = ((184, 33, 51), (0, 122, 94))  # of before and after
 INK = (20, 20, 25)
+LEAST = 0.015  # [m] to either side of the foot point that a footprint is drawn, of point feet too
 
 
 class Motion(NamedTuple):
@@ -22,11 +23,11 @@ class Motion(NamedTuple):
     qpos: Float[np.ndarray, "T nq"]  # of MuJoCo
     path: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
     reference: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
-    contact: Bool[np.ndarray, "T 2"]  # planned stance
-    feet: Float[np.ndarray, "T 2 3"]  # foot points [m]
+    contact: Bool[np.ndarray, "T feet"]  # planned stance
+    feet: Float[np.ndarray, "T feet 3"]  # foot points [m]
     R_yaw: Float[np.ndarray, "T 3 3"]  # heading of the trunk as each interval starts
-    wrenches: dict[str, Wrench]  # of the ground on the feet by source, (T, 2, 3) each
-    soles: Float[np.ndarray, "n 2 3"]  # heel and toe of each foot as it was set down
+    wrenches: dict[str, Wrench]  # of the ground on the feet by source, (T, feet, 3) each
+    soles: Float[np.ndarray, "n 2 3"]  # heel and toe of each foot as it was set down; see LEAST
     upright: int  # samples before the fall; all of them where there is none
 
     @property
@@ -55,7 +56,7 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
     Args:
         robot: the body that walked.
         walk: its trajectory, at any period.
-        ground: wrenches of the ground by source, (T, 2, 3) each, in the yaw frame of the walk.
+        ground: wrenches of the ground by source, (T, feet, 3) each, in the yaw frame of the walk.
     """
     walk = from_start(walk)
     count, fallen = len(walk.fallen), walk.fallen
@@ -66,7 +67,8 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
     heading = np.append(walk.initial.euler[2], state.euler[:-1, 2])
     R_yaw = Rotation.from_euler("z", heading[:, None]).as_matrix()
     ahead = R_yaw[:, None, :, 0]
-    soles = np.stack([feet - robot.heel * ahead, feet + robot.toe * ahead], axis=2)
+    heel, toe = max(LEAST, float(robot.heel)), max(LEAST, float(robot.toe))
+    soles = np.stack([feet - heel * ahead, feet + toe * ahead], axis=2)
     set_down = np.diff(walk.contact[:upright].astype(int), axis=0, prepend=0) > 0
     return Motion(
         period=float(walk.period),

@@ -65,7 +65,7 @@ class ViewedWalk(NamedTuple):
     ground: dict[str, Wrench]  # commanded, measured, predicted, or some; (T, 2, 3), yaw frame
 
 
-def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T 2 2 3"]:
+def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T feet 2 3"]:
     """Start and end of the arrow at each foot.
 
     Args:
@@ -74,7 +74,8 @@ def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T 2 2 3
         source: commanded, measured or predicted.
     """
     left = motion.R_yaw[:, :, 1]
-    outwards = np.stack([left, -left], axis=1)  # of the left foot and of the right
+    pairs = motion.feet.shape[1] // 2
+    outwards = np.stack([left, -left] * pairs, axis=1)  # left feet come first
     start = motion.feet + _SOURCES[source].aside * outwards
     return np.stack([start, start + _SCALES[kind] * getattr(motion.wrenches[source], kind)], axis=2)
 

@@ -9,11 +9,11 @@ import io
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from hector_jax.control.contact import LINE_FRICTION
 from hector_jax.control.controller import WalkConfig
+from hector_jax.control.mpc import input_weights
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, nominal
@@ -23,7 +23,6 @@ from hector_jax.core.environment import versions
 from hector_jax.core.files import make_folder, write_file, write_json
 from hector_jax.core.inputs import InputError, plural, unknown
 from hector_jax.core.settings import Range, from_table, read_json, to_table
-from hector_jax.core.trajectory import Wrench, pack_wrench
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.robot.model import Robot
 from hector_jax.runs.export_controller import (
@@ -150,7 +149,8 @@ def export(
     write_json(folder / SCHEMA, weights_schema(robot))
     np.savez(rows := io.BytesIO(), **as_arrays(recorded))
     contents = {f"controller-{on}.jaxexport": blob for on, blob in blobs.items()}
-    contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
+    if len(robot.foot_point) == 2:  # that controller is one of bipeds
+        contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
     contents["check.npz"] = rows.getvalue()
     for file, content in contents.items():
         write_file(folder / file, content)
@@ -244,7 +244,7 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
         heel=float(robot.heel),
         line=LINE_FRICTION in mpc.on("inputs"),
     )
-    Alpha = pack_wrench(Wrench(*map(jnp.asarray, weights.R)))
+    Alpha = input_weights(weights)
     others = weights_tree(weights).get("others", {}).items()
     notes = [f"// ATTENTION: tuned with {name} {value}.\n" for name, value in others]
     blocks = _block("Q", np.concatenate(weights.Q), _STATES), _block("Alpha", Alpha, _INPUTS)

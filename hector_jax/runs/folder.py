@@ -62,7 +62,7 @@ class RunRequest(NamedTuple):
     data: Path  # folder of its net
     net: Path | None  # or the net itself
     variant: str  # of the net
-    robot: Path | None  # TOML of the biped; None: HECTOR
+    robot: Path | None  # TOML of the robot; None: HECTOR
     body: str | None  # its `robot_hash` then; None: not in the file
 
 

@@ -70,7 +70,7 @@ class MeasuredState(NamedTuple):
 class Trace(NamedTuple):
     """What a window hands to the next."""
 
-    commands: Wrench  # (HISTORY, 2, 3) each, world frame, newest first
+    commands: Wrench  # (HISTORY, feet, 3) each, world frame, newest first
     tangents: Varied  # of the carry at its end
 
 

@@ -34,7 +34,7 @@ class Sensitivities(NamedTuple):
     """Derivatives of a rollout by the n numbers of theta, which are the first axis."""
 
     state: State  # (n, T, 3) each: dx_j+1 / dtheta
-    command: Wrench  # (n, T, 2, 3) each: du_j / dtheta
+    command: Wrench  # (n, T, feet, 3) each: du_j / dtheta
 
 
 class Varied(NamedTuple):

@@ -15,7 +15,7 @@ from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from scipy.spatial.transform import Rotation
 
-from hector_jax.core.trajectory import Trajectory, Wrench, from_start
+from hector_jax.core.trajectory import FEET, Trajectory, Wrench, from_start
 from hector_jax.grfm.nets import History
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.motion import COLOURS, Motion
@@ -128,9 +128,11 @@ def draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     axes.plot(*last.reference.position[:, :2].T, **CURVES["reference"], label="reference")
     touchdowns = np.diff(last.contact.astype(int), axis=0, prepend=0) > 0
     mark = {"linestyle": "none", "color": "0.6", "markersize": 6, "zorder": 1}
-    for foot, (side, marker) in enumerate((("left", 4), ("right", 5))):
+    names = FEET[touchdowns.shape[1]]
+    for foot, (name, marker) in enumerate(zip(names, (4, 5, 6, 7), strict=False)):
         spots = last.feet[touchdowns[:, foot] & ~last.fallen, foot]
-        axes.plot(*spots[:, :2].T, **mark, marker=marker, label=f"{side} foot set down")
+        label = f"{name.replace('_', ' ')} foot set down"
+        axes.plot(*spots[:, :2].T, **mark, marker=marker, label=label)
     axes.set(xlabel="x, ahead [m]", ylabel="y, left [m]", aspect="equal")
     axes.margins(0.05, 0.1)
 
@@ -204,13 +206,13 @@ def weights(
 def wrenches(
     path: Path, period: float, curves: Mapping[str, Wrench], *, seconds: float = 0.4
 ) -> str:
-    """Draw the commanded, predicted and measured wrench of the left foot over the first steps.
+    """Draw the commanded, predicted and measured wrench of the first foot over the first steps.
 
     Args:
         path: file to write.
         period: [s] between samples.
         curves: `commanded`, `predicted`, `paper`, `linear`, `measured`, or some of them, one per
-            period, (T, 2, 3) each; held over the period.
+            period, (T, feet, 3) each; held over the period.
         seconds: of the walk's beginning; two steps by default.
     """
     count = round(seconds / period)
@@ -228,7 +230,8 @@ def wrenches(
             panel.set_ylabel(label)
             style.widen(panel, 5.0 if "[N]" in label else 0.5)
         setp(panels[-1], xlabel="time [s]")
-    return caption("wrenches", side="left")
+    feet = next(iter(curves.values())).force.shape[1]
+    return caption("wrenches", side=FEET[feet][0].replace("_", " "))
 
 
 def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:

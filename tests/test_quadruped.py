@@ -1,0 +1,373 @@
+"""Four point feet: gaits, weights without moments, the net's views, both engines, export."""
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import jsonschema
+import numpy as np
+import pytest
+from test_rollout import OBLIQUE, check_gradient
+
+from hector_jax.cli.arguments import with_gait
+from hector_jax.cli.main import main
+from hector_jax.control import gait
+from hector_jax.control.controller import contacts_needed, plan_horizon, walk_config
+from hector_jax.control.footstep import Feet
+from hector_jax.control.gait import GaitConfig, gait_named
+from hector_jax.control.mpc import MpcProblem, solve_mpc
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import (
+    direction_names,
+    expert,
+    named_like,
+    nominal,
+    vector_to_weights,
+    weight_names,
+    weights_to_vector,
+)
+from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
+from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State, Wrench
+from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, partners, with_mirror
+from hector_jax.grfm.effect import last_command
+from hector_jax.grfm.gated import fit_gated
+from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net
+from hector_jax.grfm.paper import init as init_paper
+from hector_jax.grfm.paper import with_statistics as with_paper_statistics
+from hector_jax.grfm.residual import init, with_statistics
+from hector_jax.qp import active_set
+from hector_jax.robot.model import load_robot
+from hector_jax.runs.export import (
+    TOLERANCE,
+    controller,
+    export_controller,
+    load_controller,
+    weights_schema,
+)
+from hector_jax.runs.export_controller import check, record
+from hector_jax.sim.loop import Job
+from hector_jax.sim.parallel import walk_batch
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import hfs, ideal
+from hector_jax.tuning.rollout import RolloutConfig, rollout
+
+FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
+ROBOT = load_robot(FILE)
+CONFIG = walk_config(ROBOT)
+ANCHOR = standing_anchor(ROBOT)
+FAST = 0.25 * float(np.sqrt(ROBOT.gravity[2] * ROBOT.standing_height))  # [m/s]
+
+
+# Gaits
+
+
+@pytest.mark.parametrize(
+    ("name", "together", "most"),
+    [("trot", [(0, 3), (1, 2)], 2), ("pace", [(0, 2), (1, 3)], 2), ("crawl", [], 3)],
+)
+def test_feet_stand_in_the_pattern_of_the_gait(name, together, most):
+    config = gait_named(CONFIG.gait, name)
+    ticks = jnp.arange(config.first_tick, config.first_tick + 2 * config.cycle)
+    stands = np.asarray(gait.contact(config, ticks))
+    for one, other in together:
+        assert (stands[:, one] == stands[:, other]).all()
+        assert (stands[:, one] != stands[:, (one + 1) % 2]).all()
+    assert config.swing == CONFIG.gait.swing
+    assert stands.sum(axis=1).max() == stands.sum(axis=1).min() == most == config.most_contacts
+
+
+def test_a_crawl_lifts_a_hind_foot_before_the_front_foot_of_its_side():
+    config = gait_named(CONFIG.gait, "crawl")
+    lifts = np.asarray(gait.contact(config, jnp.arange(config.cycle))).argmin(axis=0)
+    order = np.argsort((lifts - lifts[3]) % config.cycle)
+    assert order.tolist() == [3, 1, 2, 0]  # hind right, front right, hind left, front left
+
+
+def test_who_stands_needs_no_touchdown():
+    config = gait_named(CONFIG.gait, "stand")
+    assert np.asarray(gait.contact(config, jnp.arange(-9, 90))).all()
+    assert not np.asarray(gait.touchdowns(config, jnp.array(3), jnp.arange(3, 90))).any()
+    assert contacts_needed(walk_config(with_gait(ROBOT, "stand")), 50) == 4
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"pattern": "gallop"}, "unknown pattern 'gallop'"),
+        ({"pattern": (0.0, 0.5, 0.5)}, "numbers in [0, 1), one for each of 2 or 4 feet"),
+        ({"pattern": (0.0, 0.5, 0.5, 1.0)}, "numbers in [0, 1)"),
+        ({"pattern": (0.0, 0.5, 0.5, -0.1)}, "numbers in [0, 1)"),
+        ({"pattern": (0.0, 0.0, 0.0, 0.0)}, "one has to stand at each tick"),
+        ({"pattern": "trot", "stance": 16}, "one has to stand at each tick"),
+        ({"pattern": (0.0, 0.33, 0.5, 0.5)}, "whole number of ticks"),
+        ({"pattern": "crawl", "stance": 21}, "whole number of ticks"),
+        ({"swing": -1}, "swing"),
+    ],
+)
+def test_a_gait_that_cannot_be_is_refused(wrong, words):
+    with pytest.raises(InputError) as error:
+        GaitConfig(**wrong)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ('pattern = "walk"', ["gait.pattern must be one of 4 feet (trot, pace, crawl", "'walk'"]),
+        ("pattern = [0, 0.5]", ["gait.pattern must be one of 4 feet"]),
+        ('pattern = "canter"', ["unknown pattern 'canter'"]),
+    ],
+)
+def test_a_gait_of_other_feet_is_refused_in_one_line(tmp_path, line, words):
+    text = FILE.read_text().replace('pattern = "trot"', line)
+    (tmp_path / "robot.toml").write_text(text)
+    (tmp_path / "quadruped.xml").write_text(FILE.with_name("quadruped.xml").read_text())
+    with pytest.raises(InputError) as error:
+        walk_config(load_robot(tmp_path / "robot.toml"))
+    for word in words:
+        assert word in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def call(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
+    return main()
+
+
+def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
+    flags = ("--robot", FILE, "--world", "srbm", "--seconds", "0.3", "--json")
+    assert call(monkeypatch, "walk", *flags, "--gait", "crawl") == 0
+    crawl = capsys.readouterr().out
+    assert call(monkeypatch, "walk", *flags) == 0
+    assert capsys.readouterr().out != crawl
+    assert call(monkeypatch, "walk", "--gait", "trot") == 2
+    assert "--gait: unknown gait 'trot'" in capsys.readouterr().err
+
+
+# The MPC
+
+
+def planned(config, tick, command):
+    """What is planned about at a tick, a little off the reference."""
+    state = State(
+        *(np.asarray(x) + 0.01 for x in (np.zeros(3), ANCHOR.position, *np.zeros((2, 3))))
+    )
+    feet = Feet(jnp.asarray(ROBOT.foot_ahead)[:, None] * jnp.eye(3)[0], jnp.zeros(4))
+    return state, *plan_horizon(
+        config,
+        ROBOT,
+        config.footstep.parameters,
+        command=command,
+        anchor=ANCHOR,
+        tick=jnp.asarray(tick),
+        state=jax.tree.map(jnp.asarray, state),
+        feet=feet,
+    )
+
+
+def problem(config, tick):
+    """What is solved for at a tick."""
+    state, horizon, _ = planned(config, tick, named_command("s"))
+    return MpcProblem(ROBOT, config.mpc.parameters(nominal(ROBOT)), state, horizon)
+
+
+def test_room_for_more_feet_changes_nothing_while_two_stand():
+    solve = partial(solve_mpc, CONFIG.mpc, problem(CONFIG, 3), dt=CONFIG.mpc_step)
+    two, four = (solve(max_contacts=count)[0] for count in (2, 4))
+    np.testing.assert_allclose(four.force, two.force, atol=1e-6)
+    assert np.asarray(two.force[:, 2] > 1.0).tolist() == [True, False, False, True]
+    assert not np.asarray(two.moment).any()
+
+
+def test_a_foot_of_each_pair_lands_beside_its_own_hips():
+    """Two feet of a trot, of either pair and side, land at once: as far apart as they stand."""
+    still = jax.tree.map(np.zeros_like, named_command("straight"))._replace(duration=np.ones(2))
+    *_, touchdown = planned(CONFIG, 3, still)
+    front, hind = np.asarray(touchdown.position)[[0, 3]]
+    ahead, aside = float(np.ptp(ROBOT.foot_ahead)), 2 * CONFIG.footstep.width
+    assert ahead > 0.3
+    np.testing.assert_allclose(front - hind, [ahead, aside, 0.0], atol=0.01)
+
+
+def test_a_qp_larger_than_the_gpu_s_kernel_is_told(monkeypatch):
+    monkeypatch.setattr(active_set.jax, "default_backend", lambda: "gpu")
+    said = []
+    monkeypatch.setattr(active_set, "say", said.append)
+    active_set._say_slower.cache_clear()
+    for _ in range(2):
+        solve_mpc(CONFIG.mpc, problem(CONFIG, 3), dt=CONFIG.mpc_step, max_contacts=4)
+    (line,) = said
+    assert "a QP of 120 variables and 200 rows takes the slower path" in line
+
+
+# Weights
+
+
+def test_point_feet_have_weights_of_forces_alone(tmp_path):
+    weights = expert(ROBOT)
+    names = weight_names(weights)
+    assert len(names) == 24
+    assert names[12:15] == ("R_Fx_front_left", "R_Fy_front_left", "R_Fz_front_left")
+    assert direction_names(weights)[12:] == ("R_Fx", "R_Fy", "R_Fz")
+    again = vector_to_weights(weights_to_vector(weights), weights)
+    jax.tree.map(np.testing.assert_array_equal, again, weights)
+    like = named_like({name: 0.0 for name in names})
+    assert jax.tree.map(np.shape, like) == jax.tree.map(np.shape, weights)
+    save_weights(tmp_path / "w.json", weights)
+    jax.tree.map(np.testing.assert_array_equal, load_weights(tmp_path / "w.json", ROBOT), weights)
+    jsonschema.validate(weights_tree(weights), weights_schema(ROBOT))
+    assert "moment" not in weights_tree(weights)["R"]
+    with pytest.raises(InputError, match="missing weight"):
+        load_weights(tmp_path / "w.json")  # HECTOR's
+    save_weights(tmp_path / "two.json", nominal())
+    with pytest.raises(InputError, match="R.force must be 4 x 3 numbers"):
+        load_weights(tmp_path / "two.json", ROBOT)
+
+
+# The net
+
+
+@pytest.fixture(scope="module")
+def data():
+    """Samples of two walks on the rigid body whose ground answers a little less than commanded."""
+    config = RolloutConfig(walk=CONFIG, ticks=60, lead=10)
+    walk_ = jax.jit(partial(rollout, config, ROBOT))
+    walks = [
+        walk_(weights, named_command("s"), ANCHOR, last_command)
+        for weights in (nominal(ROBOT), expert(ROBOT))
+    ]
+    walks = jax.tree.map(lambda *x: np.stack(x), *walks)
+    rng = np.random.default_rng(0)
+    push = lambda x: 0.9 * x + rng.normal(size=x.shape)  # noqa: E731
+    walks = walks._replace(effect=Wrench(push(walks.effect.force), walks.effect.moment))
+    return make_dataset(ROBOT, walks)[0]
+
+
+def flip(wrench):
+    other = partners(4)
+    return Wrench(wrench.force[other] * ALONG, wrench.moment[other] * ACROSS)
+
+
+@pytest.mark.parametrize("variant", ["residual", "gated", "paper"])
+def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant):
+    key = jax.random.key(0)
+    params = {
+        "residual": lambda: with_statistics(init(key, 4), data),
+        "gated": lambda: fit_gated(data),
+        "paper": lambda: with_paper_statistics(init_paper(key, 4), data),
+    }[variant]()
+    params = jax.tree.map(np.asarray, params)
+    save_net(tmp_path / "net.npz", params, robot=ROBOT, about={})
+    again, name, _ = load_net(tmp_path / "net.npz", ROBOT)
+    assert name == variant
+    jax.tree.map(np.testing.assert_array_equal, again, params)
+    window = jax.tree.map(lambda x: jnp.asarray(x[7]), data.window)
+    assert as_effect(params)(window).wrench.force.shape == (4, 3)
+    with pytest.raises(InputError):
+        load_net(tmp_path / "net.npz", load_robot())
+
+
+def test_a_mirrored_window_of_four_feet_has_the_mirrored_effect(data):
+    both, count = with_mirror(data), len(data.walk)
+    phi = jax.jit(as_effect(with_statistics(init(jax.random.key(0), 4), data)))
+    for i in (0, 20, 37):
+        here, there = (
+            phi(jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), both.window)) for k in (i, count + i)
+        )
+        same = partial(np.testing.assert_allclose, atol=1e-9)
+        jax.tree.map(same, flip(here.wrench), there.wrench)
+        same(here.legs.force * ALONG, there.legs.force)
+        same(here.legs.torque * ACROSS, there.legs.torque)
+
+
+def test_the_push_of_each_pair_of_legs_is_found(data):
+    """Legs that push the trunk as a map of each pair says, seen only as their sum."""
+    true = jax.tree.map(np.asarray, fit_gated(data))
+    rng = np.random.default_rng(0)
+    true = true._replace(
+        legs_bias=rng.normal(size=true.legs_bias.shape), legs=np.zeros_like(true.legs)
+    )
+    told = jax.vmap(as_effect(true))(jax.tree.map(jnp.asarray, data.window))
+    known = data._replace(legs=jax.tree.map(np.asarray, told.legs))
+    found = jax.vmap(as_effect(fit_gated(known)))(jax.tree.map(jnp.asarray, data.window))
+    for found_, told_ in zip(found.legs, told.legs, strict=True):
+        np.testing.assert_allclose(found_, told_, atol=0.1)
+
+
+def test_the_plain_net_of_four_feet_returns_every_command(data):
+    windows = jax.tree.map(jnp.asarray, data.window)
+    plain, same = (
+        jax.vmap(phi)(windows).wrench for phi in (effect_of(None, CONFIG.gait), last_command)
+    )
+    jax.tree.map(np.testing.assert_array_equal, plain, same)
+
+
+# Gradients, engines, export
+
+
+def test_gradient_of_the_quadruped_over_50_ticks_is_that_of_differences():
+    short = RolloutConfig(walk=CONFIG, ticks=50)
+    model = named_command("s"), ANCHOR, last_command
+    check_gradient(short, ROBOT, nominal(ROBOT), *model, 1e-6, OBLIQUE)
+
+
+@pytest.mark.slow
+def test_gradient_of_the_quadruped_over_4_seconds_is_that_of_differences():
+    long = RolloutConfig(walk=CONFIG, ticks=400)
+    check_gradient(long, ROBOT, nominal(ROBOT), named_command("c"), ANCHOR, last_command, 1e-4)
+
+
+@pytest.mark.slow
+def test_the_quadruped_walks_alike_in_both_engines():
+    job = Job(nominal(ROBOT), named_command("straight"), hfs(ROBOT.description), seconds=0.4)
+    (batch,) = walk_batch(CONFIG, ROBOT, [job])
+    alone = at_interval(walk(CONFIG, ROBOT, job), 0.01)
+    np.testing.assert_allclose(batch.state.position, alone.state.position, atol=1e-6)
+    np.testing.assert_allclose(batch.effect.force, alone.effect.force, atol=1e-2)
+
+
+@pytest.mark.slow
+def test_the_controller_of_the_quadruped_is_exported():
+    weights = nominal(ROBOT)
+    example = controller(CONFIG, ROBOT, weights)[1]
+    loaded = load_controller(export_controller(CONFIG, ROBOT, weights)), example
+    walked = record(CONFIG, ROBOT, weights, command=named_command("s"), seconds=0.4)
+    found = check(CONFIG, *loaded, walked)
+    assert max(found.force, found.moment, found.torque) <= TOLERANCE
+    assert found.unsolved == 0
+
+
+def test_the_quadruped_stands_on_all_feet():
+    robot = with_gait(ROBOT, "stand")
+    still = jax.tree.map(np.zeros_like, named_command("straight"))._replace(duration=np.ones(2))
+    job = Job(nominal(robot), still, hfs(robot.description), 1.0)
+    found = walk(walk_config(robot), robot, job)
+    assert not found.fallen.any()
+    assert found.contact.all()
+    assert np.abs(found.state.position[-1] - found.initial.position).max() < 5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["trot", "pace"])
+def test_the_quadruped_walks_twelve_seconds_in_hfs(name):
+    """At 0.25 sqrt(g h), and in a turn of 0.5 rad/s."""
+    robot, straight = with_gait(ROBOT, name), jax.tree.map(np.asarray, named_command("straight"))
+    for turn in (0.0, 0.5):
+        velocity = np.tile([FAST, 0.0], (2, 1))
+        command = straight._replace(velocity=velocity, yaw_rate=np.full(2, turn))
+        job = Job(nominal(robot), command, hfs(robot.description), 12.0)
+        found = walk(walk_config(robot), robot, job)
+        assert not found.fallen.any(), turn
+        assert found.state.euler[-1, 2] - found.initial.euler[2] == pytest.approx(
+            12 * turn, abs=0.2
+        )
+
+
+@pytest.mark.slow
+def test_the_quadruped_crawls():
+    robot = with_gait(ROBOT, "crawl")
+    job = Job(nominal(robot), named_command("straight"), ideal(robot.description), 4.0)
+    assert not walk(walk_config(robot), robot, job).fallen.any()
