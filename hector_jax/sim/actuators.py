@@ -51,5 +51,7 @@ def step_actuators(
     if robot.description.linkage is None:
         return motors, torque
     joints = robot.description.leg_joints
-    motor, turned = (np.array([i - 1, joints + i - 1]) for i in robot.description.linkage)
-    return motors, torque.at[turned].add(imperfections.linkage * torque[motor])
+    for first in range(0, len(torque), joints):  # one by one: a scatter is a kernel of its own
+        motor, turned = (first + i - 1 for i in robot.description.linkage)
+        torque = torque.at[turned].add(imperfections.linkage * torque[motor])
+    return motors, torque

@@ -6,7 +6,6 @@ as the controller has it. A wrench is that of the ground on the robot at the foo
 world frame. The controller gets an estimate; losses and labels read the truth.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -23,6 +22,7 @@ from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim.world import Estimator, World
 
+_EDGES = np.arange(4)  # of a friction pyramid, in order
 CONTACTS = 16  # contacts kept of a millisecond in MuJoCo C
 DRIFT_TIME = 4.0  # [s] after which the drift has its stated size
 
@@ -132,31 +132,22 @@ def ground_wrench(
     return Wrench(at_foot.sum(axis=1), jnp.cross(lever, at_foot).sum(axis=1))
 
 
-def read_contacts(data: mujoco.MjData) -> tuple[np.ndarray, ...]:
-    """Copies of the contacts of the last step of MuJoCo C, and its constraint forces."""
-    found = data.contact
-    arrays = found.geom, found.pos, found.frame, found.friction, found.efc_address, data.efc_force
-    return tuple(x.copy() for x in arrays)
-
-
-def pad_contacts(world: World, steps: Sequence[tuple[np.ndarray, ...]]) -> Contacts:
-    """Contacts of several steps, each from `read_contacts`, with a row for each step (numpy)."""
-    geoms, position, frame, friction, address, force = map(np.concatenate, zip(*steps, strict=True))
-    counts, forces = (np.array([len(step[i]) for step in steps]) for i in (0, -1))
-    row = np.repeat(np.arange(len(steps)), counts)
-    slot = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
-    edges = (address + (np.cumsum(forces) - forces)[row])[:, None] + np.arange(4)
-    # a contact that is left out of the constraints has the address -1
-    pyramid = np.where(address[:, None] >= 0, np.append(force, 0.0).take(edges, mode="clip"), 0.0)
-    few = slot < CONTACTS
-    at = row[few], slot[few]
-    out = empty_contacts(len(steps))
-    given = geoms, position, frame.reshape(-1, 3, 3), pyramid, friction[:, :2]
-    for padded, values in zip(out, given, strict=True):
-        padded[at] = values[few]
-    # nobody walks with more: told as the floor touched by no foot
-    out.geoms[counts > CONTACTS] = world.floor
-    return out
+def read_contacts(world: World, data: mujoco.MjData, out: Contacts, row: int) -> None:
+    """Copy the contacts of the last step of MuJoCo C into a row of `out` (numpy)."""
+    count, found = data.ncon, data.contact
+    out.geoms[row] = -1
+    if count > CONTACTS:  # nobody walks with so many: told as the floor touched by no foot
+        out.geoms[row] = world.floor
+    elif count:
+        address = found.efc_address  # -1: left out of the constraints
+        edges = address[:, None] + _EDGES
+        out.geoms[row, :count] = found.geom
+        out.position[row, :count] = found.pos
+        out.frame[row, :count] = found.frame.reshape(-1, 3, 3)
+        out.friction[row, :count] = found.friction[:, :2]
+        out.pyramid[row, :count] = data.efc_force.take(edges, mode="clip")
+        if address.min() < 0:
+            out.pyramid[row, :count][address < 0] = 0.0
 
 
 def empty_contacts(rows: int) -> Contacts:

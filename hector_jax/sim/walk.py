@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Float
 
 from hector_jax.control.controller import (
@@ -72,6 +73,26 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     )
 
 
+def one_kernel(
+    function: Callable[..., Array], *arguments: jax.ShapeDtypeStruct
+) -> Callable[..., Array]:
+    """Compile a small function for arguments of these shapes, on a CPU into a single kernel.
+
+    XLA runs a kernel for each of some hundred operations and shares them out to its threads, which
+    takes several times as long as they do. A call with this mark it compiles as one; where it
+    cannot (an operation that is not a loop of its own) the function is compiled as others are.
+    """
+
+    def marked(*inputs: Array) -> Array:
+        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+            return jax.jit(function)(*inputs)
+
+    try:
+        return jax.jit(marked).lower(*arguments).compile()
+    except jax.errors.JaxRuntimeError:
+        return jax.jit(function).lower(*arguments).compile()
+
+
 @cache
 def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
     """The compiled torques of a millisecond, from packed arrays to the next packed state.
@@ -89,7 +110,7 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
         motors, yaw, torque = loop.motor_torques(config, *before, *millisecond)
         return pack((torque, yaw, motors))
 
-    return jax.jit(torques)
+    return one_kernel(torques, *(jax.eval_shape(pack, leaves) for _, leaves in layouts))
 
 
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
@@ -105,7 +126,7 @@ class _Plant:
         world = self.world = build_world(job.imperfections, body.description)
         self.data = mujoco.MjData(world.model)
         self.data.qpos[:] = standing_qpos(world, body.standing_joints, float(body.trunk_height))
-        self.contacts = [sensing.read_contacts(self.data)] * count
+        self.contacts = sensing.empty_contacts(count)
         self._first, self._where = first, sensing.coordinates(world)
         self._worlds = worlds_by_step(world, job.changes, first, end)
         self._forces = np.asarray(_push_forces(job.push, np.arange(first, end)))
@@ -128,7 +149,7 @@ class _Plant:
         self._push[:] = self._forces[number]
         mujoco.mj_step(world.model, self.data)
         self._read(substep + 1)
-        self.contacts[substep] = sensing.read_contacts(self.data)
+        sensing.read_contacts(world, self.data, self.contacts, substep)
 
     @property
     def broken(self) -> bool:
@@ -223,7 +244,7 @@ def _walk_ticks(
             if on_sample is not None:
                 on_sample(plant.world, plant.data)
         yaw = torque[-1]
-        truth = now, yaw_before, plant.readings, sensing.pad_contacts(plant.world, plant.contacts)
+        truth = now, yaw_before, plant.readings, plant.contacts
         samples = programs.samples(body, command, anchor, *truth, place)
         yield plan, samples
         if np.asarray(samples.fallen).any() or plant.broken:
