@@ -9,7 +9,6 @@ All of it is linear after the limit and cheap, and the same function serves MuJo
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array

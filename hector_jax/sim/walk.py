@@ -9,7 +9,8 @@ marked, never started afresh.
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from functools import cache, partial
+from contextlib import suppress
+from functools import cache
 from itertools import repeat
 from types import SimpleNamespace
 from typing import Any
@@ -73,46 +74,32 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     )
 
 
-def one_kernel(
-    function: Callable[..., Array], *arguments: jax.ShapeDtypeStruct
-) -> Callable[..., Array]:
-    """Compile a small function for arguments of these shapes, on a CPU into a single kernel.
-
-    XLA runs a kernel for each of some hundred operations and shares them out to its threads, which
-    takes several times as long as they do. A call with this mark it compiles as one; where it
-    cannot (an operation that is not a loop of its own) the function is compiled as others are.
-    """
-
-    def marked(*inputs: Array) -> Array:
-        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-            return jax.jit(function)(*inputs)
-
-    try:
-        return jax.jit(marked).lower(*arguments).compile()
-    except jax.errors.JaxRuntimeError:
-        return jax.jit(function).lower(*arguments).compile()
-
-
 @cache
 def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
-    """The compiled torques of a millisecond, from packed arrays to the next packed state.
+    """The compiled torques of a millisecond, from packed trees to the next state, packed.
 
-    Args:
-        config: the controller.
-        layouts: of what is fixed in a walk (robot, legs, imperfections), of what holds over a tick
-            (memory, plan), of the state (torque, yaw, motors) and of the millisecond's number in
-            its tick, reading and error.
+    XLA runs a kernel for each of a hundred operations and shares them out to its threads, which
+    takes several times as long as they do: a call with this mark is compiled into one. Where that
+    fails, as an operation has code in a kernel of its own only, they are compiled as ever.
     """
 
     def torques(*packed: Array) -> Array:
         fixed, held, (_, yaw, motors), millisecond = map(unpack, layouts, packed)
-        before = *fixed, *held, motors, yaw
-        motors, yaw, torque = loop.motor_torques(config, *before, *millisecond)
+        motors, yaw, torque = loop.motor_torques(config, *fixed, *held, motors, yaw, *millisecond)
         return pack((torque, yaw, motors))
 
-    return one_kernel(torques, *(jax.eval_shape(pack, leaves) for _, leaves in layouts))
+    def marked(*packed: Array) -> Array:
+        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+            return jax.jit(torques)(*packed)
+
+    shapes = [jax.eval_shape(pack, leaves) for _, leaves in layouts]
+    if jax.default_backend() == "cpu":
+        with suppress(jax.errors.JaxRuntimeError):
+            return jax.jit(marked, compiler_options=_LOOPS).lower(*shapes).compile()
+    return jax.jit(torques).lower(*shapes).compile()
 
 
+_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""}  # products are loops, not calls of a library
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
 
