@@ -68,7 +68,7 @@ def test_a_proposal_loads_and_names_joints_and_feet_as_the_robots_own_toml(path)
         assert (got.contacts, got.body) == (expected.contacts, expected.body)
     np.testing.assert_allclose(robot.foot_point, robot_of(own).foot_point, atol=1e-9)
     assert len(config.legs.kp) == own.leg_joints
-    assert proposal.survey.forwards == (path == HUMANOID)
+    assert proposal.survey.forwards == (path == HUMANOID,)
 
 
 def test_legs_are_told_from_arms_and_what_is_of_no_leg_is_welded(tmp_path):
@@ -79,7 +79,7 @@ def test_legs_are_told_from_arms_and_what_is_of_no_leg_is_welded(tmp_path):
     ]
     assert set(found.weld) == {"waist", "shoulder"}
     assert found.model.body(found.trunk).name == "base"
-    assert (found.knee, found.forwards) == (2, True)
+    assert (found.knee, found.forwards) == (2, (True,))
     proposal = propose(found.path)
     assert proposal.wrong == ()
     _, robot, _ = loaded(proposal)
@@ -93,7 +93,7 @@ def test_a_urdf_is_proposed_as_the_mjcf_that_it_came_from(tmp_path):
     found, own = survey_file(path), survey_file(description.model)
     names = [[one.model.joint(j).name for leg in one.legs for j in leg] for one in (found, own)]
     assert names[0] == names[1]
-    assert found.forwards
+    assert found.forwards == (True,)
 
 
 def test_a_turned_model_is_told_to_be_turned(tmp_path):

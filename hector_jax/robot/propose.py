@@ -3,6 +3,7 @@
 Rules scale HECTOR (m0 = 12 kg; h0 = 0.423 m, the height of its centre of mass standing) to a robot
 of mass m and height h:
 
+    armature                 of joints without one 2e-4 kg m^2 per N m of their torque limit
     stance, swing [ticks]    20 sqrt(h / h0): a pendulum's time
     step_ticks               0.15 swing, rounded up, at least 3: ten steps see past the next step
     max_force                2.5 m g
@@ -48,6 +49,7 @@ from hector_jax.robot.survey import Survey, survey_file
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
 _W = 30.0  # [rad/s] of the swing leg's joints
 _KP_PER_LIMIT = 2.0  # [1/rad]
+_ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
 _COLUMNS = 100
 
 
@@ -80,6 +82,7 @@ def propose(path: Path) -> Proposal:
     angles, balanced = standing_pose(survey, soles)
     if len(soles[0].contacts) == 1:  # round: it touches elsewhere where the leg is bent
         soles = find_soles(survey, angles)
+        angles, balanced = standing_pose(survey, soles, angles)
     table = names(survey, soles, angles)
     wrong = []
     if soles[0].guessed:
@@ -98,6 +101,9 @@ def propose(path: Path) -> Proposal:
         robot = robot_of(description)
     except InputError as error:
         return Proposal(survey, soles, table, (*wrong, str(error)))
+    if armature := _armature(survey, robot):
+        table["joints"]["armature"] = armature
+        description = description_of(description.path, table)
     table |= sections(size_of(description, robot))
     return Proposal(survey, soles, table, tuple(wrong))
 
@@ -174,6 +180,14 @@ def sections(size: Size) -> dict[str, Any]:
             "payload": _short(mass),
         },
     }
+
+
+def _armature(survey: Survey, robot: Robot) -> list[float] | None:
+    """Inertia of a leg's motors [kg m^2] where the file leaves one out, of the others its own."""
+    legs = list(survey.legs[0])
+    given = survey.model.dof_armature[survey.model.jnt_dofadr[legs]]
+    guess = _ARMATURE_PER_LIMIT * robot.torque_limit[: len(legs)]
+    return None if np.all(given) else [_short(x) for x in np.where(given, given, guess)]
 
 
 def _gains(size: Size) -> dict[str, list[float]]:

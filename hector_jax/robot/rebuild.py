@@ -1,6 +1,6 @@
 """A robot written anew from its links: the form that all later code reads.
 
-A trunk with a free joint, one body a leg joint, left legs first; torque motors in that order; a
+A trunk with a free joint, one body a leg joint, leg by leg; torque motors in that order; a
 floor; small spheres where a sole touches and a site where its wrench acts; a keyframe that stands.
 
 Contact bits: 1 floor, 2 first leg, 4 second leg, and so on. Soles touch the floor with their
@@ -57,7 +57,7 @@ _SITE = {"size": [0.005] * 3, "group": 4}
 _FLOOR_BITS = {"contype": 0, "conaffinity": 1, "condim": 3}
 _GREY, _DARK = [0.75, 0.78, 0.82, 1.0], [0.1, 0.1, 0.1, 1.0]
 _STICK = 0.02  # [m] radius
-_SHORTEST = 1e-3  # [m] half length of a capsule
+_SHORTEST = 1e-4  # [m] half length of a capsule; Go1's hips are 1.5 mm apart
 
 
 class Pieces(NamedTuple):

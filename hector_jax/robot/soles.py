@@ -197,15 +197,15 @@ def _placed(
     places = (contacts @ axes.T - origin) @ R
     ahead, middle = contacts[:, 0], 0.5 * (contacts.min(axis=0) + contacts.max(axis=0))
     section: dict[str, Any] = {"body": model.body(body).name}
-    digits = 4 if np.allclose(np.abs(axes.T @ R).max(axis=0), 1.0, rtol=0.0, atol=1e-9) else 8
-    if np.abs(origin - np.round(origin, 4)).max() > 1e-9:
-        digits = 8
+    aligned = np.allclose(np.abs(axes.T @ R).max(axis=0), 1.0, rtol=0.0, atol=1e-9)
+    aligned = aligned and np.abs(origin - np.round(origin, 4)).max() <= 1e-9
+    digits = 4 if aligned or len(contacts) == 1 else 8  # a point has nothing to be level with
     section["contacts"] = [_numbers(place, digits) for place in places]
     point = np.array([0.0, middle[1], middle[2]])
-    under = ahead.min() < -1e-3 and ahead.max() > 1e-3
-    if len(contacts) == 1 or not under:  # the last joint is not above the sole
+    if not ahead.min() < -1e-3 < 1e-3 < ahead.max():  # the last joint is not above the sole
         point = middle
-        section["point"] = _numbers((axes @ point - origin) @ R, digits)
+        if len(contacts) > 1:
+            section["point"] = _numbers((axes @ point - origin) @ R, digits)
     return Sole(section, contacts, point, axes, guessed)
 
 

@@ -246,7 +246,7 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
         ("free joint added to the trunk", file.free < 0),
         (f"fixed: {listed(description.weld)}", description.weld),
         (f"made one with their parents: {listed(static)}", static),
-        ("joints put in order, left leg first", file.free >= 0 and not (order or description.weld)),
+        ("joints put in order, leg by leg", file.free >= 0 and not (order or description.weld)),
         ("frames of the joints put into their anchors", not at_origin and order),
         (f"torque motors {motors}", not _motors_right(file, limits)),
         ("floor added" if not floor else "floor replaced", bits != [(1, 0)]),

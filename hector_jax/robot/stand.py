@@ -8,7 +8,7 @@ kinematics, whatever the order and the turns of the axes.
 Where another joint then reaches its limit, the knees are bent less.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -29,12 +29,20 @@ _SOLVED = (2e-3, 5e-3)  # [rad] of the soles, [m] of the centre of mass
 _ROUND, _NOTHING = 4, 2e-4  # digits, [rad]
 
 
-def standing_pose(survey: Survey, soles: Sequence[Sole]) -> tuple[dict[str, float], bool]:
-    """Angle [rad] by joint, those at zero left out, and whether soles and balance are right."""
+def standing_pose(
+    survey: Survey, soles: Sequence[Sole], seen: Mapping[str, float] | None = None
+) -> tuple[dict[str, float], bool]:
+    """Angle [rad] by joint, those at zero left out, and whether soles and balance are right.
+
+    Args:
+        survey: the robot.
+        soles: its feet.
+        seen: pose [rad] by joint in which `find_soles` looked at them; all joints at zero if None.
+    """
     model, legs = survey.model, [list(leg) for leg in survey.legs]
     bend, angles, right = KNEE, np.zeros(len(legs) * len(legs[0])), False
     for _ in range(_TRIALS):
-        angles, right = _solve(survey, soles, bend)
+        angles, right = _solve(survey, soles, bend, seen or {})
         if right:
             break
         bend *= _LESS
@@ -44,28 +52,29 @@ def standing_pose(survey: Survey, soles: Sequence[Sole]) -> tuple[dict[str, floa
 
 
 def _solve(
-    survey: Survey, soles: Sequence[Sole], bend: float
+    survey: Survey, soles: Sequence[Sole], bend: float, seen: Mapping[str, float]
 ) -> tuple[Float[np.ndarray, " joints"], bool]:
     """Angles of all legs with the knees at a bend [rad]."""
-    model, data = survey.model, at_zero(survey.model)
+    model = survey.model
+    data = at_zero(model, {int(model.joint(name).qposadr[0]): q for name, q in seen.items()})
     joints = list(sum(survey.legs, ()))
     address, count = model.jnt_qposadr[joints], len(survey.legs[0])
     bodies = [int(model.jnt_bodyid[leg[-1]]) for leg in survey.legs]
-    zero = [data.xmat[b].reshape(3, 3).copy() for b in bodies]
-    local = [R.T @ sole.axes for R, sole in zip(zero, soles, strict=True)]  # sole in the body
+    then = [data.xmat[b].reshape(3, 3).copy() for b in bodies]
+    local = [R.T @ sole.axes for R, sole in zip(then, soles, strict=True)]  # sole in the body
     anchors = [
         data.xanchor[leg[-1]] - data.xpos[b] for leg, b in zip(survey.legs, bodies, strict=True)
     ]
     points = [
         R.T @ (anchor + sole.axes @ sole.point)
-        for R, anchor, sole in zip(zero, anchors, soles, strict=True)
+        for R, anchor, sole in zip(then, anchors, soles, strict=True)
     ]
     flat = len(soles[0].contacts) > 1
     knees = list(range(survey.knee, len(joints), count))
     low, high = _ranges(model, joints)
     start = np.clip(np.zeros(len(joints)), low, high)
-    for knee in knees:
-        sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if survey.forwards else -1.0)
+    for knee, ahead in zip(knees, np.repeat(survey.forwards, 2), strict=True):
+        sign = np.sign(data.xaxis[joints[knee]][1]) * (1.0 if ahead else -1.0)
         start[knee] = np.clip(sign * bend, low[knee], high[knee])
     free = [i for i in range(len(joints)) if i not in knees]
 

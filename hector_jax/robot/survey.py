@@ -5,7 +5,8 @@ chain of three to seven hinges from where the two legs part down to the last hin
 two such chains that mirror each other and end lowest; the left one is that whose first joint has
 the larger y or, where both have the same, whose name says so. A second such pair of as many joints
 that ends as low makes it a robot with four legs. What turns about y swings a leg forwards: the knee
-is the one of these joints, but the first, that is farthest from hip and sole.
+is the one of these joints, but the first, that is farthest from hip and sole. It bends to the side
+to which its range is larger; where both are the same, to that to which it is bent at zero.
 """
 
 import re
@@ -27,7 +28,7 @@ from hector_jax.robot.source import compile_bare
 
 _HINGE, _FREE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
 _MIRRORED = 0.03  # [m] between a joint and the mirror image of the other leg's
-_AS_LOW = 0.05  # [m] between the ends of two pairs of legs
+_AS_LOW = 0.25  # of a leg's height, between the ends of two pairs of legs
 _BENDS = 0.7  # least share of y in the axis of a joint that swings the leg forwards
 _DIRECTIONS = ("roll", "pitch", "yaw")
 
@@ -41,7 +42,7 @@ class Survey(NamedTuple):
     legs: tuple[tuple[int, ...], ...]  # joints, in the order of `FEET`, from the trunk down
     weld: tuple[str, ...]  # joints of no leg
     knee: int  # of a leg, counted from 0
-    forwards: bool  # whether the knees point ahead
+    forwards: tuple[bool, ...]  # whether the knees of each pair of legs point ahead
 
 
 def survey_file(path: Path) -> Survey:
@@ -67,7 +68,6 @@ def survey_file(path: Path) -> Survey:
             f"{path}: a joint of body {unnamed[0]!r} has no name, expected one: it is to be welded"
         )
     knee = _knee(path, model, data, legs[0])
-    span = model.jnt_range[legs[0][knee]] * np.sign(data.xaxis[legs[0][knee]][1])
     return Survey(
         path=path,
         model=model,
@@ -75,7 +75,7 @@ def survey_file(path: Path) -> Survey:
         legs=legs,
         weld=tuple(model.joint(j).name for j in others),
         knee=knee,
-        forwards=bool(span[np.argmax(np.abs(span))] > 0.0),
+        forwards=tuple(_bends_forwards(model, data, leg, knee) for leg in legs[::2]),
     )
 
 
@@ -131,13 +131,19 @@ def _legs(path: Path, model: mujoco.MjModel, free: Sequence[int]) -> tuple[tuple
             "hinges that mirror each other; chains by their last joint: "
             f"{', '.join(ends) or 'none'}"
         )
-    low, _, *legs = min(pairs)
-    found = [legs]
-    for lowest, _, *more in sorted(pairs):
-        new = not {*legs[0], *legs[1]} & {*more[0], *more[1]}
-        if new and len(more[0]) == len(legs[0]) and lowest - low <= _AS_LOW:
-            found.append(more)
-            break
+    low, _, lowest_leg, _ = min(pairs)
+    near, found = _AS_LOW * (data.xanchor[lowest_leg[0]][2] - low), []
+    for lowest, _, *pair in sorted(pairs):
+        new = not {*pair[0], *pair[1]} & set(sum((*sum(found, []),), ()))
+        if new and lowest - low <= near:
+            found.append(pair)
+    counts = [len(pair[0]) for pair in found]
+    if len(found) > 2 or len(set(counts)) > 1:
+        ends = ", ".join(model.joint(leg[-1]).name for pair in found for leg in pair)
+        raise InputError(
+            f"{path}: {len(found)} pairs of chains of {counts} hinges end as low as legs: {ends}; "
+            "expected one pair, or two of as many hinges"
+        )
     found.sort(key=lambda pair: -data.xanchor[pair[0][0]][0])
     for pair in found:
         if _is_right(model, data, *pair):
@@ -173,3 +179,13 @@ def _knee(path: Path, model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[
         return float(min(np.linalg.norm(anchors[i] - place) for place in (hip, end)))
 
     return max(bend[1:], key=apart)
+
+
+def _bends_forwards(
+    model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int], knee: int
+) -> bool:
+    """Whether a knee points ahead when it is bent."""
+    joint = leg[knee]
+    side = model.jnt_range[joint].sum() * np.sign(data.xaxis[joint][1])
+    end = data.xipos[_body(model, leg[-1])]
+    return bool(side > 0.0 if abs(side) > 1e-6 else end[0] < data.xanchor[joint][0])

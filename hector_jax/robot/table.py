@@ -12,7 +12,6 @@ from hector_jax.robot.source import build_spec
 from hector_jax.robot.survey import Survey, axis_words
 
 _HEADER = ("joint", "axis", "range [rad]", "motor [N m]", "link [kg]", "standing [rad]")
-_WAYS = {True: "forwards", False: "backwards"}
 _HEAVY = 0.35  # share of the legs in the mass
 
 
@@ -22,7 +21,7 @@ def table_of(robot: Robot) -> list[str]:
     count = description.leg_joints
     share = float(robot.link_mass.sum() / robot.mass)
     _, knee, _ = knee_joints(robot)
-    forwards = robot.standing_joints[knee] * robot.joint_axis[0, knee, 1] > 0.0
+    bends = robot.standing_joints.reshape(-1, count)[::2, knee] * robot.joint_axis[::2, knee, 1]
     model = compile_model(description)
     trunk = model.body(trunk_body(model)).name
     rows = [
@@ -39,8 +38,8 @@ def table_of(robot: Robot) -> list[str]:
     return [
         f"robot    {description.name}: {robot.mass:.4g} kg, trunk {trunk!r}; standing, its centre "
         f"of mass is {robot.standing_height:.3g} m high",
-        f"legs     {count} joints each, {100 * share:.0f} % of the mass; knees bend "
-        f"{_WAYS[forwards]}; axes and numbers of the {_words_of(description.legs[0])} leg:",
+        f"legs     {count} joints each, {100 * share:.0f} % of the mass; "
+        f"{_knees((bends > 0.0).tolist())}",
         *_columns([_HEADER, *rows]),
         f"feet     {robot.structure.contact}: {_sole(robot)}",
         *_words("fixed", description.weld),
@@ -63,8 +62,7 @@ def table_of_survey(survey: Survey) -> list[str]:
     mass = float(model.body_subtreemass[survey.trunk])
     return [
         f"robot    {mass:.4g} kg, trunk {model.body(survey.trunk).name!r}",
-        f"legs     {len(rows)} joints each; knees bend {_WAYS[survey.forwards]}; axes and numbers "
-        f"of the {_words_of(FEET[len(survey.legs)][0])} leg:",
+        f"legs     {len(rows)} joints each; {_knees(survey.forwards)}",
         *_columns([_HEADER[:3], *rows]),
         *_words("fixed", survey.weld),
     ]
@@ -109,8 +107,12 @@ def _sole(robot: Robot) -> str:
     return text
 
 
-def _words_of(leg: str) -> str:
-    return leg.replace("_", " ")
+def _knees(forwards: Sequence[bool]) -> str:
+    """To which side the knees of each pair of legs bend, and whose numbers follow."""
+    ways = ["forwards" if ahead else "backwards" for ahead in forwards]
+    way = ways[0] if len(set(ways)) == 1 else f"{ways[0]} in front and {ways[1]} behind"
+    leg = FEET[2 * len(ways)][0].replace("_", " ")
+    return f"knees bend {way}; axes and numbers of the {leg} leg:"
 
 
 def _words(title: str, words: Sequence[str]) -> list[str]:
