@@ -106,12 +106,15 @@ def check_jax(on_cpu: bool = False) -> None:
 def setup_jax() -> None:
     """Turn on 64 bits, full precision and the compilation cache; call before the first array.
 
-    Python's garbage collector runs less often.
+    Programs on the CPU run at once, and Python's garbage collector runs less often.
     """
     import jax
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_default_matmul_precision", "highest")
+    # A program on the CPU runs in the thread that calls it: to wake another one takes as long as
+    # the small programs of a walk.
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
     jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

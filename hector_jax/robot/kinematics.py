@@ -278,7 +278,7 @@ def _searched_leg(
         damping = _DAMPING * jax.lax.stop_gradient(now @ now) + 1e-12
         damped = J @ J.T + damping * jnp.eye(len(rows), dtype=J.dtype)
         rest = leg.standing - still  # of what the foot leaves free
-        return rest - J.T @ jnp.linalg.solve(damped, now + J @ rest)
+        return rest - J.T @ _solve(damped, now + J @ rest)
 
     def improved(joints: Array, _: None) -> tuple[Array, None]:
         moved = joints + jnp.clip(step(joints, *fixed), -_LARGEST_STEP, _LARGEST_STEP)
@@ -289,6 +289,15 @@ def _searched_leg(
     joints, _ = jax.lax.scan(improved, jax.lax.stop_gradient(start), length=steps)
     # one step more, the only one that is differentiated: its derivative is that of the solution
     return joints + step(joints, *target)
+
+
+def _solve(A: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Solve A x = b, A positive definite and small: elimination in operations that fuse."""
+    rows = jnp.concatenate([A, b[:, None]], axis=1)
+    for i in range(len(b)):
+        pivot = rows[i] / rows[i, i]
+        rows = jnp.where(np.arange(len(b))[:, None] == i, pivot, rows - rows[:, i : i + 1] * pivot)
+    return rows[:, -1]
 
 
 def _rotation_vector(R: Float[Array, "3 3"]) -> Float[Array, "3"]:

@@ -9,7 +9,6 @@ All of it is linear after the limit and cheap, and the same function serves MuJo
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array
@@ -51,5 +50,7 @@ def step_actuators(
     if robot.description.linkage is None:
         return motors, torque
     joints = robot.description.leg_joints
-    motor, turned = (np.array([i - 1, joints + i - 1]) for i in robot.description.linkage)
-    return motors, torque.at[turned].add(imperfections.linkage * torque[motor])
+    for first in range(0, len(torque), joints):  # one by one: a scatter is a kernel of its own
+        motor, turned = (first + i - 1 for i in robot.description.linkage)
+        torque = torque.at[turned].add(imperfections.linkage * torque[motor])
+    return motors, torque

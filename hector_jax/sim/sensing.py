@@ -22,6 +22,7 @@ from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim.world import Estimator, World
 
+_EDGES = np.arange(4)  # of a friction pyramid, in order
 CONTACTS = 16  # contacts kept of a millisecond in MuJoCo C
 DRIFT_TIME = 4.0  # [s] after which the drift has its stated size
 
@@ -136,19 +137,20 @@ def ground_wrench(
 
 def read_contacts(world: World, data: mujoco.MjData, out: Contacts, row: int) -> None:
     """Copy the contacts of the last step of MuJoCo C into a row of `out` (numpy)."""
-    count = data.ncon
+    count, found = data.ncon, data.contact
     out.geoms[row] = -1
     if count > CONTACTS:  # nobody walks with so many: told as the floor touched by no foot
         out.geoms[row] = world.floor
     elif count:
-        contact = data.contact
-        edges = contact.efc_address[:, None] + np.arange(4)
-        included = contact.efc_address[:, None] >= 0
-        out.geoms[row, :count] = contact.geom
-        out.position[row, :count] = contact.pos
-        out.frame[row, :count] = contact.frame.reshape(-1, 3, 3)
-        out.friction[row, :count] = contact.friction[:, :2]
-        out.pyramid[row, :count] = included * data.efc_force.take(edges, mode="clip")
+        address = found.efc_address  # -1: left out of the constraints
+        edges = address[:, None] + _EDGES
+        out.geoms[row, :count] = found.geom
+        out.position[row, :count] = found.pos
+        out.frame[row, :count] = found.frame.reshape(-1, 3, 3)
+        out.friction[row, :count] = found.friction[:, :2]
+        out.pyramid[row, :count] = data.efc_force.take(edges, mode="clip")
+        if address.min() < 0:
+            out.pyramid[row, :count][address < 0] = 0.0
 
 
 def empty_contacts(rows: int) -> Contacts:

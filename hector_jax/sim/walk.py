@@ -2,19 +2,23 @@
 
 Controller and sensing are compiled once per process and serve every walk, whatever its weights,
 command and plant: per tick one program plans and one samples, per millisecond one turns the plan
-into torques, and MuJoCo steps between. A fall ends the walk: what is missing is held and marked,
-never started afresh.
+into torques, and MuJoCo steps between. What that one takes and gives is packed into a few flat
+arrays, because a call costs by the array. A fall ends the walk: what is missing is held and
+marked, never started afresh.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from functools import cache, partial
+from contextlib import suppress
+from functools import cache
 from itertools import repeat
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Float
 
 from hector_jax.control.controller import (
@@ -29,7 +33,7 @@ from hector_jax.control.reference import anchor_at, standing_anchor
 from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import Trajectory
-from hector_jax.core.tree import stack
+from hector_jax.core.tree import Layout, layout, pack, stack, unpack
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot, quiet_mujoco
 from hector_jax.sim import loop, sensing
@@ -49,6 +53,10 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
         still = jnp.zeros(()), sensing.no_error(robot)
         return init_memory(robot, loop.measure(robot, reading, *still))
 
+    def plan(*inputs: Any, max_contacts: int) -> tuple[Memory, Plan, Array]:
+        memory, plan = loop.plan_tick(config, *inputs, max_contacts=max_contacts)
+        return memory, plan, pack((memory, plan))
+
     def samples(robot, command, anchor, tick, yaw, readings, contacts, place) -> Sample:
         def one(time: Array, before: Array, after: Array, contacts: Contacts) -> Sample:
             effect, touches = loop.contact_wrench(robot, before, contacts, *place)
@@ -61,12 +69,37 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     return SimpleNamespace(
         begin=jax.jit(begin),
         measure=jax.jit(loop.measure),
-        plan=jax.jit(partial(loop.plan_tick, config), static_argnames="max_contacts"),
-        torques=jax.jit(partial(loop.motor_torques, config)),
+        plan=jax.jit(plan, static_argnames="max_contacts"),
         samples=jax.jit(samples),
     )
 
 
+@cache
+def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
+    """The compiled torques of a millisecond, from packed trees to the next state, packed.
+
+    XLA runs a kernel for each of a hundred operations and shares them out to its threads, which
+    takes several times as long as they do: a call with this mark is compiled into one. Where that
+    fails, as an operation has code in a kernel of its own only, they are compiled as ever.
+    """
+
+    def torques(*packed: Array) -> Array:
+        fixed, held, (_, yaw, motors), millisecond = map(unpack, layouts, packed)
+        motors, yaw, torque = loop.motor_torques(config, *fixed, *held, motors, yaw, *millisecond)
+        return pack((torque, yaw, motors))
+
+    def marked(*packed: Array) -> Array:
+        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+            return jax.jit(torques)(*packed)
+
+    shapes = [jax.eval_shape(pack, leaves) for _, leaves in layouts]
+    if jax.default_backend() == "cpu":
+        with suppress(jax.errors.JaxRuntimeError):
+            return jax.jit(marked, compiler_options=_LOOPS).lower(*shapes).compile()
+    return jax.jit(torques).lower(*shapes).compile()
+
+
+_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""}  # products are loops, not calls of a library
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
 
@@ -84,18 +117,23 @@ class _Plant:
         self._first, self._where = first, sensing.coordinates(world)
         self._worlds = worlds_by_step(world, job.changes, first, end)
         self._forces = np.asarray(_push_forces(job.push, np.arange(first, end)))
+        # views, which stay: each look-up in MjData costs half a microsecond
+        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
+        self._push = self.data.xfrc_applied[world.trunk, :3]
+        self._flat = np.zeros(len(self._qpos) + len(self._qvel) + 1)
         self.readings = np.zeros((count + 1, len(self._where)))
         self._read(0)
 
     def _read(self, row: int) -> None:
-        flat = np.concatenate([self.data.qpos, self.data.qvel, np.zeros(1)])
-        flat.take(self._where, out=self.readings[row])
+        split = len(self._qpos)
+        self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
+        self._flat.take(self._where, out=self.readings[row], mode="clip")
 
     def step(self, number: int, substep: int, torque: Float[Array, " joints"]) -> None:
         """Millisecond `number` of the walk, which is `substep` of its tick."""
         self.world = world = self._worlds.get(self._first + number, self.world)
-        self.data.ctrl[world.actuator] = torque
-        self.data.xfrc_applied[world.trunk, :3] = self._forces[number]
+        self._ctrl[world.actuator] = torque
+        self._push[:] = self._forces[number]
         mujoco.mj_step(world.model, self.data)
         self._read(substep + 1)
         sensing.read_contacts(world, self.data, self.contacts, substep)
@@ -154,37 +192,45 @@ def _walk_ticks(
     start, steps = job.start_tick, (job.start_tick - begin + ticks) * count
     body, weights, command, imperfections = jax.device_put((robot, *job[:3]))
     place = jax.device_put((np.array(plant.world.floor), plant.world.foot_of_geom))
-    numbers = [jax.device_put(np.array(i, np.int32)) for i in range(count)]
     joints, lead = len(robot.joint_lower), steps - ticks * count
     errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
     anchor = jax.device_put(standing_anchor(robot, start))
-    legs = jax.device_put(config.parameters(weights).legs)
-    memory, motors = programs.begin(body, plant.readings[0]), init_actuators(joints)
-    yaw = jnp.zeros(())
+    fixed = body, config.parameters(weights).legs, imperfections
+    memory, yaw = programs.begin(body, plant.readings[0]), np.zeros(())
+    state = np.zeros(joints), yaw, init_actuators(joints)
+    constants, packed = pack(fixed), pack(state)
+    millisecond = np.array(0, np.int32), plant.readings[0], errors[0]
+    rows = np.zeros((count, pack(millisecond).size))
+    rows[:, 0] = np.arange(count)
     carry = None if retune is None else retune.init
-    plan = samples = None
+    torques = plan = samples = None
     for tick in range(begin, start + ticks):
         if tick == start:
             assert samples is not None  # `walk_ticks` refuses a walk that begins at t = 0
             last = jax.tree.map(lambda x: x[-1], samples.state)
             anchor = jax.device_put(anchor_at(robot, last, start))
         done = (tick - begin) * count
-        error, yaw_before, now = errors[done:], yaw, np.array(tick, np.int32)
+        error, yaw_before, now = errors[done : done + count], yaw, np.array(tick, np.int32)
         inputs = yaw, plant.readings[0], error[0]
         if retune is not None and plan is not None and tick >= start:
             measurement = programs.measure(body, inputs[1], yaw, error[0])
             carry, weights = retune.step(carry, tick, anchor, measurement, plan.wrench)
             weights = jax.device_put(weights)
         max_contacts = contacts_needed(config, tick)
-        memory, plan = programs.plan(
+        memory, plan, held = programs.plan(
             body, weights, command, anchor, now, memory, *inputs, max_contacts=max_contacts
         )
+        if torques is None:
+            torques = _torques(config, *map(layout, (fixed, (memory, plan), state, millisecond)))
+        rows[:, -error.shape[1] :] = error
         for i in range(count):
-            held = imperfections, memory, plan, motors, yaw, numbers[i]
-            motors, yaw, torque = programs.torques(body, legs, *held, plant.readings[i], error[i])
-            plant.step(done + i, i, torque)
+            rows[i, 1 : -error.shape[1]] = plant.readings[i]
+            packed = torques(constants, held, packed, rows[i])
+            torque = np.asarray(packed)[: joints + 1]
+            plant.step(done + i, i, torque[:-1])
             if on_sample is not None:
                 on_sample(plant.world, plant.data)
+        yaw = torque[-1]
         truth = now, yaw_before, plant.readings, plant.contacts
         samples = programs.samples(body, command, anchor, *truth, place)
         yield plan, samples
