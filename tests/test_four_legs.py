@@ -24,6 +24,7 @@ from hector_jax.robot.kinematics import foot_poses, leg_gravity
 from hector_jax.robot.model import compile_model, load_robot, robot_of
 from hector_jax.robot.propose import propose
 from hector_jax.robot.survey import survey_file
+from hector_jax.robot.table import remarks
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
 MODEL = FILE.with_name("quadruped.xml")
@@ -86,6 +87,9 @@ def test_motors_without_armature_get_one_by_their_torque(tmp_path):
         2e-4 * ROBOT.torque_limit[:3], rel=5e-3
     )
     assert "armature" not in tomllib.loads(TABLE)["joints"]
+    assert remarks(ROBOT) == []
+    (line,) = remarks(robot_of(replace(ROBOT.description, model=tmp_path / "quadruped.xml")))
+    assert line.startswith("joint 'front_left_roll' has no armature")
 
 
 HIND_PITCH = ("-0.5236 4.5379", "-4.5379 0.5236")

@@ -83,6 +83,13 @@ def remarks(robot: Robot) -> list[str]:
             f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they stretch: "
             "set legs.gravity_compensation = true and bend the knees"
         )
+    model = compile_model(robot.description)
+    bare = [n for n in robot.description.joints if not model.dof_armature[model.joint(n).dofadr[0]]]
+    if bare:
+        lines.append(
+            f"joint {bare[0]!r} has no armature, without which backlash cannot be simulated: set "
+            "joints.armature"
+        )
     if robot.heel > 1.2 * robot.toe:
         lines.append(
             "the heel is longer than the toe: if the robot looks along -x, turn the model so that "
