@@ -194,13 +194,13 @@ def test_a_foot_of_each_pair_lands_beside_its_own_hips():
 
 def test_a_qp_larger_than_the_gpu_s_kernel_is_told(monkeypatch):
     monkeypatch.setattr(active_set.jax, "default_backend", lambda: "gpu")
-    said = []
+    config, said = replace(CONFIG, mpc=replace(CONFIG.mpc, horizon=9)), []
     monkeypatch.setattr(active_set, "say", said.append)
     active_set._say_slower.cache_clear()
     for _ in range(2):
-        solve_mpc(CONFIG.mpc, problem(CONFIG, 3), dt=CONFIG.mpc_step, max_contacts=4)
+        solve_mpc(config.mpc, problem(config, 3), dt=config.mpc_step, max_contacts=4)
     (line,) = said
-    assert "a QP of 120 variables and 200 rows takes the slower path" in line
+    assert "a QP of 108 variables and 180 rows takes the slower path" in line
 
 
 # Weights
