@@ -1,6 +1,7 @@
-"""Legs of any number, order and sign of joints, with turned bodies, against MuJoCo."""
+"""Two or four legs of any number, order and sign of joints, turned bodies, against MuJoCo."""
 
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -92,9 +93,11 @@ def written(folder, count):
     return path
 
 
-@pytest.fixture(scope="module", params=LEGS)
+@pytest.fixture(scope="module", params=[*LEGS, "quadruped"])
 def made(request, tmp_path_factory):
-    path = written(tmp_path_factory.mktemp("made"), request.param)
+    path = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
+    if request.param in LEGS:
+        path = written(tmp_path_factory.mktemp("made"), request.param)
     return load_robot(path), compile_model(describe(path))
 
 
@@ -123,7 +126,7 @@ def test_feet_and_jacobians_are_those_of_mujoco(made):
     for joints in random_joints(robot):
         data, feet = posed(robot, model, joints), poses(robot, jnp.asarray(joints))
         J_v, J_w = jacobians(robot, jnp.asarray(joints))
-        count = len(joints) // 2
+        count = robot.description.leg_joints
         for side, (name, body) in enumerate(zip(names, bodies, strict=True)):
             np.testing.assert_allclose(feet.position[side], data.site(name).xpos, atol=1e-12)
             R = data.xmat[body].reshape(3, 3) @ soles[side]
@@ -149,14 +152,15 @@ def test_joints_are_found_from_feet(made):
     """In the rows that a leg places; the position always, all of the sole from six joints on."""
     robot, _ = made
     count = robot.description.leg_joints
-    assert robot.structure.placed == ((0, 1, 2, 4) if count == 4 else (0, 1, 2, 3, 4, 5))
+    assert robot.structure.placed == {3: (0, 1, 2), 4: (0, 1, 2, 4)}.get(count, tuple(range(6)))
     inverse = jax.jit(partial(inverse_legs, steps=20))
     start = jnp.asarray(robot.standing_joints)
-    rng = np.random.default_rng(1)
+    rng, legs = np.random.default_rng(1), len(robot.foot_point)
+    reach = np.array([0.0, 0.0, 0.05])  # less than standing: the quadruped's knees stay bent
     for _ in range(20):
         feet = foot_poses(robot, start)
-        position = feet.position + rng.uniform(-0.04, 0.04, (2, 3))
-        roll, pitch, yaw = jnp.asarray(rng.uniform(-0.2, 0.2, (3, 2)))
+        position = feet.position + reach + rng.uniform(-0.04, 0.04, (legs, 3))
+        roll, pitch, yaw = jnp.asarray(rng.uniform(-0.2, 0.2, (3, legs)))
         level = [rot_y(p) @ rot_x(r) for r, p in zip(roll, pitch, strict=True)]
         up = jnp.stack([R.T[:, 2] for R in level])
         found = foot_poses(robot, inverse(robot, position, yaw, up, start))
@@ -168,10 +172,14 @@ def test_joints_are_found_from_feet(made):
 
 def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
     robot, _ = made
-    start, up = jnp.asarray(robot.standing_joints), jnp.tile(jnp.array([0.0, 0.0, 1.0]), (2, 1))
-    position = foot_poses(robot, start).position
-    moved = jnp.array([[0.3, 0.1, 0.2], [-0.2, 0.1, 0.3]])
-    at = jax.jit(lambda t: inverse_legs(robot, position + t * moved, jnp.zeros(2), up, start, 12))
+    start, legs = jnp.asarray(robot.standing_joints), len(robot.foot_point)
+    position, up = (
+        foot_poses(robot, start).position,
+        jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1)),
+    )
+    moved = jnp.tile(jnp.array([[0.3, 0.1, 0.2], [-0.2, 0.1, 0.3]]), (legs // 2, 1))
+    yaw = jnp.zeros(legs)
+    at = jax.jit(lambda t: inverse_legs(robot, position + t * moved, yaw, up, start, 12))
     rates = jax.jvp(at, (jnp.asarray(0.05),), (jnp.asarray(1.0),))[1]
     difference = (at(jnp.asarray(0.05 + 1e-5)) - at(jnp.asarray(0.05 - 1e-5))) / 2e-5
     if robot.description.leg_joints <= 6:  # of a seventh joint the part that moves no foot is left

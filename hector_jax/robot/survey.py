@@ -3,10 +3,10 @@
 All is read in the pose in which the trunk is at the origin and all joints are zero. A leg is a
 chain of three to seven hinges from where the two legs part down to the last hinge. The legs are the
 two such chains that mirror each other and end lowest; the left one is that whose first joint has
-the larger y or, where both have the same, whose name says so. A second such pair of as many joints
-that ends as low makes it a robot with four legs. What turns about y swings a leg forwards: the knee
-is the one of these joints, but the first, that is farthest from hip and sole. It bends to the side
-to which its range is larger; where both are the same, to that to which it is bent at zero.
+the larger y or, where both have the same, whose name says so. A second such pair that ends as low
+makes it a robot with four legs. What turns about y swings a leg forwards: the knee is the one of
+these joints, but the first, that is farthest from hip and sole. It bends to the side to which its
+range is larger; where both are the same, to that to which it is bent at zero.
 """
 
 import re
