@@ -9,6 +9,7 @@ from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.runtime import workers
+from hector_jax.core.tree import layout, pack, unpack
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.standin import standin
@@ -100,6 +101,18 @@ def test_a_seed_gives_the_same_bytes():
     first, same, other = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(r)]) for r in runs)
     assert first.tobytes() == same.tobytes()
     assert first.tobytes() != other.tobytes()
+
+
+def test_what_is_packed_comes_back_with_its_shapes_and_types():
+    given = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": (np.array(7, np.int32), np.array([True, False])),
+    }
+    for one, other in zip(
+        jax.tree.leaves(unpack(layout(given), pack(given))), jax.tree.leaves(given), strict=True
+    ):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_fall_is_held_and_marked():

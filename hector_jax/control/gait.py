@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, short_repr, unknown
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, choose
 from hector_jax.core.trajectory import FEET
 
 PATTERNS = {
@@ -43,8 +43,8 @@ class GaitConfig:
     def __post_init__(self) -> None:
         rules = {"tick": POSITIVE, "stance": AT_LEAST_ONE, "swing": NOT_NEGATIVE}
         check(self, **rules, stand=NOT_NEGATIVE, cycles=NOT_NEGATIVE)
-        if isinstance(self.pattern, str) and self.pattern not in PATTERNS:
-            raise InputError(f"GaitConfig.pattern: {unknown('pattern', self.pattern, PATTERNS)}")
+        if isinstance(self.pattern, str):
+            choose("GaitConfig.pattern", self.pattern, PATTERNS)
         if not all(0.0 <= share < 1.0 for share in self.offsets) or len(self.offsets) not in FEET:
             raise InputError(
                 "GaitConfig.pattern must be numbers in [0, 1), one for each of 2 or 4 feet, "

@@ -92,8 +92,8 @@ def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Wei
 
     def side(name: str) -> Weights:
         return Weights(
-            jax.tree.map(lambda w: np.full_like(w, getattr(Q, name)), like.Q),
-            jax.tree.map(lambda w: np.full_like(w, getattr(R, name)), like.R),
+            jax.tree.map(lambda w: np.full(np.shape(w), getattr(Q, name)), like.Q),
+            jax.tree.map(lambda w: np.full(np.shape(w), getattr(R, name)), like.R),
             {one: getattr(TUNABLES[one], name) for one in others},
         )
 

@@ -129,7 +129,7 @@ class _Plant:
         self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
         self._flat.take(self._where, out=self.readings[row], mode="clip")
 
-    def step(self, number: int, substep: int, torque: Float[Array, " joints"]) -> None:
+    def step(self, number: int, substep: int, torque: Float[np.ndarray, " joints"]) -> None:
         """Millisecond `number` of the walk, which is `substep` of its tick."""
         self.world = world = self._worlds.get(self._first + number, self.world)
         self._ctrl[world.actuator] = torque
