@@ -218,7 +218,7 @@ def _fit_legs(
     """
     rows, feet = view.alone.any(axis=1), view.alone.shape[1]
     load = np.concatenate([dataset.legs.force, dataset.legs.torque], axis=-1)[rows]
-    term_scale = np.concatenate([_spread(view.motion[view.alone]), scale])
+    term_scale = np.concatenate([_spread(np.asarray(view.motion)[view.alone]), scale])
     terms = np.concatenate([view.motion, view.changes], axis=-1)[rows] / term_scale
     gated = gate[rows][:, None, :, None] * terms[:, :, None]  # (n, feet, gates, terms)
     one = np.repeat(tick[rows][:, None], feet, axis=1)
@@ -226,7 +226,8 @@ def _fit_legs(
     legs_bias = np.zeros((tick.shape[1], pairs, 6))
     legs = np.zeros((gate.shape[1], terms.shape[-1], pairs, 6))
     for axes in (signs(2)[1] > 0.0, signs(2)[1] < 0.0):
-        share = (view.alone[rows] * signs(feet)[:, axes][:, 0]).reshape(-1, pairs, 2)
+        share = np.asarray(view.alone)[rows] * signs(feet)[:, axes][:, 0]
+        share = share.reshape(-1, pairs, 2)
 
         def by_pair(x: np.ndarray, share: np.ndarray = share) -> np.ndarray:
             both = x.reshape(*share.shape, -1)

@@ -85,7 +85,8 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
 
     def torques(*packed: Array) -> Array:
         fixed, held, (_, yaw, motors), millisecond = map(unpack, layouts, packed)
-        motors, yaw, torque = loop.motor_torques(config, *fixed, *held, motors, yaw, *millisecond)
+        inputs: Any = *fixed, *held, motors, yaw, *millisecond
+        motors, yaw, torque = loop.motor_torques(config, *inputs)
         return pack((torque, yaw, motors))
 
     def marked(*packed: Array) -> Array:
@@ -226,11 +227,10 @@ def _walk_ticks(
         for i in range(count):
             rows[i, 1 : -error.shape[1]] = plant.readings[i]
             packed = torques(constants, held, packed, rows[i])
-            torque = np.asarray(packed)[: joints + 1]
-            plant.step(done + i, i, torque[:-1])
+            plant.step(done + i, i, np.asarray(packed)[:joints])
             if on_sample is not None:
                 on_sample(plant.world, plant.data)
-        yaw = torque[-1]
+        yaw = np.asarray(packed)[joints]
         truth = now, yaw_before, plant.readings, plant.contacts
         samples = programs.samples(body, command, anchor, *truth, place)
         yield plan, samples
