@@ -1,5 +1,6 @@
 """Four point feet: gaits, weights without moments, the net's views, both engines, export."""
 
+import json
 import sys
 from dataclasses import replace
 from functools import partial
@@ -144,6 +145,10 @@ def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
     crawl = capsys.readouterr().out
     assert call(monkeypatch, "walk", *flags) == 0
     assert capsys.readouterr().out != crawl
+    assert call(monkeypatch, "walk", *flags, "--gait", "stand") == 0
+    out, told = capsys.readouterr()
+    assert "straight is not walked: all feet stand" in told
+    assert json.loads(out)["L"] < 1.0
     assert call(monkeypatch, "walk", "--gait", "trot") == 2
     assert "--gait: unknown gait 'trot'" in capsys.readouterr().err
 

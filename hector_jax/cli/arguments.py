@@ -6,6 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+
 from hector_jax.cli.flags import View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
@@ -135,13 +138,18 @@ def with_gait(robot: Robot, name: str) -> Robot:
 def course(text: str, robot: Robot) -> NamedCommand:
     """What to walk; one line says where a file asks for more than the robot may be able to.
 
+    A robot whose feet all stand stays where it is.
+
     Raises:
         InputError: there is no such trajectory, or its file is wrong.
     """
-    trajectory = trajectories.command_of(text)
-    if trajectory.seconds and (
-        excess := beyond(limits(robot, walk_config(robot).gait), trajectory.command)
-    ):
+    trajectory, gait = trajectories.command_of(text), walk_config(robot).gait
+    if gait.swing == 0:
+        say(f"{text} is not walked: all feet stand")
+        still = jax.tree.map(np.zeros_like, trajectory.command)
+        still = still._replace(duration=trajectory.command.duration)
+        return trajectory._replace(command=still)
+    if trajectory.seconds and (excess := beyond(limits(robot, gait), trajectory.command)):
         say(f"warning: {text}: {excess}")
     return trajectory
 
