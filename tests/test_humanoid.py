@@ -137,25 +137,35 @@ def test_gradient_of_the_humanoid_over_4_seconds_is_that_of_differences():
     check_gradient(long, ROBOT, nominal(ROBOT), command, anchor, last_command, 1e-4)
 
 
-@pytest.mark.slow
-def test_the_humanoid_walks_alike_in_both_engines():
-    plant = hfs(ROBOT.description)
-    job = Job(nominal(ROBOT), named_command("straight"), plant, seconds=0.4)
-    (batch,) = walk_batch(CONFIG, ROBOT, [job])
-    alone = at_interval(walk(CONFIG, ROBOT, job), 0.01)
+def check_engines(robot):
+    """Both engines walk alike."""
+    config, plant = walk_config(robot), hfs(robot.description)
+    job = Job(nominal(robot), named_command("straight"), plant, seconds=0.4)
+    (batch,) = walk_batch(config, robot, [job])
+    alone = at_interval(walk(config, robot, job), 0.01)
     np.testing.assert_allclose(batch.state.position, alone.state.position, atol=1e-6)
     np.testing.assert_allclose(batch.effect.force, alone.effect.force, atol=1e-2)
 
 
-@pytest.mark.slow
-def test_the_controller_of_the_humanoid_is_exported():
-    weights = nominal(ROBOT)
-    example = controller(CONFIG, ROBOT, weights)[1]
-    loaded = load_controller(export_controller(CONFIG, ROBOT, weights)), example
-    walked = record(CONFIG, ROBOT, weights, command=named_command("s"), seconds=0.4)
-    found = check(CONFIG, *loaded, walked)
+def check_export(robot):
+    """The exported controller answers as the live one."""
+    config, weights = walk_config(robot), nominal(robot)
+    example = controller(config, robot, weights)[1]
+    loaded = load_controller(export_controller(config, robot, weights)), example
+    walked = record(config, robot, weights, command=named_command("s"), seconds=0.4)
+    found = check(config, *loaded, walked)
     assert max(found.force, found.moment, found.torque) <= TOLERANCE
     assert found.unsolved == 0
+
+
+@pytest.mark.slow
+def test_the_humanoid_walks_alike_in_both_engines():
+    check_engines(ROBOT)
+
+
+@pytest.mark.slow
+def test_the_controller_of_the_humanoid_is_exported():
+    check_export(ROBOT)
 
 
 @pytest.mark.slow

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from pretend import pretend_history
+from test_humanoid import check_engines, check_export
 from test_rollout import OBLIQUE, check_gradient
 
 from hector_jax.cli.arguments import with_gait
@@ -33,28 +35,25 @@ from hector_jax.control.weights import (
 from hector_jax.control.weights_file import load_weights, save_weights, weights_tree
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench
-from hector_jax.grfm.dataset import ACROSS, ALONG, at_interval, make_dataset, partners, with_mirror
+from hector_jax.grfm.dataset import ACROSS, ALONG, make_dataset, partners, with_mirror
 from hector_jax.grfm.effect import last_command
 from hector_jax.grfm.gated import fit_gated
 from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net
 from hector_jax.grfm.paper import init as init_paper
 from hector_jax.grfm.paper import with_statistics as with_paper_statistics
-from hector_jax.grfm.residual import init, with_statistics
+from hector_jax.grfm.residual import init, plain_net, with_statistics
 from hector_jax.qp import active_set
 from hector_jax.robot.model import load_robot
+from hector_jax.runs import replay
 from hector_jax.runs.export import (
-    TOLERANCE,
-    controller,
-    export_controller,
-    load_controller,
     weights_schema,
 )
-from hector_jax.runs.export_controller import check, record
 from hector_jax.sim.loop import Job
-from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.status import StepStatus
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
 ROBOT = load_robot(FILE)
@@ -328,22 +327,24 @@ def test_gradient_of_the_quadruped_over_4_seconds_is_that_of_differences():
 
 @pytest.mark.slow
 def test_the_quadruped_walks_alike_in_both_engines():
-    job = Job(nominal(ROBOT), named_command("straight"), hfs(ROBOT.description), seconds=0.4)
-    (batch,) = walk_batch(CONFIG, ROBOT, [job])
-    alone = at_interval(walk(CONFIG, ROBOT, job), 0.01)
-    np.testing.assert_allclose(batch.state.position, alone.state.position, atol=1e-6)
-    np.testing.assert_allclose(batch.effect.force, alone.effect.force, atol=1e-2)
+    check_engines(ROBOT)
 
 
 @pytest.mark.slow
 def test_the_controller_of_the_quadruped_is_exported():
-    weights = nominal(ROBOT)
-    example = controller(CONFIG, ROBOT, weights)[1]
-    loaded = load_controller(export_controller(CONFIG, ROBOT, weights)), example
-    walked = record(CONFIG, ROBOT, weights, command=named_command("s"), seconds=0.4)
-    found = check(CONFIG, *loaded, walked)
-    assert max(found.force, found.moment, found.torque) <= TOLERANCE
-    assert found.unsolved == 0
+    check_export(ROBOT)
+
+
+def test_a_dump_knows_four_feet(tmp_path):
+    weights, one = expert(ROBOT), pretend_history(1)[0]
+    evaluation = one.evaluation._replace(fallen=np.array(1.0), gradient=weights)
+    fell = one._replace(weights=weights, evaluation=evaluation, status=np.array(StepStatus.FELL))
+    what = {"config": TuneConfig(rollout=RolloutConfig(walk=CONFIG)), "robot": ROBOT}
+    what |= {"command": named_command("straight"), "net": plain_net(CONFIG.gait)}
+    found, _, _ = replay.load(replay.keep(tmp_path / "dumps", "with", fell, **what))
+    assert found.robot.structure == ROBOT.structure
+    jax.tree.map(np.testing.assert_array_equal, found.robot, ROBOT)
+    jax.tree.map(np.testing.assert_array_equal, found.weights, weights)
 
 
 def test_the_quadruped_stands_on_all_feet():

@@ -23,7 +23,7 @@ from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
 from hector_jax.grfm.network import Params, effect_of, layout, variant_of
 from hector_jax.robot.description import Description
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.model import Robot, Structure, load_robot
 from hector_jax.tuning.difftune import (
     Iteration,
     TuneConfig,
@@ -115,6 +115,7 @@ def keep(
         "net": variant and {"variant": variant.name, "hidden": variant.widths(net)},
         "config": config.as_table(),
         "description": to_table(robot.description),
+        "structure": to_table(robot.structure),
         "environment": environment(),
     }
     try:
@@ -133,19 +134,24 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         InputError: one line naming the file that is damaged, no dump or of another version.
     """
     about = read_card(path, _KIND)["about"]
-    net, none = about.get("net"), np.zeros(())
+    net, none, hector = about.get("net"), np.zeros(()), load_robot()
     try:
-        params = None if net is None else layout(net["variant"], tuple(net["hidden"]))
         description = from_table(f"{path}: description", Description, about.get("description", {}))
+        before = to_table(hector.structure)  # of files that do not say it
+        structure = from_table(f"{path}: structure", Structure, about.get("structure", before))
         config = TuneConfig.from_table(f"{path}: config", about.get("config"))
+        feet = len(config.rollout.walk.gait.offsets)
+        params = None if net is None else layout(net["variant"], tuple(net["hidden"]), feet)
         weights = config.rollout.walk.with_others(nominal(), about.get("others", ()))
     except InputError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: settings that this version does not know: {error!r}") from error
     terms = {term.name: none for term in config.loss}
+    # axes of length 0 stand for any number of feet and joints
+    of_any, weights = jax.tree.map(lambda x: np.zeros((0,) * np.ndim(x)), (hector, weights))
     like = Dump(
-        load_robot()._replace(description=description),
+        of_any._replace(description=description, structure=structure),
         weights,
         Command(np.zeros(0), np.zeros((0, 2)), np.zeros(0)),
         Anchor(np.zeros(3), none, none),
