@@ -132,12 +132,6 @@ def from_views(values: Float[Array, "feet 6"]) -> Wrench:
     return Wrench(back[:, :3], back[:, 3:])
 
 
-def _by_foot(table: Float[Array, "*terms columns"], feet: int) -> Float[Array, "feet *terms each"]:
-    """The columns of each foot's pair."""
-    of_pairs = jnp.split(table, feet // 2, axis=-1)
-    return jnp.stack([of_pairs[foot // 2] for foot in range(feet)])
-
-
 def apply_gated(
     gated: GatedMap, window: Window, view: View
 ) -> tuple[Float[Array, "feet 6"], Load, Float[Array, "feet 3"]]:
@@ -156,14 +150,17 @@ def apply_gated(
         + jnp.einsum("fi,fio->fo", view.changes, gated.changes[view.kind])
     )
     terms = jnp.concatenate([view.motion, view.changes], axis=-1)
+    pairs = feet // 2
     legs_bias, legs, touchdown = (
-        _by_foot(table, feet) for table in (gated.legs_bias, gated.legs, gated.touchdown)
+        table.reshape(*table.shape[:-1], pairs, -1)
+        for table in (gated.legs_bias, gated.legs, gated.touchdown)
     )
-    push = jnp.einsum("k,fko->fo", tick, legs_bias)
-    push = push + jnp.einsum("g,fi,fgio->fo", gate, terms, legs)
-    back = from_views(push * view.alone[:, None])
-    shift = touchdown[:, 0] + jnp.einsum("fi,fio->fo", _touchdown_terms(view), touchdown[:, 1:])
-    shift = shift * jnp.asarray(signs(feet)[:, :3], shift.dtype)
+    terms, aims = (x.reshape(pairs, 2, -1) for x in (terms, _touchdown_terms(view)))
+    push = jnp.einsum("k,kpo->po", tick, legs_bias)[:, None]
+    push = push + jnp.einsum("g,psi,gipo->pso", gate, terms, legs)
+    back = from_views(push.reshape(feet, -1) * view.alone[:, None])
+    shift = touchdown[0][:, None] + jnp.einsum("psi,ipo->pso", aims, touchdown[1:])
+    shift = shift.reshape(feet, -1) * jnp.asarray(signs(feet)[:, :3], shift.dtype)
     return ground, Load(back.force.sum(axis=0), back.moment.sum(axis=0)), shift
 
 
