@@ -6,9 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
-
 from hector_jax.cli.flags import View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
@@ -146,8 +143,8 @@ def course(text: str, robot: Robot) -> NamedCommand:
     trajectory, gait = trajectories.command_of(text), walk_config(robot).gait
     if gait.swing == 0:
         say(f"{text} is not walked: all feet stand")
-        still = jax.tree.map(np.zeros_like, trajectory.command)
-        still = still._replace(duration=trajectory.command.duration)
+        moves = trajectory.command
+        still = moves._replace(velocity=0.0 * moves.velocity, yaw_rate=0.0 * moves.yaw_rate)
         return trajectory._replace(command=still)
     if trajectory.seconds and (excess := beyond(limits(robot, gait), trajectory.command)):
         say(f"warning: {text}: {excess}")

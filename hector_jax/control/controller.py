@@ -307,7 +307,7 @@ def actuate(
         start=memory.liftoff,
         end=plan.touchdown,
         elapsed=plan.swing_ticks * config.gait.tick + TIME_STEP * substep,
-        swing=config.gait.tick * max(config.gait.swing, 1),
+        swing=config.gait.tick * max(config.gait.swing, 1),  # at 0 no foot follows its path
     )
     return legs.joint_torques(
         robot,
