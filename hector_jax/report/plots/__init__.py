@@ -106,7 +106,10 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
     walks = {name: from_start(walk) for name, walk in walks.items()}
     span, width = span_of(walks), 7.0
     height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9
-    with drawing(path, width, height, legend_columns=4) as figure:
+    columns = (
+        4 if next(iter(walks.values())).contact.shape[-1] == 2 else 3
+    )  # names of feet are long
+    with drawing(path, width, height, legend_columns=columns) as figure:
         draw_path(figure.subplots(), walks)
     return caption("path_from_above", last=list(walks)[-1])
 
