@@ -154,7 +154,8 @@ def _millisecond(
     wide = lambda x: x.astype(before.dtype) if x.dtype == data.qpos.dtype else x  # noqa: E731
     contacts = jax.tree.map(wide, mjx_model.mjx_contacts(data))
     place = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
-    effect, touches = loop.contact_wrench(robot, before, contacts, *place)
+    ground = sensing.ground_of(contacts, *place, len(robot.foot_point))
+    effect, touches = loop.effect_of(robot, before, ground), ground.touches
     reading = sensing.unpack_reading(_read(program, walk, physics))
     down = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
     fallen = carry.fallen | down | touches.floor | mjx_model.in_floor(places, walk.model, data)
