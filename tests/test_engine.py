@@ -49,5 +49,5 @@ def test_auto_is_mjx_where_there_is_an_accelerator(monkeypatch):
 
 
 def test_an_unknown_engine_is_refused_by_name():
-    with pytest.raises(InputError, match="engine must be 'auto', 'c' or 'mjx', got 'mjxx'.*'mjx'"):
+    with pytest.raises(InputError, match="engine must be 'auto', 'c', .*, got 'mjxx'.*'mjx'"):
         choose_engine("mjxx")

@@ -135,7 +135,7 @@ ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
         ([job(expert()), job(expert(), start_tick=-110)], "start_tick -110 is not later"),
         (
             [job(expert()), job(expert())._replace(changes=(Change(payload=2.0),))],
-            r"do not change: jobs \[1\] have changes",
+            r"cannot change, got changes of jobs \[1\]",
         ),
         ([job(expert(), plant=hfs()._replace(mass=np.array(-1.0)))], "Imperfections.mass"),
     ],

@@ -13,7 +13,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import Robot
 from hector_jax.sim.changes import worlds_by_step
 from hector_jax.sim.loop import Job
-from hector_jax.sim.sensing import Ground
+from hector_jax.sim.sensing import Ground, Touches
 from hector_jax.sim.world import World, build_world
 
 
@@ -46,6 +46,38 @@ It takes the job, the robot of the plant (`Job.body`), which stands at the origi
 milliseconds after t = 0 at which the walk begins and ends. It raises an InputError where the engine
 cannot have such a plant.
 """
+
+
+OTHER, LEGS = -1, -2  # in the place of a foot: another part on the floor; a leg on another
+
+
+class PointContacts:
+    """Forces at points, noted step by step and summed up into a `Ground`."""
+
+    def __init__(self, feet: int) -> None:
+        """Of a robot with so many feet."""
+        self._feet, self._steps = feet, 0
+        self._rows: list[tuple[float, ...]] = []
+
+    def note(self, foot: int, force: Float[np.ndarray, "3"], point: Float[np.ndarray, "3"]) -> None:
+        """Note a force [N] of the ground on a foot at a point [m]; or `OTHER` or `LEGS`."""
+        self._rows.append((self._steps, foot, *force, *point))
+
+    def end_step(self) -> None:
+        """What follows is of the next step."""
+        self._steps += 1
+
+    def ground(self) -> Ground:
+        """Return the sums of each step, and begin anew."""
+        rows, steps = np.array(self._rows).reshape(-1, 8), self._steps
+        self._rows, self._steps = [], 0
+        step, foot = rows[:, :2].astype(int).T
+        other, legs = (np.isin(np.arange(steps), step[foot == kind]) for kind in (OTHER, LEGS))
+        force, moment = np.zeros((2, steps, self._feet, 3))
+        rows, where = rows[foot >= 0], (step[foot >= 0], foot[foot >= 0])
+        np.add.at(force, where, rows[:, 2:5])
+        np.add.at(moment, where, np.cross(rows[:, 5:], rows[:, 2:5]))
+        return Ground(force, moment, Touches(other, legs))
 
 
 def lasting_world(engine: str, job: Job, body: Robot, first: int, end: int) -> World:

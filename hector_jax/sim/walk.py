@@ -227,7 +227,7 @@ def on_host(job: Job) -> Job:
 
 
 def walk_many(
-    pool: Executor,
+    pool: Executor | None,
     config: WalkConfig,
     robot: Robot,
     jobs: Sequence[Job],
@@ -236,9 +236,10 @@ def walk_many(
     batch: int = 0,
     build: BuildPlant = MujocoPlant,
 ) -> Iterator[Trajectory]:
-    """Walk all jobs in a pool (`runtime.workers`); gives the walks in order, as they come.
+    """Walk all jobs in a pool (`runtime.workers`) or here; gives the walks in order, as they come.
 
     `exact` and `batch` are those of an `Engine`: this one is always exact and compiles no batch.
     """
     sent, walk_in = map(on_host, jobs), partial(walk, build=build)
-    yield from pool.map(walk_in, repeat(config), repeat(jax.tree.map(np.asarray, robot)), sent)
+    many = map if pool is None else pool.map
+    yield from many(walk_in, repeat(config), repeat(jax.tree.map(np.asarray, robot)), sent)
