@@ -151,7 +151,8 @@ class DrakePlant:
         self._time += 1
         try:
             # a time of whole steps: a sum of steps drifts, and a step is made twice or not at all
-            self._failed or self._simulator.AdvanceTo(self._time * TIME_STEP)
+            if not self._failed:
+                self._simulator.AdvanceTo(self._time * TIME_STEP)
         except RuntimeError:
             self._failed = True
         self._look()
