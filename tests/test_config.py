@@ -74,7 +74,7 @@ def test_what_is_written_is_read_as_it_was(tmp_path, kind):
             moved[field.name] = old + 1
         elif isinstance(old, tuple):
             moved[field.name] = (*old, "friction" if field.name == "also" else "more")
-        elif field.name not in ("config", "variant", "engine", "alpha", "world", "gait"):
+        elif field.name not in ("config", "variant", "engine", "alpha", "world", "gait", "family"):
             moved[field.name] = Path("else") if old is None else type(old)("else")
     asked = kind(**moved)
     told = json.dumps({"flags": as_table(asked), "tune": {"other": "things"}})

@@ -129,7 +129,7 @@ def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
 def test_the_command_line_takes_the_plant_and_names_it(monkeypatch, capsys, tmp_path):
     jobs = []
 
-    def walks_of(pool, config, robot, asked, title):
+    def walks_of(pool, config, robot, asked, title, engine):
         for job in asked:
             jobs.append((robot, job))
             yield pretend_walk(job.seed)

@@ -44,7 +44,7 @@ def evaluate(args: Evaluate) -> None:
     plant, course = arguments.plant_of(args.plant, robot), arguments.course(args.traj, robot)
     seconds = arguments.seconds(args.seconds, course)
     # ideal and hfs are one plant each, without chance
-    count = args.seeds if args.world in ("standin", "hfs-varied") else 1
+    count = args.seeds if args.world not in ("ideal", "hfs") else 1
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights(text, robot) for text in args.weights}
     plants = arguments.plants(args.world, seeds, (plant or robot).description)
