@@ -277,7 +277,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
     """The table as JSON values, with every score by seed."""
     trajectories = {}
     for trajectory, verdict in table.verdicts.items():
-        result = metrics.as_result(verdict) | {"family": table.family}
+        result: dict[str, Any] = {**metrics.as_result(verdict), "family": table.family}
         for name, score in verdict.scores.items():
             by_seed = {part: losses.tolist() for part, losses in score.losses.items()}
             by_seed["fallen"] = score.fallen.astype(bool).tolist()

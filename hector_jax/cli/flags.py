@@ -134,6 +134,8 @@ class Tune(Configured):
     run: Path | None = None  # the older name of --out
     resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
     video: bool = True  # make a film of the nominal and the tuned weights
+    # print up to 12 walks more: in other engines, or else with other masses of the robot
+    verdict: bool = False
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR

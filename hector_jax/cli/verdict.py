@@ -1,7 +1,8 @@
 """What weight sets are worth in several engines and models of the robot."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -25,6 +26,7 @@ from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.columns import HEAVY, LIGHT, OWN, Cells, Column
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
+from hector_jax.tuning.difftune import TuneConfig
 
 _ENGINES = get_args(JudgingEngine)[:-1]  # all but `all`
 _MASSES = {OWN: 1.0, LIGHT: 0.9, HEAVY: 1.1}  # of the robot's own model, times those of a plant
@@ -41,6 +43,7 @@ class Plan(NamedTuple):
     """What is to be walked."""
 
     robot: Robot
+    family: str
     courses: dict[str, tuple[NamedCommand, float]]  # and how long [s], by the trajectory's name
     sets: dict[str, dict[str, Weights]]  # by trajectory and set
     models: dict[str, Model]
@@ -58,8 +61,9 @@ def verdict(args: Verdict) -> None:
     plan = plan_of(args)
     say(_in_words(plan))
     make_folder(args.out)
-    about = environment()
-    cells = walk_cells(plan, args, about.get("commit", ""))
+    about, config = environment(), tunings.tune_config(plan.robot)
+    with workers(args.processes) as pool:
+        cells = walk_cells(pool, config, plan, args.out / "scores", about.get("commit", ""))
     result = report.write_report(
         args.out,
         cells,
@@ -104,7 +108,8 @@ def plan_of(args: Verdict) -> Plan:
         for engine in engines
         for model in models
     }
-    return Plan(robot, courses, _sets(args, robot, courses), models, columns, engines)
+    sets = _sets(args, robot, courses)
+    return Plan(robot, args.family, courses, sets, models, columns, engines)
 
 
 def _seeds(args: Verdict, *, first: bool, own: bool) -> range:
@@ -122,12 +127,17 @@ def _engines(names: Sequence[str]) -> dict[str, Engine]:
     """
     if "all" not in names:
         return {name: choose_engine(name) for name in names}
+    return _installed(say)
+
+
+def _installed(tell: Callable[[str], None]) -> dict[str, Engine]:
+    """The engines that can be used here; tells of the others why not."""
     engines = {}
     for name in _ENGINES:
         try:
             engines[name] = choose_engine(name)
         except InputError as error:
-            say(f"without {report.ENGINES[name]}: {error}")
+            tell(f"without {report.ENGINES[name]}: {error}")
     return engines
 
 
@@ -166,24 +176,26 @@ def _sets(args: Verdict, robot: Robot, courses: Mapping[str, Any]) -> dict[str, 
 def _in_words(plan: Plan) -> str:
     """How many walks there are to be, and what engines cannot have."""
     each = len(plan.courses) * len(next(iter(plan.sets.values())))
-    texts = [f"{report.title_of(column)} {len(seeds)}" for column, seeds in plan.columns.items()]
+    texts = [f"{report.title_of(column)} ({len(seeds)})" for column, seeds in plan.columns.items()]
     text = f"{plural(each * sum(map(len, plan.columns.values())), 'walk')}: {each} on each plant"
-    text += f", plants: {', '.join(texts)}"
+    text += f"; plants: {', '.join(texts)}"
     for name, what in plan.lacks.items():
         text += f"; {report.ENGINES[name]} has no {', no '.join(what)}" if what else ""
     return text
 
 
-def walk_cells(plan: Plan, args: Verdict, commit: str) -> Cells:
-    """All walks, engine by engine; those in OUT/scores are not walked again."""
-    config, scores = tunings.tune_config(plan.robot), {}
-    with workers(args.processes) as pool:
-        for name, engine in plan.engines.items():
-            jobs = _jobs(plan, name, args.family)
-            notes = {"title": f"walking in {report.ENGINES[name]}", "commit": commit}
-            inputs = pool, config, plan.robot, {case: job for case, job in jobs.values()}
-            found = verdicts.score_jobs(*inputs, engine=engine, folder=args.out / "scores", **notes)
-            scores |= {key: found[case][0] for key, (case, _) in jobs.items()}
+def walk_cells(
+    pool: Executor, config: TuneConfig, plan: Plan, folder: Path, commit: str = ""
+) -> Cells:
+    """All walks, engine by engine; those whose scores are in the folder are not walked again."""
+    scores: dict[tuple[Column, str, str, int], verdicts.ScoredWalk] = {}
+    for name, engine in plan.engines.items():
+        jobs, title = _jobs(plan, name), f"walking in {report.ENGINES[name]}"
+        inputs = pool, config, plan.robot, {case: job for case, job in jobs.values()}
+        found = verdicts.score_jobs(
+            *inputs, title=title, folder=folder, commit=commit, engine=engine
+        )
+        scores |= {key: found[case][0] for key, (case, _) in jobs.items()}
     cells = {}
     for column, seeds in plan.columns.items():
         for course, sets in plan.sets.items():
@@ -195,11 +207,9 @@ def walk_cells(plan: Plan, args: Verdict, commit: str) -> Cells:
     return cells
 
 
-def _jobs(
-    plan: Plan, engine: str, family: str
-) -> dict[tuple[Column, str, str, int], tuple[verdicts.Case, Job]]:
+def _jobs(plan: Plan, engine: str) -> dict[tuple[Column, str, str, int], tuple[verdicts.Case, Job]]:
     """The walks of an engine with the case that each is stored as."""
-    jobs, world = {}, "standin" if family == "standin" else f"standin-{family}"
+    jobs, world = {}, "standin" if plan.family == "standin" else f"standin-{plan.family}"
     for column, seeds in plan.columns.items():
         if column.engine != engine:
             continue
@@ -213,3 +223,30 @@ def _jobs(
                     case = f"{engine}-{column.model}-{course}-{name}", seed
                     jobs[column, course, name, seed] = case, job
     return jobs
+
+
+def small_verdict(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    sets: Mapping[str, Weights],
+    course: NamedCommand,
+    seconds: float,
+    folder: Path,
+) -> Callable[[], None]:
+    """At most twelve walks of a run's sets on one plant, where the run itself has not walked.
+
+    Those are the other engines that are installed, or else the robot with other masses.
+
+    Returns:
+        What prints the table.
+    """
+    few = {name: sets[name] for name in ("nominal", "expert", "without", "with")}
+    others = list(_installed(lambda text: None).items())[1:][:3]
+    engines = dict(others) or {"c": choose_engine("c")}
+    models = {OWN: Model()} if others else {n: Model(_MASSES[n]) for n in (LIGHT, HEAVY)}
+    columns = {Column(engine, model): range(1) for engine in engines for model in models}
+    walks = {course.name: (course, seconds)}, {course.name: few}
+    plan = Plan(robot, "standin", *walks, models, columns, engines)
+    cells = walk_cells(pool, config, plan, folder)
+    return partial(report.print_verdict, cells, plan.lacks, plan.family)
