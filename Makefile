@@ -11,7 +11,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 QUICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,footstep gait legs reference trajectories weights mpc controller \
 	qp gpu_kernel loss difftune rollout measured))
 
-.PHONY: help setup tune table grfm ceiling test quick test-all bench check format docs lock
+.PHONY: help setup tune table verdict grfm ceiling test quick test-all bench check format docs lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -31,6 +31,10 @@ tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s"
 
 table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a trial
 	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
+
+verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal expert mine.json"
+	@$(BIN)/hector verdict --engine all --light-heavy --plant examples/hector-v2/robot.toml \
+		--weights $(or $(WEIGHTS),nominal expert shared_mean=docs/batch/shared/weights/mean-of-all.json)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm

@@ -84,11 +84,17 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
 
 
 def _score_walk(
-    pool: Executor, config: TuneConfig, robot: Robot, job: Job, walk: Trajectory, commit: str
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    job: Job,
+    walk: Trajectory,
+    commit: str,
+    engine: Engine,
 ) -> ScoredWalk:
     up, text = int(np.sum(~np.asarray(walk.fallen))), ""
     upright = up * float(walk.period)
-    if not up:
+    if not up and engine is MUJOCO_C:  # in which the fall is looked at once more
         inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
         if startup := pool.submit(startup_fall, *inputs).result():
             upright, text = startup.time, str(startup)
@@ -164,7 +170,8 @@ def score_jobs(
         walks = walk_jobs(pool, config, robot, asked, title + there, engine)
         for case, walk in zip(missing, walks, strict=True):
             samples = at_interval(walk, tick) if with_walk(case) else None
-            yield case, (_score_walk(pool, config, robot, jobs[case], walk, commit), samples)
+            score = _score_walk(pool, config, robot, jobs[case], walk, commit, engine)
+            yield case, (score, samples)
 
     if folder is None:
         return dict(make(list(jobs), {}))
