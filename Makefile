@@ -14,7 +14,7 @@ QUICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,footstep gait legs refere
 LOCK = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --no-header \
 	--no-emit-index-url pyproject.toml
 
-.PHONY: help setup engines tune table grfm ceiling test quick test-all bench check format docs lock
+.PHONY: help setup engines tune table verdict grfm ceiling test quick test-all bench check format docs lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -37,6 +37,10 @@ tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s"
 
 table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a trial
 	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
+
+verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal expert mine.json"
+	@$(BIN)/hector verdict --engine all --light-heavy --plant examples/hector-v2/robot.toml \
+		--weights $(or $(WEIGHTS),nominal expert shared_mean=docs/batch/shared/weights/mean-of-all.json)
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm

@@ -52,7 +52,7 @@ from hector_jax.runs import metrics
 from hector_jax.runs.metrics import Score
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
-from hector_jax.sim.standin import standin
+from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import named_world
 from hector_jax.tuning.loss import loss_of_robot
 
@@ -64,7 +64,7 @@ class Flags:
     """What to compare."""
 
     set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()  # NAME=FILE, beside the two
-    world: str = "hfs-varied"  # to choose by; standin for verdicts
+    world: str = "hfs-varied"  # to choose by; standin or standin-even for verdicts
     seeds: int = 2  # plants
     first_seed: int = 0
     scenes: Annotated[SceneConfig, tyro.conf.arg(name="")] = SceneConfig()
@@ -139,7 +139,8 @@ def main() -> None:
     robot = jax.tree.map(np.asarray, load_robot(flags.robot))
     sets, body, config = weight_sets(flags.set, robot), robot.description, walk_config(robot)
     seeds = range(flags.first_seed, flags.first_seed + flags.seeds)
-    plant = standin if flags.world == "standin" else partial(named_world, flags.world)
+    family = metrics.family_of(flags.world)
+    plant = FAMILIES.get(family or "", partial(named_world, flags.world))
     plants = {seed: plant(seed, body) for seed in seeds}
     scenes = make_scenes(flags.scenes, config.gait, body.plants)
 
@@ -207,6 +208,7 @@ def report(
     numbers = {
         "flags": {name: value for name, value in asdict(flags).items() if name in named},
         "weights": {name: tree_hash(w) for name, w in sets.items()},
+        "family": metrics.family_of(flags.world),
         "residual": result.residual,
         "levels": {
             level.name: {

@@ -18,7 +18,7 @@ from table_plots import draw
 from table_report import Earlier, Fall, Search, Table, load_earlier, write_table
 from table_steps import Bench
 
-from hector_jax.cli.flags import Configured, Folder, Iterations, Plants, Processes, Seed
+from hector_jax.cli.flags import Configured, Family, Folder, Iterations, Plants, Processes, Seed
 from hector_jax.cli.parse import as_command, as_table, check, read_flags
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.weights import Weights, expert, nominal
@@ -36,7 +36,7 @@ from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.tunings import Tuned
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
-from hector_jax.sim.standin import standin
+from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig
 
@@ -66,6 +66,7 @@ class Flags(Configured):
     trajectories: tuple[str, ...] = COMMANDS  # some of these three
     seeds: Plants = 32  # stand-in plants
     first_seed: Seed = 0  # first plant: 0 in development, 1000 for the final evaluation
+    family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
     # walks of the search, row `searched`
     rollouts: Annotated[int, Range(SearchConfig.population, 1_000_000)] = 200
     iterations: Iterations = 100  # largest number of iterations of each tuning
@@ -99,7 +100,7 @@ def main() -> None:
     """Make the table and print it."""
     flags = read_flags(Flags, sys.argv[1:], PROGRAM)
     setup_jax()
-    path, by_trajectory = make_table(flags, lambda seeds: [standin(seed) for seed in seeds])
+    path, by_trajectory = make_table(flags, lambda seeds: list(map(FAMILIES[flags.family], seeds)))
     if flags.json:
         results = {name: metrics.as_result(verdict) for name, verdict in by_trajectory.items()}
         print(as_json({"report": str(path), "trajectories": results}))
@@ -158,7 +159,9 @@ def read_files(flags: Flags) -> Files:
             paths = {CEILING: ceiling, **paths}
             ceilings[name] = _read_card(ceiling.with_name(f"{name}-card.json"))
         sets[name] = {key: load_weights(path) for key, path in paths.items()}
-    earlier = None if flags.earlier is None else load_earlier(flags.earlier, flags.plants)
+    earlier = (
+        None if flags.earlier is None else load_earlier(flags.earlier, flags.plants, flags.family)
+    )
     return Files(sets, ceilings, earlier)
 
 
@@ -216,6 +219,7 @@ def _make_table(
         commits=sorted(commits),
         command=command,
         earlier=files.earlier,
+        family=flags.family,
     )
     return write_table(out, content), by_trajectory
 

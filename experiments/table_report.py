@@ -94,7 +94,7 @@ class Search(NamedTuple):
 class Earlier(NamedTuple):
     """An earlier table, on other plants, to hold the order of the sets against."""
 
-    seeds: str
+    plants: str  # family and seeds
     rankings: Mapping[str, Sequence[str]]  # by trajectory, best first
 
 
@@ -112,6 +112,7 @@ class Table(NamedTuple):
     commits: Sequence[str]  # at which the results were made
     command: str  # that makes this table again
     earlier: Earlier | None = None
+    family: str = "standin"  # of the plants
 
     @property
     def seeds(self) -> np.ndarray:
@@ -151,7 +152,12 @@ def ranking(verdict: Verdict) -> list[str]:
     return sorted(verdict.scores, key=lambda name: float(np.median(verdict.scores[name].L / base)))
 
 
-def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
+def plants_text(seeds: str, family: str) -> str:
+    """Which plants a table has: their seeds, and their family where it is not the first one."""
+    return f"seeds {seeds}" + ("" if family == "standin" else f" of the family {family}")
+
+
+def load_earlier(path: Path, seeds: Sequence[int], family: str = "standin") -> Earlier:
     """Read the order of the sets from a table.json of other plants than those of `seeds`.
 
     Raises:
@@ -161,12 +167,13 @@ def load_earlier(path: Path, seeds: Sequence[int]) -> Earlier:
     table = read_json(path, "a table.json", 100_000_000)
     try:
         rankings = {name: list(one["ranking"]) for name, one in table["trajectories"].items()}
-        earlier = Earlier(str(table["seeds"]), rankings)
+        plants = plants_text(str(table["seeds"]), table.get("family", "standin"))
+        earlier = Earlier(plants, rankings)
     except (TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{path}: not a table.json of experiments/table.py: {error!r}") from error
-    if earlier.seeds == seeds_text(seeds):
+    if earlier.plants == plants_text(seeds_text(seeds), family):
         raise InputError(
-            f"{path}: a table of the same plants, seeds {earlier.seeds}; expected others, to "
+            f"{path}: a table of the same plants, {earlier.plants}; expected others, to "
             "compare the order of the sets"
         )
     return earlier
@@ -270,7 +277,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
     """The table as JSON values, with every score by seed."""
     trajectories = {}
     for trajectory, verdict in table.verdicts.items():
-        result = metrics.as_result(verdict)
+        result: dict[str, Any] = {**metrics.as_result(verdict), "family": table.family}
         for name, score in verdict.scores.items():
             by_seed = {part: losses.tolist() for part, losses in score.losses.items()}
             by_seed["fallen"] = score.fallen.astype(bool).tolist()
@@ -295,6 +302,7 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
         "environment": dict(table.environment),
         "commits": list(table.commits),
         "seeds": seeds_text(table.seeds),
+        "family": table.family,
         "config": dict(table.config),
         "swapped": swapped_sets(table.verdicts, table.earlier) if table.earlier else None,
         "falls": [fall._asdict() for fall in table.falls],

@@ -101,7 +101,7 @@ def training(folder: Path) -> None:
 
 
 def table(folder: Path) -> None:
-    def walks_of(pool, config, robot, jobs, title):
+    def walks_of(pool, config, robot, jobs, title, engine):
         for job in jobs:
             done(folder, f"{job.seed} {float(job.weights.Q.euler[0])}")
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)

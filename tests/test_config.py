@@ -62,6 +62,9 @@ def test_lists_paths_and_whole_numbers_are_taken_as_their_flags_want_them(tmp_pa
     assert from_file(Table, written(tmp_path, text)) == Table(kept=Path("shelf"), extra=("a=x",))
 
 
+_MORE = {"also": "friction", "engine": "drake", "plant": Path("more")}  # of tuples
+
+
 @pytest.mark.parametrize("kind", FILES)
 def test_what_is_written_is_read_as_it_was(tmp_path, kind):
     """Every field is moved from its default, written as a run does, and read again."""
@@ -73,8 +76,8 @@ def test_what_is_written_is_read_as_it_was(tmp_path, kind):
         elif isinstance(old, int | float):
             moved[field.name] = old + 1
         elif isinstance(old, tuple):
-            moved[field.name] = (*old, "friction" if field.name == "also" else "more")
-        elif field.name not in ("config", "variant", "engine", "alpha", "world", "gait"):
+            moved[field.name] = (*old, _MORE.get(field.name, "more"))
+        elif field.name not in ("config", "variant", "engine", "alpha", "world", "gait", "family"):
             moved[field.name] = Path("else") if old is None else type(old)("else")
     asked = kind(**moved)
     told = json.dumps({"flags": as_table(asked), "tune": {"other": "things"}})

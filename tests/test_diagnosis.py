@@ -195,7 +195,7 @@ def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
 ):
     made = []
 
-    def walks_of(pool, config, robot, jobs, title):
+    def walks_of(pool, config, robot, jobs, title, engine):
         for job in jobs:
             made.append(job.seed)
             yield pretend_walk(1, seconds=1.0) if job.seed == 1 else fallen_at_once(job.seed)

@@ -51,7 +51,7 @@ def walked(monkeypatch):
     """Seeds of the walks that are really walked; `cut` many walks at most."""
     seeds = []
 
-    def walks_of(pool, config, robot, jobs, title):
+    def walks_of(pool, config, robot, jobs, title, engine):
         for job in jobs:
             if len(seeds) == walks_of.cut:
                 raise KeyboardInterrupt
@@ -192,7 +192,7 @@ def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
 
 @pytest.mark.parametrize("residual", [1.0, np.nan])
 def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, residual):
-    def walks_of(pool, config, robot, jobs, title):
+    def walks_of(pool, config, robot, jobs, title, engine):
         for job in jobs:
             walk = pretend_walk(job.seed, 0.03, 1.0)
             yield walk._replace(residual=np.where(job.seed == 1, residual, walk.residual))

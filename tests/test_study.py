@@ -47,7 +47,7 @@ def asked(monkeypatch):
         for name in problems:
             yield name, Tuning(pretend_history(12), nominal(), expert(), "done")
 
-    def walks_of(pool, config, robot, jobs, title):
+    def walks_of(pool, config, robot, jobs, title, engine):
         for job in jobs:
             told["walks"] += 1
             yield pretend_walk(job.seed, 0.02, 1.0, fall_at=0.5 if job.seed == 3 else None)

@@ -73,7 +73,8 @@ def test_the_ranking_is_by_the_median_of_the_paired_ratio():
 def test_the_order_is_held_against_that_of_an_earlier_table(tmp_path):
     write_table(tmp_path, whole(s=judged(**GOOD, mine=1e6)))
     earlier = table.load_earlier(tmp_path / "table.json", range(4, 8))
-    assert earlier.seeds == "0-3"
+    assert earlier.plants == "seeds 0-3"
+    assert table.load_earlier(tmp_path / "table.json", range(4), "even") == earlier
     with pytest.raises(ValueError, match=r"table.json: a table of the same plants, seeds 0-3"):
         table.load_earlier(tmp_path / "table.json", range(4))
     assert table.swapped_sets({"s": judged(**GOOD)}, earlier) == {"s": []}

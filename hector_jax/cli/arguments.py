@@ -23,9 +23,10 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import RunRequest
+from hector_jax.runs.metrics import family_of
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job, check_plant
-from hector_jax.sim.standin import standin
+from hector_jax.sim.standin import FAMILIES
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import TuneConfig
 
@@ -98,7 +99,8 @@ def default_of(flag: Path, usual: Path, path: Path | None, robot: Robot) -> Path
 
 def plants(world: str, seeds: range, description: Description) -> list[Imperfections]:
     """One plant of a world for each seed, sized for the robot of a description."""
-    draw = standin if world == "standin" else partial(named_world, world)
+    family = family_of(world)
+    draw = FAMILIES[family] if family else partial(named_world, world)
     return [draw(seed, description) for seed in seeds]
 
 

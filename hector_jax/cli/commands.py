@@ -6,7 +6,7 @@ from dataclasses import asdict
 from functools import partial, singledispatch
 from typing import Any
 
-from hector_jax.cli import arguments, doctor, evaluate, flags, tune, view
+from hector_jax.cli import arguments, doctor, evaluate, flags, tune, verdict, view
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS
@@ -43,6 +43,7 @@ def run(args: Any) -> None:
 
 for _command in (doctor.doctor, evaluate.evaluate, evaluate.walk, evaluate.grfm, tune.tune):
     run.register(_command)
+run.register(verdict.verdict)
 run.register(view.view_run)
 
 

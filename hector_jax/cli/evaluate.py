@@ -45,20 +45,21 @@ def evaluate(args: Evaluate) -> None:
     plant, course = arguments.plant_of(args.plant, robot), arguments.course(args.traj, robot)
     seconds = arguments.seconds(args.seconds, course)
     # ideal and hfs are one plant each, without chance
-    count = args.seeds if args.world in ("standin", "hfs-varied") else 1
+    count = args.seeds if args.world not in ("ideal", "hfs") else 1
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights(text, robot) for text in args.weights}
     plants = arguments.plants(args.world, seeds, (plant or robot).description)
-    config = tunings.tune_config(robot)
+    config, engine = tunings.tune_config(robot), choose_engine(args.engine)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         inputs = pool, config, robot, sets, course.command, plants, seeds
-        walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant)
+        walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
     result, what = (
         metrics.as_result(verdict, args.world),
         f"{course.name}, {plural(count, 'plant')}",
     )
+    result["engine"] = engine.name
     if plant is not None:
         result["plant"] = plant.description.name
         what += f" of {plant.description.name}"

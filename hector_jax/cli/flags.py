@@ -21,6 +21,7 @@ class Source(Enum):
     FOLDER = "a folder"  # which may be missing
     EXPORTABLE = "a run folder or a weights file"
     WEIGHTS = "nominal, expert or a weights file"
+    SETS = "nominal, expert, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
     ROBOT = "a TOML file that names an MJCF (docs/howto/robot.md)"
 
@@ -32,11 +33,16 @@ Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper,
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Number = Literal["footstep_feedback", "footstep_width", "turn_lead", "effort_reference", "friction"]
 Variant = Literal["residual", "paper"]
-Engine = Literal["auto", "c", "mjx", "drake"]
-OneEngine = Literal["c", "mjx", "drake"]
+Engine = Literal["auto", "c", "mjx", "drake", "dart"]
+OneEngine = Literal["c", "mjx", "drake", "dart"]
+JudgingEngine = Literal["c", "drake", "dart", "all"]  # MJX walks no plant that errs in its estimate
 Gait = Literal["own", "walk", "trot", "pace", "crawl", "stand"]
+Family = Literal["standin", "even"]
+PlantWorld = Literal["ideal", "hfs", "hfs-varied", "standin", "standin-even"]
+World = Literal["srbm", PlantWorld]
 RobotFile = Annotated[Path | None, Source.ROBOT]
 Weights = Annotated[str, Source.WEIGHTS]
+WeightSets = Annotated[str, Source.SETS]  # NAME= may stand before it
 Trajectory = Annotated[str, Source.TRAJECTORY]
 Trajectories = tuple[Trajectory, ...]
 Run = Annotated[Path, Source.RUN]
@@ -129,6 +135,8 @@ class Tune(Configured):
     run: Path | None = None  # the older name of --out
     resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
     video: bool = True  # make a film of the nominal and the tuned weights
+    # print up to 12 walks more: in other engines, or else with other masses of the robot
+    verdict: bool = False
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
@@ -165,9 +173,9 @@ class Evaluate(Configured):
 
     weights: tuple[Weights, ...] = NAMED_WEIGHTS  # nominal, expert or weights files
     traj: Trajectory = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
-    world: Literal["ideal", "hfs", "hfs-varied", "standin"] = "standin"  # world of the plants
+    world: PlantWorld = "standin"  # world of the plants; standin-even: masses drawn evenly
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
-    seeds: Plants = 8  # number of plants, in the worlds hfs-varied and standin
+    seeds: Plants = 8  # number of plants, in the worlds that have several
     first_seed: Seed = 0  # first plant
     out: Path | None = None  # file for the result as JSON
     processes: Processes = 2  # worker processes, one core each
@@ -179,6 +187,31 @@ class Evaluate(Configured):
 
 
 @_command
+class Verdict(Configured):
+    """Evaluate weight sets in several engines and models, and say what may be claimed of them.
+
+    Example: hector verdict --weights nominal expert with=runs/tuned --light-heavy
+    """
+
+    # nominal, expert, weights files, folders of straight.json, c.json, ...; or NAME=any of these
+    weights: tuple[WeightSets, ...] = NAMED_WEIGHTS
+    traj: Trajectories = ("straight", "c", "s")  # trajectories: names or TOML files
+    engine: tuple[JudgingEngine, ...] = ("c",)  # c: MuJoCo; or all: every one that is installed
+    plant: tuple[Annotated[Path, Source.ROBOT], ...] = ()  # TOML files of models of the robot
+    light_heavy: bool = False  # also the robot's own model with masses times 0.9 and 1.1
+    family: Family = "standin"  # of the plants; even: masses drawn evenly about the nominal ones
+    seeds: Plants = 8  # number of plants of the robot's own model, in the first engine
+    model_seeds: Plants = 4  # number of plants of each other model, in the first engine
+    engine_seeds: Plants = 4  # number of plants of each model in each further engine
+    first_seed: Seed = 0  # first plant
+    seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
+    out: Folder = Path("runs/verdict")  # folder for the report; a later call continues there
+    processes: Processes = 2  # worker processes, one core each
+    json: bool = False  # print JSON instead of text
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
+
+
+@_command
 class Walk(Configured):
     """Walk once and report losses and tracking errors.
 
@@ -186,7 +219,7 @@ class Walk(Configured):
     """
 
     traj: Trajectory = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
-    world: Literal["srbm", "ideal", "hfs", "hfs-varied", "standin"] = "hfs"  # where to walk
+    world: World = "hfs"  # where to walk
     seed: Seed = 0  # seed of the plant and of the estimator's noise
     weights: Weights = "nominal"  # nominal, expert or a weights file
     seconds: Seconds = 4.0  # length of the walk [s]
@@ -246,7 +279,7 @@ class View:
 
     run: Run  # folder of a run of `hector tune`, finished or in progress, or `latest`
     sets: tuple[str, str] = ("nominal", "with")  # weight sets of the run: before and after
-    world: Literal["srbm", "ideal", "hfs", "hfs-varied", "standin"] = "hfs"  # where both walk
+    world: World = "hfs"  # where both walk
     seed: Seed = 0  # seed of the plant and of the estimator's noise
     seconds: Annotated[float, Range(0.1, 600)] = 4.0  # length of each walk [s]
     data: Path | None = None  # folder of the net that predicts the ground; by default the run's

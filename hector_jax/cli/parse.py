@@ -245,11 +245,17 @@ def _check_source(label: str, value: Path | str, source: Source) -> None:
     elif source is Source.WEIGHTS:
         fine = named or path.suffix or os.path.lexists(path)
         hint = did_you_mean(str(value), NAMED_WEIGHTS)
+    elif source is Source.SETS:
+        path = Path(str(value).rpartition("=")[2])
+        named, is_dir = str(path) in NAMED_WEIGHTS, os.path.isdir(path)
+        fine = named or is_dir or path.suffix
+        hint = did_you_mean(str(path), NAMED_WEIGHTS)
     if not fine:
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
     if (
         source in (Source.FILE, Source.ROBOT)
         or (source is Source.WEIGHTS and not named)
+        or (source is Source.SETS and not named and not is_dir)
         or (source is Source.EXPORTABLE and not is_dir)
         or (source is Source.TRAJECTORY and path.suffix == ".toml")
     ):

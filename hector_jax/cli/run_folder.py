@@ -23,7 +23,7 @@ TIME = "%Y%m%d-%H%M%S"  # names a run
 _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice", "runs.walks")
 # flags of a call, not of the run that it begins or resumes
 _OF_A_CALL = ("config", "each", "out", "resume", "run", "runs")
-_FREE = ("data", "json", "processes", "video")  # may be others when a run is resumed
+_FREE = ("data", "json", "processes", "verdict", "video")  # may be others when a run is resumed
 
 
 def exists_error(folder: Path) -> InputError:

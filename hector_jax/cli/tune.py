@@ -17,6 +17,7 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
 from hector_jax.cli.parse import as_command
+from hector_jax.cli.verdict import small_verdict
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, expert, nominal
@@ -184,6 +185,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
         settings = _note_settings(run)
         tuned = _tune_sets(pool, run)
         walks = _walk_sets(pool, run, tuned.sets)
+        where = trajectories[0], run.seconds, run.artefacts / "elsewhere"
+        small = small_verdict(pool, run.config, robot, tuned.sets, *where) if args.verdict else None
     result, by_name = _result(run, tuned, walks)
     seconds = f"{time.monotonic() - begun:.0f}"
     write_json(folder / VERSIONS, made_with | {"seconds": seconds})
@@ -207,6 +210,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
     def in_words() -> None:
         for name, one in by_name.items():
             print_table(one, f"{name}, {plural(args.seeds, 'plant')}")
+        if small:
+            small()
 
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, in_words)
     say(f"the report is {report}")

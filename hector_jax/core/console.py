@@ -13,7 +13,14 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from hector_jax.core.inputs import InputError, printable
 
@@ -54,6 +61,8 @@ def bar(title: str) -> Iterator[Tell]:
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
             TextColumn("{task.fields[remark]}"),
         )
         with Progress(*columns, console=console) as progress:
@@ -74,7 +83,11 @@ def bar(title: str) -> Iterator[Tell]:
         if remark == "compiling":
             say("  compiling")
         elif now - last >= _QUIET:
-            say(f"  {done}/{of} after {now - start:.0f} s  {remark}".rstrip())
+            left = (now - start) / done * (of - done) if done else 0.0
+            text = f"  {done}/{of} after {now - start:.0f} s" + f", about {left:.0f} s left" * (
+                done > 0
+            )
+            say(f"{text}  {remark}".rstrip())
             last = now
 
     yield tell

@@ -22,7 +22,8 @@ from rich.text import Text
 from hector_jax.core.inputs import plural
 from hector_jax.runs.metrics import BASELINES, FEWEST, Comparison, Summary, Verdict, rms, summarize
 
-WORLDS = {"standin": "hardware stand-in"}  # what worlds are called where it is not their name
+# what worlds are called where it is not their name
+WORLDS = {"standin": "hardware stand-in", "standin-even": "hardware stand-in, family even"}
 VOID = "*"
 
 

@@ -221,9 +221,20 @@ def summarize(verdict: Verdict, name: str, others: Sequence[str] = BASELINES) ->
     )
 
 
+def family_of(world: str) -> str | None:
+    """The family of plants of a world of the stand-in; None of another world.
+
+    >>> family_of("standin"), family_of("standin-even"), family_of("hfs")
+    ('standin', 'even', None)
+    """
+    name, _, family = world.partition("-")
+    return (family or name) if name == "standin" else None
+
+
 def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
     """The verdict as JSON values: the content of result.json.
 
+    `family` is that of the plants; results without one are of the family `standin`.
     `sets.<name>.<world>.<part>.{mean,low,high}`, `.falls`, `.seeds`, `.legs_touch` [s, all
     walks together], `.L_ctrl_switching` and `.rms`, and
     `sets.<name>.<world>.change.<baseline>.{median,low,high,wins,counts}` in %, of L, with those of
@@ -231,6 +242,7 @@ def as_result(verdict: Verdict, world: str = "standin") -> dict[str, Any]:
     """
     return {
         "alpha": alphas(verdict.loss),
+        "family": family_of(world),
         "sets": {name: {world: _set_result(verdict, name)} for name in verdict.scores},
     }
 

@@ -1,6 +1,6 @@
 """The step `judge`: walks of weight sets on plants, each score an artefact (cache.py)."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.sim.diagnosis import startup_fall
-from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import Imperfections
@@ -31,10 +31,10 @@ from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import rollout, rollout_config
 
 # modules that decide the numbers, for `content_key`
-_CODE = ("sim.walk", "sim.diagnosis", "runs.metrics")
+_CODE = ("sim.diagnosis", "runs.metrics")
 
 Case = tuple[str, int]
-"""A set and a seed."""
+"""A set, with what else tells its walk from others on the same plant, and a seed."""
 
 
 class ScoredWalk(NamedTuple):
@@ -60,12 +60,17 @@ class ScoredWalks(NamedTuple):
 
 
 def walk_jobs(
-    pool: Executor, config: TuneConfig, robot: Robot, jobs: Sequence[Job], title: str
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    jobs: Sequence[Job],
+    title: str,
+    engine: Engine = MUJOCO_C,
 ) -> Iterator[Trajectory]:
     """The walks of jobs, in order, as they come."""
     with bar(title) as tell:
         tell(0, len(jobs), "compiling")
-        for done, walk in enumerate(MUJOCO_C.walk(pool, config.rollout.walk, robot, jobs), 1):
+        for done, walk in enumerate(engine.walk(pool, config.rollout.walk, robot, jobs), 1):
             yield walk
             tell(done, len(jobs), "")
 
@@ -79,11 +84,17 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
 
 
 def _score_walk(
-    pool: Executor, config: TuneConfig, robot: Robot, job: Job, walk: Trajectory, commit: str
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    job: Job,
+    walk: Trajectory,
+    commit: str,
+    engine: Engine,
 ) -> ScoredWalk:
     up, text = int(np.sum(~np.asarray(walk.fallen))), ""
     upright = up * float(walk.period)
-    if not up:
+    if not up:  # MuJoCo C says why, where the robot falls in it as well
         inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
         if startup := pool.submit(startup_fall, *inputs).result():
             upright, text = startup.time, str(startup)
@@ -100,13 +111,16 @@ def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
     return one, walk if with_walk else None
 
 
-def _file_name(config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk: bool) -> str:
-    parts = config.rollout.walk, repr(config.loss), robot, job, *([job.plant] if job.plant else [])
+def _file_name(
+    config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk: bool, engine: Engine
+) -> str:
+    parts = engine.name, engine.version, config.rollout.walk, repr(config.loss), robot, job
+    key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
     (name, seed), stem = case, "walk" if with_walk else "score"
-    return f"{stem}-{name}-{seed}-{content_key(*parts, code=_CODE)}.npz"
+    return f"{stem}-{name}-{seed}-{key}.npz"
 
 
-def _say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
+def say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
     """Say which sets have walks with an unsolved QP or a fall in the start-up."""
     for name, each in walks.items():
         worst = np.max([walk.score.residual for walk in each])
@@ -119,6 +133,55 @@ def _say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
 def _restored(one: ScoredWalk) -> ScoredWalk:
     """A walk from a file, where texts are arrays."""
     return one._replace(commit=str(one.commit), startup=str(one.startup))
+
+
+def score_jobs(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    jobs: Mapping[Case, Job],
+    *,
+    title: str,
+    folder: Path | None = None,
+    commit: str = "",
+    engine: Engine = MUJOCO_C,
+    with_walk: Callable[[Case], bool] = lambda case: False,
+) -> dict[Case, tuple[ScoredWalk, Trajectory | None]]:
+    """Walk jobs and score the walks; those that are in the folder are not walked again.
+
+    Args:
+        pool: worker processes.
+        config, robot: controller and loss, nominal body.
+        jobs: by case; the names of cases are parts of the names of files.
+        title: for the person who waits.
+        folder: of the scores; None: keep none.
+        commit: to note with what is walked now.
+        engine: that walks.
+        with_walk: whether the walk of a case is kept beside its score.
+
+    Raises:
+        InputError: the folder cannot be written, or the engine cannot walk a job.
+    """
+    tick = config.rollout.walk.gait.tick
+
+    def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
+        there = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
+        asked = [jobs[case] for case in missing]
+        walks = walk_jobs(pool, config, robot, asked, title + there, engine)
+        for case, walk in zip(missing, walks, strict=True):
+            samples = at_interval(walk, tick) if with_walk(case) else None
+            score = _score_walk(pool, config, robot, jobs[case], walk, commit, engine)
+            yield case, (score, samples)
+
+    if folder is None:
+        return dict(make(list(jobs), {}))
+    paths = {
+        case: folder / _file_name(config, robot, case, job, with_walk(case), engine)
+        for case, job in jobs.items()
+    }
+    like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
+    results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
+    return {case: (_restored(one), walk) for case, (one, walk) in results.items()}
 
 
 def judge(
@@ -135,6 +198,7 @@ def judge(
     folder: Path | None = None,
     commit: str = "",
     plant: Robot | None = None,
+    engine: Engine = MUJOCO_C,
 ) -> ScoredWalks:
     """Walk every weight set on every plant and score the walks.
 
@@ -148,35 +212,20 @@ def judge(
         folder: of the scores, where walks that are there are not walked again; None: keep none.
         commit: to note with what is walked now.
         plant: another model of the robot, of which the plants are.
+        engine: that walks.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder cannot be written, or the engine cannot walk a plant.
     """
     jobs = {
         (name, seed): Job(weights, command, imperfections, seconds, seed, plant=plant)
         for imperfections, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
-    tick = config.rollout.walk.gait.tick
     with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
-
-    def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
-        there = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
-        walks = walk_jobs(pool, config, robot, [jobs[case] for case in missing], title + there)
-        for case, walk in zip(missing, walks, strict=True):
-            samples = at_interval(walk, tick) if with_walk(case) else None
-            yield case, (_score_walk(pool, config, robot, jobs[case], walk, commit), samples)
-
-    if folder is None:
-        results = dict(make(list(jobs), {}))
-    else:
-        paths = {
-            case: folder / _file_name(config, robot, case, job, with_walk(case))
-            for case, job in jobs.items()
-        }
-        like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
-        results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
-    by_set = {name: [_restored(results[name, seed][0]) for seed in seeds] for name in sets}
-    _say_faults(by_set)
-    first = {name: results[name, seeds[0]][1] for name in sets if folder is not None}
-    return ScoredWalks(by_set, first)
+    notes: dict[str, Any] = {"title": title, "folder": folder, "commit": commit}
+    results = score_jobs(pool, config, robot, jobs, engine=engine, with_walk=with_walk, **notes)
+    by_set = {name: [results[name, seed][0] for seed in seeds] for name in sets}
+    say_faults(by_set)
+    kept = {name: results[name, seeds[0]][1] for name in sets}
+    return ScoredWalks(by_set, {name: walk for name, walk in kept.items() if walk is not None})

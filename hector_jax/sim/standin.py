@@ -1,9 +1,12 @@
-"""The stand-in for hardware: a family of plants, one per seed, that only verdicts may walk.
+"""The stand-in for hardware: families of plants, one per seed, that only verdicts may walk.
 
 No collection, training, tuning, search or choice reads this module; tests/test_architecture.py
 holds that. The plants differ from the hfs in strength and in kind (masses, ground, an estimator
 that errs and drifts), so that a map learned on the hfs is not tested on its own simulator. Seeds
 0-31 are for development, 1000-1031 for the final verdict.
+
+There are two families. `standin` draws masses of 0.95 to 1.08 times the nominal ones, so most of
+its plants are heavier; `even` draws them evenly about the nominal ones, and farther from them.
 """
 
 import numpy as np
@@ -13,14 +16,35 @@ from hector_jax.sim.world import Estimator, Imperfections
 
 
 def standin(seed: int, description: Description = HECTOR) -> Imperfections:
-    """The plant of a seed; every number is drawn uniformly from its range, each on its own.
+    """The plant of a seed of the first family.
 
     Args:
         seed: which plant.
         description: of the robot, HECTOR by default; joint friction and damping and the shift of
             the trunk's centre of mass are times its sizes.
     """
-    sizes, rng = description.plants, np.random.default_rng([0x57A, seed])
+    return _draw(np.random.default_rng([0x57A, seed]), (0.95, 1.08), description)
+
+
+def even(seed: int, description: Description = HECTOR) -> Imperfections:
+    """The plant of a seed of the second family, with masses drawn evenly about the nominal ones.
+
+    Args:
+        seed: which plant.
+        description: of the robot, as for `standin`.
+    """
+    return _draw(np.random.default_rng([0xE7E, seed]), (0.85, 1.15), description)
+
+
+FAMILIES = {"standin": standin, "even": even}
+"""Every family by its name."""
+
+
+def _draw(
+    rng: np.random.Generator, mass: tuple[float, float], description: Description
+) -> Imperfections:
+    """A plant; every number is drawn uniformly from its range, each on its own."""
+    sizes = description.plants
     draw = lambda low, high, size=(): np.asarray(rng.uniform(low, high, size))  # noqa: E731
     return Imperfections(
         joint_friction=draw(0.3, 0.7) * sizes.joint_friction,
@@ -33,7 +57,7 @@ def standin(seed: int, description: Description = HECTOR) -> Imperfections:
         linkage=draw(0.3, 1.0) * (description.linkage is not None),
         contact_time=draw(0.006, 0.02),
         floor_friction=draw(0.65, 1.0),
-        mass=draw(0.95, 1.08),
+        mass=draw(*mass),
         trunk_com=draw(-0.015, 0.015, 3) * sizes.trunk_com,
         estimator=Estimator(
             position=np.asarray(0.003),

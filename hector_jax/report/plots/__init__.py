@@ -6,7 +6,7 @@ be told apart in grey too. Figures are made without pyplot: no display, no globa
 draw pictures of their own with `style`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,8 @@ from hector_jax.report.motion import COLOURS, Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
+from hector_jax.runs.columns import Cells, Column, columns_of, sets_of, trajectories_of
+from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
 from hector_jax.tuning.loss import Loss
 
@@ -276,3 +278,51 @@ def training(path: Path, history: History) -> str:
             top = 1.6 * np.percentile(np.concatenate([train, valid]), 90)
             panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
     return caption("training")
+
+
+def columns(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
+    """Draw the change of L of every set against nominal, a row for each engine and model.
+
+    Args:
+        path: file to write.
+        cells: walks of all sets, by column and trajectory.
+        title_of: words for a column.
+    """
+    every, names, trajectories = columns_of(cells), sets_of(cells), trajectories_of(cells)
+    height = (0.15 * len(names) + 0.12) * len(every) + 1.1
+    with drawing(path, 2.9 * len(trajectories) + 1.5, height) as figure:
+        panels = figure.subplots(1, len(trajectories), sharex=True, sharey=True, squeeze=False)[0]
+        for panel, trajectory in zip(panels, trajectories, strict=True):
+            panel.axvline(0.0, color="black", linewidth=1.0, zorder=1)
+            _draw_columns(panel, [cells[column, trajectory] for column in every], names)
+            panel.set(title=trajectory, xlabel=f"change of L against {BASELINES[0]} [%]")
+            panel.grid(visible=False, axis="y")
+            for edge in range(1, len(every)):
+                other = every[edge].engine != every[edge - 1].engine
+                panel.axhline(edge - 0.5, color="0.4" if other else "0.9", linewidth=0.8, zorder=0)
+        panels[0].set_yticks(range(len(every)), [title_of(column) for column in every])
+        panels[0].set(ylim=(len(every) - 0.5, -0.5), xlim=(-100.0, _WORST + 45.0))
+        setp(panels, xticks=[-100, -50, 0, 50])
+    return caption("columns")
+
+
+_WORST = 60.0  # [%] right of it a change is an arrow
+
+
+def _draw_columns(panel: Axes, verdicts: Sequence[Verdict], names: Sequence[str]) -> None:
+    for i, (name, look) in enumerate(looks_of(names).items()):
+        edge = {"color": look.color, "ha": "right", "va": "center", "fontsize": 7}
+        for row, verdict in enumerate(verdicts):
+            one, y = (
+                compare(verdict, name, BASELINES[0]),
+                row + 0.8 * ((i + 0.5) / len(names) - 0.5),
+            )
+            value, low, high = one.change["L"]
+            beyond = value > _WORST
+            dot = dict(look.dot, markerfacecolor=look.color if one.counts else "white")
+            dot |= {"marker": ">"} if beyond else {}
+            panel.plot([low, min(high, _WORST)], [y, y], color=look.color, linewidth=1.6)
+            label = label_of(name) if not row else None
+            panel.plot(min(value, _WORST), y, **dot, zorder=3, label=label)
+            if falls := int(verdict.scores[name].fallen.sum()):
+                panel.text(_WORST + 43.0, y, f"{falls} fell", **edge)

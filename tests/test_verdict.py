@@ -1,0 +1,356 @@
+"""Weight sets in several engines and models: the counts, what is claimed of them, the command."""
+
+import json
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pretend import pretend_score, pretend_walk
+
+from hector_jax.cli import verdict as command
+from hector_jax.cli.main import main
+from hector_jax.control.reference import named_command
+from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import save_weights
+from hector_jax.core.inputs import InputError
+from hector_jax.core.tree import stack
+from hector_jax.report import columns as report
+from hector_jax.robot.description import HECTOR
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import columns, verdicts
+from hector_jax.runs.columns import Column
+from hector_jax.runs.metrics import Verdict, family_of
+from hector_jax.runs.tunings import tune_config
+from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.standin import FAMILIES, even, standin
+from hector_jax.tuning.loss import PAPER_LOSS
+
+C, DRAKE, HEAVY = Column("c", "own"), Column("drake", "own"), Column("c", "heavy")
+LEVEL = {"nominal": 4e6, "expert": 3e6, "with": 1e6}
+
+
+def cell(seeds=8, fallen=(), **levels):
+    """Walks of sets on plants of which the losses differ alike; `fallen` pairs of set and seed."""
+    plant = 1.0 + 0.1 * np.arange(seeds)
+    scores = {
+        name: stack([pretend_score(L * p, (name, i) in fallen) for i, p in enumerate(plant)])
+        for name, L in (LEVEL | levels).items()
+    }
+    return Verdict(np.arange(seeds), scores, PAPER_LOSS)
+
+
+def said(cells, differs=None):
+    """All sentences of the report."""
+    known = cells, differs or {}, "standin"
+    return "\n".join(report.claims(*known)), "\n".join(report.limits(*known))
+
+
+# The counts
+
+
+def test_cells_below_and_clear_and_void_are_counted():
+    mixed = cell()
+    mixed.scores["with"].losses["L"][:3] *= 8.0  # the median stays below, the interval does not
+    cells = {
+        (C, "s"): cell(),
+        (C, "c"): mixed,
+        (HEAVY, "s"): cell(fallen=[("with", 1)]),
+        (HEAVY, "c"): cell(**{"with": 5e6}),
+    }
+    assert columns.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
+
+
+def test_intervals_of_falls_are_exact():
+    none, one = columns.fall_share(0, 32), columns.fall_share(1, 8)
+    assert none.low == 0.0
+    assert none.high == pytest.approx(1.0 - 0.025 ** (1 / 32))
+    # P(X >= 1 | low) = P(X <= 1 | high) = 2.5 %
+    assert 1.0 - (1.0 - one.low) ** 8 == pytest.approx(0.025)
+    assert (1 - one.high) ** 8 + 8 * one.high * (1 - one.high) ** 7 == pytest.approx(0.025)
+    both = {(C, "s"): cell(4, [("with", 0)]), (HEAVY, "s"): cell(8, [("with", 0)])}
+    assert columns.falls(both, "with")[:2] == (2, 12)
+
+
+def test_kendalls_tau_tells_the_order_of_the_sets():
+    turned = cell(4, nominal=1e6, **{"with": 4e6})
+    cells = {(C, "s"): cell(8), (DRAKE, "s"): cell(4), (HEAVY, "s"): turned}
+    found = {(one.one, one.other): one.tau for one in columns.agreements(cells)}
+    assert found == pytest.approx({(C, DRAKE): 1.0, (C, HEAVY): -1.0, (DRAKE, HEAVY): -1.0})
+    two = {
+        key: v._replace(scores={n: v.scores[n] for n in LEVEL if n != "expert"})
+        for key, v in cells.items()
+    }
+    assert columns.agreements(two) == []
+
+
+def test_the_spread_is_between_engines_on_the_plants_that_both_have():
+    first = cell(8)
+    first.scores["with"].losses["L"][4:] *= 3.0  # on plants that the other engine has not
+    cells = {(C, "s"): first, (DRAKE, "s"): cell(4, **{"with": 2e6}), (HEAVY, "s"): cell(4)}
+    (found,) = columns.spreads(cells, "with", "nominal")
+    assert (found.trajectory, found.model) == ("s", "own")
+    assert (found.gain, found.spread) == pytest.approx((50.0, 25.0))
+    assert found.is_small
+    assert not found._replace(gain=49.0).is_small
+    assert columns.spreads({(C, "s"): cell()}, "with", "nominal") == []
+
+
+def test_the_worst_walk_is_named():
+    bad = cell(4, fallen=[("with", 2)])
+    bad.scores["with"].losses["L"][2] *= 10.0
+    found = columns.worst({(C, "s"): cell(), (HEAVY, "c"): bad}, "with", "nominal")
+    assert found[:3] == (HEAVY, "c", 2)
+    assert found.change == pytest.approx(150.0)
+    assert found.fallen
+
+
+# The report
+
+
+def test_what_holds_everywhere_is_claimed_and_what_does_not_is_not():
+    claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell()})
+    assert "`with` is below nominal in 2 of 2 cells, the interval clear of zero in 2." in claims
+    assert "In these engines and models its loss is lower than that of nominal." in claims
+    assert "in 1 of 1 case: the gain does not rest on one engine." in claims
+    assert "All columns order the sets by their median L in the same way" in claims
+    claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell(**{"with": 5e6})})
+    assert "`with` is below nominal in 1 of 2 cells" in claims
+    assert "It may not be said that its loss is lower everywhere." in claims
+    assert "The whole interval is above zero in s in Drake." in claims
+    assert "by up to 100.0 percentage points" in claims
+    assert "in 0 of 1 case; elsewhere it may belong to the engine." in claims
+    assert "differs most between MuJoCo C and Drake: Kendall's tau is -0.33" in claims
+
+
+def test_few_plants_and_falls_are_said():
+    claims, limits = said({(C, "s"): cell(3), (HEAVY, "s"): cell(4, [("with", 0)])})
+    assert "Where no interval is clear of zero" not in claims  # falls already forbid the claim
+    assert "Falls make 1 cell no comparison: s in MuJoCo C, heavy." in claims
+    assert "`with` falls in 1 of 7 walks: 14.3 [0.4, 57.9] %." in claims
+    assert "no interval from fewer than four plants: MuJoCo C.\n" in limits
+    assert "fewer than eight plants is coarse: MuJoCo C, heavy.\n" in limits
+    claims, _ = said({(C, "s"): cell(3)})
+    assert "Where no interval is clear of zero, the difference may be chance." in claims
+
+
+def test_the_limits_name_what_was_not_walked():
+    _, limits = said({(C, "s"): cell()})
+    assert "Nothing here is a statement about hardware." in limits
+    assert "Only MuJoCo C has walked" in limits
+    assert "Only the robot's own model has walked" in limits
+    assert "family `standin` (seeds 0-7)" in limits
+    assert "The columns of MuJoCo C are not independent of sets" in limits
+    _, limits = said({(DRAKE, "s"): cell()}, {"drake": "dry friction is smooth"})
+    assert "in Drake dry friction is smooth" in limits
+    assert "GRFM-Net" not in limits
+
+
+def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
+    fell = cell(4, [("with", 0), ("with", 1)])
+    fell.scores["with"].losses["L"][:2] *= 20.0
+    cells = {(c, t): cell(4) for c in (C, HEAVY, DRAKE) for t in ("straight", "s")}
+    cells[HEAVY, "s"] = fell
+    facts = {"config": {}, "environment": {"python": "3"}, "command": "hector verdict"}
+    report.write_report(
+        tmp_path, cells, family="even", differs={"drake": "dry friction is smooth"}, **facts
+    )
+    page = (tmp_path / "report.md").read_text()
+    assert page.startswith("# Verdict in several engines and models: straight, s\n")
+    assert "72 walks: `nominal`, `expert`, `with`, on 2 trajectories in 3 columns." in page
+    for line in (*report.claims(cells, {}, "even"), *report.limits(cells, {}, "even")):
+        assert f"- {line}\n" in page
+    assert "| MuJoCo C, heavy | with |" in page
+    told = json.loads((tmp_path / "verdict.json").read_text())
+    assert told["family"] == "even"
+    assert [one["model"] for one in told["columns"]] == ["own", "heavy", "own"]
+    there = told["columns"][1]["trajectories"]["s"]["with"]
+    assert there["falls_share"]["value"] == 0.5
+    assert there["change"]["nominal"]["counts"] is False
+    assert told["sets"]["with"]["against"]["nominal"]["void"] == 1
+    assert told["sets"]["with"]["against"]["nominal"]["worst"]["column"]["model"] == "heavy"
+    assert len(told["kendall"]) == 6
+    panels = drawn[0].axes
+    assert [panel.get_title() for panel in panels] == ["straight", "s"]
+    assert [text.get_text() for text in panels[1].texts] == ["2 fell"]
+
+
+def test_one_set_beside_nominal_is_enough_and_is_printed(capsys):
+    two = cell(4, [("expert", 0)])
+    two = two._replace(scores={name: two.scores[name] for name in ("nominal", "expert")})
+    report.print_verdict({(C, "s"): two}, {}, "standin")
+    out = capsys.readouterr().out
+    assert "s in MuJoCo C" in out
+    assert "expert -25 [-25, -25] * (1 fall)\n" in out
+    assert "`expert` is below nominal in 0 of 1 cell" in out
+
+
+# The command
+
+
+@pytest.fixture
+def walked(monkeypatch):
+    """Engine and job of each walk; no process is started."""
+    jobs = []
+
+    def walks_of(pool, config, robot, asked, title, engine):
+        for job in asked:
+            if len(jobs) == walks_of.cut:
+                raise KeyboardInterrupt
+            jobs.append((engine.name, job))
+            yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
+
+    walks_of.cut = None
+    other = MUJOCO_C._replace(name="drake", title="Drake")
+    monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
+    monkeypatch.setattr(
+        command,
+        "choose_engine",
+        lambda name: {"c": MUJOCO_C, "drake": other}.get(name) or missing(),
+    )
+    return SimpleNamespace(jobs=jobs, walks_of=walks_of)
+
+
+def missing():
+    raise InputError("DART is not installed: pip install pretend")
+
+
+def call(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["hector", *map(str, words)])
+    return main()
+
+
+def words_of(folder, *more):
+    return "verdict", "--out", folder, "--traj", "s", "--seeds", 2, "--model-seeds", 1, *more
+
+
+def test_all_engines_and_models_walk_and_a_cut_verdict_goes_on(
+    monkeypatch, tmp_path, capsys, walked
+):
+    words = words_of(tmp_path, "--engine", "all", "--engine-seeds", 1, "--light-heavy", "--json")
+    walked.walks_of.cut = 9
+    assert call(monkeypatch, *words) == 130
+    walked.walks_of.cut = None
+    capsys.readouterr()
+    assert call(monkeypatch, *words) == 0
+    assert len(walked.jobs) == 14  # two sets; 2 + 1 + 1 plants in C, 1 + 1 + 1 in the other engine
+    told, err = capsys.readouterr()
+    assert "14 walks: 2 on each plant; plants: MuJoCo C (2), MuJoCo C, light (1), " in err
+    assert "left out: DART is not installed" in err
+    mass = sorted({float(j.imperfections.mass) for name, j in walked.jobs if name == "drake"})
+    np.testing.assert_allclose(mass, np.array([0.9, 1.0, 1.1]) * standin(0).mass)
+    assert [one["seeds"] for one in json.loads(told)["columns"]] == [
+        [0, 1],
+        [0],
+        [0],
+        [0],
+        [0],
+        [0],
+    ]
+    assert call(monkeypatch, *words) == 0
+    assert capsys.readouterr().out == told
+    assert len(walked.jobs) == 14
+
+
+def test_engines_do_not_share_scores(monkeypatch, tmp_path, walked):
+    for engine in ("c", "drake"):
+        assert call(monkeypatch, *words_of(tmp_path, "--engine", engine)) == 0
+    assert [name for name, _ in walked.jobs] == ["c"] * 4 + ["drake"] * 4
+
+
+def test_a_folder_has_a_file_for_each_trajectory_and_a_family_other_plants(
+    monkeypatch, tmp_path, capsys, walked
+):
+    for name, weights in (("s", expert()), ("c", nominal())):
+        save_weights(tmp_path / "sets" / f"{name}.json", weights)
+    words = "--weights", "nominal", f"mine={tmp_path / 'sets'}", "--family", "even", "--json"
+    words = "verdict", "--out", tmp_path / "out", "--traj", "s", "c", "--seeds", 1, *words
+    assert call(monkeypatch, *words) == 0
+    told = json.loads(capsys.readouterr().out)
+    s, c = (told["columns"][0]["trajectories"][name]["mine"] for name in ("s", "c"))
+    assert s["change"]["nominal"]["median"] != 0.0
+    assert c["change"]["nominal"]["median"] == 0.0
+    assert told["family"] == "even"
+    assert {float(job.imperfections.mass) for _, job in walked.jobs} == {float(even(0).mass)}
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["--weights", "expert"], "--weights must be nominal, which changes are against, and"),
+        (["--weights", "nominal", "nominla"], "got 'nominla'; did you mean 'nominal'?"),
+        (["--weights", "nominal", "a=none.json"], "none.json: cannot read the file"),
+        (["--weights", "nominal", "a b={file}"], "'a b' is no name of letters, digits and _"),
+        (["--weights", "nominal", "expert={file}"], "there is a set 'expert' already"),
+        (["--weights", "nominal", "{folder}"], "straight.json: cannot read"),
+        (["--engine", "bullet"], "invalid choice 'bullet' for argument '--engine'"),
+        (["--engine", "dart"], "DART is not installed"),
+        (["--plant", "a.xml"], "--plant must be a TOML file"),
+        (["--traj", "straight", "moon"], "moon"),
+        (
+            ["--first-seed", "4294967293", "--seeds", "1", "--light-heavy"],
+            "the largest is 4294967295",
+        ),
+    ],
+)
+def test_wrong_input_is_one_line_before_anything_is_walked(
+    monkeypatch, tmp_path, capsys, walked, words, fault
+):
+    save_weights(tmp_path / "sets" / "c.json", nominal())
+    paths = {"file": tmp_path / "sets" / "c.json", "folder": tmp_path / "sets"}
+    words = [word.format(**paths) for word in words]
+    assert call(monkeypatch, "verdict", "--out", tmp_path / "out", *words) == 2
+    lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("hector: ")]
+    assert len(lines) == 1
+    assert fault in lines[0]
+    assert walked.jobs == []
+    assert not (tmp_path / "out").exists()
+
+
+def small(folder):
+    """The walks that `hector tune --verdict` adds, and their table."""
+    robot = load_robot()
+    sets = {name: nominal() for name in ("nominal", "expert", "without_ten", "without", "with")}
+    course = NamedCommand("s", named_command("s"))
+    with ThreadPoolExecutor(1) as pool:
+        inputs = pool, tune_config(robot), robot, sets, course
+        command.small_verdict(*inputs, seconds=1.0, folder=folder)()
+
+
+def test_a_tuning_walks_its_sets_in_the_engines_where_it_has_not_walked(tmp_path, capsys, walked):
+    small(tmp_path)
+    assert [name for name, _ in walked.jobs] == ["drake"] * 4
+    assert "s in Drake" in capsys.readouterr().out
+
+
+def test_a_tuning_without_other_engines_walks_on_other_masses(monkeypatch, tmp_path, walked):
+    monkeypatch.setattr(
+        command, "choose_engine", lambda name: MUJOCO_C if name == "c" else missing()
+    )
+    small(tmp_path)
+    assert [name for name, _ in walked.jobs] == ["c"] * 8
+    masses = sorted({float(job.imperfections.mass) for _, job in walked.jobs})
+    np.testing.assert_allclose(masses, np.array([0.9, 1.1]) * standin(0).mass)
+
+
+# The families
+
+
+def test_masses_of_the_second_family_are_even_about_the_nominal_ones():
+    mass = np.array([float(even(seed).mass) for seed in range(32)])
+    assert mass.min() >= 0.85
+    assert mass.max() <= 1.15
+    assert np.ptp(mass) > 0.24
+    assert abs(np.mean(mass) - 1.0) < 0.04
+
+
+def test_families_share_ranges_but_no_numbers():
+    for seed in range(3):
+        one, other = (draw(seed, HECTOR)._asdict() for draw in FAMILIES.values())
+        assert one["estimator"] == other["estimator"]
+        for name in ("joint_friction", "armature", "delay", "contact_time", "floor_friction"):
+            assert one[name] != other[name]
+            assert 0.3 < one[name] / other[name] < 10.0
+    assert [family_of(world) for world in ("standin", "standin-even")] == list(FAMILIES)
