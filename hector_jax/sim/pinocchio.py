@@ -1,0 +1,263 @@
+# pyright: reportMissingImports=false
+"""A plant in Pinocchio: rigid contact with Coulomb's law (the extra `pinocchio`).
+
+Dynamics and contact solver are Pinocchio's, the time stepping is Moreau's: the velocities at the
+end of a step follow from impulses that keep the points of the soles out of the floor. The floor does
+not give way, and friction is Coulomb's cone itself, not a convex relaxation of it. Legs that touch
+are told of and pass through each other.
+"""
+
+import coal
+import numpy as np
+import pinocchio as pin
+from jaxtyping import Float
+
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.model import Robot
+from hector_jax.sim import bodies
+from hector_jax.sim.bodies import Body, Shape
+from hector_jax.sim.loop import Job
+from hector_jax.sim.plant import LEGS, OTHER, PointContacts, lasting_world
+from hector_jax.sim.sensing import Ground
+from hector_jax.sim.world import STOP_TIME, World, standing_qpos
+
+_NEAR = 1e-3  # [m] above the floor from where on a point may touch within the step
+_BEND = 0.1  # of a backlash, by which the largest torque bends the gear's teeth
+_CLOSE = 1e-9  # [m/s], of the contact solver
+_FAR = 1e-4  # [m/s], its residual from which on a step counts as failed
+
+
+class PinocchioPlant:
+    """A `Plant` in Pinocchio; its world is the same from the walk's start to its end."""
+
+    def __init__(self, job: Job, body: Robot, first: int, end: int) -> None:
+        """Build as a `BuildPlant` does."""
+        world = lasting_world("pinocchio", job, body, first, end)
+        robot = bodies.bodies(world)
+        self.model, self._joint_of_body = _model(robot, world)
+        self.data, self.failed = self.model.createData(), False
+        hinges = [hinge for one in robot for hinge in one.hinges]
+        at = {h.dof: self.model.idx_vs[self.model.getJointId(h.name)] for h in hinges}
+        self._motors = np.array([at[dof] for dof in world.joint_dof])
+        self._slack = np.array([at[world.model.jnt_dofadr[j]] for j in world.slack], int)
+        self.order = np.array([at[hinge.dof] for hinge in hinges])
+        self._friction, self._stiction = bodies.dry_friction(hinges)
+        self._damping = np.zeros(self.model.nv)
+        self._damping[self.order] = [hinge.damping for hinge in hinges]
+        width = float(job.imperfections.backlash)
+        self._width, self._teeth = width, np.asarray(body.torque_limit) / (_BEND * (width or 1.0))
+        self._com, self._trunk = world.model.body_ipos[world.trunk], self._joint_of_body[1]
+        self._soles = _Soles(world, self.model, self._joint_of_body)
+        self._others = _Others(world, self.model, self._joint_of_body)
+        self._contacts = PointContacts(len(body.foot_point))
+        self.stand(standing_qpos(world, body.standing_joints, float(body.trunk_height)))
+
+    def stand(self, qpos: Float[np.ndarray, " nq"]) -> None:
+        """Take up the coordinates of a MuJoCo model of this world, at rest."""
+        self.q, self.v = np.zeros(self.model.nq), np.zeros(self.model.nv)
+        self.q[:3], self.q[3:7] = qpos[:3], qpos[[4, 5, 6, 3]]
+        self.q[self.order + 1] = qpos[7:]  # the trunk's quaternion has one more
+
+    @property
+    def broken(self) -> bool:
+        """Whether the contact solver failed, or the state is no number."""
+        return self.failed or not np.isfinite(self.v).all()
+
+    def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
+        """See `Plant`."""
+        if self.broken:
+            self._contacts.end_step()
+            return
+        model, data, q, v = self.model, self.data, self.q, self.v
+        pin.computeAllTerms(model, data, q, v)  # mass matrix, nonlinear effects, Jacobians
+        A = np.triu(data.M) + np.triu(data.M, 1).T
+        force = -data.nle - self._damping * v
+        rates = v[self.order]
+        force[self.order] -= self._friction * np.tanh(rates / self._stiction)
+        force[self._motors] += torque
+        if push.any():
+            R = data.oMi[self._trunk].rotation
+            force[:3] += R.T @ push
+            force[3:6] += np.cross(self._com, R.T @ push)
+        stiff = self._damping.copy()
+        if len(self._slack):
+            self._add_stops(force, stiff)
+        A[np.diag_indices_from(A)] += TIME_STEP * stiff
+        self.v = v + np.linalg.solve(A, TIME_STEP * force)
+        self._add_impulses(A)
+        self.q = pin.integrate(model, q, TIME_STEP * self.v)
+        self._others.note(model, data, self._contacts)
+        self._contacts.end_step()
+
+    def _add_stops(
+        self, force: Float[np.ndarray, " nv"], stiff: Float[np.ndarray, " nv"]
+    ) -> None:
+        """Teeth at the ends of the backlash, springs and dampers that are linear over the step."""
+        gap = self.q[self._slack + 1]
+        over = gap - np.clip(gap, -self._width, self._width)
+        on, teeth = over != 0.0, self._teeth
+        slope = on * teeth * STOP_TIME  # of damper and spring over a step together
+        force[self._slack] -= teeth * over + slope * self.v[self._slack]
+        stiff[self._slack] += slope
+
+    def _add_impulses(self, A: Float[np.ndarray, "nv nv"]) -> None:
+        """Impulses at the points that would sink in."""
+        points, J = self._soles.near(self.model, self.data)
+        if not len(points):
+            return
+        height = points[:, 2]
+        inverse = np.linalg.solve(A, J.T)
+        aim = (J @ self.v).reshape(-1, 3)
+        aim[:, 2] += height / TIME_STEP  # at most down to the floor, and out of it at once
+        impulse, self.failed = self._soles.solve(J @ inverse, aim.ravel())
+        self.v = self.v + inverse @ impulse
+        for foot, force, point in zip(
+            self._soles.feet, impulse.reshape(-1, 3) / TIME_STEP, points, strict=True
+        ):
+            if force.any():
+                self._contacts.note(foot, force, point)
+
+    def read(self, row: Float[np.ndarray, " reading"]) -> None:
+        """See `Plant`."""
+        joints, R = len(self._motors), pin.Quaternion(self.q[3:7]).toRotationMatrix()
+        row[:3], row[3:7] = self.q[:3], self.q[[6, 3, 4, 5]]
+        row[7:10], row[10:13] = R @ self.v[:3], self.v[3:6]
+        row[13 : 13 + joints] = self.q[self._motors + 1]
+        row[13 + joints : 13 + 2 * joints] = self.v[self._motors]
+        row[13 + 2 * joints :] = self.q[self._slack + 1] if len(self._slack) else 0.0
+
+    def ground(self) -> Ground:
+        """See `Plant`."""
+        return self._contacts.ground()
+
+
+def _model(robot: list[Body], world: World) -> tuple[pin.Model, dict[int, int]]:
+    """Pinocchio's model, and its joint of each body of MuJoCo's."""
+    model, joint_of = pin.Model(), {0: 0}
+    model.gravity.linear = np.array(world.model.opt.gravity)
+    armature = {}
+    for body in robot:
+        joint, place = joint_of[body.parent], pin.SE3(body.rotation, body.position)
+        if not body.hinges:
+            free = pin.JointModelFreeFlyer()
+            joint = model.addJoint(joint, free, pin.SE3.Identity(), body.name)
+        for hinge in body.hinges:
+            turn = pin.JointModelRevoluteUnaligned(np.array(hinge.axis))
+            joint, place = model.addJoint(joint, turn, place, hinge.name), pin.SE3.Identity()
+            armature[joint] = hinge.armature
+        inertia = pin.Inertia(body.mass, np.array(body.com), body.inertia)
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+        joint_of[body.id] = joint
+    rotors = np.zeros(model.nv)
+    for joint, value in armature.items():
+        rotors[model.idx_vs[joint]] = value
+    model.armature = rotors
+    return model, joint_of
+
+
+class _Soles:
+    """The spheres of the soles, and impulses at those near the floor."""
+
+    def __init__(self, world: World, model: pin.Model, joint_of: dict[int, int]) -> None:
+        spheres = [
+            shape
+            for shape in bodies.shapes(world)
+            if shape.kind == "sphere" and world.foot_of_geom[shape.id] >= 0
+        ]
+        self._joints = [joint_of[one.body] for one in spheres]
+        self._centres = np.array([one.position for one in spheres])
+        self._radii = np.array([one.size[0] for one in spheres])
+        self._foot = world.foot_of_geom[[one.id for one in spheres]]
+        self._solver, self._settings = pin.ADMMConstraintSolver(), pin.ADMMSolverSettings()
+        self._settings.absolute_feasibility_tol = _CLOSE
+        self._settings.absolute_complementarity_tol = _CLOSE
+        friction = float(world.model.geom_friction[world.floor, 0])
+        self._cones = [_cones(model, count, friction) for count in range(len(spheres) + 1)]
+        self.feet: list[int] = []  # of the points that `near` returned last
+
+    def near(
+        self, model: pin.Model, data: pin.Data
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m nv"]]:
+        """The points near the floor [m], and their Jacobian in the world's frame."""
+        places = [data.oMi[joint] for joint in self._joints]
+        centres = np.array([at.act(c) for at, c in zip(places, self._centres, strict=True)])
+        points = centres - np.outer(self._radii, [0.0, 0.0, 1.0])
+        rows = np.flatnonzero(points[:, 2] < _NEAR)
+        self.feet = [int(self._foot[i]) for i in rows]
+        J = np.zeros((len(rows), 3, model.nv))
+        for row, i in enumerate(rows):
+            frame = pin.getJointJacobian(
+                model, data, self._joints[i], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            )
+            J[row] = frame[:3] - pin.skew(points[i] - places[i].translation) @ frame[3:]
+        return points[rows], J.reshape(-1, model.nv)
+
+    def solve(
+        self, G: Float[np.ndarray, "m m"], free: Float[np.ndarray, " m"]
+    ) -> tuple[Float[np.ndarray, " m"], bool]:
+        """Impulses [N s] that satisfy Signorini's and Coulomb's laws; whether the solver failed.
+
+        Args:
+            G: velocities of the points for impulses at them.
+            free: velocities without impulses [m/s].
+        """
+        result = pin.ADMMSolverResult()
+        G = G + 1e-6 * np.trace(G) / len(G) * np.eye(len(G))  # four points of a flat sole
+        cones = self._cones[len(free) // 3]
+        good = self._solver.solve(
+            pin.DelassusOperatorDense(G), free, *cones, self._settings, result
+        )
+        residual = max(result.primal_feasibility, result.dual_feasibility, result.complementarity)
+        return np.array(result.retrieveConstraintImpulses()), not (good or residual < _FAR)
+
+
+def _cones(
+    model: pin.Model, count: int, friction: float
+) -> tuple[pin.StdVec_ConstraintModel, pin.StdVec_ConstraintData]:
+    """Friction cones about the world's z axis, for so many points."""
+    models, datas = pin.StdVec_ConstraintModel(), pin.StdVec_ConstraintData()
+    for _ in range(count):
+        one = pin.PointContactConstraintModel(model, 1)
+        one.setFriction(friction)
+        models.append(pin.ConstraintModel(one))
+        datas.append(pin.ConstraintModel(one).createData())
+    return models, datas
+
+
+class _Others:
+    """What touches beside the soles and the floor: looked for, without forces."""
+
+    def __init__(self, world: World, model: pin.Model, joint_of: dict[int, int]) -> None:
+        self._geometry, shapes, index = pin.GeometryModel(), bodies.shapes(world), {}
+        soles = {s.id for s in shapes if s.kind == "sphere" and world.foot_of_geom[s.id] >= 0}
+        for shape in shapes:
+            place = pin.SE3(shape.rotation, shape.position)
+            one = pin.GeometryObject(str(shape.id), joint_of[shape.body], place, _shape(shape))
+            index[shape.id] = self._geometry.addGeometryObject(one)
+        self._kinds = []
+        for pair in sorted(bodies.touching_pairs(world)):
+            if not (world.floor in pair and soles & set(pair)):
+                self._geometry.addCollisionPair(pin.CollisionPair(*(index[i] for i in pair)))
+                self._kinds.append(OTHER if world.floor in pair else LEGS)
+        self._found = self._geometry.createData()
+
+    def note(self, model: pin.Model, data: pin.Data, contacts: PointContacts) -> None:
+        """Note what touches, at the poses of `data`."""
+        pin.updateGeometryPlacements(model, data, self._geometry, self._found)
+        if pin.computeCollisions(self._geometry, self._found, True):
+            pin.computeCollisions(self._geometry, self._found, False)
+            for kind, result in zip(self._kinds, self._found.collisionResults, strict=True):
+                if result.isCollision():
+                    contacts.note(kind, np.zeros(3), np.zeros(3))
+
+
+def _shape(shape: Shape) -> coal.CollisionGeometry:
+    match shape.kind:
+        case "plane":
+            return coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+        case "sphere":
+            return coal.Sphere(shape.size[0])
+        case "capsule":
+            return coal.Capsule(shape.size[0], 2.0 * shape.size[1])
+        case _:
+            return coal.Box(*(2.0 * shape.size))
