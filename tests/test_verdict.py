@@ -191,16 +191,15 @@ def test_one_set_beside_nominal_is_enough_and_is_printed(capsys):
 @pytest.fixture
 def walked(monkeypatch):
     """Engine and job of each walk; no process is started."""
-    jobs = []
+    state = SimpleNamespace(jobs=[], cut=None)
 
     def walks_of(pool, config, robot, asked, title, engine):
         for job in asked:
-            if len(jobs) == walks_of.cut:
+            if len(state.jobs) == state.cut:
                 raise KeyboardInterrupt
-            jobs.append((engine.name, job))
+            state.jobs.append((engine.name, job))
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
-    walks_of.cut = None
     other = Engine("drake", MUJOCO_C.walk, MUJOCO_C.bits)
     monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
     monkeypatch.setattr(
@@ -208,7 +207,7 @@ def walked(monkeypatch):
         "choose_engine",
         lambda name: {"c": MUJOCO_C, "drake": other}.get(name) or missing(),
     )
-    return SimpleNamespace(jobs=jobs, walks_of=walks_of)
+    return state
 
 
 def missing():
@@ -228,9 +227,9 @@ def test_all_engines_and_models_walk_and_a_cut_verdict_goes_on(
     monkeypatch, tmp_path, capsys, walked
 ):
     words = words_of(tmp_path, "--engine", "all", "--engine-seeds", 1, "--light-heavy", "--json")
-    walked.walks_of.cut = 9
+    walked.cut = 9
     assert call(monkeypatch, *words) == 130
-    walked.walks_of.cut = None
+    walked.cut = None
     capsys.readouterr()
     assert call(monkeypatch, *words) == 0
     assert len(walked.jobs) == 14  # two sets; 2 + 1 + 1 plants in C, 1 + 1 + 1 in the other engine
