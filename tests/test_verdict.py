@@ -29,15 +29,15 @@ from hector_jax.sim.standin import FAMILIES, even, standin
 from hector_jax.tuning.loss import PAPER_LOSS
 
 C, DRAKE, HEAVY = Column("c", "own"), Column("drake", "own"), Column("c", "heavy")
-LEVEL = {"nominal": 4e6, "expert": 3e6, "with": 1e6}
+SETS = ("nominal", "expert", "with")
 
 
-def cell(seeds=8, fallen=(), **levels):
+def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
     """Walks of sets on plants of which the losses differ alike; `fallen` pairs of set and seed."""
     plant = 1.0 + 0.1 * np.arange(seeds)
     scores = {
         name: stack([pretend_score(L * p, (name, i) in fallen) for i, p in enumerate(plant)])
-        for name, L in (LEVEL | levels).items()
+        for name, L in zip(SETS, (nominal, 3e6, tuned), strict=True)
     }
     return Verdict(np.arange(seeds), scores, PAPER_LOSS)
 
@@ -58,7 +58,7 @@ def test_cells_below_and_clear_and_void_are_counted():
         (C, "s"): cell(),
         (C, "c"): mixed,
         (HEAVY, "s"): cell(fallen=[("with", 1)]),
-        (HEAVY, "c"): cell(**{"with": 5e6}),
+        (HEAVY, "c"): cell(tuned=5e6),
     }
     assert columns.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
 
@@ -75,12 +75,12 @@ def test_intervals_of_falls_are_exact():
 
 
 def test_kendalls_tau_tells_the_order_of_the_sets():
-    turned = cell(4, nominal=1e6, **{"with": 4e6})
+    turned = cell(4, nominal=1e6, tuned=4e6)
     cells = {(C, "s"): cell(8), (DRAKE, "s"): cell(4), (HEAVY, "s"): turned}
     found = {(one.one, one.other): one.tau for one in columns.agreements(cells)}
     assert found == pytest.approx({(C, DRAKE): 1.0, (C, HEAVY): -1.0, (DRAKE, HEAVY): -1.0})
     two = {
-        key: v._replace(scores={n: v.scores[n] for n in LEVEL if n != "expert"})
+        key: v._replace(scores={n: v.scores[n] for n in SETS if n != "expert"})
         for key, v in cells.items()
     }
     assert columns.agreements(two) == []
@@ -89,7 +89,7 @@ def test_kendalls_tau_tells_the_order_of_the_sets():
 def test_the_spread_is_between_engines_on_the_plants_that_both_have():
     first = cell(8)
     first.scores["with"].losses["L"][4:] *= 3.0  # on plants that the other engine has not
-    cells = {(C, "s"): first, (DRAKE, "s"): cell(4, **{"with": 2e6}), (HEAVY, "s"): cell(4)}
+    cells = {(C, "s"): first, (DRAKE, "s"): cell(4, tuned=2e6), (HEAVY, "s"): cell(4)}
     (found,) = columns.spreads(cells, "with", "nominal")
     assert (found.trajectory, found.model) == ("s", "own")
     assert (found.gain, found.spread) == pytest.approx((50.0, 25.0))
@@ -116,7 +116,7 @@ def test_what_holds_everywhere_is_claimed_and_what_does_not_is_not():
     assert "In these engines and models its loss is lower than that of nominal." in claims
     assert "in 1 of 1 case: the gain does not rest on one engine." in claims
     assert "All columns order the sets by their median L in the same way" in claims
-    claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell(**{"with": 5e6})})
+    claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell(tuned=5e6)})
     assert "`with` is below nominal in 1 of 2 cells" in claims
     assert "It may not be said that its loss is lower everywhere." in claims
     assert "The whole interval is above zero in s in Drake." in claims
