@@ -11,7 +11,10 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 QUICK_TESTS := $(addprefix tests/test_,$(addsuffix .py,footstep gait legs reference trajectories weights mpc controller \
 	qp gpu_kernel loss difftune rollout measured))
 
-.PHONY: help setup tune table verdict grfm ceiling test quick test-all bench check format docs lock
+LOCK = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --no-header \
+	--no-emit-index-url pyproject.toml
+
+.PHONY: help setup engines tune table verdict grfm ceiling test quick test-all bench check format docs lock
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -25,6 +28,9 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -r requirements.lock
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
+
+engines: $(STAMP) ## install the other physics engines, Drake and DART (150 MB)
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -r requirements-engines.lock
 
 tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
 	@$(BIN)/hector tune --traj $(TRAJ) $(if $(ROBOT),--robot $(ROBOT))
@@ -67,7 +73,7 @@ format: $(STAMP) ## format the code
 docs: $(STAMP) ## the site, into docs/_build; a warning is an error
 	@$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build
 
-lock: $(STAMP) ## resolve pyproject.toml into requirements.lock
+lock: $(STAMP) ## resolve pyproject.toml into requirements.lock and requirements-engines.lock
 	@$(BIN)/python -m pip install --quiet uv
-	@$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --no-header \
-		--no-emit-index-url pyproject.toml -o requirements.lock
+	@$(LOCK) --extra dev -o requirements.lock
+	@$(LOCK) --extra dart --extra drake -c requirements.lock -o requirements-engines.lock

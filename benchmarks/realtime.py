@@ -7,6 +7,7 @@ time does not.
 
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 from benchmarks.measuring import Check, Report, pin_one_core, show
@@ -24,6 +25,7 @@ from hector_jax.core.runtime import setup_jax
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.loop import Job, substeps
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 
@@ -43,7 +45,7 @@ def measure(seconds: float = SECONDS, robot_file: Path | None = None) -> Report:
         rows.append(known[sensing.coordinates(world)])
 
     job = Job(weights, command, ideal(robot.description), seconds)
-    walked = walk(config, robot, job, on_sample=record)
+    walked = walk(config, robot, job, build=partial(MujocoPlant, on_step=record))
     count, no_error = substeps(config), sensing.no_error(robot)
     readings = rows[-round(seconds * 1000) - 1 :: count][: round(seconds / config.gait.tick)]
 

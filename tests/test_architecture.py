@@ -29,6 +29,7 @@ FLOORS = [
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}
 DOORS = {
     "mujoco": ("core.headless", "sim.mjx_model"),
+    "pydrake": ("sim.drake",),
     "viser": ("report.view",),
     "trimesh": ("report.view",),
     "flax": ("grfm.nets",),

@@ -1,5 +1,7 @@
 """What becomes of a plant while it is walked on."""
 
+from functools import partial
+
 import jax
 import mujoco
 import numpy as np
@@ -11,6 +13,7 @@ from hector_jax.control.weights import expert
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.changes import Change, changed_world, worlds_by_step
 from hector_jax.sim.loop import Job
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos
 
@@ -40,10 +43,10 @@ def held(world, steps=400, slide=0.0):
     return data
 
 
-def short(*changes, seconds=0.3, plant=None, on_sample=None):
+def short(*changes, seconds=0.3, plant=None, on_step=None):
     command = named_command("straight")
     job = Job(expert(), command, plant or ideal(), seconds, changes=changes)
-    return walk(CONFIG, ROBOT, job, on_sample=on_sample)
+    return walk(CONFIG, ROBOT, job, build=partial(MujocoPlant, on_step=on_step))
 
 
 @pytest.mark.parametrize("plant", [ideal(), hfs()._replace(trunk_com=np.array([0.01, 0.02, 0.0]))])
@@ -121,7 +124,7 @@ def test_an_impossible_change_is_refused(change, message):
 def test_a_payload_that_arrives_is_felt_from_then_on_and_not_before():
     seen = []
     arrives = Change(start=0.1, payload=2.0)
-    loaded = short(arrives, on_sample=lambda world, _: seen.append(world.model.body_mass.sum()))
+    loaded = short(arrives, on_step=lambda world, _: seen.append(world.model.body_mass.sum()))
     free = short()
     before, after = (jax.tree.map(lambda x, s=s: x[s], loaded.state) for s in (99, -1))
     for one, other in zip(before, jax.tree.map(lambda x: x[99], free.state), strict=True):
@@ -140,7 +143,7 @@ def test_a_walk_on_a_slope_is_pulled_down_it():
         mujoco.mj_subtreeVel(world.model, data)
         momentum.append(data.subtree_linvel[0] * world.model.body_subtreemass[0])
 
-    walked = short(Change(slope=(0.0, SLOPE)), seconds=0.1, on_sample=record)
+    walked = short(Change(slope=(0.0, SLOPE)), seconds=0.1, on_step=record)
     assert not walked.fallen.any()
     # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
     gained = np.diff(np.array(momentum), axis=0)[1100:] / 0.001

@@ -3,6 +3,7 @@
 import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from hector_jax.runs import metrics, verdicts
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Record, StartupFall, likeliest_cause, not_the_weights
 from hector_jax.sim.loop import Job
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
@@ -91,7 +93,12 @@ def test_torques_of_a_robot_that_is_half_over_are_nobodys_fault():
 def test_a_fall_in_the_start_up_is_that_of_the_walk():
     heavy = JOB._replace(imperfections=hfs()._replace(mass=np.array(6.0)), seconds=0.05)
     config, rows = WalkConfig(), []
-    walked = walk(config, ROBOT, heavy, on_sample=lambda world, data: rows.append(data.qpos[2]))
+    walked = walk(
+        config,
+        ROBOT,
+        heavy,
+        build=partial(MujocoPlant, on_step=lambda world, data: rows.append(data.qpos[2])),
+    )
     assert walked.fallen.all()
     fall = diagnosis.startup_fall(config, ROBOT, heavy)
     assert fall is not None

@@ -1,9 +1,13 @@
 """Engines as values: what is chosen once and passed down, and how one is added."""
 
+import json
+import sys
+
 import jax
 import numpy as np
 import pytest
 
+from hector_jax.cli.main import main
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
@@ -49,5 +53,36 @@ def test_auto_is_mjx_where_there_is_an_accelerator(monkeypatch):
 
 
 def test_an_unknown_engine_is_refused_by_name():
-    with pytest.raises(InputError, match="engine must be 'auto', 'c' or 'mjx', got 'mjxx'.*'mjx'"):
+    with pytest.raises(InputError, match="engine must be 'auto', 'c', .*, got 'mjxx'.*'mjx'"):
         choose_engine("mjxx")
+
+
+def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(ENGINES, "drake", ENGINES["drake"]._replace(package="no_such_package"))
+    expected = (
+        r"drake needs no_such_package, which is not installed: pip install 'hector-jax\[drake\]'"
+    )
+    with pytest.raises(InputError, match=expected):
+        choose_engine("drake")
+
+
+def test_a_walk_and_an_evaluation_take_another_engine(monkeypatch, capsys):
+    jobs = []
+
+    def walk(pool, config, robot, them, **others):
+        jobs.extend(them)
+        return walk_rigid(pool, config, robot, them)
+
+    monkeypatch.setitem(ENGINES, "mjx", MJX._replace(walk=walk))
+    flags = ["--engine", "mjx", "--seconds", "0.1", "--json"]
+    monkeypatch.setattr(sys, "argv", ["hector", "walk", "--world", "ideal", *flags])
+    assert main() == 0
+    assert json.loads(capsys.readouterr().out)["engine"] == "mjx"
+    evaluate = ["hector", "evaluate", "--world", "hfs", "--weights", "nominal", *flags]
+    monkeypatch.setattr(sys, "argv", evaluate)
+    assert main() == 0
+    assert json.loads(capsys.readouterr().out)["engine"] == "mjx"
+    assert len(jobs) == 2
+    monkeypatch.setattr(sys, "argv", ["hector", "walk", "--world", "srbm", *flags])
+    assert main() == 2
+    assert "--engine mjx needs a world with a plant" in capsys.readouterr().err

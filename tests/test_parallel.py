@@ -1,6 +1,7 @@
 """The closed loop in MJX, against MuJoCo C."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -15,8 +16,9 @@ from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
 from hector_jax.sim.changes import Change
-from hector_jax.sim.loop import Job
+from hector_jax.sim.loop import Job, effect_of
 from hector_jax.sim.mjx_model import batched_model, find_places, in_floor, mjx, mjx_contacts
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk
@@ -40,15 +42,19 @@ def recorded():
             rows.append(dict(before, ctrl=data.ctrl.copy(), after=now["qvel"], contacts=contacts))
         before.update(now)
 
-    walk(CONFIG, ROBOT, Job(expert(), named_command("s"), hfs(), 0.8), on_sample=record)
+    walk(
+        CONFIG,
+        ROBOT,
+        Job(expert(), named_command("s"), hfs(), 0.8),
+        build=partial(MujocoPlant, on_step=record),
+    )
     return world, rows[-800::4]
 
 
 @jax.jit
 def wrench_of(row, contacts, floor, foot_of_geom):
-    foot, _ = sensing.foot_contacts(contacts, floor, foot_of_geom)
-    points = sensing.foot_points(ROBOT, sensing.unpack_reading(row))
-    return sensing.ground_wrench(contacts, foot, floor, points)
+    ground = sensing.ground_of(contacts, floor, foot_of_geom, feet=2)
+    return effect_of(ROBOT, row, ground)
 
 
 @pytest.mark.slow
@@ -129,7 +135,7 @@ ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
         ([job(expert()), job(expert(), start_tick=-110)], "start_tick -110 is not later"),
         (
             [job(expert()), job(expert())._replace(changes=(Change(payload=2.0),))],
-            r"do not change: jobs \[1\] have changes",
+            r"cannot change, got changes of jobs \[1\]",
         ),
         ([job(expert(), plant=hfs()._replace(mass=np.array(-1.0)))], "Imperfections.mass"),
     ],

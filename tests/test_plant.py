@@ -4,6 +4,7 @@ import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import verdicts
 from hector_jax.sim import parallel
 from hector_jax.sim.loop import Job
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
@@ -54,7 +56,7 @@ def test_the_world_is_the_plants_model_and_it_stands_in_its_own_pose(arms):
             seen.append((world.model.body_mass.sum(), data.qpos[world.joint_qpos], data.qpos[2]))
 
     job = Job(expert(), STRAIGHT, ideal(), 0.01, plant=plant)
-    walked = walk(CONFIG, ROBOT, job, on_sample=look)
+    walked = walk(CONFIG, ROBOT, job, build=partial(MujocoPlant, on_step=look))
     ((mass, joints, height),) = seen
     assert mass == pytest.approx(float(arms.mass), rel=1e-6)
     assert mass > 1.15 * ROBOT.mass

@@ -8,6 +8,7 @@ import pytest
 
 from hector_jax.robot.model import load_robot
 from hector_jax.sim import sensing
+from hector_jax.sim.loop import effect_of
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import build_world, hfs, ideal, standing_qpos, truth
 
@@ -17,10 +18,9 @@ ROBOT = load_robot()
 @jax.jit
 def sensed(robot, row, contacts, floor, foot_of_geom):
     reading = sensing.unpack_reading(row)
-    foot, touches = sensing.foot_contacts(contacts, floor, foot_of_geom)
-    points = sensing.foot_points(robot, reading)
-    wrench = sensing.ground_wrench(contacts, foot, floor, points)
-    return sensing.base_state(robot, reading, jnp.zeros(())), wrench, points, touches
+    ground = sensing.ground_of(contacts, floor, foot_of_geom, feet=2)
+    points, wrench = sensing.foot_points(robot, reading), effect_of(robot, row, ground)
+    return sensing.base_state(robot, reading, jnp.zeros(())), wrench, points, ground.touches
 
 
 def flat_reading(world, data):

@@ -1,5 +1,7 @@
 """The closed loop in MuJoCo C."""
 
+from functools import partial
+
 import jax
 import mujoco
 import numpy as np
@@ -12,6 +14,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.tree import layout, pack, unpack
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.standin import standin
 from hector_jax.sim.walk import walk, walk_many
 from hector_jax.sim.world import Push, build_world, hfs, ideal
@@ -129,7 +132,12 @@ def test_a_fall_is_held_and_marked():
 def test_every_sample_can_be_watched():
     times = []
     job = Job(expert(), named_command("c"), ideal(), seconds=0.01)
-    walk(CONFIG, ROBOT, job, on_sample=lambda world, data: times.append(data.time))
+    walk(
+        CONFIG,
+        ROBOT,
+        job,
+        build=partial(MujocoPlant, on_step=lambda world, data: times.append(data.time)),
+    )
     np.testing.assert_allclose(times, 0.001 * np.arange(1, len(times) + 1))
     assert len(times) == 1100 + 10
 
@@ -198,7 +206,9 @@ def test_a_push_moves_the_robot_and_the_sensed_wrench_stays_the_grounds():
         gained.append(data.subtree_linvel[0] * world.model.body_subtreemass[0])
 
     job = Job(expert(), named_command("straight"), ideal(), 0.1)
-    pushed = walk(CONFIG, ROBOT, job._replace(push=push), on_sample=record)
+    pushed = walk(
+        CONFIG, ROBOT, job._replace(push=push), build=partial(MujocoPlant, on_step=record)
+    )
     free = walk(CONFIG, ROBOT, job)
     assert (pushed.state.velocity - free.state.velocity)[70, 1] > 0.05
     # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
@@ -218,7 +228,7 @@ def test_the_ground_carries_and_moves_the_whole_robot():
         momentum.append(data.subtree_linvel[0] * world.model.body_subtreemass[0])
 
     job = Job(expert(), named_command("s"), hfs(), 1.0)
-    walked = walk(CONFIG, ROBOT, job, on_sample=record)
+    walked = walk(CONFIG, ROBOT, job, build=partial(MujocoPlant, on_step=record))
     # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
     gained = np.diff(np.array(momentum), axis=0)[1100:] / 0.001
     weight = build_world(hfs()).model.body_mass.sum() * 9.81

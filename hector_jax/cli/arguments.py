@@ -24,9 +24,9 @@ from hector_jax.runs import verdicts
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import RunRequest
 from hector_jax.runs.metrics import family_of
+from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job, check_plant
 from hector_jax.sim.standin import FAMILIES
-from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import TuneConfig
 
@@ -178,13 +178,19 @@ def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
 
 
 def walk_once(
-    args: Walk | View, robot: Robot, course: NamedCommand, weights: Weights, plant: Robot | None
+    args: Walk | View,
+    robot: Robot,
+    course: NamedCommand,
+    weights: Weights,
+    plant: Robot | None,
+    engine: Engine = MUJOCO_C,
 ) -> Trajectory:
     """One walk in the world of the flags; `plant` is another model of the robot."""
     if args.world == "srbm":
         lasts = seconds(args.seconds, course)
         return verdicts.walk_rigid_body(robot, weights, course.command, lasts)
-    return walk(walk_config(robot), robot, job_of(args, robot, course, weights, plant))
+    jobs = [job_of(args, robot, course, weights, plant)]
+    return next(engine.walk(None, walk_config(robot), robot, jobs))
 
 
 def job_of(

@@ -24,6 +24,7 @@ from hector_jax.report.video import VideoConfig, VideoUnavailable, write_film
 from hector_jax.robot.description import MODEL_PATH
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.verdicts import walk_rigid_body
+from hector_jax.sim.engine import ENGINES
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
@@ -66,6 +67,9 @@ def examine() -> tuple[dict[str, str], list[str]]:
     if jnp.asarray(0.0).dtype != jnp.float64:
         faults.append("JAX computes in 32 bits")
     facts["cache"] = str(cache_folder())
+    facts["engines"] = ", ".join(
+        f"{name}: {'yes' if engine.installed else 'no'}" for name, engine in ENGINES.items()
+    )
     facts["extras"] = ", ".join(
         f"{name}: {'yes' if find_spec(package) else 'no'} (for {use})"
         for name, (package, use) in _EXTRAS.items()

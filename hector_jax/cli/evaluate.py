@@ -33,6 +33,7 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
 from hector_jax.sim.diagnosis import StartupFall, startup_fall
+from hector_jax.sim.engine import MUJOCO_C, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss, loss_of_robot
@@ -40,7 +41,10 @@ from hector_jax.tuning.loss import Loss, loss_of_robot
 
 def evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
-    robot = arguments.with_gait(load_robot(args.robot), args.gait)
+    robot, engine = (
+        arguments.with_gait(load_robot(args.robot), args.gait),
+        choose_engine(args.engine),
+    )
     plant, course = arguments.plant_of(args.plant, robot), arguments.course(args.traj, robot)
     seconds = arguments.seconds(args.seconds, course)
     # ideal and hfs are one plant each, without chance
@@ -52,15 +56,15 @@ def evaluate(args: Evaluate) -> None:
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         inputs = pool, config, robot, sets, course.command, plants, seeds
-        walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant)
+        walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
-    result, what = (
-        metrics.as_result(verdict, args.world),
-        f"{course.name}, {plural(count, 'plant')}",
-    )
+    result = metrics.as_result(verdict, args.world) | {"engine": engine.name}
+    what = f"{course.name}, {plural(count, 'plant')}"
     if plant is not None:
         result["plant"] = plant.description.name
         what += f" of {plant.description.name}"
+    if engine is not MUJOCO_C:
+        what += f" in engine {engine.name}"
     if args.out is not None:
         write_json(args.out, result)
     names = arguments.short_names(args.weights)
@@ -80,10 +84,13 @@ def walk(args: Walk) -> None:
     plant = arguments.plant_of(args.plant, robot)
     if args.world == "srbm" and plant is not None:
         raise InputError("--plant needs a world of MuJoCo, got --world srbm")
+    if args.world == "srbm" and args.engine != "c":
+        raise InputError(f"--engine {args.engine} needs a world with a plant, got --world srbm")
+    engine = choose_engine(args.engine)
     weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = arguments.walk_once(args, robot, course, weights, plant)
+    trajectory = arguments.walk_once(args, robot, course, weights, plant, engine)
     score = metrics.score(loss, trajectory)
     upright, startup = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen))), None
     if upright == 0.0 and args.world != "srbm":
@@ -94,7 +101,10 @@ def walk(args: Walk) -> None:
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
     what = f"{course.name} in {args.world}"
+    if engine is not MUJOCO_C:
+        what += f" in engine {engine.name}"
     result: dict[str, Any] = {
+        "engine": engine.name,
         "seconds": upright if startup is None else startup.time,
         "fell": bool(score.fallen)
         and not unsolved,  # without a plan it is no fall of these weights
@@ -120,7 +130,7 @@ def walk(args: Walk) -> None:
         name = Path(args.weights).stem
         beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
         say(f"walking with {beside} weights for the other half of the film")
-        reference = arguments.walk_once(args, robot, course, other(robot), plant)
+        reference = arguments.walk_once(args, robot, course, other(robot), plant, engine)
         pictures.film(args.video, robot, {beside: reference, name: trajectory})
 
 

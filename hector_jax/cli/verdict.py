@@ -51,9 +51,9 @@ class Plan(NamedTuple):
     engines: dict[str, Engine]
 
     @property
-    def lacks(self) -> dict[str, Sequence[str]]:
-        """What each engine cannot have."""
-        return {name: () for name in self.engines}
+    def differs(self) -> dict[str, str]:
+        """What plants of each engine have otherwise than in MuJoCo C, where there is something."""
+        return {name: engine.differs for name, engine in self.engines.items() if engine.differs}
 
 
 def verdict(args: Verdict) -> None:
@@ -68,13 +68,13 @@ def verdict(args: Verdict) -> None:
         args.out,
         cells,
         family=args.family,
-        lacks=plan.lacks,
+        differs=plan.differs,
         config={"flags": as_table(args)},
         environment=about,
         command=as_command("hector verdict", args),
     )
     path = args.out / "report.md"
-    in_words = partial(report.print_verdict, cells, plan.lacks, args.family)
+    in_words = partial(report.print_verdict, cells, plan.differs, args.family)
     print_result(args.json, {"report": str(path), **result}, in_words)
     say(f"the report is {path}")
 
@@ -174,14 +174,12 @@ def _sets(args: Verdict, robot: Robot, courses: Mapping[str, Any]) -> dict[str, 
 
 
 def _in_words(plan: Plan) -> str:
-    """How many walks there are to be, and what engines cannot have."""
+    """How many walks there are to be, and what plants have otherwise in an engine."""
     each = len(plan.courses) * len(next(iter(plan.sets.values())))
     texts = [f"{report.title_of(column)} ({len(seeds)})" for column, seeds in plan.columns.items()]
     text = f"{plural(each * sum(map(len, plan.columns.values())), 'walk')}: {each} on each plant"
     text += f"; plants: {', '.join(texts)}"
-    for name, what in plan.lacks.items():
-        text += f"; {report.ENGINES[name]} has no {', no '.join(what)}" if what else ""
-    return text
+    return text + "".join(f"; in {report.ENGINES[n]} {what}" for n, what in plan.differs.items())
 
 
 def walk_cells(
@@ -249,4 +247,4 @@ def small_verdict(
     walks = {course.name: (course, seconds)}, {course.name: few}
     plan = Plan(robot, "standin", *walks, models, columns, engines)
     cells = walk_cells(pool, config, plan, folder)
-    return partial(report.print_verdict, cells, plan.lacks, plan.family)
+    return partial(report.print_verdict, cells, plan.differs, plan.family)

@@ -1,6 +1,6 @@
 """The report of weight sets in several engines and models: one page, its numbers, one picture."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -47,23 +47,23 @@ def share_text(share: Interval) -> str:
     return f"{value} [{low}, {high}] %"
 
 
-def claims(cells: Cells, lacks: Mapping[str, Sequence[str]], family: str) -> list[str]:
+def claims(cells: Cells, differs: Mapping[str, str], family: str) -> list[str]:
     """What may be claimed, line by line."""
-    return _lines("claims.txt.j2", cells, lacks, family)
+    return _lines("claims.txt.j2", cells, differs, family)
 
 
-def limits(cells: Cells, lacks: Mapping[str, Sequence[str]], family: str) -> list[str]:
+def limits(cells: Cells, differs: Mapping[str, str], family: str) -> list[str]:
     """What may not be claimed, line by line.
 
     Args:
         cells: the walks.
-        lacks: what each engine cannot have, by its name.
+        differs: what plants of an engine have otherwise than in MuJoCo C, by its name.
         family: of the plants.
     """
-    return _lines("limits.txt.j2", cells, lacks, family)
+    return _lines("limits.txt.j2", cells, differs, family)
 
 
-def _lines(template: str, cells: Cells, lacks: Mapping[str, Sequence[str]], family: str) -> Any:
+def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str) -> Any:
     names = columns.sets_of(cells)
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
@@ -82,9 +82,9 @@ def _lines(template: str, cells: Cells, lacks: Mapping[str, Sequence[str]], fami
         ENGINES=ENGINES,
         falls={name: columns.falls(cells, name) for name in names},
         family=family,
+        differs=differs,
         coarse=[c for c, verdict in verdicts.items() if FEWEST <= len(verdict.seeds) < _COARSE],
         few=[c for c, verdict in verdicts.items() if len(verdict.seeds) < FEWEST],
-        lacks={engine: what for engine, what in lacks.items() if what},
         LEARNED_FROM=LEARNED_FROM,
         models=list(dict.fromkeys(column.model for column in every)),
         pairs=pairs,
@@ -124,7 +124,7 @@ def tables(cells: Cells) -> dict[str, str]:
     return found
 
 
-def print_verdict(cells: Cells, lacks: Mapping[str, Sequence[str]], family: str) -> None:
+def print_verdict(cells: Cells, differs: Mapping[str, str], family: str) -> None:
     """Print the change of every set in every cell, and what may be claimed."""
     baseline = BASELINES[0]
     print(f"change of L against {baseline} in %, with falls where there are any")
@@ -135,7 +135,7 @@ def print_verdict(cells: Cells, lacks: Mapping[str, Sequence[str]], family: str)
             text = change_text(compare(verdict, name, baseline), void=" *")
             texts.append(f"{name} {text}" + f" ({plural(fell, 'fall')})" * bool(fell))
         print(f"{cell_text(cell):32s} {'   '.join(texts)}")
-    for line in claims(cells, lacks, family):
+    for line in claims(cells, differs, family):
         print(line)
 
 
@@ -144,7 +144,7 @@ def write_report(
     cells: Cells,
     *,
     family: str,
-    lacks: Mapping[str, Sequence[str]],
+    differs: Mapping[str, str],
     config: Mapping[str, Any],
     environment: Mapping[str, str],
     command: str,
@@ -155,14 +155,14 @@ def write_report(
         folder: where to.
         cells: the walks.
         family: of the plants.
-        lacks: what each engine cannot have, by its name.
+        differs: what plants of an engine have otherwise than in MuJoCo C, by its name.
         config: the flags, as JSON values.
         environment: versions and machine.
         command: that makes the report again.
     """
-    known = cells, lacks, family
+    known = cells, differs, family
     result = columns.as_result(cells, family) | {
-        "lacks": {engine: list(what) for engine, what in lacks.items()},
+        "differs": dict(differs),
         "claims": claims(*known),
         "limits": limits(*known),
         "config": dict(config),

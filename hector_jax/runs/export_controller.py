@@ -47,6 +47,7 @@ from hector_jax.qp import Status
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.loop import Job, first_tick, substeps
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, ideal, standing_qpos
 
@@ -254,7 +255,12 @@ def record(
         entries = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(entries[sensing.coordinates(world)])
 
-    trajectory = walk(config, robot, Job(weights, command, plant, seconds), on_sample=append)
+    trajectory = walk(
+        config,
+        robot,
+        Job(weights, command, plant, seconds),
+        build=partial(MujocoPlant, on_step=append),
+    )
     if np.asarray(trajectory.fallen).any():
         raise InputError(
             f"with these weights the robot falls within {seconds:g} s in the ideal world: there is "

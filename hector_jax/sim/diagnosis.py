@@ -5,6 +5,7 @@ start-up, and what its motors did, is found by walking once more, which gives th
 each millisecond recorded: a walk that goes well pays nothing for it.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job, first_tick, substeps
+from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import World
 
@@ -84,7 +86,7 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
         rows.append((height, roll, pitch, share, fallen))
         touching[:] = parts
 
-    trajectory = walk(config, robot, job, on_sample=append)
+    trajectory = walk(config, robot, job, build=partial(MujocoPlant, on_step=append))
     heights, rolls, pitches, torques, fallen = zip(*rows, strict=True)
     lead = (job.start_tick - first_tick(config)) * substeps(config)
     return Record(

@@ -7,15 +7,19 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import redirect_stdout
+from functools import partial
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import jax
 
 from hector_jax.control.controller import WalkConfig
+from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import choose
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
+from hector_jax.sim.plant import Plant
 from hector_jax.sim.walk import walk_many
 
 
@@ -25,7 +29,7 @@ class Engine(NamedTuple):
     `walk(pool, config, robot, jobs, *, exact, batch)` gives the trajectories of the jobs in their
     order, as they come:
 
-    - pool: worker processes, for an engine that walks on several.
+    - pool: worker processes, for an engine that walks on several; None walks in this one.
     - config, robot: the controller.
     - exact: samples of 1 ms and physics in 64 bits. Otherwise one sample per tick will do, and 32
       bits where they are faster.
@@ -36,10 +40,37 @@ class Engine(NamedTuple):
     name: str  # in flags, logs and cards
     walk: Callable[..., Iterator[Trajectory]]
     bits: Callable[[bool], int]  # of the physics, by `exact`
+    package: str = "mujoco"  # that it needs; the extra of its name installs it
+    differs: str = ""  # what its plants have otherwise than in MuJoCo C
+
+    @property
+    def installed(self) -> bool:
+        """Whether its package is there."""
+        return find_spec(self.package) is not None
 
 
-MUJOCO_C = Engine("c", walk_many, lambda exact: 64)
+def _double(exact: bool) -> int:
+    return 64
+
+
+MUJOCO_C = Engine("c", walk_many, _double)
 """MuJoCo C, one walk per process."""
+
+
+def _drake(job: Job, body: Robot, first: int, end: int) -> Plant:
+    from hector_jax.sim.drake import DrakePlant  # an extra
+
+    return DrakePlant(job, body, first, end)
+
+
+DRAKE = Engine(
+    "drake",
+    partial(walk_many, build=_drake),
+    _double,
+    package="pydrake",
+    differs="dry friction is smooth, a change of the plant lasts for the whole walk",
+)
+"""Drake, one walk per process: compliant contact, solved as a convex problem."""
 
 
 def _mjx_bits(exact: bool) -> int:
@@ -67,7 +98,7 @@ def _walk_mjx(
 MJX = Engine("mjx", _walk_mjx, _mjx_bits)
 """MuJoCo in JAX, all walks at once."""
 
-ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX)}
+ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX, DRAKE)}
 """Every engine by its name; whoever adds one adds it here."""
 
 
@@ -75,8 +106,14 @@ def choose_engine(name: str) -> Engine:
     """The engine of a name; `auto` is MJX where JAX sees an accelerator, MuJoCo C elsewhere.
 
     Raises:
-        InputError: no such engine.
+        InputError: no such engine, or its package is not installed.
     """
     if choose("engine", name, ("auto", *ENGINES)) == "auto":
         return MUJOCO_C if jax.default_backend() == "cpu" else MJX
-    return ENGINES[name]
+    engine = ENGINES[name]
+    if not engine.installed:
+        raise InputError(
+            f"engine {name} needs {engine.package}, which is not installed: "
+            f"pip install 'hector-jax[{name}]'"
+        )
+    return engine

@@ -2,13 +2,14 @@
 
 A walk starts with double stance under the MPC, then gait cycles in place; at t = 0 the reference is
 anchored at the true centre of mass and yaw. Per tick `plan_tick` solves the MPC, per millisecond
-`motor_torques` turns the plan into torques, the engine steps its physics, `contact_wrench` reads
-the contacts and `sample` says what became of the robot. An engine gives its coordinates as a flat
+`motor_torques` turns the plan into torques, the engine steps its physics and reads its
+contacts, and `sample` says what became of the robot. An engine gives its coordinates as a flat
 reading (`sensing.unpack_reading`); the continuous yaw is carried beside it.
 """
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -25,7 +26,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.actuators import Motors, step_actuators
 from hector_jax.sim.changes import Change
-from hector_jax.sim.sensing import Contacts, Touches
+from hector_jax.sim.sensing import Ground, Touches
 from hector_jax.sim.world import NO_PUSH, Imperfections, Push
 
 
@@ -161,24 +162,16 @@ def motor_torques(
     return motors, yaw, applied
 
 
-def contact_wrench(
-    robot: Robot,
-    before: Float[Array, " reading"],
-    contacts: Contacts,
-    floor: Int[Array, ""],
-    foot_of_geom: Int[Array, " ngeom"],
-) -> tuple[Wrench, Touches]:
-    """The ground's wrench over a millisecond, and what touches beside the feet and the floor.
+def effect_of(robot: Robot, before: Float[Array, " reading"], ground: Ground) -> Wrench:
+    """The ground's wrench over a millisecond, its moments about the foot points.
 
     Args:
         robot: nominal body.
         before: coordinates at its start.
-        contacts: found at its start; their forces act over it.
-        floor, foot_of_geom: from the World.
+        ground: what touched over it.
     """
-    foot, touches = sensing.foot_contacts(contacts, floor, foot_of_geom)
     points = sensing.foot_points(robot, sensing.unpack_reading(before))
-    return sensing.ground_wrench(contacts, foot, floor, points), touches
+    return Wrench(ground.force, ground.moment - jnp.cross(points, ground.force))
 
 
 def sample(

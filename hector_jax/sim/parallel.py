@@ -27,6 +27,7 @@ from hector_jax.control.controller import (
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
 from hector_jax.core.tree import stack, where
 from hector_jax.robot.mjcf import TIME_STEP
@@ -154,7 +155,8 @@ def _millisecond(
     wide = lambda x: x.astype(before.dtype) if x.dtype == data.qpos.dtype else x  # noqa: E731
     contacts = jax.tree.map(wide, mjx_model.mjx_contacts(data))
     place = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
-    effect, touches = loop.contact_wrench(robot, before, contacts, *place)
+    ground = sensing.ground_of(contacts, *place, len(robot.foot_point))
+    effect, touches = loop.effect_of(robot, before, ground), ground.touches
     reading = sensing.unpack_reading(_read(program, walk, physics))
     down = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
     fallen = carry.fallen | down | touches.floor | mjx_model.in_floor(places, walk.model, data)
@@ -281,10 +283,12 @@ def _check_batch(jobs: Sequence[Job]) -> None:
     if len({job.plant and job.plant.description for job in jobs}) > 1:
         raise ValueError("walks of one batch must be on plants of one model")
     if any(np.any(np.asarray(x)) for job in jobs for x in job.imperfections.estimator):
-        raise ValueError("a batch in MJX knows its state exactly: estimator errors must be zero")
+        raise InputError(
+            "engine mjx knows its state exactly: expected a plant whose estimator errs 0"
+        )
     changing = [i for i, job in enumerate(jobs) if job.changes]
     if changing:
-        raise ValueError(f"MJX walks plants that do not change: jobs {changing} have changes")
+        raise InputError(f"engine mjx: a plant cannot change, got changes of jobs {changing}")
 
 
 def _in_chunks(jobs: WalkBatch, chunk: int, walk: Any) -> Iterator[Trajectory]:
@@ -322,11 +326,11 @@ def walk_batch(
         The walks (numpy) in the order of their jobs, as their chunks are done.
 
     Raises:
-        InputError: the joints of the jobs' plant are not those of the robot.
+        InputError: the joints of the jobs' plant are not those of the robot, or a plant changes or
+            has errors of the estimator.
         ValueError: the jobs differ in their plant's model, in length, in the pieces of their
-            commands, in the number of their pushes or in their joints, have errors of the estimator
-            or changes, or a number of one is out of its range; or a geom that may touch the floor
-            has a shape unknown here.
+            commands, in the number of their pushes or in their joints, or a number of one is out of
+            its range; or a geom that may touch the floor has a shape unknown here.
     """
     if chunk is None:
         chunk = CPU_CHUNK if jax.default_backend() == "cpu" else DEVICE_CHUNK

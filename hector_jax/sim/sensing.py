@@ -16,7 +16,7 @@ from hector_jax.control.legs import Measurement
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import euler_from_rotation, rotation_from_quaternion, wrap_angle
 from hector_jax.core.headless import mujoco
-from hector_jax.core.trajectory import State, Wrench
+from hector_jax.core.trajectory import State
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
@@ -28,7 +28,7 @@ DRIFT_TIME = 4.0  # [s] after which the drift has its stated size
 
 
 class Reading(NamedTuple):
-    """MuJoCo's coordinates of the robot, whatever else the model has."""
+    """Coordinates of the robot, those of MuJoCo in every engine."""
 
     pose: Float[Array, "*batch 7"]  # trunk: position [m], quaternion
     velocity: Float[
@@ -44,6 +44,14 @@ class Touches(NamedTuple):
 
     floor: Bool[Array, "*batch"]  # the floor is touched by anything else
     legs: Bool[Array, "*batch"]  # one leg touches the other
+
+
+class Ground(NamedTuple):
+    """What the ground does to the feet over a millisecond."""
+
+    force: Float[Array, "*batch feet 3"]  # [N] on each foot, world frame
+    moment: Float[Array, "*batch feet 3"]  # [N m] about the world's origin
+    touches: Touches
 
 
 class Contacts(NamedTuple):
@@ -108,20 +116,17 @@ def foot_contacts(
     return foot, Touches(jnp.any(ground & (foot < 0)), jnp.any(real & ~ground))
 
 
-def ground_wrench(
-    contacts: Contacts,
-    foot: Int[Array, " n"],
-    floor: Int[Array, ""],
-    points: Float[Array, "feet 3"],
-) -> Wrench:
-    """Force [N] and moment [N m] of the ground on each foot at its foot point, world frame.
+def ground_of(
+    contacts: Contacts, floor: Int[Array, ""], foot_of_geom: Int[Array, " ngeom"], feet: int
+) -> Ground:
+    """What the contacts of a step of MuJoCo do to each of `feet` feet.
 
     Args:
         contacts: of the step; pyramidal cones of three dimensions.
-        foot: foot of each contact, from `foot_contacts`.
-        floor: the floor's geom.
-        points: foot points in the world [m] when the contacts were found.
+        floor, foot_of_geom: from the World.
+        feet: their number.
     """
+    foot, touches = foot_contacts(contacts, floor, foot_of_geom)
     p, mu = contacts.pyramid, contacts.friction
     local = jnp.stack(
         [p.sum(axis=1), mu[:, 0] * (p[:, 0] - p[:, 1]), mu[:, 1] * (p[:, 2] - p[:, 3])], axis=1
@@ -129,10 +134,10 @@ def ground_wrench(
     # MuJoCo's contact force acts on the second geom.
     sign = jnp.where(contacts.geoms[:, 1] == floor, -1.0, 1.0)
     force = sign[:, None] * jnp.einsum("nij,ni->nj", contacts.frame, local)
-    mine = (foot[None, :] == jnp.arange(len(points))[:, None])[..., None]  # (feet, n, 1)
-    lever = contacts.position - points[:, None]
+    mine = (foot[None, :] == jnp.arange(feet)[:, None])[..., None]  # (feet, n, 1)
     at_foot = jnp.where(mine, force, 0.0)
-    return Wrench(at_foot.sum(axis=1), jnp.cross(lever, at_foot).sum(axis=1))
+    moment = jnp.cross(contacts.position, at_foot).sum(axis=1)
+    return Ground(at_foot.sum(axis=1), moment, touches)
 
 
 def read_contacts(world: World, data: mujoco.MjData, out: Contacts, row: int) -> None:

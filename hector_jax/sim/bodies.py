@@ -1,0 +1,167 @@
+"""The bodies of a world as plain numbers, for engines that do not read a MuJoCo model.
+
+A world's model already holds every number of its plant (masses, friction, armature, backlash as
+second hinges), so that an engine that takes its bodies from here has the same plant.
+"""
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.sim.world import World
+
+_SHAPES = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+}
+
+
+class Hinge(NamedTuple):
+    """A joint that turns its body about an axis through the body's origin."""
+
+    name: str
+    axis: Float[np.ndarray, "3"]  # body frame
+    qpos: int  # its place in MuJoCo's coordinates
+    dof: int  # and in its velocities
+    damping: float  # [N m s/rad]
+    armature: float  # [kg m2]
+    friction: float  # [N m] dry
+    limits: tuple[float, float]  # [rad], infinite where there are none
+
+
+class Body(NamedTuple):
+    """A rigid body; at zero angles its frame is fixed in that of its parent."""
+
+    id: int  # of MuJoCo
+    name: str
+    parent: int  # 0: the world, of which the trunk is free
+    position: Float[np.ndarray, "3"]  # [m] in the parent's frame
+    rotation: Float[np.ndarray, "3 3"]
+    mass: float  # [kg]
+    com: Float[np.ndarray, "3"]  # [m] body frame
+    inertia: Float[np.ndarray, "3 3"]  # [kg m2] about the centre of mass, body frame
+    hinges: tuple[Hinge, ...]  # of a leg's link: the motor's and then, with backlash, the gear's
+
+
+class Shape(NamedTuple):
+    """A geom that may touch something."""
+
+    id: int  # of MuJoCo
+    body: int  # 0: the floor, which is the plane z = 0
+    kind: str  # plane, sphere, capsule along z, box
+    size: Float[np.ndarray, "3"]  # [m] as MuJoCo's: radius, half length; half edges
+    position: Float[np.ndarray, "3"]  # [m] body frame
+    rotation: Float[np.ndarray, "3 3"]
+
+
+def rotation_of(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Rotation of a quaternion (w, x, y, z)."""
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, quaternion)
+    return R.reshape(3, 3)
+
+
+def bodies(world: World) -> list[Body]:
+    """The robot's bodies, parents before their children."""
+    return [_body(world.model, i) for i in range(1, world.model.nbody)]
+
+
+def _body(model: mujoco.MjModel, i: int) -> Body:
+    R = rotation_of(model.body_iquat[i])
+    first, count = model.body_jntadr[i], model.body_jntnum[i]
+    hinges = (_hinge(model, j) for j in range(first, first + count) if model.jnt_type[j])
+    return Body(
+        id=i,
+        name=model.body(i).name,
+        parent=int(model.body_parentid[i]),
+        position=model.body_pos[i],
+        rotation=rotation_of(model.body_quat[i]),
+        mass=float(model.body_mass[i]),
+        com=model.body_ipos[i],
+        inertia=R @ np.diag(model.body_inertia[i]) @ R.T,
+        hinges=tuple(hinges),
+    )
+
+
+def _hinge(model: mujoco.MjModel, j: int) -> Hinge:
+    dof = model.jnt_dofadr[j]
+    limits = model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf)
+    return Hinge(
+        name=model.joint(j).name,
+        axis=model.jnt_axis[j],
+        qpos=int(model.jnt_qposadr[j]),
+        dof=int(dof),
+        damping=float(model.dof_damping[dof]),
+        armature=float(model.dof_armature[dof]),
+        friction=float(model.dof_frictionloss[dof]),
+        limits=(float(limits[0]), float(limits[1])),
+    )
+
+
+def shapes(world: World) -> list[Shape]:
+    """The geoms that may touch something, the floor among them."""
+    model, pairs = world.model, touching_pairs(world)
+    ids = sorted({geom for pair in pairs for geom in pair})
+    return [
+        Shape(
+            id=i,
+            body=int(model.geom_bodyid[i]),
+            kind="plane" if i == world.floor else _SHAPES[mujoco.mjtGeom(model.geom_type[i])],
+            size=model.geom_size[i],
+            position=model.geom_pos[i],
+            rotation=rotation_of(model.geom_quat[i]),
+        )
+        for i in ids
+    ]
+
+
+def touching_pairs(world: World) -> set[tuple[int, int]]:
+    """Pairs of geoms (the smaller id first) that may touch, by the bits of the model."""
+    type_, mask, body = (
+        world.model.geom_contype,
+        world.model.geom_conaffinity,
+        world.model.geom_bodyid,
+    )
+    return {
+        (a, b)
+        for a, b in combinations(range(world.model.ngeom), 2)
+        if (type_[a] & mask[b] or type_[b] & mask[a]) and body[a] != body[b]
+    }
+
+
+class Spring(NamedTuple):
+    """A contact's give in numbers that every engine understands."""
+
+    stiffness: float  # [N/m] at each point that touches
+    damping: float  # [s/m] of Hunt and Crossley: force = stiffness * sink * (1 + damping * speed)
+
+
+def contact_spring(world: World, points: int) -> Spring:
+    """The spring and damper under each of some points, all of which carry the robot standing.
+
+    A contact of time constant T gives way under the robot's weight by g T^2 / 3, which is what
+    MuJoCo's does (measured: 0.31 to 0.47 mm at 10 ms), and its damper is 2 / (g T).
+    """
+    time, mass = world.model.geom_solref[world.floor, 0], world.model.body_subtreemass[0]
+    gravity = np.linalg.norm(world.model.opt.gravity)
+    return Spring(float(3.0 * mass / time**2 / points), float(2.0 / (gravity * time)))
+
+
+STICTION = 0.05  # [rad/s] from which on dry friction has its full size
+
+
+def dry_friction(
+    hinges: list[Hinge],
+) -> tuple[Float[np.ndarray, " hinges"], Float[np.ndarray, " hinges"]]:
+    """Size [N m] and speed [rad/s] of dry friction as a torque -size tanh(rate / speed).
+
+    The speed is `STICTION` or, where that would not be stable over a step, as much larger.
+    """
+    size = np.array([hinge.friction for hinge in hinges])
+    inertia = np.array([hinge.armature for hinge in hinges])
+    return size, np.maximum(STICTION, size * TIME_STEP / np.maximum(inertia, 1e-9))

@@ -1,0 +1,248 @@
+# pyright: reportMissingImports=false
+"""A plant in Drake: compliant contact at points, solved as a convex problem (the extra `drake`).
+
+It is built from a world's bodies, not by Drake's own reader of MJCF, which reads two joints on one
+body wrong and leaves out contact bits and dry friction. A link with a gear's backlash hangs on a
+body of a milligram between its two hinges. Dry friction is a torque of ours: Drake has none.
+"""
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float
+from pydrake.geometry import (
+    AddContactMaterial,
+    Box,
+    Capsule,
+    CollisionFilterDeclaration,
+    GeometrySet,
+    HalfSpace,
+    ProximityProperties,
+    SceneGraph,
+    Sphere,
+)
+from pydrake.geometry import Shape as DrakeShape
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    DiscreteContactApproximation,
+    MultibodyPlant,
+)
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    RevoluteJoint,
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.robot.model import Robot
+from hector_jax.sim import bodies
+from hector_jax.sim.bodies import Body, Shape
+from hector_jax.sim.loop import Job
+from hector_jax.sim.plant import LEGS, OTHER, PointContacts, lasting_world
+from hector_jax.sim.sensing import Ground
+from hector_jax.sim.world import World, standing_qpos
+
+_BETWEEN = 1e-6  # [kg] of the body between a motor's hinge and a gear's
+
+
+@contextmanager
+def _quiet_drake() -> Iterator[None]:
+    """Without the warning that deformable bodies, of which there are none, miss half spaces."""
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+class DrakePlant:
+    """A `Plant` in Drake; its world is the same from the walk's start to its end."""
+
+    def __init__(self, job: Job, body: Robot, first: int, end: int) -> None:
+        """Build as a `BuildPlant` does."""
+        world = lasting_world("drake", job, body, first, end)
+        builder = DiagramBuilder()
+        plant, scene = AddMultibodyPlantSceneGraph(builder, TIME_STEP)
+        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+        plant.mutable_gravity_field().set_gravity_vector(world.model.opt.gravity)
+        links, joints = _add_bodies(plant, bodies.bodies(world))
+        with _quiet_drake():
+            _add_shapes(plant, scene, links, world)
+        plant.Finalize()
+        self._simulator = Simulator(builder.Build())
+        self.context = plant.GetMyMutableContextFromRoot(self._simulator.get_mutable_context())
+        self.plant, self._trunk = plant, links[world.trunk]
+        self._com = np.array(world.model.body_ipos[world.trunk])
+        self._foot_of_body = {
+            int(links[world.model.geom_bodyid[geom]].index()): int(foot)
+            for geom, foot in enumerate(world.foot_of_geom)
+            if foot >= 0
+        }
+        self._contacts, self._time, self._failed = PointContacts(len(body.foot_point)), 0, False
+        self._joints = joints
+        self._index(world, joints)
+        self.stand(standing_qpos(world, body.standing_joints, float(body.trunk_height)))
+
+    def _index(self, world: World, joints: Mapping[int, RevoluteJoint]) -> None:
+        """Find out where Drake has what."""
+        nq, nv = self.plant.num_positions(), self.plant.num_velocities()
+        motors = [joints[dof] for dof in world.joint_dof]
+        slack = [joints[world.model.jnt_dofadr[j]].position_start() for j in world.slack]
+        base = self._trunk.floating_positions_start()
+        self._base_rates = self._trunk.floating_velocities_start_in_v()
+        self._motors = np.array([joint.velocity_start() for joint in motors])
+        self._where = np.concatenate(
+            [
+                base + np.r_[4:7, 0:4],
+                nq + self._base_rates + np.r_[3:6, 0:3],
+                [joint.position_start() for joint in motors],
+                nq + self._motors,
+                slack or np.full(len(motors), nq + nv),
+            ]
+        ).astype(int)
+        hinges = [hinge for body in bodies.bodies(world) for hinge in body.hinges]
+        by_velocity = sorted(hinges, key=lambda hinge: joints[hinge.dof].velocity_start())
+        self._hinges = np.array([joints[hinge.dof].velocity_start() for hinge in by_velocity])
+        self._friction, self._stiction = bodies.dry_friction(by_velocity)
+        self._state, self._force = np.zeros(nq + nv + 1), np.zeros(nv)
+        port = self.plant.get_applied_generalized_force_input_port()
+        self._input = port.FixValue(self.context, self._force).GetMutableData()
+        self._rates = nq
+
+    def stand(self, qpos: Float[np.ndarray, " nq"]) -> None:
+        """Take up the coordinates of a MuJoCo model of this world, at rest."""
+        pose = RigidTransform(RotationMatrix(bodies.rotation_of(qpos[3:7])), qpos[:3])
+        self.plant.SetFreeBodyPose(self.context, self._trunk, pose)
+        for dof, joint in self._joints.items():
+            joint.set_angle(self.context, qpos[dof + 1])  # the trunk's quaternion has one more
+        self._simulator.Initialize()
+        self._look()
+
+    def _look(self) -> None:
+        self._state[:-1] = self.plant.GetPositionsAndVelocities(self.context)
+
+    @property
+    def broken(self) -> bool:
+        """Whether Drake's solver failed."""
+        return self._failed
+
+    def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
+        """See `Plant`."""
+        rates, force = self._state[self._rates : -1], self._force
+        force[:] = 0.0
+        force[self._hinges] = -self._friction * np.tanh(rates[self._hinges] / self._stiction)
+        force[self._motors] += torque
+        if push.any():
+            lever = bodies.rotation_of(self._state[self._where[3:7]]) @ self._com
+            force[self._base_rates : self._base_rates + 6] = *np.cross(lever, push), *push
+        self._input.set_value(force)
+        self._time += 1
+        try:
+            # a time of whole steps: a sum of steps drifts, and a step is made twice or not at all
+            if not self._failed:
+                self._simulator.AdvanceTo(self._time * TIME_STEP)
+        except RuntimeError:
+            self._failed = True
+        self._look()
+        self._note_contacts()
+        self._contacts.end_step()
+
+    def _note_contacts(self) -> None:
+        contacts = self.plant.get_contact_results_output_port().Eval(self.context)
+        for i in range(contacts.num_point_pair_contacts()):
+            info = contacts.point_pair_contact_info(i)
+            one, other = int(info.bodyA_index()), int(info.bodyB_index())
+            force = info.contact_force() if other else -info.contact_force()  # 0 is the world
+            foot = LEGS if one and other else self._foot_of_body.get(one or other, OTHER)
+            self._contacts.note(foot, force, info.contact_point())
+
+    def read(self, row: Float[np.ndarray, " reading"]) -> None:
+        """See `Plant`."""
+        self._state.take(self._where, out=row)
+        row[3:7] /= np.linalg.norm(row[3:7])  # Drake lets it drift
+        row[10:13] = row[10:13] @ bodies.rotation_of(row[3:7])  # into the trunk's frame
+
+    def ground(self) -> Ground:
+        """See `Plant`."""
+        return self._contacts.ground()
+
+
+def _add_bodies(
+    plant: MultibodyPlant, robot: list[Body]
+) -> tuple[dict[int, RigidBody], dict[int, RevoluteJoint]]:
+    """Links by MuJoCo's number of the body, and joints by that of the degree of freedom."""
+    links, joints = {0: plant.world_body()}, {}
+    for body in robot:
+        parent = links[body.parent]
+        place = RigidTransform(RotationMatrix(body.rotation), body.position)
+        links[body.id] = link = plant.AddRigidBody(body.name, _inertia(body))
+        for hinge in body.hinges:
+            child = link
+            if hinge is not body.hinges[-1]:
+                ball = UnitInertia.SolidSphere(0.01)
+                small = SpatialInertia(_BETWEEN, np.zeros(3), ball)
+                child = plant.AddRigidBody(f"{hinge.name} side", small)
+            name = hinge.name
+            anchor = FixedOffsetFrame(f"{name} anchor", parent.body_frame(), place)
+            frames = plant.AddFrame(anchor), child.body_frame()
+            joint = RevoluteJoint(name, *frames, hinge.axis, hinge.damping)
+            joints[hinge.dof] = joint = plant.AddJoint(joint)
+            joint.set_position_limits([hinge.limits[0]], [hinge.limits[1]])
+            plant.AddJointActuator(name, joint).set_default_rotor_inertia(hinge.armature)
+            parent, place = child, RigidTransform()
+    return links, joints
+
+
+def _inertia(body: Body) -> SpatialInertia:
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia
+    central = RotationalInertia(xx, yy, zz, xy, xz, yz)
+    return SpatialInertia.MakeFromCentralInertia(body.mass, body.com, central)
+
+
+def _add_shapes(
+    plant: MultibodyPlant, scene: SceneGraph, links: Mapping[int, RigidBody], world: World
+) -> None:
+    """Geoms that may touch something, and which of them may touch which."""
+    shapes, places = bodies.shapes(world), {}
+    soles = {s.id for s in shapes if s.kind == "sphere" and world.foot_of_geom[s.id] >= 0}
+    spring = bodies.contact_spring(world, len(soles))
+    for shape in shapes:
+        rough = shape.id == world.floor or shape.id in soles  # nothing else rubs
+        friction = world.model.geom_friction[world.floor, 0] * rough
+        properties = ProximityProperties()
+        # two springs in a row have half the stiffness of one
+        stiffness, cone = 2.0 * spring.stiffness, CoulombFriction(friction, friction)
+        AddContactMaterial(spring.damping, stiffness, cone, properties)
+        place = RigidTransform(RotationMatrix(shape.rotation), shape.position)
+        places[shape.id] = plant.RegisterCollisionGeometry(
+            links[shape.body], place, _shape(shape), str(shape.id), properties
+        )
+    touching, apart = bodies.touching_pairs(world), CollisionFilterDeclaration()
+    for pair in combinations(sorted(places), 2):
+        if pair not in touching:
+            apart.ExcludeBetween(*(GeometrySet(places[geom]) for geom in pair))
+    scene.collision_filter_manager().Apply(apart)
+
+
+def _shape(shape: Shape) -> DrakeShape:
+    match shape.kind:
+        case "plane":
+            return HalfSpace()
+        case "sphere":
+            return Sphere(shape.size[0])
+        case "capsule":
+            return Capsule(shape.size[0], 2.0 * shape.size[1])
+        case _:
+            return Box(*(2.0 * shape.size))

@@ -1,0 +1,80 @@
+"""A plant in MuJoCo C."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.core.headless import mujoco
+from hector_jax.robot.model import Robot
+from hector_jax.sim import sensing
+from hector_jax.sim.changes import worlds_by_step
+from hector_jax.sim.loop import Job
+from hector_jax.sim.sensing import Contacts, Ground
+from hector_jax.sim.world import World, build_world, standing_qpos
+
+
+@partial(jax.jit, static_argnames="feet")
+def _ground(contacts: Contacts, floor, foot_of_geom, feet: int) -> Ground:
+    of_one = partial(sensing.ground_of, feet=feet)
+    return jax.vmap(of_one, in_axes=(0, None, None))(contacts, floor, foot_of_geom)
+
+
+class MujocoPlant:
+    """A `Plant` in MuJoCo C; the only one that a `Change` can meet on the way."""
+
+    def __init__(
+        self,
+        job: Job,
+        body: Robot,
+        first: int,
+        end: int,
+        *,
+        on_step: Callable[[World, mujoco.MjData], None] | None = None,
+    ) -> None:
+        """Build as a `BuildPlant` does.
+
+        `on_step` is called after each step with the world of that moment.
+        """
+        world = self.world = build_world(job.imperfections, body.description)
+        self.data = mujoco.MjData(world.model)
+        self.data.qpos[:] = standing_qpos(world, body.standing_joints, float(body.trunk_height))
+        self._contacts, self._steps = sensing.empty_contacts(end - first), 0
+        self._now, self._where = first, sensing.coordinates(world)
+        self._place = jax.device_put((np.array(world.floor), world.foot_of_geom))
+        self._feet, self._on_step = len(body.foot_point), on_step
+        self._worlds = worlds_by_step(world, job.changes, first, end)
+        # views, which stay: each look-up in MjData costs half a microsecond
+        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
+        self._push = self.data.xfrc_applied[world.trunk, :3]
+        self._flat = np.zeros(len(self._qpos) + len(self._qvel) + 1)
+
+    @property
+    def broken(self) -> bool:
+        """Whether MuJoCo warned."""
+        return bool(self.data.warning.number.any())
+
+    def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
+        """See `Plant`."""
+        world = self.world = self._worlds.get(self._now, self.world)
+        self._ctrl[world.actuator] = torque
+        self._push[:] = push
+        mujoco.mj_step(world.model, self.data)
+        sensing.read_contacts(world, self.data, self._contacts, self._steps)
+        self._now, self._steps = self._now + 1, self._steps + 1
+        if self._on_step is not None:
+            self._on_step(world, self.data)
+
+    def read(self, row: Float[np.ndarray, " reading"]) -> None:
+        """See `Plant`."""
+        split = len(self._qpos)
+        self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
+        self._flat.take(self._where, out=row, mode="clip")
+
+    def ground(self) -> Ground:
+        """See `Plant`."""
+        contacts = Contacts(*(x[: self._steps] for x in self._contacts))
+        self._steps = 0
+        return _ground(contacts, *self._place, feet=self._feet)

@@ -1,0 +1,134 @@
+"""Drake against MuJoCo C: the same masses, the same weight, nearly the same walk."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hector_jax.control.controller import walk_config
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import load_weights
+from hector_jax.core.headless import mujoco
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.model import load_robot
+from hector_jax.runs.metrics import score
+from hector_jax.sim import bodies
+from hector_jax.sim.changes import Change
+from hector_jax.sim.loop import Job
+from hector_jax.sim.mujoco_plant import MujocoPlant
+from hector_jax.sim.walk import walk
+from hector_jax.sim.world import Push, build_world, hfs, ideal
+from hector_jax.tuning.loss import PAPER_LOSS
+
+pytest.importorskip("pydrake", reason="the extra drake is not installed")
+from hector_jax.sim.drake import DrakePlant  # noqa: E402
+
+HECTOR = load_robot()
+CONFIG = walk_config(HECTOR)
+NAMES = ("mean-of-all", "c-alone")
+ROOT = Path(__file__).parents[1]
+FILES = [None, *(ROOT / "examples" / name / "robot.toml" for name in ("humanoid", "quadruped"))]
+
+
+def job(imperfections, seconds=1.0, weights=None, traj="s", **others):
+    command = named_command(traj)
+    return Job(weights or expert(), command, imperfections, seconds, **others)
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize(("backlash", "close"), [(0.0, 1e-12), (0.005, 1e-4)])
+def test_the_mass_matrix_is_that_of_mujoco(file, backlash, close):
+    robot = load_robot(file)
+    plant = hfs(robot.description)._replace(backlash=np.asarray(backlash))
+    world, rng = build_world(plant, robot.description), np.random.default_rng(0)
+    drake = DrakePlant(job(plant), robot, 0, 1)
+    model, data = world.model, mujoco.MjData(world.model)
+    hinges = [drake.plant.GetJointByName(model.joint(j).name) for j in range(1, model.njnt)]
+    # MuJoCo's trunk: linear, then angular in its own frame; Drake's: angular in the world's, linear
+    order = [3, 4, 5, 0, 1, 2, *(hinge.velocity_start() for hinge in hinges)]
+    for _ in range(20):
+        data.qpos[:] = rng.uniform(-1.0, 1.0, model.nq)
+        data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+        mujoco.mj_forward(model, data)
+        ours, turn = np.zeros((model.nv, model.nv)), np.eye(model.nv)
+        mujoco.mj_fullM(model, data, ours)
+        turn[3:6, 3:6] = bodies.rotation_of(data.qpos[3:7]).T
+        drake.stand(data.qpos)
+        theirs = drake.plant.CalcMassMatrix(drake.context)[np.ix_(order, order)]
+        np.testing.assert_allclose(theirs, turn.T @ ours @ turn, atol=close * np.abs(ours).max())
+
+
+def held(plant, robot, milliseconds):
+    """Force on the feet while a stiff robot stands (milliseconds, 3)."""
+    joints, row = len(robot.joint_lower), np.zeros(13 + 3 * len(robot.joint_lower))
+    for _ in range(milliseconds):
+        plant.read(row)
+        angles, rates = row[13 : 13 + joints], row[13 + joints : 13 + 2 * joints]
+        plant.step(400.0 * (robot.standing_joints - angles) - 10.0 * rates, np.zeros(3))
+    return np.asarray(plant.ground().force).sum(axis=1)
+
+
+def test_the_feet_carry_the_weight():
+    force = held(DrakePlant(job(ideal()), HECTOR, 0, 2000), HECTOR, 2000)
+    weight = 9.81 * float(HECTOR.mass)
+    np.testing.assert_allclose(force[-500:].mean(axis=0), [0.0, 0.0, weight], atol=1e-3 * weight)
+
+
+def test_on_a_slope_the_weight_is_tilted():
+    sloping = job(ideal(), changes=(Change(slope=(0.05, 0.0)),))
+    force = held(DrakePlant(sloping, HECTOR, 0, 2000), HECTOR, 2000)
+    weight = 9.81 * float(HECTOR.mass)
+    np.testing.assert_allclose(force[-500:, 0].mean(), weight * np.sin(0.05), rtol=0.05)
+
+
+@pytest.mark.parametrize("plant", [ideal(), hfs()])
+def test_a_second_of_walking_is_nearly_that_of_mujoco(plant):
+    walks = [walk(CONFIG, HECTOR, job(plant), build=one) for one in (MujocoPlant, DrakePlant)]
+    ours, theirs = (score(PAPER_LOSS, one) for one in walks)
+    assert not theirs.fallen
+    assert theirs.L == pytest.approx(ours.L, rel=0.25)
+    # what the ground gives and what the robot weighs
+    carried = [np.asarray(one.effect.force)[:, :, 2].sum(axis=1).mean() for one in walks]
+    assert carried[1] == pytest.approx(carried[0], rel=0.01)
+    # moments are about the foot points, as in MuJoCo: a line foot carries little of them
+    assert np.abs(walks[1].effect.moment).mean() < 2.0 * np.abs(walks[0].effect.moment).mean()
+
+
+def test_a_walk_is_the_same_each_time():
+    pushed = job(hfs(), 0.2, push=Push(np.array([[0.0, 40.0, 0.0]]), np.zeros(1), np.full(1, 0.1)))
+    one, again = (walk(CONFIG, HECTOR, pushed, build=DrakePlant) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, one, again)
+    free = walk(CONFIG, HECTOR, job(hfs(), 0.2), build=DrakePlant)
+    there = walk(CONFIG, HECTOR, pushed, build=MujocoPlant)
+    free_there = walk(CONFIG, HECTOR, job(hfs(), 0.2), build=MujocoPlant)
+    gained, expected = (
+        (a.state.velocity - b.state.velocity)[100, 1] for a, b in ((one, free), (there, free_there))
+    )
+    assert gained == pytest.approx(expected, rel=0.1)
+
+
+def test_a_change_on_the_way_is_refused_in_one_line():
+    late = job(ideal(), changes=(Change(start=0.5, payload=2.0),))
+    with pytest.raises(InputError, match="engine drake: a plant cannot change during a walk"):
+        walk(CONFIG, HECTOR, late, build=DrakePlant)
+
+
+def test_a_fall_is_a_fall():
+    hard = Push(np.array([[0.0, 400.0, 0.0]]), np.zeros(1), np.full(1, 0.2))
+    walked = walk(CONFIG, HECTOR, job(ideal(), push=hard), build=DrakePlant)
+    assert walked.fallen[-1]
+    assert not walked.fallen[0]
+
+
+@pytest.mark.slow
+def test_four_sets_rank_as_in_mujoco():
+    folder = ROOT / "docs" / "batch" / "shared" / "weights"
+    sets = [nominal(), expert(), *(load_weights(folder / f"{n}.json") for n in NAMES)]
+    ranks = [
+        np.argsort([score(PAPER_LOSS, walk(CONFIG, HECTOR, one, build=build)).L for one in jobs])
+        for build in (MujocoPlant, DrakePlant)
+        for jobs in [[job(ideal(), 4.0, weights) for weights in sets]]
+    ]
+    np.testing.assert_array_equal(*ranks)
