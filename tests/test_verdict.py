@@ -113,7 +113,10 @@ def test_the_worst_walk_is_named():
 def test_what_holds_everywhere_is_claimed_and_what_does_not_is_not():
     claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell()})
     assert "`with` is below nominal in 2 of 2 cells, the interval clear of zero in 2." in claims
-    assert "In these engines and models its loss is lower than that of nominal." in claims
+    assert (
+        "Its loss is lower than that of nominal in every engine and model that has walked here."
+        in claims
+    )
     assert "in 1 of 1 case: the gain does not rest on one engine." in claims
     assert "All columns order the sets by their median L in the same way" in claims
     claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell(tuned=5e6)})
