@@ -30,7 +30,7 @@ def walk_rigid(pool, config, robot, jobs, *, exact=True, batch=0):
         yield jax.device_get(walked(rollout_config, robot, *known))
 
 
-RIGID = Engine("rigid", walk_rigid, lambda exact: 64)
+RIGID = Engine("rigid", "rigid body", walk_rigid, lambda exact: 64)
 
 
 def test_an_engine_is_added_in_one_place(monkeypatch):
@@ -58,9 +58,9 @@ def test_an_unknown_engine_is_refused_by_name():
 
 
 def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(ENGINES, "drake", ENGINES["drake"]._replace(package="no_such_package"))
+    monkeypatch.setitem(ENGINES, "drake", ENGINES["drake"]._replace(package="no-such-package"))
     expected = (
-        r"drake needs no_such_package, which is not installed: pip install 'hector-jax\[drake\]'"
+        r"drake needs no-such-package, which is not installed: pip install 'hector-jax\[drake\]'"
     )
     with pytest.raises(InputError, match=expected):
         choose_engine("drake")

@@ -22,6 +22,7 @@ from hector_jax.robot.description import PlantSizes
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import verdicts
 from hector_jax.sim import parallel
+from hector_jax.sim import walk as sim_walk
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.parallel import walk_batch
@@ -136,12 +137,12 @@ def test_the_command_line_takes_the_plant_and_names_it(monkeypatch, capsys, tmp_
             jobs.append((robot, job))
             yield pretend_walk(job.seed)
 
-    def walk_one(config, robot, job):
+    def walk_one(config, robot, job, **others):
         jobs.append((robot, job))
         return pretend_walk()
 
     monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
-    monkeypatch.setattr(arguments, "walk", walk_one)
+    monkeypatch.setattr(sim_walk, "walk", walk_one)
     words = ["evaluate", "--plant", ARMS, "--world", "hfs", "--out", tmp_path / "result.json"]
     assert call(monkeypatch, *words) == 0
     assert "straight, 1 plant of hector-v2-arms on the hfs" in capsys.readouterr().out

@@ -68,7 +68,7 @@ def examine() -> tuple[dict[str, str], list[str]]:
         faults.append("JAX computes in 32 bits")
     facts["cache"] = str(cache_folder())
     facts["engines"] = ", ".join(
-        f"{name}: {'yes' if engine.installed else 'no'}" for name, engine in ENGINES.items()
+        f"{name}: {engine.version or 'no'}" for name, engine in ENGINES.items()
     )
     facts["extras"] = ", ".join(
         f"{name}: {'yes' if find_spec(package) else 'no'} (for {use})"

@@ -41,10 +41,7 @@ from hector_jax.tuning.loss import Loss, loss_of_robot
 
 def evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
-    robot, engine = (
-        arguments.with_gait(load_robot(args.robot), args.gait),
-        choose_engine(args.engine),
-    )
+    robot = arguments.with_gait(load_robot(args.robot), args.gait)
     plant, course = arguments.plant_of(args.plant, robot), arguments.course(args.traj, robot)
     seconds = arguments.seconds(args.seconds, course)
     # ideal and hfs are one plant each, without chance
@@ -52,19 +49,20 @@ def evaluate(args: Evaluate) -> None:
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights(text, robot) for text in args.weights}
     plants = arguments.plants(args.world, seeds, (plant or robot).description)
-    config = tunings.tune_config(robot)
+    config, engine = tunings.tune_config(robot), choose_engine(args.engine)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
         inputs = pool, config, robot, sets, course.command, plants, seeds
         walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
-    result = metrics.as_result(verdict, args.world) | {"engine": engine.name}
-    what = f"{course.name}, {plural(count, 'plant')}"
+    result, what = (
+        metrics.as_result(verdict, args.world),
+        f"{course.name}, {plural(count, 'plant')}",
+    )
+    result["engine"] = engine.name
     if plant is not None:
         result["plant"] = plant.description.name
         what += f" of {plant.description.name}"
-    if engine is not MUJOCO_C:
-        what += f" in engine {engine.name}"
     if args.out is not None:
         write_json(args.out, result)
     names = arguments.short_names(args.weights)

@@ -52,7 +52,7 @@ class Plan(NamedTuple):
 
     @property
     def differs(self) -> dict[str, str]:
-        """What plants of each engine have otherwise than in MuJoCo C, where there is something."""
+        """What plants have otherwise in each engine than in MuJoCo C."""
         return {name: engine.differs for name, engine in self.engines.items() if engine.differs}
 
 
@@ -137,7 +137,7 @@ def _installed(tell: Callable[[str], None]) -> dict[str, Engine]:
         try:
             engines[name] = choose_engine(name)
         except InputError as error:
-            tell(f"without {report.ENGINES[name]}: {error}")
+            tell(f"left out: {error}")
     return engines
 
 
@@ -174,12 +174,14 @@ def _sets(args: Verdict, robot: Robot, courses: Mapping[str, Any]) -> dict[str, 
 
 
 def _in_words(plan: Plan) -> str:
-    """How many walks there are to be, and what plants have otherwise in an engine."""
+    """How many walks there are to be, and what engines cannot have."""
     each = len(plan.courses) * len(next(iter(plan.sets.values())))
     texts = [f"{report.title_of(column)} ({len(seeds)})" for column, seeds in plan.columns.items()]
     text = f"{plural(each * sum(map(len, plan.columns.values())), 'walk')}: {each} on each plant"
     text += f"; plants: {', '.join(texts)}"
-    return text + "".join(f"; in {report.ENGINES[n]} {what}" for n, what in plan.differs.items())
+    for name, what in plan.differs.items():
+        text += f"; in {report.TITLES[name]} {what}"
+    return text
 
 
 def walk_cells(
@@ -188,7 +190,7 @@ def walk_cells(
     """All walks, engine by engine; those whose scores are in the folder are not walked again."""
     scores: dict[tuple[Column, str, str, int], verdicts.ScoredWalk] = {}
     for name, engine in plan.engines.items():
-        jobs, title = _jobs(plan, name), f"walking in {report.ENGINES[name]}"
+        jobs, title = _jobs(plan, name), f"walking in {report.TITLES[name]}"
         inputs = pool, config, plan.robot, {case: job for case, job in jobs.values()}
         found = verdicts.score_jobs(
             *inputs, title=title, folder=folder, commit=commit, engine=engine

@@ -19,15 +19,16 @@ from hector_jax.report.report import (
 from hector_jax.runs import columns
 from hector_jax.runs.columns import OWN, Cells, Column
 from hector_jax.runs.metrics import BASELINES, FEWEST, Interval, compare
+from hector_jax.sim.engine import ENGINES
 
-ENGINES = {"c": "MuJoCo C", "mjx": "MJX", "drake": "Drake", "dart": "DART"}
+TITLES = {name: engine.title for name, engine in ENGINES.items()}
 _COARSE = 8  # fewer plants have a coarse interval
 LEARNED_FROM = ("c", "mjx")  # engines whose walks nets and searches of this project use
 
 
 def title_of(column: Column) -> str:
     """A column in words: its engine, and its model where it is not the robot's own."""
-    engine = ENGINES.get(column.engine, column.engine)
+    engine = TITLES.get(column.engine, column.engine)
     return engine if column.model == OWN else f"{engine}, {column.model}"
 
 
@@ -57,7 +58,7 @@ def limits(cells: Cells, differs: Mapping[str, str], family: str) -> list[str]:
 
     Args:
         cells: the walks.
-        differs: what plants of an engine have otherwise than in MuJoCo C, by its name.
+        differs: what plants have otherwise in an engine than in MuJoCo C, by its name.
         family: of the plants.
     """
     return _lines("limits.txt.j2", cells, differs, family)
@@ -79,12 +80,12 @@ def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str)
         agreements=columns.agreements(cells),
         cell_text=cell_text,
         engines=list(dict.fromkeys(column.engine for column in every)),
-        ENGINES=ENGINES,
+        ENGINES=TITLES,
         falls={name: columns.falls(cells, name) for name in names},
         family=family,
-        differs=differs,
         coarse=[c for c, verdict in verdicts.items() if FEWEST <= len(verdict.seeds) < _COARSE],
         few=[c for c, verdict in verdicts.items() if len(verdict.seeds) < FEWEST],
+        differs=differs,
         LEARNED_FROM=LEARNED_FROM,
         models=list(dict.fromkeys(column.model for column in every)),
         pairs=pairs,
@@ -155,7 +156,7 @@ def write_report(
         folder: where to.
         cells: the walks.
         family: of the plants.
-        differs: what plants of an engine have otherwise than in MuJoCo C, by its name.
+        differs: what plants have otherwise in an engine than in MuJoCo C, by its name.
         config: the flags, as JSON values.
         environment: versions and machine.
         command: that makes the report again.

@@ -31,7 +31,7 @@ from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import rollout, rollout_config
 
 # modules that decide the numbers, for `content_key`
-_CODE = ("sim.engine", "sim.walk", "sim.diagnosis", "runs.metrics")
+_CODE = ("sim.diagnosis", "runs.metrics")
 
 Case = tuple[str, int]
 """A set, with what else tells its walk from others on the same plant, and a seed."""
@@ -94,7 +94,7 @@ def _score_walk(
 ) -> ScoredWalk:
     up, text = int(np.sum(~np.asarray(walk.fallen))), ""
     upright = up * float(walk.period)
-    if not up and engine is MUJOCO_C:  # in which the fall is looked at once more
+    if not up:  # MuJoCo C says why, where the robot falls in it as well
         inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
         if startup := pool.submit(startup_fall, *inputs).result():
             upright, text = startup.time, str(startup)
@@ -114,8 +114,8 @@ def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
 def _file_name(
     config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk: bool, engine: Engine
 ) -> str:
-    parts = engine.name, config.rollout.walk, repr(config.loss), robot, job
-    key = content_key(*parts, *([job.plant] if job.plant else []), code=_CODE)
+    parts = engine.name, engine.version, config.rollout.walk, repr(config.loss), robot, job
+    key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
     (name, seed), stem = case, "walk" if with_walk else "score"
     return f"{stem}-{name}-{seed}-{key}.npz"
 

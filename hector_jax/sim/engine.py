@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import redirect_stdout
 from functools import partial
-from importlib.util import find_spec
+from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
 import jax
@@ -38,22 +38,27 @@ class Engine(NamedTuple):
     """
 
     name: str  # in flags, logs and cards
+    title: str  # in reports
     walk: Callable[..., Iterator[Trajectory]]
     bits: Callable[[bool], int]  # of the physics, by `exact`
+    modules: tuple[str, ...] = ("sim.walk",)  # of this package, that decide its numbers
     package: str = "mujoco"  # that it needs; the extra of its name installs it
     differs: str = ""  # what its plants have otherwise than in MuJoCo C
 
     @property
-    def installed(self) -> bool:
-        """Whether its package is there."""
-        return find_spec(self.package) is not None
+    def version(self) -> str | None:
+        """Version of its package; None where that is not installed."""
+        try:
+            return version(self.package)
+        except PackageNotFoundError:
+            return None
 
 
 def _double(exact: bool) -> int:
     return 64
 
 
-MUJOCO_C = Engine("c", walk_many, _double)
+MUJOCO_C = Engine("c", "MuJoCo C", walk_many, _double)
 """MuJoCo C, one walk per process."""
 
 
@@ -65,9 +70,11 @@ def _drake(job: Job, body: Robot, first: int, end: int) -> Plant:
 
 DRAKE = Engine(
     "drake",
+    "Drake",
     partial(walk_many, build=_drake),
     _double,
-    package="pydrake",
+    modules=("sim.walk", "sim.drake"),
+    package="drake",
     differs="dry friction is smooth, a change of the plant lasts for the whole walk",
 )
 """Drake, one walk per process: compliant contact, solved as a convex problem."""
@@ -95,7 +102,7 @@ def _walk_mjx(
     return (walk for _, walk in zip(jobs, walks, strict=False))
 
 
-MJX = Engine("mjx", _walk_mjx, _mjx_bits)
+MJX = Engine("mjx", "MJX", _walk_mjx, _mjx_bits, modules=("sim.parallel",), package="mujoco-mjx")
 """MuJoCo in JAX, all walks at once."""
 
 ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX, DRAKE)}
@@ -111,7 +118,7 @@ def choose_engine(name: str) -> Engine:
     if choose("engine", name, ("auto", *ENGINES)) == "auto":
         return MUJOCO_C if jax.default_backend() == "cpu" else MJX
     engine = ENGINES[name]
-    if not engine.installed:
+    if engine.version is None:
         raise InputError(
             f"engine {name} needs {engine.package}, which is not installed: "
             f"pip install 'hector-jax[{name}]'"
