@@ -2,6 +2,7 @@
 
 import io
 import time
+from types import SimpleNamespace
 
 from rich.console import Console
 
@@ -33,3 +34,15 @@ def test_what_is_slow_is_told_and_what_is_not_is_silent(capsys):
 def test_nothing_that_controls_a_terminal_is_said(capsys):
     console.say("two\nlines\x1b[31m")
     assert capsys.readouterr().err == "two lines?[31m\n"
+
+
+def test_time_left_is_told_from_what_was_done_after_compiling(capsys, monkeypatch):
+    clock = iter([0.0, 1.0, 100.0, 120.0, 130.0])
+    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    with console.bar("walking") as tell:
+        tell(0, 50, "compiling")
+        tell(1, 50, "")
+        tell(11, 50, "")
+    said = capsys.readouterr().err
+    assert "  1/50 after 100 s\n" in said
+    assert "  11/50 after 120 s, about 78 s left\n" in said

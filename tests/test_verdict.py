@@ -29,15 +29,15 @@ from hector_jax.sim.standin import FAMILIES, even, standin
 from hector_jax.tuning.loss import PAPER_LOSS
 
 C, DRAKE, HEAVY = Column("c", "own"), Column("drake", "own"), Column("c", "heavy")
-LEVEL = {"nominal": 4e6, "expert": 3e6, "with": 1e6}
+SETS = ("nominal", "expert", "with")
 
 
-def cell(seeds=8, fallen=(), **levels):
+def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
     """Walks of sets on plants of which the losses differ alike; `fallen` pairs of set and seed."""
     plant = 1.0 + 0.1 * np.arange(seeds)
     scores = {
         name: stack([pretend_score(L * p, (name, i) in fallen) for i, p in enumerate(plant)])
-        for name, L in (LEVEL | levels).items()
+        for name, L in zip(SETS, (nominal, 3e6, tuned), strict=True)
     }
     return Verdict(np.arange(seeds), scores, PAPER_LOSS)
 
@@ -58,7 +58,7 @@ def test_cells_below_and_clear_and_void_are_counted():
         (C, "s"): cell(),
         (C, "c"): mixed,
         (HEAVY, "s"): cell(fallen=[("with", 1)]),
-        (HEAVY, "c"): cell(**{"with": 5e6}),
+        (HEAVY, "c"): cell(tuned=5e6),
     }
     assert columns.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
 
@@ -75,12 +75,12 @@ def test_intervals_of_falls_are_exact():
 
 
 def test_kendalls_tau_tells_the_order_of_the_sets():
-    turned = cell(4, nominal=1e6, **{"with": 4e6})
+    turned = cell(4, nominal=1e6, tuned=4e6)
     cells = {(C, "s"): cell(8), (DRAKE, "s"): cell(4), (HEAVY, "s"): turned}
     found = {(one.one, one.other): one.tau for one in columns.agreements(cells)}
     assert found == pytest.approx({(C, DRAKE): 1.0, (C, HEAVY): -1.0, (DRAKE, HEAVY): -1.0})
     two = {
-        key: v._replace(scores={n: v.scores[n] for n in LEVEL if n != "expert"})
+        key: v._replace(scores={n: v.scores[n] for n in SETS if n != "expert"})
         for key, v in cells.items()
     }
     assert columns.agreements(two) == []
@@ -89,7 +89,7 @@ def test_kendalls_tau_tells_the_order_of_the_sets():
 def test_the_spread_is_between_engines_on_the_plants_that_both_have():
     first = cell(8)
     first.scores["with"].losses["L"][4:] *= 3.0  # on plants that the other engine has not
-    cells = {(C, "s"): first, (DRAKE, "s"): cell(4, **{"with": 2e6}), (HEAVY, "s"): cell(4)}
+    cells = {(C, "s"): first, (DRAKE, "s"): cell(4, tuned=2e6), (HEAVY, "s"): cell(4)}
     (found,) = columns.spreads(cells, "with", "nominal")
     assert (found.trajectory, found.model) == ("s", "own")
     assert (found.gain, found.spread) == pytest.approx((50.0, 25.0))
@@ -113,10 +113,13 @@ def test_the_worst_walk_is_named():
 def test_what_holds_everywhere_is_claimed_and_what_does_not_is_not():
     claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell()})
     assert "`with` is below nominal in 2 of 2 cells, the interval clear of zero in 2." in claims
-    assert "In these engines and models its loss is lower than that of nominal." in claims
+    assert (
+        "Its loss is lower than that of nominal in every engine and model that has walked here."
+        in claims
+    )
     assert "in 1 of 1 case: the gain does not rest on one engine." in claims
     assert "All columns order the sets by their median L in the same way" in claims
-    claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell(**{"with": 5e6})})
+    claims, _ = said({(C, "s"): cell(), (DRAKE, "s"): cell(tuned=5e6)})
     assert "`with` is below nominal in 1 of 2 cells" in claims
     assert "It may not be said that its loss is lower everywhere." in claims
     assert "The whole interval is above zero in s in Drake." in claims
@@ -193,16 +196,15 @@ def test_one_set_beside_nominal_is_enough_and_is_printed(capsys):
 @pytest.fixture
 def walked(monkeypatch):
     """Engine and job of each walk; no process is started."""
-    jobs = []
+    state = SimpleNamespace(jobs=[], cut=None)
 
     def walks_of(pool, config, robot, asked, title, engine):
         for job in asked:
-            if len(jobs) == walks_of.cut:
+            if len(state.jobs) == state.cut:
                 raise KeyboardInterrupt
-            jobs.append((engine.name, job))
+            state.jobs.append((engine.name, job))
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
-    walks_of.cut = None
     other = MUJOCO_C._replace(name="drake", title="Drake")
     monkeypatch.setattr(verdicts, "walk_jobs", walks_of)
     monkeypatch.setattr(
@@ -210,7 +212,7 @@ def walked(monkeypatch):
         "choose_engine",
         lambda name: {"c": MUJOCO_C, "drake": other}.get(name) or missing(),
     )
-    return SimpleNamespace(jobs=jobs, walks_of=walks_of)
+    return state
 
 
 def missing():
@@ -230,9 +232,9 @@ def test_all_engines_and_models_walk_and_a_cut_verdict_goes_on(
     monkeypatch, tmp_path, capsys, walked
 ):
     words = words_of(tmp_path, "--engine", "all", "--engine-seeds", 1, "--light-heavy", "--json")
-    walked.walks_of.cut = 9
+    walked.cut = 9
     assert call(monkeypatch, *words) == 130
-    walked.walks_of.cut = None
+    walked.cut = None
     capsys.readouterr()
     assert call(monkeypatch, *words) == 0
     assert len(walked.jobs) == 14  # two sets; 2 + 1 + 1 plants in C, 1 + 1 + 1 in the other engine

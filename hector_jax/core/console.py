@@ -75,20 +75,22 @@ def bar(title: str) -> Iterator[Tell]:
             progress.update(task, completed=total, total=total)
         return
     start = last = time.monotonic()
+    first: tuple[int, float] | None = None  # done, and when; what was before it is compiling
     say(f"{title} ...")
 
     def tell(done: int, of: int, remark: str = "") -> None:
-        nonlocal last
+        nonlocal first, last
         now = time.monotonic()
         if remark == "compiling":
             say("  compiling")
-        elif now - last >= _QUIET:
-            left = (now - start) / done * (of - done) if done else 0.0
-            text = f"  {done}/{of} after {now - start:.0f} s" + f", about {left:.0f} s left" * (
-                done > 0
-            )
+        elif first is None:
+            first = done, now
+        if now - last >= _QUIET and remark != "compiling":
+            text, last = f"  {done}/{of} after {now - start:.0f} s", now
+            if first and done > first[0]:
+                left = (now - first[1]) / (done - first[0]) * (of - done)
+                text += f", about {left:.0f} s left"
             say(f"{text}  {remark}".rstrip())
-            last = now
 
     yield tell
     say(f"{title}: done in {time.monotonic() - start:.0f} s")

@@ -320,7 +320,7 @@ def _draw_columns(panel: Axes, verdicts: Sequence[Verdict], names: Sequence[str]
             value, low, high = one.change["L"]
             beyond = value > _WORST
             dot = dict(look.dot, markerfacecolor=look.color if one.counts else "white")
-            dot |= {"marker": ">"} if beyond else {}
+            dot |= {"marker": r"$\rightarrow$", "markersize": 9} if beyond else {}
             panel.plot([low, min(high, _WORST)], [y, y], color=look.color, linewidth=1.6)
             label = label_of(name) if not row else None
             panel.plot(min(value, _WORST), y, **dot, zorder=3, label=label)
