@@ -29,7 +29,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-deps --editable .
 	@touch $@
 
-engines: $(STAMP) ## install the other physics engines, Drake and DART (150 MB)
+engines: $(STAMP) ## install the other physics engines, Drake and Pinocchio
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -r requirements-engines.lock
 
 tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
@@ -76,4 +76,4 @@ docs: $(STAMP) ## the site, into docs/_build; a warning is an error
 lock: $(STAMP) ## resolve pyproject.toml into requirements.lock and requirements-engines.lock
 	@$(BIN)/python -m pip install --quiet uv
 	@$(LOCK) --extra dev -o requirements.lock
-	@$(LOCK) --extra dart --extra drake -c requirements.lock -o requirements-engines.lock
+	@$(LOCK) --extra drake --extra pinocchio -c requirements.lock -o requirements-engines.lock

@@ -216,7 +216,7 @@ def walked(monkeypatch):
 
 
 def missing():
-    raise InputError("DART is not installed: pip install pretend")
+    raise InputError("Pinocchio is not installed: pip install pretend")
 
 
 def call(monkeypatch, *words):
@@ -240,7 +240,7 @@ def test_all_engines_and_models_walk_and_a_cut_verdict_goes_on(
     assert len(walked.jobs) == 14  # two sets; 2 + 1 + 1 plants in C, 1 + 1 + 1 in the other engine
     told, err = capsys.readouterr()
     assert "14 walks: 2 on each plant; plants: MuJoCo C (2), MuJoCo C, light (1), " in err
-    assert "left out: DART is not installed" in err
+    assert "left out: Pinocchio is not installed" in err
     mass = sorted({float(j.imperfections.mass) for name, j in walked.jobs if name == "drake"})
     np.testing.assert_allclose(mass, np.array([0.9, 1.0, 1.1]) * standin(0).mass)
     assert [one["seeds"] for one in json.loads(told)["columns"]] == [
@@ -288,7 +288,7 @@ def test_a_folder_has_a_file_for_each_trajectory_and_a_family_other_plants(
         (["--weights", "nominal", "expert={file}"], "there is a set 'expert' already"),
         (["--weights", "nominal", "{folder}"], "straight.json: cannot read"),
         (["--engine", "bullet"], "invalid choice 'bullet' for argument '--engine'"),
-        (["--engine", "dart"], "DART is not installed"),
+        (["--engine", "pinocchio"], "Pinocchio is not installed"),
         (["--plant", "a.xml"], "--plant must be a TOML file"),
         (["--traj", "straight", "moon"], "moon"),
         (

@@ -91,7 +91,7 @@ class DrakePlant:
             if foot >= 0
         }
         self._contacts, self._time, self._failed = PointContacts(len(body.foot_point)), 0, False
-        self._joints = joints
+        self.joints = joints
         self._index(world, joints)
         self.stand(standing_qpos(world, body.standing_joints, float(body.trunk_height)))
 
@@ -125,7 +125,7 @@ class DrakePlant:
         """Take up the coordinates of a MuJoCo model of this world, at rest."""
         pose = RigidTransform(RotationMatrix(bodies.rotation_of(qpos[3:7])), qpos[:3])
         self.plant.SetFreeBodyPose(self.context, self._trunk, pose)
-        for dof, joint in self._joints.items():
+        for dof, joint in self.joints.items():
             joint.set_angle(self.context, qpos[dof + 1])  # the trunk's quaternion has one more
         self._simulator.Initialize()
         self._look()

@@ -68,6 +68,12 @@ def _drake(job: Job, body: Robot, first: int, end: int) -> Plant:
     return DrakePlant(job, body, first, end)
 
 
+def _pinocchio(job: Job, body: Robot, first: int, end: int) -> Plant:
+    from hector_jax.sim.pinocchio import PinocchioPlant  # an extra
+
+    return PinocchioPlant(job, body, first, end)
+
+
 DRAKE = Engine(
     "drake",
     "Drake",
@@ -105,7 +111,19 @@ def _walk_mjx(
 MJX = Engine("mjx", "MJX", _walk_mjx, _mjx_bits, modules=("sim.parallel",), package="mujoco-mjx")
 """MuJoCo in JAX, all walks at once."""
 
-ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX, DRAKE)}
+PINOCCHIO = Engine(
+    "pinocchio",
+    "Pinocchio",
+    partial(walk_many, build=_pinocchio),
+    _double,
+    modules=("sim.walk", "sim.pinocchio"),
+    package="pin",
+    differs="the floor is rigid, dry friction is smooth, legs pass through each other, a change of "
+    "the plant lasts for the whole walk",
+)
+"""Pinocchio, one walk per process: rigid contact with Coulomb's law."""
+
+ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX, DRAKE, PINOCCHIO)}
 """Every engine by its name; whoever adds one adds it here."""
 
 

@@ -2,7 +2,7 @@
 """A plant in Pinocchio: rigid contact with Coulomb's law (the extra `pinocchio`).
 
 Dynamics and contact solver are Pinocchio's, the time stepping is Moreau's: the velocities at the
-end of a step follow from impulses that keep the points of the soles out of the floor. The floor does
+end of a step follow from impulses that keep the soles' points out of the floor. The floor does
 not give way, and friction is Coulomb's cone itself, not a convex relaxation of it. Legs that touch
 are told of and pass through each other.
 """
@@ -24,6 +24,9 @@ from hector_jax.sim.world import STOP_TIME, World, standing_qpos
 _NEAR = 1e-3  # [m] above the floor from where on a point may touch within the step
 _BEND = 0.1  # of a backlash, by which the largest torque bends the gear's teeth
 _CLOSE = 1e-9  # [m/s], of the contact solver
+# shares of the mean diagonal that are added, as four points of a flat sole have no one answer; the
+# larger one where the solver does not end with the smaller
+_SOFT = 1e-6, 1e-3
 _FAR = 1e-4  # [m/s], its residual from which on a step counts as failed
 
 
@@ -58,6 +61,10 @@ class PinocchioPlant:
         self.q[:3], self.q[3:7] = qpos[:3], qpos[[4, 5, 6, 3]]
         self.q[self.order + 1] = qpos[7:]  # the trunk's quaternion has one more
 
+    def mass_matrix(self) -> Float[np.ndarray, "nv nv"]:
+        """Mass matrix [kg, kg m, kg m2], the rotors of the motors in it."""
+        return _symmetric(pin.crba(self.model, self.data, self.q))
+
     @property
     def broken(self) -> bool:
         """Whether the contact solver failed, or the state is no number."""
@@ -70,7 +77,7 @@ class PinocchioPlant:
             return
         model, data, q, v = self.model, self.data, self.q, self.v
         pin.computeAllTerms(model, data, q, v)  # mass matrix, nonlinear effects, Jacobians
-        A = np.triu(data.M) + np.triu(data.M, 1).T
+        A = _symmetric(data.M)
         force = -data.nle - self._damping * v
         rates = v[self.order]
         force[self.order] -= self._friction * np.tanh(rates / self._stiction)
@@ -89,9 +96,7 @@ class PinocchioPlant:
         self._others.note(model, data, self._contacts)
         self._contacts.end_step()
 
-    def _add_stops(
-        self, force: Float[np.ndarray, " nv"], stiff: Float[np.ndarray, " nv"]
-    ) -> None:
+    def _add_stops(self, force: Float[np.ndarray, " nv"], stiff: Float[np.ndarray, " nv"]) -> None:
         """Teeth at the ends of the backlash, springs and dampers that are linear over the step."""
         gap = self.q[self._slack + 1]
         over = gap - np.clip(gap, -self._width, self._width)
@@ -129,6 +134,11 @@ class PinocchioPlant:
     def ground(self) -> Ground:
         """See `Plant`."""
         return self._contacts.ground()
+
+
+def _symmetric(M: Float[np.ndarray, "nv nv"]) -> Float[np.ndarray, "nv nv"]:
+    """The whole of a matrix of which Pinocchio fills in the upper half."""
+    return np.triu(M) + np.triu(M, 1).T
 
 
 def _model(robot: list[Body], world: World) -> tuple[pin.Model, dict[int, int]]:
@@ -201,14 +211,14 @@ class _Soles:
             G: velocities of the points for impulses at them.
             free: velocities without impulses [m/s].
         """
-        result = pin.ADMMSolverResult()
-        G = G + 1e-6 * np.trace(G) / len(G) * np.eye(len(G))  # four points of a flat sole
-        cones = self._cones[len(free) // 3]
-        good = self._solver.solve(
-            pin.DelassusOperatorDense(G), free, *cones, self._settings, result
-        )
+        cones, mean = self._cones[len(free) // 3], np.trace(G) / len(G)
+        for share in _SOFT:
+            delassus = pin.DelassusOperatorDense(G + share * mean * np.eye(len(G)))
+            result = pin.ADMMSolverResult()
+            if self._solver.solve(delassus, free, *cones, self._settings, result):
+                break
         residual = max(result.primal_feasibility, result.dual_feasibility, result.complementarity)
-        return np.array(result.retrieveConstraintImpulses()), not (good or residual < _FAR)
+        return np.array(result.retrieveConstraintImpulses()), not residual < _FAR
 
 
 def _cones(

@@ -1,6 +1,8 @@
-"""Drake against MuJoCo C: the same masses, the same weight, nearly the same walk."""
+"""The other engines against MuJoCo C: the same masses and weight, nearly the same walk."""
 
+import importlib
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -14,16 +16,12 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.metrics import score
-from hector_jax.sim import bodies
 from hector_jax.sim.changes import Change
 from hector_jax.sim.loop import Job
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import PAPER_LOSS
-
-pytest.importorskip("pydrake", reason="the extra drake is not installed")
-from hector_jax.sim.drake import DrakePlant  # noqa: E402
 
 HECTOR = load_robot()
 CONFIG = walk_config(HECTOR)
@@ -37,26 +35,57 @@ def job(imperfections, seconds=1.0, weights=None, traj="s", **others):
     return Job(weights or expert(), command, imperfections, seconds, **others)
 
 
+def mass_in_drake(plant, qpos):
+    """Mass matrix in MuJoCo's order of joints; the trunk's velocities are those of the world."""
+    hinges = sorted(plant.joints)
+    order = [3, 4, 5, 0, 1, 2, *(plant.joints[dof].velocity_start() for dof in hinges)]
+    plant.stand(qpos)
+    return plant.plant.CalcMassMatrix(plant.context)[np.ix_(order, order)], False
+
+
+def mass_in_pinocchio(plant, qpos):
+    """The same; the trunk's velocities are those of its own frame."""
+    plant.stand(qpos)
+    order = [*range(6), *plant.order]
+    return plant.mass_matrix()[np.ix_(order, order)], True
+
+
+PARTS = {
+    "drake": ("pydrake", "DrakePlant", mass_in_drake),
+    "pinocchio": ("pinocchio", "PinocchioPlant", mass_in_pinocchio),
+}
+
+
+@pytest.fixture(params=PARTS)
+def engine(request):
+    package, plant, mass_matrix = PARTS[request.param]
+    pytest.importorskip(package, reason=f"the extra {request.param} is not installed")
+    module = importlib.import_module(f"hector_jax.sim.{request.param}")
+    return SimpleNamespace(
+        name=request.param, Plant=getattr(module, plant), mass_matrix=mass_matrix
+    )
+
+
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize(("backlash", "close"), [(0.0, 1e-12), (0.005, 1e-4)])
-def test_the_mass_matrix_is_that_of_mujoco(file, backlash, close):
+def test_the_mass_matrix_is_that_of_mujoco(engine, file, backlash, close):
     robot = load_robot(file)
     plant = hfs(robot.description)._replace(backlash=np.asarray(backlash))
     world, rng = build_world(plant, robot.description), np.random.default_rng(0)
-    drake = DrakePlant(job(plant), robot, 0, 1)
+    other = engine.Plant(job(plant), robot, 0, 1)
     model, data = world.model, mujoco.MjData(world.model)
-    hinges = [drake.plant.GetJointByName(model.joint(j).name) for j in range(1, model.njnt)]
-    # MuJoCo's trunk: linear, then angular in its own frame; Drake's: angular in the world's, linear
-    order = [3, 4, 5, 0, 1, 2, *(hinge.velocity_start() for hinge in hinges)]
     for _ in range(20):
         data.qpos[:] = rng.uniform(-1.0, 1.0, model.nq)
         data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
         mujoco.mj_forward(model, data)
-        ours, turn = np.zeros((model.nv, model.nv)), np.eye(model.nv)
+        ours, turn, R = np.zeros((model.nv, model.nv)), np.eye(model.nv), np.zeros(9)
         mujoco.mj_fullM(model, data, ours)
-        turn[3:6, 3:6] = bodies.rotation_of(data.qpos[3:7]).T
-        drake.stand(data.qpos)
-        theirs = drake.plant.CalcMassMatrix(drake.context)[np.ix_(order, order)]
+        mujoco.mju_quat2Mat(R, data.qpos[3:7])
+        theirs, in_trunk = engine.mass_matrix(other, data.qpos)
+        if in_trunk:
+            turn[:3, :3] = R.reshape(3, 3)
+        else:
+            turn[3:6, 3:6] = R.reshape(3, 3).T
         np.testing.assert_allclose(theirs, turn.T @ ours @ turn, atol=close * np.abs(ours).max())
 
 
@@ -70,22 +99,22 @@ def held(plant, robot, milliseconds):
     return np.asarray(plant.ground().force).sum(axis=1)
 
 
-def test_the_feet_carry_the_weight():
-    force = held(DrakePlant(job(ideal()), HECTOR, 0, 2000), HECTOR, 2000)
+def test_the_feet_carry_the_weight(engine):
+    force = held(engine.Plant(job(ideal()), HECTOR, 0, 2000), HECTOR, 2000)
     weight = 9.81 * float(HECTOR.mass)
     np.testing.assert_allclose(force[-500:].mean(axis=0), [0.0, 0.0, weight], atol=1e-3 * weight)
 
 
-def test_on_a_slope_the_weight_is_tilted():
+def test_on_a_slope_the_weight_is_tilted(engine):
     sloping = job(ideal(), changes=(Change(slope=(0.05, 0.0)),))
-    force = held(DrakePlant(sloping, HECTOR, 0, 2000), HECTOR, 2000)
+    force = held(engine.Plant(sloping, HECTOR, 0, 2000), HECTOR, 2000)
     weight = 9.81 * float(HECTOR.mass)
     np.testing.assert_allclose(force[-500:, 0].mean(), weight * np.sin(0.05), rtol=0.05)
 
 
 @pytest.mark.parametrize("plant", [ideal(), hfs()])
-def test_a_second_of_walking_is_nearly_that_of_mujoco(plant):
-    walks = [walk(CONFIG, HECTOR, job(plant), build=one) for one in (MujocoPlant, DrakePlant)]
+def test_a_second_of_walking_is_nearly_that_of_mujoco(engine, plant):
+    walks = [walk(CONFIG, HECTOR, job(plant), build=one) for one in (MujocoPlant, engine.Plant)]
     ours, theirs = (score(PAPER_LOSS, one) for one in walks)
     assert not theirs.fallen
     assert theirs.L == pytest.approx(ours.L, rel=0.25)
@@ -96,11 +125,11 @@ def test_a_second_of_walking_is_nearly_that_of_mujoco(plant):
     assert np.abs(walks[1].effect.moment).mean() < 2.0 * np.abs(walks[0].effect.moment).mean()
 
 
-def test_a_walk_is_the_same_each_time():
+def test_a_walk_is_the_same_each_time(engine):
     pushed = job(hfs(), 0.2, push=Push(np.array([[0.0, 40.0, 0.0]]), np.zeros(1), np.full(1, 0.1)))
-    one, again = (walk(CONFIG, HECTOR, pushed, build=DrakePlant) for _ in range(2))
+    one, again = (walk(CONFIG, HECTOR, pushed, build=engine.Plant) for _ in range(2))
     jax.tree.map(np.testing.assert_array_equal, one, again)
-    free = walk(CONFIG, HECTOR, job(hfs(), 0.2), build=DrakePlant)
+    free = walk(CONFIG, HECTOR, job(hfs(), 0.2), build=engine.Plant)
     there = walk(CONFIG, HECTOR, pushed, build=MujocoPlant)
     free_there = walk(CONFIG, HECTOR, job(hfs(), 0.2), build=MujocoPlant)
     gained, expected = (
@@ -109,26 +138,28 @@ def test_a_walk_is_the_same_each_time():
     assert gained == pytest.approx(expected, rel=0.1)
 
 
-def test_a_change_on_the_way_is_refused_in_one_line():
+def test_a_change_on_the_way_is_refused_in_one_line(engine):
     late = job(ideal(), changes=(Change(start=0.5, payload=2.0),))
-    with pytest.raises(InputError, match="engine drake: a plant cannot change during a walk"):
-        walk(CONFIG, HECTOR, late, build=DrakePlant)
+    with pytest.raises(
+        InputError, match=f"engine {engine.name}: a plant cannot change during a walk"
+    ):
+        walk(CONFIG, HECTOR, late, build=engine.Plant)
 
 
-def test_a_fall_is_a_fall():
+def test_a_fall_is_a_fall(engine):
     hard = Push(np.array([[0.0, 400.0, 0.0]]), np.zeros(1), np.full(1, 0.2))
-    walked = walk(CONFIG, HECTOR, job(ideal(), push=hard), build=DrakePlant)
+    walked = walk(CONFIG, HECTOR, job(ideal(), push=hard), build=engine.Plant)
     assert walked.fallen[-1]
     assert not walked.fallen[0]
 
 
 @pytest.mark.slow
-def test_four_sets_rank_as_in_mujoco():
+def test_four_sets_rank_as_in_mujoco(engine):
     folder = ROOT / "docs" / "batch" / "shared" / "weights"
     sets = [nominal(), expert(), *(load_weights(folder / f"{n}.json") for n in NAMES)]
     ranks = [
         np.argsort([score(PAPER_LOSS, walk(CONFIG, HECTOR, one, build=build)).L for one in jobs])
-        for build in (MujocoPlant, DrakePlant)
+        for build in (MujocoPlant, engine.Plant)
         for jobs in [[job(ideal(), 4.0, weights) for weights in sets]]
     ]
     np.testing.assert_array_equal(*ranks)
