@@ -1,4 +1,4 @@
-# pyright: reportMissingImports=false
+# pyright: reportMissingImports=false, reportArgumentType=false, reportCallIssue=false
 """A plant in Drake: compliant contact at points, solved as a convex problem (the extra `drake`).
 
 It is built from a world's bodies, not by Drake's own reader of MJCF, which reads two joints on one
@@ -78,10 +78,10 @@ class DrakePlant:
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
         plant.mutable_gravity_field().set_gravity_vector(world.model.opt.gravity)
         links, joints = _add_bodies(plant, bodies.bodies(world))
-        with _quiet_drake():
-            _add_shapes(plant, scene, links, world)
+        _add_shapes(plant, scene, links, world)
         plant.Finalize()
-        self._simulator = Simulator(builder.Build())
+        with _quiet_drake():
+            self._simulator = Simulator(builder.Build())
         self.context = plant.GetMyMutableContextFromRoot(self._simulator.get_mutable_context())
         self.plant, self._trunk = plant, links[world.trunk]
         self._com = np.array(world.model.body_ipos[world.trunk])

@@ -212,9 +212,10 @@ class _Soles:
             free: velocities without impulses [m/s].
         """
         cones, mean = self._cones[len(free) // 3], np.trace(G) / len(G)
+        result = pin.ADMMSolverResult()
         for share in _SOFT:
             delassus = pin.DelassusOperatorDense(G + share * mean * np.eye(len(G)))
-            result = pin.ADMMSolverResult()
+            result.reset()
             if self._solver.solve(delassus, free, *cones, self._settings, result):
                 break
         residual = max(result.primal_feasibility, result.dual_feasibility, result.complementarity)
