@@ -25,8 +25,8 @@ _NEAR = 1e-3  # [m] above the floor from where on a point may touch within the s
 _BEND = 0.1  # of a backlash, by which the largest torque bends the gear's teeth
 _CLOSE = 1e-9  # [m/s], of the contact solver
 # shares of the mean diagonal that are added, as four points of a flat sole have no one answer; the
-# larger one where the solver does not end with the smaller
-_SOFT = 1e-6, 1e-3
+# larger ones where the solver does not end with a smaller one
+_SOFT = 1e-6, 1e-3, 1e-2
 _FAR = 1e-4  # [m/s], its residual from which on a step counts as failed
 
 
@@ -181,6 +181,7 @@ class _Soles:
         self._solver, self._settings = pin.ADMMConstraintSolver(), pin.ADMMSolverSettings()
         self._settings.absolute_feasibility_tol = _CLOSE
         self._settings.absolute_complementarity_tol = _CLOSE
+        self._settings.admm_update_rule = pin.ADMMUpdateRule.SPECTRAL  # the default cycles at times
         friction = float(world.model.geom_friction[world.floor, 0])
         self._cones = [_cones(model, count, friction) for count in range(len(spheres) + 1)]
         self.feet: list[int] = []  # of the points that `near` returned last

@@ -290,7 +290,8 @@ def columns(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
     """
     every, names, trajectories = columns_of(cells), sets_of(cells), trajectories_of(cells)
     height = (0.15 * len(names) + 0.12) * len(every) + 1.1
-    with drawing(path, 2.9 * len(trajectories) + 1.5, height) as figure:
+    width, labels = 2.9 * len(trajectories) + 1.5, 2 * len(trajectories)
+    with drawing(path, width, height, legend_columns=labels) as figure:
         panels = figure.subplots(1, len(trajectories), sharex=True, sharey=True, squeeze=False)[0]
         for panel, trajectory in zip(panels, trajectories, strict=True):
             panel.axvline(0.0, color="black", linewidth=1.0, zorder=1)
