@@ -124,7 +124,7 @@ ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
     ("jobs", "message"),
     [
         ([job(expert(), plant=ideal()), job(expert())], "all have backlash or none"),
-        ([job(expert(), plant=standin(0))], "estimator errors must be zero"),
+        ([job(expert(), plant=standin(0))], "engine mjx knows its state exactly"),
         ([job(expert()), job(expert(), seconds=0.2)], r"agree in seconds, got \[0.1, 0.2\]"),
         (
             [job(expert()), job(expert())._replace(command=ONE_PIECE)],

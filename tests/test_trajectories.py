@@ -22,6 +22,7 @@ from hector_jax.control.trajectories import beyond, command_of, limits, load_com
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import load_robot
+from hector_jax.sim import walk as sim_walk
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
@@ -151,11 +152,11 @@ def walked(monkeypatch):
     """What would have been walked, and for how long."""
     walks = []
 
-    def pretend(config, robot, job):
+    def pretend(config, robot, job, **others):
         walks.append((job.command, job.seconds))
         raise InputError("walked")
 
-    monkeypatch.setattr(arguments, "walk", pretend)
+    monkeypatch.setattr(sim_walk, "walk", pretend)
     return walks
 
 
