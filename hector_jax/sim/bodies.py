@@ -26,8 +26,7 @@ class Hinge(NamedTuple):
 
     name: str
     axis: Float[np.ndarray, "3"]  # body frame
-    qpos: int  # its place in MuJoCo's coordinates
-    dof: int  # and in its velocities
+    dof: int  # its place in MuJoCo's velocities
     damping: float  # [N m s/rad]
     armature: float  # [kg m2]
     friction: float  # [N m] dry
@@ -94,7 +93,6 @@ def _hinge(model: mujoco.MjModel, j: int) -> Hinge:
     return Hinge(
         name=model.joint(j).name,
         axis=model.jnt_axis[j],
-        qpos=int(model.jnt_qposadr[j]),
         dof=int(dof),
         damping=float(model.dof_damping[dof]),
         armature=float(model.dof_armature[dof]),
@@ -120,17 +118,30 @@ def shapes(world: World) -> list[Shape]:
     ]
 
 
+def soles(world: World) -> list[Shape]:
+    """The spheres on which the feet stand: of all shapes they alone rub."""
+    feet = world.foot_of_geom
+    return [one for one in shapes(world) if one.kind == "sphere" and feet[one.id] >= 0]
+
+
 def touching_pairs(world: World) -> set[tuple[int, int]]:
-    """Pairs of geoms (the smaller id first) that may touch, by the bits of the model."""
-    type_, mask, body = (
-        world.model.geom_contype,
-        world.model.geom_conaffinity,
-        world.model.geom_bodyid,
-    )
+    """Pairs of geoms (the smaller id first) that may touch, by MuJoCo's rules.
+
+    The bits of the geoms allow it, and the bodies are not the same, parent and child or excluded.
+    """
+    model = world.model
+    bits, mask, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
+    excluded = {(signature >> 16, signature & 0xFFFF) for signature in model.exclude_signature}
+
+    def apart(one: int, other: int) -> bool:
+        related = one and model.body_parentid[other] == one
+        return one == other or related or (one, other) in excluded
+
     return {
         (a, b)
-        for a, b in combinations(range(world.model.ngeom), 2)
-        if (type_[a] & mask[b] or type_[b] & mask[a]) and body[a] != body[b]
+        for a, b in combinations(range(model.ngeom), 2)
+        if (bits[a] & mask[b] or bits[b] & mask[a])
+        and not (apart(body[a], body[b]) or apart(body[b], body[a]))
     }
 
 

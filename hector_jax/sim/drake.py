@@ -92,12 +92,12 @@ class DrakePlant:
         }
         self._contacts, self._time, self._failed = PointContacts(len(body.foot_point)), 0, False
         self.joints = joints
-        self._index(world, joints)
+        self._index(world)
         self.stand(standing_qpos(world, body.standing_joints, float(body.trunk_height)))
 
-    def _index(self, world: World, joints: Mapping[int, RevoluteJoint]) -> None:
+    def _index(self, world: World) -> None:
         """Find out where Drake has what."""
-        nq, nv = self.plant.num_positions(), self.plant.num_velocities()
+        joints, nq, nv = self.joints, self.plant.num_positions(), self.plant.num_velocities()
         motors = [joints[dof] for dof in world.joint_dof]
         slack = [joints[world.model.jnt_dofadr[j]].position_start() for j in world.slack]
         base = self._trunk.floating_positions_start()
@@ -113,9 +113,8 @@ class DrakePlant:
             ]
         ).astype(int)
         hinges = [hinge for body in bodies.bodies(world) for hinge in body.hinges]
-        by_velocity = sorted(hinges, key=lambda hinge: joints[hinge.dof].velocity_start())
-        self._hinges = np.array([joints[hinge.dof].velocity_start() for hinge in by_velocity])
-        self._friction, self._stiction = bodies.dry_friction(by_velocity)
+        self._hinges = np.array([joints[hinge.dof].velocity_start() for hinge in hinges])
+        self._friction, self._stiction = bodies.dry_friction(hinges)
         self._state, self._force = np.zeros(nq + nv + 1), np.zeros(nv)
         port = self.plant.get_applied_generalized_force_input_port()
         self._input = port.FixValue(self.context, self._force).GetMutableData()
@@ -215,12 +214,10 @@ def _add_shapes(
     plant: MultibodyPlant, scene: SceneGraph, links: Mapping[int, RigidBody], world: World
 ) -> None:
     """Geoms that may touch something, and which of them may touch which."""
-    shapes, places = bodies.shapes(world), {}
-    soles = {s.id for s in shapes if s.kind == "sphere" and world.foot_of_geom[s.id] >= 0}
-    spring = bodies.contact_spring(world, len(soles))
-    for shape in shapes:
-        rough = shape.id == world.floor or shape.id in soles  # nothing else rubs
-        friction = world.model.geom_friction[world.floor, 0] * rough
+    rough, places = {world.floor, *(one.id for one in bodies.soles(world))}, {}
+    spring = bodies.contact_spring(world, len(rough) - 1)
+    for shape in bodies.shapes(world):
+        friction = world.model.geom_friction[world.floor, 0] * (shape.id in rough)
         properties = ProximityProperties()
         # two springs in a row have half the stiffness of one
         stiffness, cone = 2.0 * spring.stiffness, CoulombFriction(friction, friction)

@@ -37,7 +37,7 @@ class PinocchioPlant:
         """Build as a `BuildPlant` does."""
         world = lasting_world("pinocchio", job, body, first, end)
         robot = bodies.bodies(world)
-        self.model, self._joint_of_body = _model(robot, world)
+        self.model, joint_of = _model(robot, world)
         self.data, self.failed = self.model.createData(), False
         hinges = [hinge for one in robot for hinge in one.hinges]
         at = {h.dof: self.model.idx_vs[self.model.getJointId(h.name)] for h in hinges}
@@ -49,9 +49,9 @@ class PinocchioPlant:
         self._damping[self.order] = [hinge.damping for hinge in hinges]
         width = float(job.imperfections.backlash)
         self._width, self._teeth = width, np.asarray(body.torque_limit) / (_BEND * (width or 1.0))
-        self._com, self._trunk = world.model.body_ipos[world.trunk], self._joint_of_body[1]
-        self._soles = _Soles(world, self.model, self._joint_of_body)
-        self._others = _Others(world, self.model, self._joint_of_body)
+        self._com, self._trunk = world.model.body_ipos[world.trunk], joint_of[world.trunk]
+        self._soles = _Soles(world, self.model, joint_of)
+        self._others = _Others(world, self.model, joint_of)
         self._contacts = PointContacts(len(body.foot_point))
         self.stand(standing_qpos(world, body.standing_joints, float(body.trunk_height)))
 
@@ -169,11 +169,7 @@ class _Soles:
     """The spheres of the soles, and impulses at those near the floor."""
 
     def __init__(self, world: World, model: pin.Model, joint_of: dict[int, int]) -> None:
-        spheres = [
-            shape
-            for shape in bodies.shapes(world)
-            if shape.kind == "sphere" and world.foot_of_geom[shape.id] >= 0
-        ]
+        spheres = bodies.soles(world)
         self._joints = [joint_of[one.body] for one in spheres]
         self._centres = np.array([one.position for one in spheres])
         self._radii = np.array([one.size[0] for one in spheres])
@@ -241,7 +237,7 @@ class _Others:
 
     def __init__(self, world: World, model: pin.Model, joint_of: dict[int, int]) -> None:
         self._geometry, shapes, index = pin.GeometryModel(), bodies.shapes(world), {}
-        soles = {s.id for s in shapes if s.kind == "sphere" and world.foot_of_geom[s.id] >= 0}
+        soles = {one.id for one in bodies.soles(world)}
         for shape in shapes:
             place = pin.SE3(shape.rotation, shape.position)
             one = pin.GeometryObject(str(shape.id), joint_of[shape.body], place, _shape(shape))
