@@ -130,11 +130,11 @@ def touching_pairs(world: World) -> set[tuple[int, int]]:
     The bits of the geoms allow it, and the bodies are not the same, parent and child or excluded.
     """
     model = world.model
-    bits, mask, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
+    bits, mask, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid.tolist()
     excluded = {(signature >> 16, signature & 0xFFFF) for signature in model.exclude_signature}
 
     def apart(one: int, other: int) -> bool:
-        related = one and model.body_parentid[other] == one
+        related = one > 0 and model.body_parentid[other] == one
         return one == other or related or (one, other) in excluded
 
     return {
