@@ -11,7 +11,6 @@ import table_steps
 
 import hector_jax
 from hector_jax.runs import nets
-from hector_jax.sim.engine import ENGINES
 
 ROOT = Path(__file__).parents[1] / "hector_jax"
 FLOORS = [
@@ -155,9 +154,6 @@ def test_what_scripts_import_inside_functions_is_there_too():
                 if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
                     "hector_jax"
                 ):
-                    extra = ENGINES.get(node.module.rsplit(".", 1)[-1])
-                    if extra and extra.version is None:
-                        continue
                     module = importlib.import_module(node.module)
                     missing += [
                         f"{path.name}: {node.module}.{alias.name}"

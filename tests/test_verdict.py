@@ -17,11 +17,11 @@ from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree import stack
-from hector_jax.report import columns as report
+from hector_jax.report import matrix as report
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import columns, verdicts
-from hector_jax.runs.columns import Column
+from hector_jax.runs import matrix, verdicts
+from hector_jax.runs.matrix import Column
 from hector_jax.runs.metrics import Verdict, family_of
 from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.engine import MUJOCO_C
@@ -60,48 +60,48 @@ def test_cells_below_and_clear_and_void_are_counted():
         (HEAVY, "s"): cell(fallen=[("with", 1)]),
         (HEAVY, "c"): cell(tuned=5e6),
     }
-    assert columns.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
+    assert matrix.tally(cells, "with", "nominal") == (4, 2, 1, 1, 1)
 
 
 def test_intervals_of_falls_are_exact():
-    none, one = columns.fall_share(0, 32), columns.fall_share(1, 8)
+    none, one = matrix.fall_share(0, 32), matrix.fall_share(1, 8)
     assert none.low == 0.0
     assert none.high == pytest.approx(1.0 - 0.025 ** (1 / 32))
     # P(X >= 1 | low) = P(X <= 1 | high) = 2.5 %
     assert 1.0 - (1.0 - one.low) ** 8 == pytest.approx(0.025)
     assert (1 - one.high) ** 8 + 8 * one.high * (1 - one.high) ** 7 == pytest.approx(0.025)
     both = {(C, "s"): cell(4, [("with", 0)]), (HEAVY, "s"): cell(8, [("with", 0)])}
-    assert columns.falls(both, "with")[:2] == (2, 12)
+    assert matrix.falls(both, "with")[:2] == (2, 12)
 
 
 def test_kendalls_tau_tells_the_order_of_the_sets():
     turned = cell(4, nominal=1e6, tuned=4e6)
     cells = {(C, "s"): cell(8), (DRAKE, "s"): cell(4), (HEAVY, "s"): turned}
-    found = {(one.one, one.other): one.tau for one in columns.agreements(cells)}
+    found = {(one.one, one.other): one.tau for one in matrix.agreements(cells)}
     assert found == pytest.approx({(C, DRAKE): 1.0, (C, HEAVY): -1.0, (DRAKE, HEAVY): -1.0})
     two = {
         key: v._replace(scores={n: v.scores[n] for n in SETS if n != "expert"})
         for key, v in cells.items()
     }
-    assert columns.agreements(two) == []
+    assert matrix.agreements(two) == []
 
 
 def test_the_spread_is_between_engines_on_the_plants_that_both_have():
     first = cell(8)
     first.scores["with"].losses["L"][4:] *= 3.0  # on plants that the other engine has not
     cells = {(C, "s"): first, (DRAKE, "s"): cell(4, tuned=2e6), (HEAVY, "s"): cell(4)}
-    (found,) = columns.spreads(cells, "with", "nominal")
+    (found,) = matrix.spreads(cells, "with", "nominal")
     assert (found.trajectory, found.model) == ("s", "own")
     assert (found.gain, found.spread) == pytest.approx((50.0, 25.0))
     assert found.is_small
     assert not found._replace(gain=49.0).is_small
-    assert columns.spreads({(C, "s"): cell()}, "with", "nominal") == []
+    assert matrix.spreads({(C, "s"): cell()}, "with", "nominal") == []
 
 
 def test_the_worst_walk_is_named():
     bad = cell(4, fallen=[("with", 2)])
     bad.scores["with"].losses["L"][2] *= 10.0
-    found = columns.worst({(C, "s"): cell(), (HEAVY, "c"): bad}, "with", "nominal")
+    found = matrix.worst({(C, "s"): cell(), (HEAVY, "c"): bad}, "with", "nominal")
     assert found[:3] == (HEAVY, "c", 2)
     assert found.change == pytest.approx(150.0)
     assert found.fallen

@@ -33,11 +33,10 @@ Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper,
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Number = Literal["footstep_feedback", "footstep_width", "turn_lead", "effort_reference", "friction"]
 Variant = Literal["residual", "paper"]
-Engine = Literal["auto", "c", "mjx", "drake", "pinocchio"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
-JudgingEngine = Literal[
-    "c", "drake", "pinocchio", "all"
-]  # MJX walks no plant that errs in its estimate
+Engine = Literal["auto", OneEngine]
+# MJX is MuJoCo C's physics and walks no plant whose estimator errs
+JudgingEngine = Literal["c", "drake", "pinocchio", "all"]
 Gait = Literal["own", "walk", "trot", "pace", "crawl", "stand"]
 Family = Literal["standin", "even"]
 PlantWorld = Literal["ideal", "hfs", "hfs-varied", "standin", "standin-even"]
@@ -185,9 +184,7 @@ class Evaluate(Configured):
     robot: RobotFile = None  # TOML file of another robot; HECTOR by default
     plant: RobotFile = None  # TOML file of another model of the robot, of which the plants are
     gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
-    engine: OneEngine = (
-        "c"  # the physics: c is MuJoCo; mjx (exact state) or an extra: drake, pinocchio
-    )
+    engine: OneEngine = "c"  # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio
 
 
 @_command
@@ -233,9 +230,7 @@ class Walk(Configured):
     robot: RobotFile = None  # TOML file of another robot; HECTOR by default
     plant: RobotFile = None  # TOML file of another model of the robot, which is walked on
     gait: Gait = "own"  # that of the robot's file, walk, trot, pace, crawl or stand
-    engine: OneEngine = (
-        "c"  # the physics: c is MuJoCo; mjx (exact state) or an extra: drake, pinocchio
-    )
+    engine: OneEngine = "c"  # c: MuJoCo; mjx: it knows its state exactly; extras: drake, pinocchio
 
 
 @_command

@@ -20,16 +20,16 @@ from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.settings import SEED
-from hector_jax.report import columns as report
+from hector_jax.report import matrix as report
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, tunings, verdicts
-from hector_jax.runs.columns import HEAVY, LIGHT, OWN, Cells, Column
+from hector_jax.runs.matrix import HEAVY, LIGHT, OWN, Cells, Column
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import TuneConfig
 
 _ENGINES = get_args(JudgingEngine)[:-1]  # all but `all`
-_MASSES = {OWN: 1.0, LIGHT: 0.9, HEAVY: 1.1}  # of the robot's own model, times those of a plant
+_MASSES = {LIGHT: 0.9, HEAVY: 1.1}  # times those of a plant, of the robot's own model
 
 
 class Model(NamedTuple):
@@ -95,7 +95,7 @@ def plan_of(args: Verdict) -> Plan:
         courses[course.name] = course, arguments.seconds(args.seconds, course)
     models = {OWN: Model()}
     if args.light_heavy:
-        models |= {name: Model(_MASSES[name]) for name in (LIGHT, HEAVY)}
+        models |= {name: Model(mass) for name, mass in _MASSES.items()}
     for path in args.plant:
         plant = arguments.plant_of(path, robot)
         assert plant is not None  # there is a path
@@ -242,9 +242,9 @@ def small_verdict(
         What prints the table.
     """
     few = {name: sets[name] for name in ("nominal", "expert", "without", "with")}
-    others = list(_installed(lambda text: None).items())[1:][:3]
+    others = list(_installed(lambda text: None).items())[1:4]
     engines = dict(others) or {"c": choose_engine("c")}
-    models = {OWN: Model()} if others else {n: Model(_MASSES[n]) for n in (LIGHT, HEAVY)}
+    models = {OWN: Model()} if others else {n: Model(mass) for n, mass in _MASSES.items()}
     columns = {Column(engine, model): range(1) for engine in engines for model in models}
     walks = {course.name: (course, seconds)}, {course.name: few}
     plan = Plan(robot, "standin", *walks, models, columns, engines)

@@ -16,8 +16,8 @@ from hector_jax.report.report import (
     render,
     seeds_text,
 )
-from hector_jax.runs import columns
-from hector_jax.runs.columns import OWN, Cells, Column
+from hector_jax.runs import matrix
+from hector_jax.runs.matrix import OWN, Cells, Column
 from hector_jax.runs.metrics import BASELINES, FEWEST, Interval, compare
 from hector_jax.sim.engine import ENGINES
 
@@ -65,23 +65,23 @@ def limits(cells: Cells, differs: Mapping[str, str], family: str) -> list[str]:
 
 
 def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str) -> Any:
-    names = columns.sets_of(cells)
+    names = matrix.sets_of(cells)
     pairs = [(n, b) for n in names for b in BASELINES if b in names and b != n]
     pairs = [(n, b) for n, b in pairs if n not in BASELINES] or pairs[-1:]
-    every = columns.columns_of(cells)
+    every = matrix.columns_of(cells)
     verdicts = {column: next(v for (c, _), v in cells.items() if c == column) for column in every}
-    changes = {pair: columns.changes(cells, *pair) for pair in pairs}
+    changes = {pair: matrix.changes(cells, *pair) for pair in pairs}
     text = render(
         template,
         above={
             pair: [c for c, one in of.items() if one.counts and one.change["L"].low > 0.0]
             for pair, of in changes.items()
         },
-        agreements=columns.agreements(cells),
+        agreements=matrix.agreements(cells),
         cell_text=cell_text,
         engines=list(dict.fromkeys(column.engine for column in every)),
         ENGINES=TITLES,
-        falls={name: columns.falls(cells, name) for name in names},
+        falls={name: matrix.falls(cells, name) for name in names},
         family=family,
         coarse=[c for c, verdict in verdicts.items() if FEWEST <= len(verdict.seeds) < _COARSE],
         few=[c for c, verdict in verdicts.items() if len(verdict.seeds) < FEWEST],
@@ -91,23 +91,23 @@ def _lines(template: str, cells: Cells, differs: Mapping[str, str], family: str)
         pairs=pairs,
         seeds={column: seeds_text(verdict.seeds) for column, verdict in verdicts.items()},
         share_text=share_text,
-        spreads={pair: columns.spreads(cells, *pair) for pair in pairs},
-        tallies={pair: columns.tally(cells, *pair) for pair in pairs},
+        spreads={pair: matrix.spreads(cells, *pair) for pair in pairs},
+        tallies={pair: matrix.tally(cells, *pair) for pair in pairs},
         title_of=title_of,
         void={pair: [c for c, one in of.items() if not one.counts] for pair, of in changes.items()},
         tuned=[name for name in names if name not in BASELINES],
-        worst={pair: columns.worst(cells, *pair) for pair in pairs},
+        worst={pair: matrix.worst(cells, *pair) for pair in pairs},
     )
     return [line for line in text.splitlines() if line]
 
 
 def tables(cells: Cells) -> dict[str, str]:
     """A table in Markdown for each trajectory: a row for each column and set."""
-    names = columns.sets_of(cells)
+    names = matrix.sets_of(cells)
     others = [name for name in BASELINES if name in names]
     head = ["engine and model", "set", "median L", *(f"against {one} [%]" for one in others)]
     found = {}
-    for trajectory in columns.trajectories_of(cells):
+    for trajectory in matrix.trajectories_of(cells):
         rows = []
         for (column, walked), verdict in cells.items():
             if walked != trajectory:
@@ -118,7 +118,7 @@ def tables(cells: Cells) -> dict[str, str]:
                     for one in others
                 ]
                 fell, count = int(score.fallen.sum()), len(verdict.seeds)
-                share = share_text(columns.fall_share(fell, count))
+                share = share_text(matrix.fall_share(fell, count))
                 median = f"{np.median(score.L) / 1e6:.3g}e6"
                 rows.append([title_of(column), name, median, *against, f"{fell} / {count}", share])
         found[trajectory] = markdown_table([*head, "falls", "share of falls"], rows, words=2)
@@ -162,17 +162,17 @@ def write_report(
         command: that makes the report again.
     """
     known = cells, differs, family
-    result = columns.as_result(cells, family) | {
+    result = matrix.as_result(cells, family) | {
         "differs": dict(differs),
         "claims": claims(*known),
         "limits": limits(*known),
         "config": dict(config),
         "environment": dict(environment),
     }
-    picture = Picture("verdict.png", plots.columns(folder / "verdict.png", cells, title_of))
-    every = columns.columns_of(cells)
+    picture = Picture("verdict.png", plots.matrix(folder / "verdict.png", cells, title_of))
+    every = matrix.columns_of(cells)
     text = render(
-        "columns.md.j2",
+        "matrix.md.j2",
         claims=result["claims"],
         limits=result["limits"],
         pictures=[picture],
@@ -180,8 +180,8 @@ def write_report(
         config=config,
         environment=environment,
         command=command,
-        names=columns.sets_of(cells),
-        trajectories=columns.trajectories_of(cells),
+        names=matrix.sets_of(cells),
+        trajectories=matrix.trajectories_of(cells),
         count=len(every),
         walks=sum(len(v.scores) * len(v.seeds) for v in cells.values()),
     )

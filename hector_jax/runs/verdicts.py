@@ -94,7 +94,7 @@ def _score_walk(
 ) -> ScoredWalk:
     up, text = int(np.sum(~np.asarray(walk.fallen))), ""
     upright = up * float(walk.period)
-    if not up:  # MuJoCo C says why, where the robot falls in it as well
+    if not up and not engine.differs:  # the fall is walked once more, in MuJoCo C
         inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
         if startup := pool.submit(startup_fall, *inputs).result():
             upright, text = startup.time, str(startup)

@@ -139,6 +139,9 @@ class DrakePlant:
 
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
         """See `Plant`."""
+        if self._failed:
+            self._contacts.end_step()
+            return
         rates, force = self._state[self._rates : -1], self._force
         force[:] = 0.0
         force[self._hinges] = -self._friction * np.tanh(rates[self._hinges] / self._stiction)
@@ -150,12 +153,12 @@ class DrakePlant:
         self._time += 1
         try:
             # a time of whole steps: a sum of steps drifts, and a step is made twice or not at all
-            if not self._failed:
-                self._simulator.AdvanceTo(self._time * TIME_STEP)
+            self._simulator.AdvanceTo(self._time * TIME_STEP)
         except RuntimeError:
             self._failed = True
-        self._look()
-        self._note_contacts()
+        else:
+            self._look()
+            self._note_contacts()
         self._contacts.end_step()
 
     def _note_contacts(self) -> None:

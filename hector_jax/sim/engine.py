@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import redirect_stdout
 from functools import partial
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
@@ -43,7 +44,7 @@ class Engine(NamedTuple):
     bits: Callable[[bool], int]  # of the physics, by `exact`
     modules: tuple[str, ...] = ("sim.walk",)  # of this package, that decide its numbers
     package: str = "mujoco"  # that it needs; the extra of its name installs it
-    differs: str = ""  # what its plants have otherwise than in MuJoCo C
+    differs: str = ""  # what its plants have otherwise than in MuJoCo C; nothing: the same physics
 
     @property
     def version(self) -> str | None:
@@ -62,28 +63,37 @@ MUJOCO_C = Engine("c", "MuJoCo C", walk_many, _double)
 """MuJoCo C, one walk per process."""
 
 
-def _drake(job: Job, body: Robot, first: int, end: int) -> Plant:
-    from hector_jax.sim.drake import DrakePlant  # an extra
-
-    return DrakePlant(job, body, first, end)
-
-
-def _pinocchio(job: Job, body: Robot, first: int, end: int) -> Plant:
-    from hector_jax.sim.pinocchio import PinocchioPlant  # an extra
-
-    return PinocchioPlant(job, body, first, end)
+def _build_late(name: str, plant: str, job: Job, body: Robot, first: int, end: int) -> Plant:
+    """Build a plant of an engine whose package is an extra, which nothing else imports."""
+    module = import_module(f"hector_jax.sim.{name}")
+    return getattr(module, plant)(job, body, first, end)
 
 
-DRAKE = Engine(
+def _extra(name: str, title: str, plant: str, package: str, differs: str) -> Engine:
+    """An engine of an extra, one walk per process; `plant` is its class in sim/NAME.py."""
+    walk = partial(walk_many, build=partial(_build_late, name, plant))
+    modules = "sim.walk", f"sim.{name}"
+    return Engine(name, title, walk, _double, modules, package, differs)
+
+
+DRAKE = _extra(
     "drake",
     "Drake",
-    partial(walk_many, build=_drake),
-    _double,
-    modules=("sim.walk", "sim.drake"),
+    "DrakePlant",
     package="drake",
     differs="dry friction is smooth, a change of the plant lasts for the whole walk",
 )
-"""Drake, one walk per process: compliant contact, solved as a convex problem."""
+"""Drake: compliant contact, solved as a convex problem."""
+
+PINOCCHIO = _extra(
+    "pinocchio",
+    "Pinocchio",
+    "PinocchioPlant",
+    package="pin",
+    differs="the floor is rigid, dry friction is smooth, legs pass through each other, a change of "
+    "the plant lasts for the whole walk",
+)
+"""Pinocchio: rigid contact with Coulomb's law."""
 
 
 def _mjx_bits(exact: bool) -> int:
@@ -110,18 +120,6 @@ def _walk_mjx(
 
 MJX = Engine("mjx", "MJX", _walk_mjx, _mjx_bits, modules=("sim.parallel",), package="mujoco-mjx")
 """MuJoCo in JAX, all walks at once."""
-
-PINOCCHIO = Engine(
-    "pinocchio",
-    "Pinocchio",
-    partial(walk_many, build=_pinocchio),
-    _double,
-    modules=("sim.walk", "sim.pinocchio"),
-    package="pin",
-    differs="the floor is rigid, dry friction is smooth, legs pass through each other, a change of "
-    "the plant lasts for the whole walk",
-)
-"""Pinocchio, one walk per process: rigid contact with Coulomb's law."""
 
 ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX, DRAKE, PINOCCHIO)}
 """Every engine by its name; whoever adds one adds it here."""

@@ -23,7 +23,7 @@ def _ground(contacts: Contacts, floor, foot_of_geom, feet: int) -> Ground:
 
 
 class MujocoPlant:
-    """A `Plant` in MuJoCo C; the only one that a `Change` can meet on the way."""
+    """A `Plant` in MuJoCo C, which may change during a walk."""
 
     def __init__(
         self,

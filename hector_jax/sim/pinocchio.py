@@ -61,10 +61,6 @@ class PinocchioPlant:
         self.q[:3], self.q[3:7] = qpos[:3], qpos[[4, 5, 6, 3]]
         self.q[self.order + 1] = qpos[7:]  # the trunk's quaternion has one more
 
-    def mass_matrix(self) -> Float[np.ndarray, "nv nv"]:
-        """Mass matrix [kg, kg m, kg m2], the rotors of the motors in it."""
-        return _symmetric(pin.crba(self.model, self.data, self.q))
-
     @property
     def broken(self) -> bool:
         """Whether the contact solver failed, or the state is no number."""
@@ -77,7 +73,7 @@ class PinocchioPlant:
             return
         model, data, q, v = self.model, self.data, self.q, self.v
         pin.computeAllTerms(model, data, q, v)  # mass matrix, nonlinear effects, Jacobians
-        A = _symmetric(data.M)
+        A = np.triu(data.M) + np.triu(data.M, 1).T  # the lower half is not filled in
         force = -data.nle - self._damping * v
         rates = v[self.order]
         force[self.order] -= self._friction * np.tanh(rates / self._stiction)
@@ -107,7 +103,7 @@ class PinocchioPlant:
 
     def _add_impulses(self, A: Float[np.ndarray, "nv nv"]) -> None:
         """Impulses at the points that would sink in."""
-        points, J = self._soles.near(self.model, self.data)
+        feet, points, J = self._soles.near(self.model, self.data)
         if not len(points):
             return
         height = points[:, 2]
@@ -116,9 +112,8 @@ class PinocchioPlant:
         aim[:, 2] += height / TIME_STEP  # at most down to the floor, and out of it at once
         impulse, self.failed = self._soles.solve(J @ inverse, aim.ravel())
         self.v = self.v + inverse @ impulse
-        for foot, force, point in zip(
-            self._soles.feet, impulse.reshape(-1, 3) / TIME_STEP, points, strict=True
-        ):
+        forces = impulse.reshape(-1, 3) / TIME_STEP
+        for foot, force, point in zip(feet, forces, points, strict=True):
             if force.any():
                 self._contacts.note(foot, force, point)
 
@@ -134,11 +129,6 @@ class PinocchioPlant:
     def ground(self) -> Ground:
         """See `Plant`."""
         return self._contacts.ground()
-
-
-def _symmetric(M: Float[np.ndarray, "nv nv"]) -> Float[np.ndarray, "nv nv"]:
-    """The whole of a matrix of which Pinocchio fills in the upper half."""
-    return np.triu(M) + np.triu(M, 1).T
 
 
 def _model(robot: list[Body], world: World) -> tuple[pin.Model, dict[int, int]]:
@@ -180,24 +170,22 @@ class _Soles:
         self._settings.admm_update_rule = pin.ADMMUpdateRule.SPECTRAL  # the default cycles at times
         friction = float(world.model.geom_friction[world.floor, 0])
         self._cones = [_cones(model, count, friction) for count in range(len(spheres) + 1)]
-        self.feet: list[int] = []  # of the points that `near` returned last
 
     def near(
         self, model: pin.Model, data: pin.Data
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m nv"]]:
-        """The points near the floor [m], and their Jacobian in the world's frame."""
+    ) -> tuple[list[int], Float[np.ndarray, "n 3"], Float[np.ndarray, "m nv"]]:
+        """Feet of the points near the floor, these [m], and their Jacobian in the world's frame."""
         places = [data.oMi[joint] for joint in self._joints]
         centres = np.array([at.act(c) for at, c in zip(places, self._centres, strict=True)])
         points = centres - np.outer(self._radii, [0.0, 0.0, 1.0])
         rows = np.flatnonzero(points[:, 2] < _NEAR)
-        self.feet = [int(self._foot[i]) for i in rows]
         J = np.zeros((len(rows), 3, model.nv))
         for row, i in enumerate(rows):
             frame = pin.getJointJacobian(
                 model, data, self._joints[i], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
             )
             J[row] = frame[:3] - pin.skew(points[i] - places[i].translation) @ frame[3:]
-        return points[rows], J.reshape(-1, model.nv)
+        return self._foot[rows].tolist(), points[rows], J.reshape(-1, model.nv)
 
     def solve(
         self, G: Float[np.ndarray, "m m"], free: Float[np.ndarray, " m"]

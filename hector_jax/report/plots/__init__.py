@@ -22,7 +22,7 @@ from hector_jax.report.motion import COLOURS, Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
-from hector_jax.runs.columns import Cells, Column, columns_of, sets_of, trajectories_of
+from hector_jax.runs.matrix import Cells, Column, columns_of, sets_of, trajectories_of
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
 from hector_jax.tuning.loss import Loss
@@ -280,7 +280,7 @@ def training(path: Path, history: History) -> str:
     return caption("training")
 
 
-def columns(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
+def matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
     """Draw the change of L of every set against nominal, a row for each engine and model.
 
     Args:
@@ -295,7 +295,7 @@ def columns(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
         panels = figure.subplots(1, len(trajectories), sharex=True, sharey=True, squeeze=False)[0]
         for panel, trajectory in zip(panels, trajectories, strict=True):
             panel.axvline(0.0, color="black", linewidth=1.0, zorder=1)
-            _draw_columns(panel, [cells[column, trajectory] for column in every], names)
+            _draw_sets(panel, [cells[column, trajectory] for column in every], names)
             panel.set(title=trajectory, xlabel=f"change of L against {BASELINES[0]} [%]")
             panel.grid(visible=False, axis="y")
             for edge in range(1, len(every)):
@@ -304,20 +304,18 @@ def columns(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
         panels[0].set_yticks(range(len(every)), [title_of(column) for column in every])
         panels[0].set(ylim=(len(every) - 0.5, -0.5), xlim=(-100.0, _WORST + 45.0))
         setp(panels, xticks=[-100, -50, 0, 50])
-    return caption("columns")
+    return caption("matrix")
 
 
 _WORST = 60.0  # [%] right of it a change is an arrow
 
 
-def _draw_columns(panel: Axes, verdicts: Sequence[Verdict], names: Sequence[str]) -> None:
+def _draw_sets(panel: Axes, verdicts: Sequence[Verdict], names: Sequence[str]) -> None:
     for i, (name, look) in enumerate(looks_of(names).items()):
         edge = {"color": look.color, "ha": "right", "va": "center", "fontsize": 7}
         for row, verdict in enumerate(verdicts):
-            one, y = (
-                compare(verdict, name, BASELINES[0]),
-                row + 0.8 * ((i + 0.5) / len(names) - 0.5),
-            )
+            one = compare(verdict, name, BASELINES[0])
+            y = row + 0.8 * ((i + 0.5) / len(names) - 0.5)
             value, low, high = one.change["L"]
             beyond = value > _WORST
             dot = dict(look.dot, markerfacecolor=look.color if one.counts else "white")
