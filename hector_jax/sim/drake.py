@@ -48,7 +48,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
 from hector_jax.sim.bodies import Body, Shape
 from hector_jax.sim.loop import Job
-from hector_jax.sim.plant import LEGS, OTHER, PointContacts, lasting_world
+from hector_jax.sim.plant import LEGS, OTHER, PointContacts, as_it_is, lasting_world
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import World, standing_qpos
 
@@ -179,6 +179,8 @@ class DrakePlant:
     def ground(self) -> Ground:
         """See `Plant`."""
         return self._contacts.ground()
+
+    ground_of = staticmethod(as_it_is)
 
 
 def _add_bodies(

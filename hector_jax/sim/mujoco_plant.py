@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
 from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
@@ -14,12 +15,6 @@ from hector_jax.sim.changes import worlds_by_step
 from hector_jax.sim.loop import Job
 from hector_jax.sim.sensing import Contacts, Ground
 from hector_jax.sim.world import World, build_world, standing_qpos
-
-
-@partial(jax.jit, static_argnames="feet")
-def _ground(contacts: Contacts, floor, foot_of_geom, feet: int) -> Ground:
-    of_one = partial(sensing.ground_of, feet=feet)
-    return jax.vmap(of_one, in_axes=(0, None, None))(contacts, floor, foot_of_geom)
 
 
 class MujocoPlant:
@@ -44,8 +39,7 @@ class MujocoPlant:
         self._contacts, self._steps = sensing.empty_contacts(end - first), 0
         self._now, self._where = first, sensing.coordinates(world)
         self._place = jax.device_put((np.array(world.floor), world.foot_of_geom))
-        self._feet, self._on_step = len(body.foot_point), on_step
-        self._worlds = worlds_by_step(world, job.changes, first, end)
+        self._worlds, self._on_step = worlds_by_step(world, job.changes, first, end), on_step
         # views, which stay: each look-up in MjData costs half a microsecond
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._push = self.data.xfrc_applied[world.trunk, :3]
@@ -73,8 +67,14 @@ class MujocoPlant:
         self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
         self._flat.take(self._where, out=row, mode="clip")
 
-    def ground(self) -> Ground:
+    def ground(self) -> tuple[Contacts, Array, Array]:
         """See `Plant`."""
         contacts = Contacts(*(x[: self._steps] for x in self._contacts))
         self._steps = 0
-        return _ground(contacts, *self._place, feet=self._feet)
+        return contacts, *self._place
+
+    @staticmethod
+    def ground_of(robot: Robot, touched: tuple[Contacts, Array, Array]) -> Ground:
+        """See `Plant`."""
+        of_one = partial(sensing.ground_of, feet=len(robot.foot_point))
+        return jax.vmap(of_one, in_axes=(0, None, None))(*touched)

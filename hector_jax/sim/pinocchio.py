@@ -17,7 +17,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
 from hector_jax.sim.bodies import Body, Shape
 from hector_jax.sim.loop import Job
-from hector_jax.sim.plant import LEGS, OTHER, PointContacts, lasting_world
+from hector_jax.sim.plant import LEGS, OTHER, PointContacts, as_it_is, lasting_world
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import STOP_TIME, World, standing_qpos
 
@@ -129,6 +129,8 @@ class PinocchioPlant:
     def ground(self) -> Ground:
         """See `Plant`."""
         return self._contacts.ground()
+
+    ground_of = staticmethod(as_it_is)
 
 
 def _model(robot: list[Body], world: World) -> tuple[pin.Model, dict[int, int]]:

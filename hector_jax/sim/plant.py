@@ -4,7 +4,7 @@ Whatever speaks an engine's own language (geoms, solvers, contact models) stays 
 """
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -34,8 +34,13 @@ class Plant(Protocol):
         """Write the coordinates now, in the order of `sensing.Reading`, into `row`."""
         ...
 
-    def ground(self) -> Ground:
-        """What touched in each of the milliseconds since the last call (n, ...)."""
+    def ground(self) -> Any:
+        """What touched in each of the milliseconds since the last call, as `ground_of` takes it."""
+        ...
+
+    @staticmethod
+    def ground_of(robot: Robot, touched: Any) -> Ground:
+        """What touched (n, ...), in JAX: it is compiled with what reads it, once for an engine."""
         ...
 
 
@@ -46,6 +51,11 @@ It takes the job, the robot of the plant (`Job.body`), which stands at the origi
 milliseconds after t = 0 at which the walk begins and ends. It raises an InputError where the engine
 cannot have such a plant.
 """
+
+
+def as_it_is(robot: Robot, touched: Ground) -> Ground:
+    """The `ground_of` of an engine that sums up its contacts itself."""
+    return touched
 
 
 OTHER, LEGS = -1, -2  # in the place of a foot: another part on the floor; a leg on another

@@ -56,20 +56,20 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
         memory, plan = loop.plan_tick(config, *inputs, max_contacts=max_contacts)
         return memory, plan, pack((memory, plan))
 
-    def samples(robot, command, anchor, tick, yaw, readings, ground) -> Sample:
+    def samples(robot, command, anchor, tick, yaw, readings, touched, *, ground_of) -> Sample:
         def one(time: Array, before: Array, after: Array, ground: Ground) -> Sample:
             effect = loop.effect_of(robot, before, ground)
             truth = robot, command, anchor, time, yaw, after
             return loop.sample(config, *truth, effect=effect, touches=ground.touches)
 
         times = tick + (1 + jnp.arange(count)) / count
-        return jax.vmap(one)(times, readings[:-1], readings[1:], ground)
+        return jax.vmap(one)(times, readings[:-1], readings[1:], ground_of(robot, touched))
 
     return SimpleNamespace(
         begin=jax.jit(begin),
         measure=jax.jit(loop.measure),
         plan=jax.jit(plan, static_argnames="max_contacts"),
-        samples=jax.jit(samples),
+        samples=jax.jit(samples, static_argnames="ground_of"),
     )
 
 
@@ -190,7 +190,7 @@ def _walk_ticks(
             plant.read(readings[i + 1])
         yaw = np.asarray(packed)[joints]
         truth = now, yaw_before, readings, plant.ground()
-        samples = programs.samples(body, command, anchor, *truth)
+        samples = programs.samples(body, command, anchor, *truth, ground_of=plant.ground_of)
         yield plan, samples
         if np.asarray(samples.fallen).any() or plant.broken:
             return
