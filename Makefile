@@ -35,12 +35,17 @@ engines: $(STAMP) ## install the other physics engines, Drake and Pinocchio
 tune: $(STAMP) ## tune and evaluate: make tune TRAJ=straight|c|s|all, TRAJ="c s", ROBOT=robot.toml
 	@$(BIN)/hector tune --traj $(TRAJ) $(if $(ROBOT),--robot $(ROBOT))
 
+TABLE := runs/table$(if $(QUICK),/quick)
+MODELS := --light-heavy --plant examples/hector-v2/robot.toml
+SHARED := shared_mean=docs/batch/shared/weights/mean-of-all.json
+
 table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a trial
 	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
+	@$(BIN)/hector verdict --engine all $(if $(QUICK),--seeds 1 --engine-seeds 1,$(MODELS)) --out $(TABLE)/verdict \
+		--weights nominal expert $(SHARED) $(foreach set,without with searched,$(set)=$(TABLE)/weights/$(set))
 
 verdict: $(STAMP) ## sets in all engines and models: make verdict WEIGHTS="nominal expert mine.json"
-	@$(BIN)/hector verdict --engine all --light-heavy --plant examples/hector-v2/robot.toml \
-		--weights $(or $(WEIGHTS),nominal expert shared_mean=docs/batch/shared/weights/mean-of-all.json)
+	@$(BIN)/hector verdict --engine all $(MODELS) --weights $(or $(WEIGHTS),nominal expert $(SHARED))
 
 grfm: $(STAMP) ## how well the nets predict the ground forces: runs/grfm/report.md
 	@$(BIN)/hector grfm

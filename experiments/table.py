@@ -22,7 +22,7 @@ from hector_jax.cli.flags import Configured, Family, Folder, Iterations, Plants,
 from hector_jax.cli.parse import as_command, as_table, check, read_flags
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.control.weights_file import load_weights
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import exit_code, say
 from hector_jax.core.environment import environment
 from hector_jax.core.files import as_json, locked, make_folder
@@ -197,6 +197,8 @@ def _make_table(
         for name, extra in files.sets.items():
             sets = _rows(tunings[name], searches[name], extra)
             walks[name] = steps.judge(bench, name, sets, standins, flags.plants)
+            for one, weights in sets.items():
+                save_weights(out / "weights" / one / f"{name}.json", weights)
     by_trajectory = {
         name: metrics.make_verdict(config.loss, flags.plants, one.scores)
         for name, one in walks.items()

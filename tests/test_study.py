@@ -109,6 +109,7 @@ def test_a_quick_table_leaves_what_it_promises_beside_the_whole_one(tmp_path, as
     assert list(result["trajectories"]["s"]["sets"]) == list(study.SETS)
     for name in ("table.csv", "table.tex"):
         assert (out / name).exists()
+    assert {path.parent.name for path in out.glob("weights/*/s.json")} == set(study.SETS)
 
 
 def test_a_ceiling_and_extra_sets_are_rows_and_cost_only_their_own_walks(
