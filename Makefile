@@ -39,7 +39,7 @@ TABLE := runs/table$(if $(QUICK),/quick)
 MODELS := --light-heavy --plant examples/hector-v2/robot.toml
 SHARED := shared_mean=docs/batch/shared/weights/mean-of-all.json
 
-table: $(STAMP) ## all sets on all trajectories, 32 plants: runs/table/report.md; QUICK=1 for a trial
+table: $(STAMP) ## all sets on 32 plants and their verdict in all engines, into runs/table; QUICK=1 for a trial
 	@$(BIN)/python experiments/table.py $(if $(QUICK),--quick)
 	@$(BIN)/hector verdict --engine all $(if $(QUICK),--seeds 1 --engine-seeds 1,$(MODELS)) --out $(TABLE)/verdict \
 		--weights nominal expert $(SHARED) $(foreach set,without with searched,$(set)=$(TABLE)/weights/$(set))

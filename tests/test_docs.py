@@ -16,7 +16,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from table import PROGRAM
+from table import PROGRAM, SETS
 from table import Flags as Table
 
 import hector_jax
@@ -142,6 +142,18 @@ def test_targets_of_make_in_pages_are_there(path):
     for line in lines_of(path, "make"):
         words = shlex.split(line, comments=True)[1:]
         assert {word for word in words if "=" not in word} <= there, line
+
+
+@pytest.mark.parametrize("quick", ["", "1"])
+def test_make_table_ends_with_a_verdict_of_its_sets(quick):
+    call = ["make", "-n", "table", f"QUICK={quick}"]
+    said = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    last = parse.from_line(shlex.split(said.replace("\\\n", " ").splitlines()[-1])[1:])
+    folder = Path("runs/table/quick" if quick else "runs/table")
+    own = [text.split("=") for text in last.weights if f"={folder}" in text]
+    assert own == [[name, f"{folder}/weights/{name}"] for name in ("without", "with", "searched")]
+    assert {name for name, _ in own} <= set(SETS)
+    assert last.out == folder / "verdict"
 
 
 @pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)

@@ -1,5 +1,6 @@
 """What weight sets are worth on walks, and nets on the ground forces of walks they never saw."""
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
@@ -14,12 +15,12 @@ from hector_jax.cli.flags import Evaluate, Grfm, Walk
 from hector_jax.cli.parse import as_table
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.core.console import Broken, bar, say, say_if_slow
 from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, printable
 from hector_jax.core.runtime import workers
-from hector_jax.core.trajectory import SOLVED
+from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import training
@@ -88,7 +89,8 @@ def walk(args: Walk) -> None:
     weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
     say("compiling (only the first time on a machine) and walking")
-    trajectory = arguments.walk_once(args, robot, course, weights, plant, engine)
+    once = partial(arguments.walk_once, args, robot, course, plant=plant, engine=engine)
+    trajectory = once(weights)
     score = metrics.score(loss, trajectory)
     upright, startup = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen))), None
     # a fall in the start-up is walked once more, in MuJoCo C
@@ -126,11 +128,23 @@ def walk(args: Walk) -> None:
             f"{float(score.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
         )
     if args.video is not None:
-        name = Path(args.weights).stem
-        beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
-        say(f"walking with {beside} weights for the other half of the film")
-        reference = arguments.walk_once(args, robot, course, other(robot), plant, engine)
-        pictures.film(args.video, robot, {beside: reference, name: trajectory})
+        _film(args.video, Path(args.weights).stem, trajectory, robot, once)
+
+
+def _film(
+    path: Path,
+    name: str,
+    trajectory: Trajectory,
+    robot: Robot,
+    once: Callable[[Weights], Trajectory],
+) -> None:
+    """Film a walk beside that with nominal weights, or with the expert's if it has those itself.
+
+    `once` walks again with given weights.
+    """
+    beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
+    say(f"walking with {beside} weights for the other half of the film")
+    pictures.film(path, robot, {beside: once(other(robot)), name: trajectory})
 
 
 def _print_walk(

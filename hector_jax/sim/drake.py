@@ -48,7 +48,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
 from hector_jax.sim.bodies import Body, Shape
 from hector_jax.sim.loop import Job
-from hector_jax.sim.plant import LEGS, OTHER, PointContacts, as_it_is, lasting_world
+from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts, lasting_world
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import World, standing_qpos
 
@@ -67,7 +67,7 @@ def _quiet_drake() -> Iterator[None]:
         logger.setLevel(level)
 
 
-class DrakePlant:
+class DrakePlant(Plant):
     """A `Plant` in Drake; its world is the same from the walk's start to its end."""
 
     def __init__(self, job: Job, body: Robot, first: int, end: int) -> None:
@@ -179,8 +179,6 @@ class DrakePlant:
     def ground(self) -> Ground:
         """See `Plant`."""
         return self._contacts.ground()
-
-    ground_of = staticmethod(as_it_is)
 
 
 def _add_bodies(

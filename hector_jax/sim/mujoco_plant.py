@@ -13,11 +13,12 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import sensing
 from hector_jax.sim.changes import worlds_by_step
 from hector_jax.sim.loop import Job
+from hector_jax.sim.plant import Plant
 from hector_jax.sim.sensing import Contacts, Ground
 from hector_jax.sim.world import World, build_world, standing_qpos
 
 
-class MujocoPlant:
+class MujocoPlant(Plant):
     """A `Plant` in MuJoCo C, which may change during a walk."""
 
     def __init__(
@@ -74,7 +75,7 @@ class MujocoPlant:
         return contacts, *self._place
 
     @staticmethod
-    def ground_of(robot: Robot, touched: tuple[Contacts, Array, Array]) -> Ground:
+    def ground_of(robot: Robot, contacts: tuple[Contacts, Array, Array]) -> Ground:
         """See `Plant`."""
         of_one = partial(sensing.ground_of, feet=len(robot.foot_point))
-        return jax.vmap(of_one, in_axes=(0, None, None))(*touched)
+        return jax.vmap(of_one, in_axes=(0, None, None))(*contacts)

@@ -17,7 +17,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
 from hector_jax.sim.bodies import Body, Shape
 from hector_jax.sim.loop import Job
-from hector_jax.sim.plant import LEGS, OTHER, PointContacts, as_it_is, lasting_world
+from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts, lasting_world
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import STOP_TIME, World, standing_qpos
 
@@ -30,7 +30,7 @@ _SOFT = 1e-6, 1e-3, 1e-2
 _FAR = 1e-4  # [m/s], its residual from which on a step counts as failed
 
 
-class PinocchioPlant:
+class PinocchioPlant(Plant):
     """A `Plant` in Pinocchio; its world is the same from the walk's start to its end."""
 
     def __init__(self, job: Job, body: Robot, first: int, end: int) -> None:
@@ -129,8 +129,6 @@ class PinocchioPlant:
     def ground(self) -> Ground:
         """See `Plant`."""
         return self._contacts.ground()
-
-    ground_of = staticmethod(as_it_is)
 
 
 def _model(robot: list[Body], world: World) -> tuple[pin.Model, dict[int, int]]:

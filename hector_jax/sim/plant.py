@@ -3,8 +3,9 @@
 Whatever speaks an engine's own language (geoms, solvers, contact models) stays behind it.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,31 +18,34 @@ from hector_jax.sim.sensing import Ground, Touches
 from hector_jax.sim.world import World, build_world
 
 
-@runtime_checkable
-class Plant(Protocol):
+class Plant(ABC):
     """A robot in the world of one walk; it stands at the origin when it is built."""
 
     @property
+    @abstractmethod
     def broken(self) -> bool:
         """Whether the engine warned or failed: what follows means nothing."""
-        ...
 
+    @abstractmethod
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
         """Step a millisecond under joint torques [N m] and a force [N] on the trunk's centre."""
-        ...
 
+    @abstractmethod
     def read(self, row: Float[np.ndarray, " reading"]) -> None:
         """Write the coordinates now, in the order of `sensing.Reading`, into `row`."""
-        ...
 
+    @abstractmethod
     def ground(self) -> Any:
-        """What touched in each of the milliseconds since the last call, as `ground_of` takes it."""
-        ...
+        """Contacts of each of the n milliseconds since the last call, as `ground_of` takes them."""
 
     @staticmethod
-    def ground_of(robot: Robot, touched: Any) -> Ground:
-        """What touched (n, ...), in JAX: it is compiled with what reads it, once for an engine."""
-        ...
+    def ground_of(robot: Robot, contacts: Any) -> Ground:
+        """Sum up the contacts that `ground` returned, in JAX, as a Ground with a leading axis n.
+
+        The closed loop calls it within its compiled program of a tick: with a compiled call of its
+        own, walks in MuJoCo C take 7 to 9 % longer. By default `ground` has summed them up already.
+        """
+        return contacts
 
 
 BuildPlant = Callable[[Job, Robot, int, int], Plant]
@@ -51,11 +55,6 @@ It takes the job, the robot of the plant (`Job.body`), which stands at the origi
 milliseconds after t = 0 at which the walk begins and ends. It raises an InputError where the engine
 cannot have such a plant.
 """
-
-
-def as_it_is(robot: Robot, touched: Ground) -> Ground:
-    """The `ground_of` of an engine that sums up its contacts itself."""
-    return touched
 
 
 OTHER, LEGS = -1, -2  # in the place of a foot: another part on the floor; a leg on another

@@ -56,14 +56,14 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
         memory, plan = loop.plan_tick(config, *inputs, max_contacts=max_contacts)
         return memory, plan, pack((memory, plan))
 
-    def samples(robot, command, anchor, tick, yaw, readings, touched, *, ground_of) -> Sample:
+    def samples(robot, command, anchor, tick, yaw, readings, contacts, *, ground_of) -> Sample:
         def one(time: Array, before: Array, after: Array, ground: Ground) -> Sample:
             effect = loop.effect_of(robot, before, ground)
             truth = robot, command, anchor, time, yaw, after
             return loop.sample(config, *truth, effect=effect, touches=ground.touches)
 
         times = tick + (1 + jnp.arange(count)) / count
-        return jax.vmap(one)(times, readings[:-1], readings[1:], ground_of(robot, touched))
+        return jax.vmap(one)(times, readings[:-1], readings[1:], ground_of(robot, contacts))
 
     return SimpleNamespace(
         begin=jax.jit(begin),
