@@ -89,7 +89,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     fallen = np.arange(len(walk.fallen)) >= 20 * len(walk.fallen) // 30
     residual = np.where(fallen, np.inf, 0.0)
     wrong = walk._replace(fallen=fallen, residual=residual)
-    monkeypatch.setattr(arguments, "walk_once", lambda *args: wrong)
+    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: wrong)
     assert call(monkeypatch, "walk") == 1
     out, err = capsys.readouterr()
     assert "nominal weights: ended after 0.20 s" in out
@@ -98,7 +98,9 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
     found = json.loads(capsys.readouterr().out)
     assert (found["fell"], found["plans"], found["unsolved"]) == (False, 30, 10)
     assert found["residual"] is None
-    monkeypatch.setattr(arguments, "walk_once", lambda *args: walk._replace(fallen=fallen))
+    monkeypatch.setattr(
+        arguments, "walk_once", lambda *args, **kwargs: walk._replace(fallen=fallen)
+    )
     assert call(monkeypatch, "walk") == 0
     assert "nominal weights: fell after 0.20 s" in capsys.readouterr().out
 
@@ -106,7 +108,7 @@ def test_a_walk_whose_qps_were_not_solved_is_no_result_and_no_fall(monkeypatch, 
 def test_a_newline_in_the_name_of_a_file_is_not_printed(monkeypatch, capsys, tmp_path):
     path = tmp_path / "two\nlines.json"
     save_weights(path, expert())
-    monkeypatch.setattr(arguments, "walk_once", lambda *args: synthetic_walk(0, 30))
+    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: synthetic_walk(0, 30))
     assert call(monkeypatch, "walk", "--weights", path) == 0
     assert "two lines.json weights: walked" in capsys.readouterr().out.splitlines()[0]
 
@@ -576,7 +578,7 @@ def test_what_a_parser_printed_before_it_exits_needs_no_reader(monkeypatch):
 @pytest.mark.parametrize(("name", "beside"), [("nominal", "expert"), ("mine", "nominal")])
 def test_the_halves_of_a_film_have_names_of_their_own(monkeypatch, tmp_path, name, beside):
     films = []
-    monkeypatch.setattr(arguments, "walk_once", lambda *args: synthetic_walk(0, 30))
+    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: synthetic_walk(0, 30))
     monkeypatch.setattr(evaluate.pictures, "film", lambda path, robot, walks: films.append(walks))
     save_weights(tmp_path / f"{name}.json", expert())
     words = "--weights", tmp_path / f"{name}.json", "--video", tmp_path / "walk.mp4"

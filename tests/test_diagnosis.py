@@ -175,7 +175,7 @@ def test_a_tuned_set_that_walks_worse_than_nominal_is_told(capsys):
 
 
 def test_hector_walk_tells_the_fall_and_prints_no_nan(monkeypatch, capsys):
-    monkeypatch.setattr(arguments, "walk_once", lambda *args: fallen_at_once())
+    monkeypatch.setattr(arguments, "walk_once", lambda *args, **kwargs: fallen_at_once())
     monkeypatch.setattr(evaluate, "startup_fall", lambda *args: FALL)
     monkeypatch.setattr(sys, "argv", ["hector", "walk"])
     assert main() == 0
