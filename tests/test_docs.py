@@ -146,7 +146,7 @@ def test_targets_of_make_in_pages_are_there(path):
 
 @pytest.mark.parametrize("quick", ["", "1"])
 def test_make_table_ends_with_a_verdict_of_its_sets(quick):
-    call = ["make", "-n", "table", f"QUICK={quick}"]
+    call = ["make", "-n", "--no-print-directory", "table", f"QUICK={quick}"]
     said = subprocess.run(call, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     last = parse.from_line(shlex.split(said.replace("\\\n", " ").splitlines()[-1])[1:])
     folder = Path("runs/table/quick" if quick else "runs/table")
