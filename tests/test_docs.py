@@ -23,6 +23,8 @@ import hector_jax
 from hector_jax.cli import flags, parse
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import COMMANDS
+from hector_jax.control.weights import weights_to_vector
+from hector_jax.control.weights_file import load_weights
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -178,6 +180,15 @@ def test_tests_that_pages_name_are_there():
     assert len(named) > 40
     for file, name in sorted(named):  # `test_a_name...` stands for the tests that begin so
         assert f"\ndef {name}" in (ROOT / "tests" / file).read_text(), f"{file}::{name}"
+
+
+def test_the_set_best_is_half_way_between_the_sets_that_the_page_names():
+    def log(path):
+        return np.log(weights_to_vector(load_weights(DOCS / path)))
+
+    without = [log(f"verdict/weights/without/{name}.json") for name in ("straight", "c", "s")]
+    half_way = (log("batch/shared/weights/mean-of-all.json") + np.mean(without, axis=0)) / 2
+    np.testing.assert_allclose(log("results/best.json"), half_way, atol=1e-9)
 
 
 def changes(seeds):
