@@ -224,6 +224,29 @@ def test_the_table_of_the_results_page_is_that_of_its_files():
             assert text == f"{pairs[0]} ({pairs[1]})", (which, name)
 
 
+def test_what_the_readme_says_of_the_verdict_is_in_its_file():
+    result = json.loads((DOCS / "verdict" / "verdict.json").read_text())
+    cells = [of for one in result["columns"] for of in one["trajectories"].values()]
+    text = " ".join((ROOT / "README.md").read_text().split())
+    sets, ratios, voids = result["sets"], [], []
+    for base in ("nominal", "expert"):
+        assert all(of["shared"]["change"][base]["high"] < 0 for of in cells)
+        against = sets["shared"]["against"][base]
+        ratios.append(min(one["gain"] / one["spread"] for one in against["spread"]))
+        voids.append(against["void"])
+    falls = {name: one["falls"] for name, one in sets.items()}
+    on_c = sum(one["trajectories"]["c"]["with"]["falls"] for one in result["columns"])
+    assert f"{len(cells)} of {len(cells)} cases and no interval contains zero" in text
+    assert f"In {voids[0]} and {voids[1]} of them" in text
+    down = [f"{np.floor(10 * ratio) / 10:.1f}" for ratio in ratios]
+    assert f"Its gain is at least {down[0]} and {down[1]} times" in text
+    assert (
+        f"Of {sets['nominal']['walks']} walks `shared_mean` falls in {falls['shared']}, `nominal` "
+        f"in {falls['nominal']}, `expert` in {falls['expert']}, `without` and `ceiling` in "
+        f"{falls['without'] + falls['searched']}, `with` in {falls['with']}, of which {on_c} on"
+    ) in text
+
+
 def test_pages_have_titles_of_their_own():
     titles = [re.search(r"^# (.+)$", path.read_text(), re.MULTILINE).group(1) for path in PAGES]
     assert sorted(titles) == sorted(set(titles))
