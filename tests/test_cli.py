@@ -20,7 +20,13 @@ from hector_jax.cli import arguments, doctor, evaluate
 from hector_jax.cli.flags import COMMANDS, Tune
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import from_file
-from hector_jax.control.weights import expert, nominal, weight_names, weights_to_vector
+from hector_jax.control.weights import (
+    between,
+    expert,
+    nominal,
+    weight_names,
+    weights_to_vector,
+)
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import exit_code
 from hector_jax.core.tree_file import read_card
@@ -155,7 +161,13 @@ def test_missing_weights_file(monkeypatch, capsys, tmp_path):
 
 def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, capsys):
     line = refused(monkeypatch, capsys, "walk", "--weights", "exprt")
-    assert "nominal, expert or a weights file, got 'exprt'; did you mean 'expert'?" in line
+    assert "nominal, expert, best or a weights file, got 'exprt'; did you mean 'expert'?" in line
+
+
+def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys):
+    robot = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+    line = refused(monkeypatch, capsys, "walk", "--weights", "best", "--robot", robot)
+    assert f"there is no {robot.with_name('best.json')}; tune this robot" in line
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
@@ -345,6 +357,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     )
     assert float(json.loads((run / "versions.json").read_text())["seconds"]) > 0.0
     names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "with_refreshed"]
+    names += ["best"]
     for name in names:
         assert name in out
         assert (run / "weights" / f"{name}.json").exists()
@@ -359,6 +372,13 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
             assert standin[part]["low"] is None  # two plants have no interval
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert {line["set"] for line in lines} == {"without", "with", "with_refreshed"}
+    without, refreshed, best = (
+        load_weights(run / "weights" / f"{name}.json")
+        for name in ("without", "with_refreshed", "best")
+    )
+    assert best.others == {"friction": pytest.approx(0.55)}  # of the controller's 0.6
+    half_way = between(without, refreshed)._replace(others=best.others)
+    jax.tree.map(np.testing.assert_allclose, best, half_way)
     assert result["refresh"][0].keys() == {"old", "new"}
     assert len(load_walks(run / "refresh-1" / "walks", load_robot()).job.seed) == 4
     card = read_card(run / "refresh-1" / "refreshed.npz")["about"]
@@ -379,7 +399,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     for title in ("straight, c, 1 plant", "straight, 1 plant", "c, 1 plant"):
         assert f"\n{title} on the" in f"\n{out}"
     result = json.loads(Path("both/result.json").read_text())
-    names = ["nominal", "expert", "start", "without_ten", "with_ten", "without", "with"]
+    names = ["nominal", "expert", "start", "without_ten", "with_ten", "without", "with", "best"]
     assert list(result["sets"]) == names
     each = result["trajectories"]
     assert list(each) == ["straight", "c"]

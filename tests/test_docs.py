@@ -14,6 +14,7 @@ from dataclasses import fields
 from pathlib import Path
 from unittest import mock
 
+import jax
 import numpy as np
 import pytest
 from table import PROGRAM, SETS
@@ -23,8 +24,8 @@ import hector_jax
 from hector_jax.cli import flags, parse
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import COMMANDS
-from hector_jax.control.weights import weights_to_vector
-from hector_jax.control.weights_file import load_weights
+from hector_jax.control.weights import between
+from hector_jax.control.weights_file import best, load_weights
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -182,13 +183,10 @@ def test_tests_that_pages_name_are_there():
         assert f"\ndef {name}" in (ROOT / "tests" / file).read_text(), f"{file}::{name}"
 
 
-def test_the_set_best_is_half_way_between_the_sets_that_the_page_names():
-    def log(path):
-        return np.log(weights_to_vector(load_weights(DOCS / path)))
-
-    without = [log(f"verdict/weights/without/{name}.json") for name in ("straight", "c", "s")]
-    half_way = (log("batch/shared/weights/mean-of-all.json") + np.mean(without, axis=0)) / 2
-    np.testing.assert_allclose(log("results/best.json"), half_way, atol=1e-9)
+def test_the_best_set_is_half_way_between_the_sets_that_the_page_names():
+    without, tuned = (load_weights(DOCS / f"results/best/{n}.json") for n in ("without", "with"))
+    half_way = between(without, tuned)._replace(others={"friction": 0.55})
+    jax.tree.map(np.testing.assert_allclose, best(), half_way)
 
 
 def changes(seeds):

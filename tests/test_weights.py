@@ -7,6 +7,8 @@ import pytest
 
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
+    Weights,
+    between,
     direction_names,
     directions,
     expert,
@@ -75,3 +77,15 @@ def test_the_feet_share_their_weights_in_every_direction():
     weights = scale_weights(nominal(), step)
     np.testing.assert_allclose(weights.R.force[:, 2], 2.0 * nominal().R.force[:, 2])
     np.testing.assert_allclose(weights.R.force[:, :2], nominal().R.force[:, :2])
+
+
+def test_between_two_sets_weights_are_geometric_means_and_other_numbers_lie_on_a_line():
+    one, other = (w._replace(others={"turn_lead": x}) for w, x in ((nominal(), 0), (expert(), 1)))
+    for share, end in ((0.0, one), (1.0, other)):
+        jax.tree.map(np.testing.assert_allclose, between(one, other, share), end)
+    third = between(one, other, 1 / 3)
+    assert third.others == {"turn_lead": pytest.approx(1 / 3)}
+    cubes = weights_to_vector(nominal()) ** 2 * weights_to_vector(expert())
+    np.testing.assert_allclose(weights_to_vector(third) ** 3, cubes, rtol=1e-12)
+    points = Weights(nominal().Q, nominal().R._replace(moment=np.zeros((2, 0))))
+    assert between(points, points).R.moment.shape == (2, 0)

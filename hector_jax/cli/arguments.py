@@ -12,7 +12,7 @@ from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
 from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
-from hector_jax.control.weights_file import load_weights
+from hector_jax.control.weights_file import best, load_weights
 from hector_jax.core.console import say
 from hector_jax.core.files import as_json
 from hector_jax.core.inputs import InputError
@@ -37,7 +37,7 @@ def weights(text: str, robot: Robot) -> Weights:
     Raises:
         InputError: the file holds none.
     """
-    named = {"nominal": nominal, "expert": expert}
+    named = {"nominal": nominal, "expert": expert, "best": best}
     return named[text](robot) if text in named else load_weights(Path(text), robot)
 
 

@@ -10,7 +10,8 @@ from hector_jax.core.settings import SEED, Range
 
 T = TypeVar("T")
 
-NAMED_WEIGHTS = ("nominal", "expert")
+BASELINES = ("nominal", "expert")
+NAMED_WEIGHTS = (*BASELINES, "best")
 
 
 class Source(Enum):
@@ -20,8 +21,8 @@ class Source(Enum):
     RUN = "the folder of a run of `hector tune`"
     FOLDER = "a folder"  # which may be missing
     EXPORTABLE = "a run folder or a weights file"
-    WEIGHTS = "nominal, expert or a weights file"
-    SETS = "nominal, expert, a weights file, or a folder of one for each trajectory"
+    WEIGHTS = "nominal, expert, best or a weights file"
+    SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
     TRAJECTORY = "a name or a TOML file"
     ROBOT = "a TOML file that names an MJCF (docs/howto/robot.md)"
 
@@ -122,12 +123,14 @@ class Tune(Configured):
 
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
-    start: Weights = "nominal"  # where to start: nominal, expert or a weights file
+    start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
     also: tuple[Number, ...] = ()  # numbers of the controller that are tuned beside Q and R
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
+    # of `with` in row `best`; the rest is `without`, which tracks less well and falls less
+    share: Annotated[float, Range(0, 1)] = 0.5
     refresh: Annotated[int, Range(0, 100)] = 0  # times to collect at the new weights and repeat
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, Source.FILE] = None  # file of another net, instead of that in DATA
@@ -135,7 +138,7 @@ class Tune(Configured):
     out: Path | None = None  # the run folder itself, which must not exist (with --each: OUT/TRAJ)
     run: Path | None = None  # the older name of --out
     resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
-    video: bool = True  # make a film of the nominal and the tuned weights
+    video: bool = True  # make a film of the nominal and the best weights
     # print up to 12 walks more: in other engines, or else with other masses of the robot
     verdict: bool = False
     processes: Processes = 2  # worker processes, one core each
@@ -156,7 +159,7 @@ class Search(Configured):
     seed: Seed = 0  # seed of the search
     # initial standard deviation of each log-weight
     spread: Annotated[float, Range(0, 10, above=True)] = 1.0
-    start: Weights = "nominal"  # nominal, expert or a weights file
+    start: Weights = "nominal"  # nominal, expert, best or a weights file
     engine: Engine = "auto"  # c: MuJoCo, one walk per process; mjx: all at once; auto: mjx on a GPU
     out: Folder = Path("runs/search")  # folder for the best weights, each with a card
     record: Path | None = None  # folder of the record that a search resumes from; by default OUT
@@ -172,7 +175,7 @@ class Evaluate(Configured):
     Example: hector evaluate --traj c --weights nominal expert mine.json
     """
 
-    weights: tuple[Weights, ...] = NAMED_WEIGHTS  # nominal, expert or weights files
+    weights: tuple[Weights, ...] = BASELINES  # nominal, expert, best or weights files
     traj: Trajectory = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
     world: PlantWorld = "standin"  # world of the plants; standin-even: masses drawn evenly
     seconds: Seconds = 4.0  # length of each walk [s]; a whole eight takes 8
@@ -194,8 +197,8 @@ class Verdict(Configured):
     Example: hector verdict --weights nominal expert with=runs/tuned --light-heavy
     """
 
-    # nominal, expert, weights files, folders of straight.json, c.json, ...; or NAME=any of these
-    weights: tuple[WeightSets, ...] = NAMED_WEIGHTS
+    # nominal, expert, best, weights files, folders of straight.json, c.json, ...; or NAME=one
+    weights: tuple[WeightSets, ...] = BASELINES
     traj: Trajectories = ("straight", "c", "s")  # trajectories: names or TOML files
     engine: tuple[JudgingEngine, ...] = ("c",)  # c: MuJoCo; or all: every one that is installed
     plant: tuple[Annotated[Path, Source.ROBOT], ...] = ()  # TOML files of models of the robot
@@ -222,7 +225,7 @@ class Walk(Configured):
     traj: Trajectory = "straight"  # straight, c, s, sideways, turn, eight, stop-and-go or a file
     world: World = "hfs"  # where to walk
     seed: Seed = 0  # seed of the plant and of the estimator's noise
-    weights: Weights = "nominal"  # nominal, expert or a weights file
+    weights: Weights = "nominal"  # nominal, expert, best or a weights file
     seconds: Seconds = 4.0  # length of the walk [s]
     out: Path | None = None  # file for the trajectory (.npz)
     video: Path | None = None  # file for a film beside nominal weights (.mp4; .webp for a page)
@@ -262,7 +265,7 @@ class Export:
     """
 
     run: Annotated[Path, Source.EXPORTABLE]  # run folder, `latest`, or a weights file
-    set: str = "with"  # weight set of the run
+    set: str = "best"  # weight set of the run
     out: Path | None = None  # folder; by default `export` in the run or beside the weights file
     # trajectory to check on; by default that of the run, or straight
     traj: Annotated[str | None, Source.TRAJECTORY] = None

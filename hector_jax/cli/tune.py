@@ -15,12 +15,12 @@ import numpy as np
 
 from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import NAMED_WEIGHTS, Tune, Walk
+from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, command_of
-from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights import Weights, between, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
@@ -46,6 +46,7 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 
+_FRICTION = 11 / 12  # share of the controller's friction with which `best` plans
 _FOLDERS = ("out", "run", "resume")  # flags that name the run folder
 
 
@@ -261,7 +262,11 @@ def _note_settings(run: _Run) -> dict[str, Any]:
 
 
 def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
-    """Tune without and with the net, and again with it refreshed; writes the weights."""
+    """Tune without and with the net, and again with it refreshed; writes the weights.
+
+    The set between the two, `best`, is the answer: what each gains by faults of its own model is
+    half lost there, what both gain stays. It plans with less friction than the controller assumes.
+    """
     journal = Journal(run.folder / METRICS)
     step = partial(
         tunings.tune,
@@ -307,11 +312,14 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     sets = {
         "nominal": nominal(run.robot),
         "expert": expert(run.robot),
-        **({} if run.args.start in NAMED_WEIGHTS else {"start": run.start}),
+        **({} if run.args.start in BASELINES else {"start": run.start}),
         **{f"{name}_ten": tuned[name].ten for name in run.problems},
         **{name: one.converged for name, one in tuned.items()},
         **{name: one.weights for name, one in choices.items()},
     }
+    half_way = between(sets["without"], sets[name], run.args.share)
+    margin = {"friction": _FRICTION * run.config.rollout.walk.mpc.friction}
+    sets["best"] = half_way._replace(others=margin | half_way.others)
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
     return _Tuned(tuned, shifts, sets, choices)
@@ -392,8 +400,7 @@ def _film(run: _Run, walks: ScoredWalks) -> Picture | str:
     """The film of a run, or why there is none."""
     if not run.args.video:
         return "left out (--no-video)"
-    tuned = "with_walks" if "with_walks" in walks.first else "with"
-    pair = {name: walks.first[name] for name in ("nominal", tuned)}
+    pair = {name: walks.first[name] for name in ("nominal", "best")}
     film = run.folder / "film.mp4"
     reason = pictures.film(film, run.robot, pair, run.folder / "film.png")
     return reason or Picture(film.name, "Nominal and tuned weights on the first stand-in plant.")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, get_args
 
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
-from hector_jax.cli.flags import NAMED_WEIGHTS, JudgingEngine, Verdict
+from hector_jax.cli.flags import BASELINES, JudgingEngine, Verdict
 from hector_jax.cli.parse import as_command, as_table
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand
@@ -158,7 +158,7 @@ def _sets(args: Verdict, robot: Robot, courses: Mapping[str, Any]) -> dict[str, 
                 f"--weights {text}: {name!r} is no name of letters, digits and _; give it one: "
                 f"NAME={file}"
             )
-        if name in paths or (name in NAMED_WEIGHTS and file != name):
+        if name in paths or (name in BASELINES and file != name):
             raise InputError(f"--weights {text}: there is a set {name!r} already; use NAME={file}")
         paths[name] = path
     if "nominal" not in paths or len(paths) < 2:

@@ -127,6 +127,19 @@ def scale_weights(weights: Weights, logs: Float[np.ndarray, " directions"]) -> W
     return jax.tree.map(np.asarray, moved)
 
 
+def between(one: Weights, other: Weights, share: float = 0.5) -> Weights:
+    """Weights between two sets: their geometric mean, in which `share` counts the other one.
+
+    Numbers beside Q and R, which may be zero, are on the straight line from one to the other.
+
+    >>> between(nominal(), expert()).Q.euler.round(1).tolist()
+    [70.7, 70.7, 111.8]
+    """
+    Q, R = jax.tree.map(lambda x, y: x ** (1.0 - share) * y**share, one[:2], other[:2])
+    line = jax.tree.map(lambda x, y: (1.0 - share) * x + share * y, one.others, other.others)
+    return jax.tree.map(np.asarray, Weights(Q, R, line))
+
+
 def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:
     """Draw weight sets log-uniformly within x/factor of some weights, always the same ones."""
     draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(direction_names(weights))))

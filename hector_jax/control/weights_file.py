@@ -13,6 +13,7 @@ from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.settings import Range, read_json, validation_error
 from hector_jax.core.trajectory import State
+from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
 
 WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
@@ -40,6 +41,23 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
     """
     tree = {} if schema is None else {"$schema": schema}
     write_json(path, tree | weights_tree(weights))
+
+
+def best(robot: Robot | None = None) -> Weights:
+    """The tuned weights that are shipped with a robot: `best.json` beside its TOML.
+
+    Those of HECTOR, which are the default, are the row `best` of `hector tune --traj all`, the
+    friction with which to plan included (docs/results.md).
+
+    Raises:
+        InputError: one line, where the robot has no such file or it is none of weights.
+    """
+    path = (HECTOR if robot is None else robot.description).path.with_name("best.json")
+    if not path.exists():
+        raise InputError(
+            f"weights best: there is no {path}; tune this robot and name a file of its run"
+        )
+    return load_weights(path, robot)
 
 
 def load_weights(path: Path, robot: Robot | None = None) -> Weights:

@@ -44,8 +44,9 @@ def of_run(
     Returns:
         The pictures, in the order of the report.
     """
-    four = {name: walks[name] for name in ("nominal", "expert", "without", "with")}
-    flat = {name: np.asarray(weights_to_vector(sets[name])) for name in four}
+    four = {name: walks[name] for name in ("nominal", "expert", "with", "best")}
+    compared = ("nominal", "expert", "without", "with")
+    flat = {name: np.asarray(weights_to_vector(sets[name])) for name in compared}
     histories = {name: tunings[name].history for name in ("without", "with")}
     path, tick = folder / "pictures", config.rollout.walk.gait.tick
     path.mkdir(exist_ok=True)
