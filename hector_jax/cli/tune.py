@@ -318,8 +318,8 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         **{name: one.weights for name, one in choices.items()},
     }
     half_way = between(sets["without"], sets[name], run.args.share)
-    margin = {"friction": _FRICTION * run.config.rollout.walk.mpc.friction}
-    sets["best"] = half_way._replace(others=margin | half_way.others)
+    friction = _FRICTION * run.config.rollout.walk.mpc.friction
+    sets["best"] = half_way._replace(others={"friction": friction, **half_way.others})
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
     return _Tuned(tuned, shifts, sets, choices)
