@@ -336,7 +336,7 @@ def test_without_flatbuffers_it_is_said_what_to_install(monkeypatch):
 def run(tmp_path):
     """A finished run, as far as export reads it."""
     walk = asdict(CONFIG)
-    save_weights(tmp_path / "weights" / "with.json", expert())
+    save_weights(tmp_path / "weights" / "best.json", expert())
     flags = {"traj": "straight", "data": "data"}
     config = {"flags": flags, "tune": {"rollout": {"walk": walk}}}
     (tmp_path / "config.json").write_text(json.dumps(config))
@@ -432,10 +432,10 @@ def test_a_run_is_exported_with_its_own_controller(run):
     kept = asdict(own)
     del kept["mpc"]["effort_reference"]  # of a run from before there was such a setting
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
-    assert find_weights(run, "with") == (run / "weights" / "with.json", own)
-    hash(find_weights(run, "with")[1])
-    path = run / "weights" / "with.json"
-    assert find_weights(path, "with") == (path, None)
+    assert find_weights(run, "best") == (run / "weights" / "best.json", own)
+    hash(find_weights(run, "best")[1])
+    path = run / "weights" / "best.json"
+    assert find_weights(path, "best") == (path, None)
 
 
 def test_a_setting_that_this_version_does_not_know_is_not_dropped(run):
@@ -443,7 +443,7 @@ def test_a_setting_that_this_version_does_not_know_is_not_dropped(run):
     kept["mpc"]["mu"] = kept["mpc"].pop("friction")
     (run / "config.json").write_text(json.dumps({"tune": {"rollout": {"walk": kept}}}))
     with pytest.raises(InputError, match="tune.rollout.walk: mpc: unknown field 'mu'"):
-        find_weights(run, "with")
+        find_weights(run, "best")
 
 
 @pytest.mark.parametrize(
@@ -469,7 +469,7 @@ def test_bad_input_is_one_line_and_writes_nothing(monkeypatch, capsys, run, argu
 def test_a_run_without_settings_is_refused_by_name(run, text):
     (run / "config.json").write_text(text)
     with pytest.raises(ValueError, match=r"config\.json"):
-        find_weights(run, "with")
+        find_weights(run, "best")
 
 
 def test_a_weights_file_is_exported_by_its_name(monkeypatch, tmp_path):
