@@ -449,8 +449,8 @@ def test_a_setting_that_this_version_does_not_know_is_not_dropped(run):
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (["--set", "wiht"], "did you mean 'with'"),
-        (["--set", "zzz"], "known: with"),
+        (["--set", "bset"], "did you mean 'best'"),
+        (["--set", "zzz"], "known: best"),
         (["--traj", "circle"], "circle"),
         (["--seconds", "0"], "--seconds"),
     ],
