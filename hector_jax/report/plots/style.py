@@ -55,7 +55,7 @@ _SPARE = (("#b0186a", "s"), ("#6cb0dc", "^"), ("#8a8a00", "h"), ("black", "P"), 
 _NAMES = {
     "without": "without (tuned, no net)",
     "with": "with (tuned, net)",
-    "best": "best (between the two)",
+    "best": "best (tuned)",
     "ceiling": "ceiling (long search)",
     "predicted": "predicted by the net",
     "linear": "predicted by a linear map",
