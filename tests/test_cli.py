@@ -492,13 +492,13 @@ def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong)
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("flag", ["--also", "--start"])
+@pytest.mark.parametrize("flag", ["--tune", "--start"])
 def test_a_refresh_takes_q_and_r_alone(monkeypatch, capsys, tmp_path, flag):
     save_weights(tmp_path / "mine.json", nominal()._replace(others={"turn_lead": np.array(0.8)}))
-    value = "friction" if flag == "--also" else tmp_path / "mine.json"
+    value = "friction" if flag == "--tune" else tmp_path / "mine.json"
     run = "--run", tmp_path / "run", "--refresh", "1"
     line = refused(monkeypatch, capsys, "tune", *run, flag, value)
-    assert "neither --also nor a start with others" in line
+    assert "neither --tune nor a start with others" in line
     assert not (tmp_path / "run").exists()
 
 

@@ -5,6 +5,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
+import tyro
+
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import SEED, Range
 
@@ -32,7 +34,21 @@ Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]
 Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper, of which it tells
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
-Number = Literal["footstep_feedback", "footstep_width", "turn_lead", "effort_reference", "friction"]
+Tunables = Literal[
+    "weights",
+    "footsteps",
+    "integral",
+    "all",
+    "footstep_feedback",
+    "footstep_width",
+    "turn_lead",
+    "effort_reference",
+    "friction",
+    "horizontal_gain",
+    "height_gain",
+    "tilt_gain",
+    "yaw_gain",
+]
 Variant = Literal["residual", "paper"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
 Engine = Literal["auto", OneEngine]
@@ -124,7 +140,8 @@ class Tune(Configured):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
-    also: tuple[Number, ...] = ()  # numbers of the controller that are tuned beside Q and R
+    # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name
+    tune: Annotated[tuple[Tunables, ...], tyro.conf.arg(aliases=["--also"])] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net

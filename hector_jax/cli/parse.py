@@ -167,6 +167,8 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         values[name] = value
     if kind is Tune and isinstance(values.get("traj"), str):
         values["traj"] = [values["traj"]]  # older runs were tuned on one
+    if kind is Tune and "also" in values:  # its older name
+        values["tune"] = values.pop("also") or ["weights"]
     return from_table(str(path), kind, values)
 
 

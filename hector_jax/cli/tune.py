@@ -18,6 +18,7 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
+from hector_jax.control.parameters import tunables
 from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, between, expert, nominal
@@ -108,8 +109,8 @@ def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
         return courses
     if args.net:
         raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
-    if args.also or arguments.weights(args.start, robot).others:
-        raise InputError("--refresh takes Q and R alone, neither --also nor a start with others")
+    if tunables(args.tune) or arguments.weights(args.start, robot).others:
+        raise InputError("--refresh takes Q and R alone, neither --tune nor a start with others")
     if len(courses) > 1:
         raise InputError(f"--refresh takes one trajectory, got {len(courses)}; add --each")
     if pieces > PIECES:
@@ -163,7 +164,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     begun, made_with = time.monotonic(), environment()
     robot = load_robot(args.robot)
     trajectories = _trajectories(args, robot)
-    config = tunings.tune_config(robot, iterations=args.iterations, others=args.also)
+    config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         _say_what_no_weights_mend(pool, config, robot, trajectories[0])

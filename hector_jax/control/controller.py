@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hector_jax.control import gait, legs
+from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, integrate_error
 from hector_jax.control.footstep import (
     Feet,
     FootstepConfig,
@@ -107,9 +108,10 @@ def walk_config(robot: Robot) -> WalkConfig:
 
 
 class Memory(NamedTuple):
-    """What the controller remembers: where each foot last stood."""
+    """What the controller remembers: where each foot last stood, and what its model lacks."""
 
     liftoff: Feet
+    disturbance: Disturbance
 
 
 class Plan(NamedTuple):
@@ -121,6 +123,7 @@ class Plan(NamedTuple):
     swing_ticks: Int[Array, "*batch feet"]  # since lift-off
     residual: Float[Array, "*batch"]  # worst relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
+    disturbance: Disturbance  # to be carried to the next plan
 
 
 class Retune(NamedTuple):
@@ -205,6 +208,7 @@ def plan(
     tick: Int[Array, ""],
     state: State,
     feet: Feet,
+    disturbance: Disturbance = NO_DISTURBANCE,
     max_contacts: int = 1,
 ) -> Plan:
     """Solve the MPC for one tick. Returns the commanded wrench and the planned touchdowns.
@@ -215,6 +219,7 @@ def plan(
         tick: gait tick now.
         state: base now.
         feet: foot points now; of a foot in the air they are not used.
+        disturbance: of the plan before.
         max_contacts: from `contacts_needed` (static).
 
     Source: Eq. 3-6.
@@ -229,12 +234,14 @@ def plan(
         state=state,
         feet=feet,
     )
-    problem = MpcProblem(robot, parameters.mpc, state, horizon)
+    here, dt = reference_at(config.gait.tick, command, anchor, tick), config.gait.tick
+    disturbance = integrate_error(parameters.mpc.integral, disturbance, state, here, dt)
+    problem = MpcProblem(robot, parameters.mpc, state, horizon, disturbance)
     wrench, solution = solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
     residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
     residual = jnp.maximum(residual, solution.gap)
     stands, since = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
-    return Plan(wrench, stands, touchdown, since, residual, solution.status)
+    return Plan(wrench, stands, touchdown, since, residual, solution.status, disturbance)
 
 
 def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
@@ -249,7 +256,7 @@ def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
 
 def init_memory(robot: Robot, measurement: Measurement) -> Memory:
     """Memory of a robot that stands."""
-    return Memory(measured_feet(robot, measurement))
+    return Memory(measured_feet(robot, measurement), NO_DISTURBANCE)
 
 
 def step_plan(
@@ -275,9 +282,11 @@ def step_plan(
         tick=tick,
         state=measurement.state,
         feet=feet,
+        disturbance=memory.disturbance,
         max_contacts=max_contacts,
     )
-    return Memory(feet_where(planned.contact, feet, memory.liftoff)), planned
+    liftoff = feet_where(planned.contact, feet, memory.liftoff)
+    return Memory(liftoff, planned.disturbance), planned
 
 
 def actuate(

@@ -34,8 +34,10 @@ from hector_jax.control.contact import (
     Step,
     rows,
 )
+from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, IntegralGains
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
+from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.part import choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SHARE, check
@@ -52,6 +54,7 @@ class MpcParameters(NamedTuple):
     friction: Any  # mu
     max_force: Any  # [N] per foot
     effort_reference: Any  # share of the robot's weight about which R prices the forces
+    integral: IntegralGains
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,10 @@ class MpcConfig:
     sole_width: float = 1.0  # share of a flat sole's half width that the plan uses
     line_friction: bool = True  # False leaves LINE_FRICTION out of the constraints
     effort_reference: str = "zero"  # R prices u (the paper); "gravity": u less the weight's share
+    horizontal_gain: float = 0.0  # of `IntegralGains`, as the next three [1/s^3]
+    height_gain: float = 0.0
+    tilt_gain: float = 0.0
+    yaw_gain: float = 0.0
     qp: QpConfig = QpConfig()
     contact: str = LINE_FOOT  # a ContactModel or its name
     constraints: tuple[str, ...] | None = None  # of Constraint or their names; else the contact's
@@ -89,7 +96,8 @@ class MpcConfig:
     def parameters(self, weights: Weights) -> MpcParameters:
         """The numbers, to be traced."""
         effort_reference = float(self.effort_reference == "gravity")
-        return MpcParameters(weights, self.friction, self.max_force, effort_reference)
+        gains = IntegralGains(self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
+        return MpcParameters(weights, self.friction, self.max_force, effort_reference, gains)
 
     @property
     def contact_model(self) -> ContactModel:
@@ -120,6 +128,7 @@ class MpcProblem(NamedTuple):
     parameters: MpcParameters
     state: State  # base now, x_0
     horizon: Horizon
+    disturbance: Disturbance = NO_DISTURBANCE  # that lasts over the horizon
 
 
 class Condensed(NamedTuple):
@@ -165,7 +174,7 @@ def _input_map(
 
 def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int) -> Condensed:
     """Roll the dynamics out. Source: Eq. 4a."""
-    N, (robot, parameters, state, horizon) = config.horizon, problem
+    N, (robot, parameters, state, horizon, disturbance) = config.horizon, problem
     data = parameters.weights, state, horizon.lever
     dtype = jnp.result_type(*jax.tree.leaves(data), jnp.float32)
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
@@ -173,17 +182,20 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)
     # inputs turn the body and push it; rates and velocities are kept, angles and places add them up
     turn, push = B[:, 6:9] @ G, B[:, 9:12] @ G
-    turned = jnp.cumsum(A[:, 0:3, 6:9], axis=0)  # of angles by a rate kept from the start on
+    angle_by_rate = jnp.cumsum(A[:, 0:3, 6:9], axis=0)  # kept from the start on
     later, travel = (jnp.asarray(table, dtype) for table in _double_integrator(N, dt))
     # angles after step k by a rate that is there from the end of step j on
-    angles = later[:, :, None, None] * (turned[:, None] - turned)
+    angles = later[:, :, None, None] * (angle_by_rate[:, None] - angle_by_rate)
     count = jnp.arange(1, N + 1, dtype=dtype)[:, None]
     rate, speed = state.ang_velocity, state.velocity
-    fall = dt * count * jnp.asarray(robot.gravity, dtype)
+    from_yaw_frame = rot_z(state.euler[2])
+    gained = dt * from_yaw_frame @ disturbance.angular
+    gravity = jnp.asarray(robot.gravity, dtype) - from_yaw_frame @ disturbance.linear
+    fall = dt * count * gravity
     free = State(
-        state.euler + turned @ rate,
+        state.euler + angle_by_rate @ rate + jnp.einsum("kjxy,y->kx", angles, gained),
         state.position + dt * count * speed - dt * (count - 1) / 2 * fall,
-        jnp.broadcast_to(rate, (N, 3)),
+        rate + count * gained,
         speed - fall,
     )
     return Condensed(feet, G, turn, push, angles, later, travel, free)
@@ -199,7 +211,7 @@ def cost(
     config: MpcConfig, problem: MpcProblem, condensed: Condensed
 ) -> tuple[Float[Array, "n n"], Float[Array, "N b"]]:
     """Half of P and of q. Source: Eq. 3."""
-    robot, parameters, _, horizon = problem
+    robot, parameters, _, horizon, _ = problem
     feet, G, turn, push, angles, later, travel, free = condensed
     N, b, dtype = config.horizon, G.shape[-1], later.dtype
     Q, R = parameters.weights.Q, input_weights(parameters.weights)
@@ -229,7 +241,7 @@ def cost(
 
 def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
     """Rows of the constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
-    feet, (robot, parameters, _, horizon) = condensed.feet, problem
+    feet, (robot, parameters, _, horizon, _) = condensed.feet, problem
     selection = jnp.asarray(config.contact_model.selection, feet.dtype)
     robot = robot._replace(half_width=config.sole_width * robot.half_width)
 

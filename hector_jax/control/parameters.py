@@ -70,6 +70,10 @@ TUNABLES = {
     "footstep_width": Tunable("footstep.width", 0.0, 0.2),
     "turn_lead": Tunable("footstep.turn", 0.0, 2.0),
     "effort_reference": Tunable("mpc.effort_reference", 0.0, 1.0),
+    "horizontal_gain": Tunable("mpc.integral.horizontal", 0.0, 50.0),
+    "height_gain": Tunable("mpc.integral.height", 0.0, 200.0),
+    "tilt_gain": Tunable("mpc.integral.tilt", 0.0, 1000.0),
+    "yaw_gain": Tunable("mpc.integral.yaw", 0.0, 1000.0),
     "friction": Tunable("mpc.friction", 0.1, 1.0),
     "gravity_compensation": Tunable("legs.gravity_compensation", 0.0, 1.0),
     "foot_height": Tunable("legs.height", 0.02, 0.2),
@@ -77,6 +81,26 @@ TUNABLES = {
     "kd": Tunable("legs.kd", 0.05, 10.0, each_joint=True),
 }
 """What can be tuned beside Q and R, by the names that `Weights.others` has for them."""
+
+_FOOTSTEPS = ("footstep_feedback", "footstep_width", "turn_lead")
+_INTEGRAL = ("horizontal_gain", "height_gain", "tilt_gain", "yaw_gain")
+GROUPS: dict[str, tuple[str, ...]] = {
+    "weights": (),
+    "footsteps": _FOOTSTEPS,
+    "integral": _INTEGRAL,
+    "all": (*_FOOTSTEPS, "effort_reference", *_INTEGRAL),
+}
+"""Numbers tuned beside Q and R by one name; friction is not among them, for the model of the tuning
+does not know what the ground can hold."""
+
+
+def tunables(names: Iterable[str]) -> tuple[str, ...]:
+    """Numbers by their names and those of `GROUPS`, each once.
+
+    >>> tunables(["footsteps", "turn_lead"])
+    ('footstep_feedback', 'footstep_width', 'turn_lead')
+    """
+    return tuple(dict.fromkeys(one for name in names for one in GROUPS.get(name, (name,))))
 
 
 def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Weights, Weights]:

@@ -36,6 +36,7 @@ from hector_jax.control.controller import (
     contacts_needed,
     step_plan,
 )
+from hector_jax.control.disturbance import NO_DISTURBANCE
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
@@ -64,7 +65,7 @@ def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, P
         command=_STILL,
         anchor=standing_anchor(robot),
         tick=np.int32(0),
-        memory=Memory(Feet(np.zeros((feet, 3)), np.zeros(feet))),
+        memory=Memory(Feet(np.zeros((feet, 3)), np.zeros(feet)), NO_DISTURBANCE),
         measurement=Measurement(State(*np.zeros((4, 3))), joints, joints),
     )
     return jax.tree.map(lambda shape: np.zeros(shape.shape, shape.dtype), shapes)

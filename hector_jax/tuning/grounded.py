@@ -6,7 +6,7 @@ says that they change: good for some steps, and then for another walk.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Int
 
 from hector_jax import qp
 from hector_jax.control.controller import measured_feet
+from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Command, anchor_at
@@ -81,18 +82,20 @@ def fit_grounding(
     held = jax.tree.map(lambda w: jnp.broadcast_to(w[0], (HISTORY, *w.shape[1:])), walk.command)
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
 
-    def at(now: Missed, commands: Wrench) -> Carry:
-        return Carry(now.state, now.feet, commands, anchor, jnp.asarray(False))
+    def at(now: Missed, commands: Wrench, disturbance: Disturbance) -> Carry:
+        return Carry(now.state, now.feet, commands, anchor, disturbance, jnp.asarray(False))
 
-    def one(commands: Wrench, inputs: tuple) -> tuple[Wrench, Missed]:
+    def one(carried: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[Any, Missed]:
         now, then, tick = inputs
-        after, _ = step_carry(config, robot, weights, command, effect, at(now, commands), tick)
+        after, _ = step_carry(config, robot, weights, command, effect, at(now, *carried), tick)
         missed = jax.tree.map(jnp.subtract, then, Missed(after.state, after.feet))
-        return after.commands, missed
+        return (after.commands, after.disturbance), missed
 
     now, then = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
-    _, missed = jax.lax.scan(one, held, (now, then, tick + jnp.arange(ticks - 1)))
-    return Grounding(at(jax.tree.map(lambda x: x[0], measured), held), tick, missed)
+    first = jax.tree.map(lambda x: x[0], measured)
+    carried = held, NO_DISTURBANCE
+    _, missed = jax.lax.scan(one, carried, (now, then, tick + jnp.arange(ticks - 1)))
+    return Grounding(at(first, *carried), tick, missed)
 
 
 def grounded_rollout(

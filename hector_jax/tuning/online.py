@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Int
 
 from hector_jax.control.controller import Retune, measured_feet
+from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet
 from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command
@@ -84,11 +85,15 @@ def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench, weights: W
         weights: whose numbers are counted.
     """
     commands = jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), last)
-    return Trace(commands, no_tangents(_carry(anchor, measured, commands), weights))
+    carry = _carry(anchor, measured, commands, NO_DISTURBANCE)
+    return Trace(commands, no_tangents(carry, weights))
 
 
-def _carry(anchor: Anchor, measured: MeasuredState, commands: Wrench) -> Carry:
-    return Carry(measured.state, measured.feet, commands, anchor, jnp.asarray(False))
+def _carry(
+    anchor: Anchor, measured: MeasuredState, commands: Wrench, disturbance: Disturbance
+) -> Carry:
+    never = jnp.asarray(False)
+    return Carry(measured.state, measured.feet, commands, anchor, disturbance, never)
 
 
 def window_gradient(
@@ -130,7 +135,7 @@ def window_gradient(
         carry, tangents = carried
         tick, weights, now, after = inputs
         if measured:
-            carry = _carry(anchor, now, carry.commands)
+            carry = _carry(anchor, now, carry.commands, carry.disturbance)
         then, tangents, sample, columns = step_sensitivities(
             config, robot, weights, command, effect, carry, tangents, tick
         )

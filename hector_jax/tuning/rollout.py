@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from hector_jax import qp
 from hector_jax.control import gait
 from hector_jax.control.controller import Plan, WalkConfig, contacts_needed, plan, walk_config
+from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet, feet_where
 from hector_jax.control.reference import Anchor, Command, anchor_at, reference_at
 from hector_jax.control.weights import Weights
@@ -92,6 +93,7 @@ class Carry(NamedTuple):
     feet: Feet
     commands: Wrench  # (HISTORY, feet, 3) each, world frame, newest first
     anchor: Anchor  # taken anew at t = 0
+    disturbance: Disturbance  # of the controller
     fallen: Bool[Array, ""]
     before: Effect | None = None  # of the last tick, world frame; where there is a variation
 
@@ -108,6 +110,7 @@ def init_carry(robot: Robot, anchor: Anchor) -> Carry:
         feet=Feet(trunk + local, jnp.zeros(len(local))),
         commands=Wrench(standing, jnp.zeros_like(standing)),
         anchor=anchor,
+        disturbance=NO_DISTURBANCE,
         fallen=jnp.asarray(False),
     )
 
@@ -276,6 +279,7 @@ def step_carry(
         tick=tick,
         state=belief.state,
         feet=belief.feet,
+        disturbance=carry.disturbance,
         max_contacts=contacts_needed(walk, 0),
     )
     commands = jax.tree.map(
@@ -286,7 +290,8 @@ def step_carry(
     acting, feet = _on_real_ground(carry, acting, planned, belief, variation)
     moved = _move(robot, carry, acting, feet.position, ticks.tick, variation)
     fallen = carry.fallen | has_fallen(moved, *robot.description.limits)
-    after = Carry(moved, feet, commands, anchor, fallen, None if variation is None else acting)
+    before = None if variation is None else acting
+    after = Carry(moved, feet, commands, anchor, planned.disturbance, fallen, before)
     reference = reference_at(ticks.tick, command, anchor, tick + 1.0)
     return after, _sample(config, robot, carry, after, acting, planned, reference)
 

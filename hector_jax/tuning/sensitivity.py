@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
+from hector_jax.control.disturbance import Disturbance
 from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
@@ -43,13 +44,15 @@ class Varied(NamedTuple):
     state: State
     feet: Feet
     commands: Wrench
+    disturbance: Disturbance
     position: Float[Array, "*batch 3"]  # of the anchor
     yaw: Float[Array, "*batch"]
 
 
 def varied(carry: Carry) -> Varied:
     """The part of a carry that the weights have a part in."""
-    return Varied(carry.state, carry.feet, carry.commands, carry.anchor.position, carry.anchor.yaw)
+    state, feet, commands, anchor, disturbance, *_ = carry
+    return Varied(state, feet, commands, disturbance, anchor.position, anchor.yaw)
 
 
 def no_tangents(carry: Carry, weights: Weights) -> Varied:
@@ -83,7 +86,8 @@ def step_sensitivities(
 
     def move(parts: Varied, theta: Float[jax.Array, " n"]) -> tuple:
         place = Anchor(parts.position, parts.yaw, carry.anchor.tick)
-        now = Carry(parts.state, parts.feet, parts.commands, place, carry.fallen)
+        state, feet, commands, disturbance, *_ = parts
+        now = Carry(state, feet, commands, place, disturbance, carry.fallen)
         then, sample = step_carry(config, robot, as_weights(theta), command, effect, now, tick)
         return (varied(then), sample.state, sample.command), (then, sample)
 
