@@ -6,6 +6,7 @@ import pkgutil
 import re
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
@@ -73,6 +74,17 @@ _FIELD = re.compile(r"^    (\w+): [^#\n]*?  # (.+)$", re.MULTILINE)
 _CODE = re.compile(r"(`[^`]*`)")
 
 
+def _imported(module: str) -> ModuleType | None:
+    """A module; None where a package is not installed that it needs, of an extra engine."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith("hector_jax"):
+            raise
+        logger.info("reference: %s is left out, %s", module, error)
+        return None
+
+
 def _public(package: str) -> list[str]:
     """Names of a package's `__all__`; without one, those of PUBLIC."""
     package = importlib.import_module(package)
@@ -80,7 +92,7 @@ def _public(package: str) -> list[str]:
         return [f"{package.__name__}.{name}" for name in package.__all__]
     names = PUBLIC.get(package.__name__.split(".")[-1], "").split()
     inside = pkgutil.walk_packages(package.__path__, f"{package.__name__}.") if names else ()
-    modules = [importlib.import_module(module.name) for module in inside]
+    modules = filter(None, (_imported(module.name) for module in inside))
     home = {name: package.__name__ for name in names}  # where it is not found there is a warning
     for module in modules:
         for name in names:

@@ -428,7 +428,7 @@ def test_the_table_is_made_and_made_again_without_a_walk(monkeypatch, capsys, tm
     first = (tmp_path / "runs/table/table.csv").read_bytes()
     monkeypatch.setattr(verdicts, "walk_jobs", None)
     monkeypatch.setattr(tunings, "_tune_job", None)
-    monkeypatch.setattr(searches, "losses_on_hfs", None)
+    monkeypatch.setattr(searches, "losses_on_hfs", pytest.fail)
     monkeypatch.setattr(table_steps, "tune_measured", None)
     capsys.readouterr()
     assert call_table(monkeypatch, *flags) == 0
