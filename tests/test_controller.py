@@ -152,6 +152,8 @@ def test_step_plan_is_plan_with_the_measured_feet():
 def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing():
     compiled = []
     moving = standing(x=-0.3).state._replace(velocity=jnp.array([0.3, 0.0, 0.0]))
+    beside = jnp.array([0.02, -0.01, 0.03])  # all that is integrated is off
+    moving = moving._replace(euler=beside, position=moving.position + beside)
 
     @jax.jit
     def slope(parameters, moved):

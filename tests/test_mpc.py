@@ -20,6 +20,7 @@ from hector_jax.control.contact import (
     Rows,
     StateConstraint,
 )
+from hector_jax.control.disturbance import Disturbance
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
@@ -113,17 +114,37 @@ def inputs(horizon, v, max_contacts=1):
     return u.reshape(N, 12)
 
 
-def cost(weights, state, horizon, u, about=0.0):
-    """Eq. 3 by rolling u out through A_k, B_k of Eq. 4a, gravity among the 15 states."""
+def cost(weights, state, horizon, u, about=0.0, gained=0.0):
+    """Eq. 3 by rolling u out through A_k, B_k of Eq. 4a, gravity among the 15 states.
+
+    `gained` is added to the states in each step.
+    """
     A, B = linearise(horizon.euler, horizon.lever)
     x, total = np.asarray(pack_state(state, jnp.asarray(ROBOT.gravity))), 0.0
     Q, R = np.concatenate(weights.Q), np.asarray(pack_wrench(weights.R))
     wanted = np.concatenate(horizon.reference, axis=1)
     for k in range(N):
-        x = np.asarray(A[k]) @ x + np.asarray(B[k]) @ u[k]
+        x = np.asarray(A[k]) @ x + np.asarray(B[k]) @ u[k] + gained
         total += Q @ (x[:12] - wanted[k]) ** 2 + R @ (u[k] - about) ** 2
     assert (x[12:] == ROBOT.gravity).all()
     return total
+
+
+def test_what_the_model_lacks_is_predicted_to_stay():
+    state, horizon = problem(3)
+    lacking = Disturbance(np.array([0.3, -0.2, 0.5]), np.array([1.0, 2.0, -1.0]))
+    turned = np.asarray(rot_z(state.euler[2]))
+    gained = DT * np.concatenate(
+        [np.zeros(6), turned @ lacking.angular, turned @ lacking.linear, np.zeros(3)]
+    )
+    parameters = CONFIG.parameters(expert())
+    asked = MpcProblem(ROBOT, parameters, state, horizon, lacking)
+    found, _ = build_qp(CONFIG, asked, dt=DT, max_contacts=1)
+    values = []
+    for v in np.random.default_rng(0).normal(size=(3, N * 5)) * 20.0:
+        written = cost(expert(), state, horizon, inputs(horizon, v), gained=gained)
+        values.append(written - float(0.5 * v @ found.P @ v + found.q @ v))
+    np.testing.assert_allclose(values, values[0], rtol=1e-9)
 
 
 def sparse_problem(weights, state, horizon):

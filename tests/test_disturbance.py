@@ -1,0 +1,105 @@
+"""Integral action: what the errors say that the model lacks, and the walk with it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hector_jax.control.disturbance import NO_DISTURBANCE, IntegralGains, integrate_error
+from hector_jax.control.parameters import GROUPS, TUNABLES
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import nominal
+from hector_jax.core.trajectory import State
+from hector_jax.grfm.effect import Window, ground_effect
+from hector_jax.robot.model import load_robot
+from hector_jax.tuning.evaluate import evaluate_jit
+from hector_jax.tuning.loss import PAPER_LOSS
+from hector_jax.tuning.rollout import RolloutConfig, rollout
+
+ROBOT = load_robot()
+ANCHOR = standing_anchor(ROBOT)
+GAINS = {"horizontal_gain": 10.0, "height_gain": 40.0, "tilt_gain": 100.0, "yaw_gain": 50.0}
+integrate = jax.jit(integrate_error, static_argnums=4)
+AT_REST = State(*np.zeros((4, 3)))
+
+
+@jax.tree_util.Partial
+def weak(window: Window):
+    """The ground returns less than what was commanded, and a moment more."""
+    wrench = jax.tree.map(lambda w: w[0], window.commands)
+    stands = window.contact[:, None]
+    moment = wrench.moment + stands * jnp.array([0.0, 0.5, 0.0])
+    return ground_effect(wrench._replace(force=0.9 * wrench.force, moment=moment))
+
+
+def test_gains_of_zero_estimate_nothing():
+    off = AT_REST._replace(position=np.array([0.1, -0.2, 0.3]), euler=np.array([0.1, 0.2, 0.3]))
+    zero = IntegralGains(0.0, 0.0, 0.0, 0.0)
+    found = integrate(zero, NO_DISTURBANCE, off, AT_REST, 0.01)
+    assert all((x == 0.0).all() for x in found)
+
+
+def test_a_robot_too_low_lacks_force_and_is_seen_in_its_yaw_frame():
+    heading = np.array([0.0, 0.0, np.pi / 2])  # it looks along y
+    there = AT_REST._replace(euler=heading, position=np.array([0.0, -0.01, -0.02]))
+    wanted = AT_REST._replace(euler=heading)
+    gains = IntegralGains(10.0, 40.0, 100.0, 50.0)
+    found = integrate(gains, NO_DISTURBANCE, there, wanted, 0.01)
+    assert found.linear[0] < 0
+    assert found.linear[2] < 0
+    np.testing.assert_allclose(found.linear[1], 0.0, atol=1e-15)
+    np.testing.assert_allclose(found.angular, 0.0, atol=1e-15)
+    twice = integrate(gains, found, there, wanted, 0.01)
+    np.testing.assert_allclose(twice.linear, 2 * np.asarray(found.linear), atol=1e-15)
+
+
+@pytest.mark.parametrize(("error", "other"), [(0.02, 0.3), (-0.02, -0.3)])
+def test_what_a_push_leaves_counts_less_than_a_steady_error(error, other):
+    gains = IntegralGains(10.0, 40.0, 100.0, 50.0)
+    steady, pushed = (
+        integrate(
+            gains, NO_DISTURBANCE, AT_REST._replace(euler=np.full(3, e)), AT_REST, 0.01
+        ).angular
+        for e in (error, other)
+    )
+    assert (abs(pushed) < abs(steady)).all()
+    assert (np.sign(pushed) == np.sign(error)).all()
+
+
+def test_steady_errors_go():
+    """On ground that returns 90 % of the forces, and a moment that the model does not have."""
+    config = RolloutConfig()
+    walk = jax.jit(rollout, static_argnums=0)
+    last = []
+    for gains in (dict.fromkeys(GAINS, 0.0), GAINS):
+        weights = nominal()._replace(others=gains)
+        walked = walk(config, ROBOT, weights, named_command("straight"), ANCHOR, weak)
+        assert not walked.fallen.any()
+        end = jax.tree.map(
+            lambda x, y: np.mean(x[-80:] - y[-80:], 0), walked.state, walked.reference
+        )
+        last.append((end.position[2], end.euler[1]))
+    (low, pitch), (low_with, pitch_with) = last
+    assert low < -0.01
+    assert abs(low_with) < 0.2 * abs(low)
+    assert abs(pitch) > 0.01
+    assert abs(pitch_with) < 0.2 * abs(pitch)
+
+
+def test_gradients_of_all_numbers_are_those_of_differences():
+    config = RolloutConfig(ticks=100)
+    names = GROUPS["all"]
+    others = {"effort_reference": 0.3, **GAINS}
+    start = config.walk.with_others(nominal()._replace(others=others), names)
+
+    def evaluate(others):
+        weights = start._replace(others=others)
+        return evaluate_jit(config, ROBOT, weights, named_command("s"), ANCHOR, weak, PAPER_LOSS)
+
+    found = evaluate(start.others).gradient.others
+    assert set(found) == set(names)
+    for name in names:
+        step = 1e-5 * (TUNABLES[name].upper - TUNABLES[name].lower)
+        ends = [evaluate({**start.others, name: start.others[name] + s}) for s in (step, -step)]
+        slope = (ends[0].loss - ends[1].loss) / (2 * step)
+        assert float(found[name]) == pytest.approx(float(slope), rel=1e-4), name
