@@ -82,7 +82,7 @@ TUNABLES = {
 }
 """What can be tuned beside Q and R, by the names that `Weights.others` has for them."""
 
-_FOOTSTEPS = ("footstep_feedback", "footstep_width", "turn_lead")
+_FOOTSTEPS = ("footstep_feedback", "turn_lead")
 _INTEGRAL = ("horizontal_gain", "height_gain", "tilt_gain", "yaw_gain")
 GROUPS: dict[str, tuple[str, ...]] = {
     "weights": (),
@@ -90,15 +90,15 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "integral": _INTEGRAL,
     "all": (*_FOOTSTEPS, "effort_reference", *_INTEGRAL),
 }
-"""Numbers tuned beside Q and R by one name; friction is not among them, for the model of the tuning
-does not know what the ground can hold."""
+"""Numbers tuned beside Q and R by one name. Friction and the width of the steps are not among them:
+the model of the tuning does not know what the ground holds, nor that legs touch."""
 
 
 def tunables(names: Iterable[str]) -> tuple[str, ...]:
     """Numbers by their names and those of `GROUPS`, each once.
 
     >>> tunables(["footsteps", "turn_lead"])
-    ('footstep_feedback', 'footstep_width', 'turn_lead')
+    ('footstep_feedback', 'turn_lead')
     """
     return tuple(dict.fromkeys(one for name in names for one in GROUPS.get(name, (name,))))
 
