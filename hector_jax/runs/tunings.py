@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
@@ -26,6 +27,7 @@ from hector_jax.runs.folder import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
+from hector_jax.tuning import curvature as curvatures
 from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import loss_of_robot
@@ -210,6 +212,26 @@ def gradient_norms(
         running = {n: pool.submit(_norms_job, config, robot, one) for n, one in problems.items()}
         tell(0, len(problems), "compiling")
         return {name: future.result() for name, future in running.items()}
+
+
+def _curvature_job(
+    config: TuneConfig, robot: Robot, start: Weights, problem: Problem
+) -> Float[np.ndarray, "n n"]:
+    """Gauss-Newton matrix as a share of the loss, mean over the commands."""
+    curvature = partial(curvatures.curvature, config.rollout, robot, start)
+    models = _models(config, robot, problem)
+    each = [curvature(command, anchor, phi, config.loss) for command, anchor, phi in models]
+    return np.mean([np.asarray(matrix) / float(loss) for loss, matrix in each], axis=0)
+
+
+def felt(
+    pool: Executor, config: TuneConfig, robot: Robot, start: Weights, problem: Problem
+) -> curvatures.Felt:
+    """What of the starting weights the loss feels on the model."""
+    with bar("directions of the weights that the loss feels") as tell:
+        tell(0, 1, "compiling")
+        matrix = pool.submit(_curvature_job, config, robot, start, problem).result()
+    return curvatures.felt(matrix, start)
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
