@@ -392,7 +392,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     # one set for two trajectories, from those weights, on the same data
     start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "10")
     several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
-    several += ("--also", "turn_lead", "--net", Path("data/grfm.npz"), "--verdict")
+    several += ("--tune", "turn_lead", "--net", Path("data/grfm.npz"), "--verdict")
     assert call(monkeypatch, "tune", *flags, *several) == 0
     out = capsys.readouterr().out
     assert "change of L against nominal in %" in out
