@@ -72,6 +72,7 @@ class Trace(NamedTuple):
     """What a window hands to the next."""
 
     commands: Wrench  # (HISTORY, feet, 3) each, world frame, newest first
+    disturbance: Disturbance  # of the controller, at its end
     tangents: Varied  # of the carry at its end
 
 
@@ -86,7 +87,7 @@ def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench, weights: W
     """
     commands = jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), last)
     carry = _carry(anchor, measured, commands, NO_DISTURBANCE)
-    return Trace(commands, no_tangents(carry, weights))
+    return Trace(commands, carry.disturbance, no_tangents(carry, weights))
 
 
 def _carry(
@@ -145,7 +146,8 @@ def window_gradient(
         return (then, tangents), (sample, columns)
 
     now, after = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
-    start = _carry(anchor, jax.tree.map(lambda x: x[0], states), trace.commands)
+    first = jax.tree.map(lambda x: x[0], states)
+    start = _carry(anchor, first, trace.commands, trace.disturbance)
     ticks = tick + jnp.arange(len(now.feet.yaw))
     (last, tangents), (samples, columns) = jax.lax.scan(
         one, (start, trace.tangents), (ticks, weights, now, after)
@@ -155,7 +157,7 @@ def window_gradient(
     value, gradient = sensitivity.gradient(loss, walk, columns, first)
     fallen, residual = jnp.mean(1.0 * samples.fallen), jnp.max(samples.residual)
     evaluation = Evaluation(value, losses(loss, walk), gradient, fallen, residual)
-    return Trace(last.commands, tangents), evaluation
+    return Trace(last.commands, last.disturbance, tangents), evaluation
 
 
 _window_gradient = jax.jit(window_gradient, static_argnums=0, static_argnames="measured")
