@@ -308,3 +308,15 @@ def test_the_race_is_told_as_its_file_has_it():
     assert not (ours[:136] < rivals[64:]).any()
     for page in ("README.md", "docs/decisions.md", "docs/notes.md"):
         assert re.search(r"(between|from) 36 (and|to) 91", (ROOT / page).read_text()), page
+
+
+def test_the_table_of_more_than_weights_is_that_of_its_walks():
+    walks = json.loads((DOCS / "results/tunables/walks.json").read_text())
+    page = (DOCS / "results.md").read_text()
+    for name, each in walks.items():
+        changes = [
+            100 * (np.median(np.divide(one["L"], walks["nominal"][t]["L"])) - 1)
+            for t, one in each.items()
+        ]
+        numbers = [f"{x:.0f}" for x in changes] + [str(one["falls"]) for one in each.values()]
+        assert f"| {name} | {' | '.join(numbers)} |" in page
