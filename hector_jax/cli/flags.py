@@ -5,8 +5,6 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
-import tyro
-
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import SEED, Range
 
@@ -141,7 +139,7 @@ class Tune(Configured):
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
     # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name
-    tune: Annotated[tuple[Tunables, ...], tyro.conf.arg(aliases=["--also"])] = ("weights",)
+    tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net

@@ -68,6 +68,8 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     wants_help = any(word in _HELP for word in words)
     options: dict[str, Any] = {"prog": program}
     words = [word for word in words if word not in _HELP]
+    if kind is Tune:
+        words = [re.sub("^--also(?==|$)", "--tune", word) for word in words]  # its older name
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
     flags = [name.removeprefix("no-") for name in names]
     for name in flags:

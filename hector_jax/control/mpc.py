@@ -40,7 +40,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.part import choose_part
-from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SHARE, check
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, check
 from hector_jax.core.trajectory import State, Wrench, pack_wrench, unpack_wrench
 from hector_jax.qp import QP, QpConfig, Solution, block_diagonal, solve_qp
 from hector_jax.robot import srbm
@@ -81,6 +81,7 @@ class MpcConfig:
     def __post_init__(self) -> None:
         rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
         rules |= {"sole_width": SHARE, "step_ticks": AT_LEAST_ONE}
+        rules |= {f"{name}_gain": NOT_NEGATIVE for name in IntegralGains._fields}
         check(self, **rules, effort_reference=("zero", "gravity"))
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
@@ -188,7 +189,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     angles = later[:, :, None, None] * (angle_by_rate[:, None] - angle_by_rate)
     count = jnp.arange(1, N + 1, dtype=dtype)[:, None]
     rate, speed = state.ang_velocity, state.velocity
-    from_yaw_frame = rot_z(state.euler[2])
+    from_yaw_frame = rot_z(jnp.asarray(state.euler[2]))
     gained = dt * from_yaw_frame @ disturbance.angular
     gravity = jnp.asarray(robot.gravity, dtype) - from_yaw_frame @ disturbance.linear
     fall = dt * count * gravity
