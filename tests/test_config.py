@@ -68,7 +68,7 @@ def test_lists_paths_and_whole_numbers_are_taken_as_their_flags_want_them(tmp_pa
     assert from_file(Table, written(tmp_path, text)) == Table(kept=Path("shelf"), extra=("a=x",))
 
 
-_MORE = {"also": "friction", "engine": "drake", "plant": Path("more")}  # of tuples
+_MORE = {"tune": "friction", "engine": "drake", "plant": Path("more")}  # of tuples
 
 
 @pytest.mark.parametrize("kind", FILES)
