@@ -205,7 +205,12 @@ def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
     """Walks whose losses make the gradients at a weight set: phases, directions, both sides."""
     steps = alignment.STEP * np.eye(len(direction_names()))
     return [
-        Job(scale_weights(point.weights, side * step), point.command, hfs(), start_tick=phase)
+        Job(
+            jax.device_get(scale_weights(point.weights, side * step)),
+            point.command,
+            hfs(),
+            start_tick=phase,
+        )
         for phase in phases
         for step in steps
         for side in (1, -1)

@@ -133,7 +133,7 @@ def test_a_standing_foot_is_remembered_and_a_flying_one_is_not():
 def test_step_plan_is_plan_with_the_measured_feet():
     measurement = standing(yaw=0.05, x=-0.02)
     _, decided = at(3, measurement)
-    direct = jax.jit(
+    direct, _ = jax.jit(
         lambda state, feet: plan(
             CONFIG,
             ROBOT,
@@ -160,7 +160,7 @@ def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing(
         compiled.append(1)
 
         def force(parameters):
-            decided = plan(
+            decided, _ = plan(
                 CONFIG,
                 ROBOT,
                 parameters,

@@ -1,4 +1,4 @@
-"""What the loss feels: the Gauss-Newton matrix against differences, and its words."""
+"""Which weights matter: the Gauss-Newton matrix against differences, and its words."""
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import direction_names, nominal, scale_weights
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.curvature import curvature, felt
+from hector_jax.tuning.curvature import gauss_newton, main_directions
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
@@ -19,7 +19,7 @@ WALK = named_command("c"), standing_anchor(ROBOT), last_command
 
 
 def test_the_matrix_is_the_curvature_of_the_loss_along_the_change_of_the_walk():
-    loss, matrix = curvature(CONFIG, ROBOT, nominal(), *WALK, PAPER_LOSS)
+    loss, matrix = gauss_newton(CONFIG, ROBOT, nominal(), *WALK, PAPER_LOSS)
     walk = jax.jit(rollout, static_argnums=0)
 
     def walked(name, step):
@@ -52,9 +52,9 @@ def test_directions_are_said_with_the_weights_that_matter_in_them():
     vector = np.zeros(18)
     vector[[NAMES.index("Q_pitch"), NAMES.index("Q_x"), NAMES.index("R_Fz")]] = 0.9, -0.43, 0.05
     matrix += np.outer(vector, vector)
-    found = felt(matrix, nominal())
+    found = main_directions(matrix, nominal())
     (one,) = found.directions
     assert one.text == "`Q_pitch` against `Q_x`"
     assert one.change == pytest.approx(0.5 * np.log(2.0) ** 2 * vector @ vector)
     assert found.count == 18
-    assert set(found.unfelt) == {*NAMES} - {"Q_pitch", "Q_x"}
+    assert set(found.flat) == {*NAMES} - {"Q_pitch", "Q_x"}

@@ -15,7 +15,7 @@ from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import tuning_section, write_report
 from hector_jax.runs.metrics import Verdict
-from hector_jax.tuning.curvature import Direction, Felt
+from hector_jax.tuning.curvature import Curvature, Direction
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.status import StepStatus
@@ -40,7 +40,7 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         verdict=verdict or pretend_verdict(),
         tunings={"without": tuning, "with": tuning},
         norms={"without": {"L_Eul": 12.0, "L_pos": 7.0, "L_ctrl": 8e5}},
-        felt=Felt([Direction(0.25, {"Q_pitch": 0.9, "Q_x": -0.4})], 18, ["R_Mz"]),
+        curvature=Curvature([Direction(0.25, {"Q_pitch": 0.9, "Q_x": -0.4})], 18, ["R_Mz"]),
         errors=errors,
         pictures=[Picture("loss.png", "Loss by iteration.")],
         film=film,

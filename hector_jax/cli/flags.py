@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
 
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import SEED, Range
@@ -134,6 +134,8 @@ class Tune(Configured):
 
     Example: hector tune --traj straight c s --seeds 32
     """
+
+    RENAMED: ClassVar = {"also": ("tune", {"[]": ["weights"], "()": ["weights"]})}
 
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own

@@ -68,8 +68,8 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     wants_help = any(word in _HELP for word in words)
     options: dict[str, Any] = {"prog": program}
     words = [word for word in words if word not in _HELP]
-    if kind is Tune:
-        words = [re.sub("^--also(?==|$)", "--tune", word) for word in words]  # its older name
+    for old, (new, _) in getattr(kind, "RENAMED", {}).items():
+        words = [re.sub(f"^--{old}(?==|$)", f"--{new}", word) for word in words]
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
     flags = [name.removeprefix("no-") for name in names]
     for name in flags:
@@ -169,8 +169,6 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         values[name] = value
     if kind is Tune and isinstance(values.get("traj"), str):
         values["traj"] = [values["traj"]]  # older runs were tuned on one
-    if kind is Tune and "also" in values:  # its older name
-        values["tune"] = values.pop("also") or ["weights"]
     return from_table(str(path), kind, values)
 
 

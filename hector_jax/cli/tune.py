@@ -185,7 +185,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say("loss weights: " + ", ".join(f"{t.name} {t.weight:g}" for t in loss))
             run = run._replace(config=replace(run.config, loss=loss))
         settings = _note_settings(run)
-        felt = tunings.felt(pool, run.config, robot, run.start, run.problems["with"])
+        curvature = tunings.curvature(pool, run.config, robot, run.start, run.problems["with"])
         tuned = _tune_sets(pool, run)
         walks = _walk_sets(pool, run, tuned.sets)
         where = trajectories[0], run.seconds, run.artefacts / "elsewhere"
@@ -200,7 +200,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         verdict=verdict,
         tunings=tuned.tunings,
         norms=norms,
-        felt=felt,
+        curvature=curvature,
         errors=run.net.errors,
         shifts=tuned.shifts,
         chosen=result.get("chosen", {}),

@@ -123,7 +123,6 @@ class Plan(NamedTuple):
     swing_ticks: Int[Array, "*batch feet"]  # since lift-off
     residual: Float[Array, "*batch"]  # worst relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
-    disturbance: Disturbance  # to be carried to the next plan
 
 
 class Retune(NamedTuple):
@@ -210,8 +209,8 @@ def plan(
     feet: Feet,
     disturbance: Disturbance = NO_DISTURBANCE,
     max_contacts: int = 1,
-) -> Plan:
-    """Solve the MPC for one tick. Returns the commanded wrench and the planned touchdowns.
+) -> tuple[Plan, Disturbance]:
+    """Solve the MPC for one tick.
 
     Args:
         config, robot, parameters: the controller.
@@ -221,6 +220,9 @@ def plan(
         feet: foot points now; of a foot in the air they are not used.
         disturbance: of the plan before.
         max_contacts: from `contacts_needed` (static).
+
+    Returns:
+        The commanded wrench with the planned touchdowns, and the disturbance for the next plan.
 
     Source: Eq. 3-6.
     """
@@ -241,7 +243,8 @@ def plan(
     residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
     residual = jnp.maximum(residual, solution.gap)
     stands, since = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
-    return Plan(wrench, stands, touchdown, since, residual, solution.status, disturbance)
+    planned = Plan(wrench, stands, touchdown, since, residual, solution.status)
+    return planned, disturbance
 
 
 def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
@@ -273,7 +276,7 @@ def step_plan(
 ) -> tuple[Memory, Plan]:
     """`plan` from what is measured; remembers where the standing feet are. Once a tick."""
     feet = measured_feet(robot, measurement)
-    planned = plan(
+    planned, disturbance = plan(
         config,
         robot,
         parameters,
@@ -285,8 +288,7 @@ def step_plan(
         disturbance=memory.disturbance,
         max_contacts=max_contacts,
     )
-    liftoff = feet_where(planned.contact, feet, memory.liftoff)
-    return Memory(liftoff, planned.disturbance), planned
+    return Memory(feet_where(planned.contact, feet, memory.liftoff), disturbance), planned
 
 
 def actuate(

@@ -114,7 +114,7 @@ def directions(like: Weights | None = None) -> Float[np.ndarray, "directions wei
     return np.array([of_weight == name for name in direction_names(like)], float)
 
 
-def scale_weights(weights: Weights, logs: Float[np.ndarray, " directions"]) -> Weights:
+def scale_weights(weights: Weights, logs: Float[Array | np.ndarray, " directions"]) -> Weights:
     """Weights after a step in the `directions`; `others` stay.
 
     >>> steps = np.zeros(18)
@@ -123,8 +123,7 @@ def scale_weights(weights: Weights, logs: Float[np.ndarray, " directions"]) -> W
     [50.0, 50.0, 100.0]
     """
     vector = weights_to_vector(weights) * jnp.exp(logs @ directions(weights))
-    moved = vector_to_weights(vector, weights)._replace(others=weights.others)
-    return jax.tree.map(np.asarray, moved)
+    return vector_to_weights(vector, weights)._replace(others=weights.others)
 
 
 def between(one: Weights, other: Weights, share: float = 0.5) -> Weights:
@@ -143,4 +142,5 @@ def between(one: Weights, other: Weights, share: float = 0.5) -> Weights:
 def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:
     """Draw weight sets log-uniformly within x/factor of some weights, always the same ones."""
     draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(direction_names(weights))))
-    return [scale_weights(weights, np.log(factor) * row) for row in draws]
+    scaled = [scale_weights(weights, np.log(factor) * row) for row in draws]
+    return jax.device_get(scaled)

@@ -25,7 +25,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
             trajectory, verdict: what was walked, and the walks of all sets on the stand-in.
             tunings: by set, `without`, `with` and, refreshed, `with_refreshed`.
             norms: of the terms' gradients in log-weights at nominal, by model.
-            felt: what of the starting weights the loss feels.
+            curvature: of the loss in the starting weights.
             errors: held-out, of `raw`, `linear`, `net`, as `training.report` has them.
             shifts: of each refresh, by `nets.refresh`.
             chosen: by set, iteration that was taken, where not the last.

@@ -27,8 +27,8 @@ from hector_jax.runs.folder import Journal
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.tuning import curvature as curvatures
 from hector_jax.tuning import difftune, evaluate
+from hector_jax.tuning.curvature import Curvature, gauss_newton, main_directions
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import rollout_config
@@ -214,24 +214,24 @@ def gradient_norms(
         return {name: future.result() for name, future in running.items()}
 
 
-def _curvature_job(
+def _gauss_newton_job(
     config: TuneConfig, robot: Robot, start: Weights, problem: Problem
 ) -> Float[np.ndarray, "n n"]:
-    """Gauss-Newton matrix as a share of the loss, mean over the commands."""
-    curvature = partial(curvatures.curvature, config.rollout, robot, start)
+    """The matrix divided by the loss, mean over the commands."""
+    matrix_of = partial(gauss_newton, config.rollout, robot, start)
     models = _models(config, robot, problem)
-    each = [curvature(command, anchor, phi, config.loss) for command, anchor, phi in models]
+    each = [matrix_of(command, anchor, phi, config.loss) for command, anchor, phi in models]
     return np.mean([np.asarray(matrix) / float(loss) for loss, matrix in each], axis=0)
 
 
-def felt(
+def curvature(
     pool: Executor, config: TuneConfig, robot: Robot, start: Weights, problem: Problem
-) -> curvatures.Felt:
-    """What of the starting weights the loss feels on the model."""
-    with bar("directions of the weights that the loss feels") as tell:
+) -> Curvature:
+    """How the loss on the model is curved in the starting weights."""
+    with bar("directions of the weights that matter") as tell:
         tell(0, 1, "compiling")
-        matrix = pool.submit(_curvature_job, config, robot, start, problem).result()
-    return curvatures.felt(matrix, start)
+        matrix = pool.submit(_gauss_newton_job, config, robot, start, problem).result()
+    return main_directions(matrix, start)
 
 
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:

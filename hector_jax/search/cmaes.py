@@ -214,7 +214,8 @@ def to_generation(steps: Any, losses: Any) -> Generation:
 
 def project(start: Weights, steps: Float[np.ndarray, " directions"]) -> Weights:
     """Weights after steps, inside the box to the last digit, whatever the logarithm rounds to."""
-    return jax.tree.map(np.clip, scale_weights(start, steps), *bounds(start.others, start))
+    scaled = jax.device_get(scale_weights(start, steps))
+    return jax.tree.map(np.clip, scaled, *bounds(start.others, start))
 
 
 def log_bounds(start: Weights) -> Float[np.ndarray, "directions 2"]:

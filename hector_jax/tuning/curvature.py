@@ -1,4 +1,4 @@
-"""Which directions of the weights the loss feels: eigenvectors of its Gauss-Newton matrix.
+"""Which directions of the weights matter: eigenvectors of the loss's Gauss-Newton matrix.
 
 The loss is nearly quadratic in a walk, so along a step s in the log-weights it is curved by
 s' H s with H = J' (d2L / dw2) J, where w are the states and commands of the walk and J is their
@@ -14,27 +14,21 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.reference import Anchor, Command
-from hector_jax.control.weights import (
-    Weights,
-    direction_names,
-    directions,
-    vector_to_weights,
-    weights_to_vector,
-)
+from hector_jax.control.weights import Weights, direction_names, scale_weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-_MEMBER = 0.35  # least share of its largest entry that a weight has to be named in a direction
-_UNFELT = 1e-3  # share of the loss by which doubling an unfelt weight changes it at most
+_NAMED = 0.35  # least share of the largest entry with which a weight is named in a direction
+_FLAT = 1e-3  # least share of the loss that a direction or a weight that matters changes
 
 
 class Direction(NamedTuple):
     """A direction in the log-weights."""
 
-    change: float  # of the loss in second order where its weights double or halve, as a share
+    change: float  # share of the loss, in second order, after a step as long as a doubled weight's
     steps: dict[str, float]  # by weight: entry of the unit vector
 
     @property
@@ -43,20 +37,20 @@ class Direction(NamedTuple):
         ordered = sorted(self.steps, key=lambda name: -abs(self.steps[name]))
         largest = self.steps[ordered[0]]  # its side is named first
         shares = {name: self.steps[name] / largest for name in ordered}
-        sides = ([n for n in ordered if s * shares[n] >= _MEMBER][:3] for s in (1.0, -1.0))
+        sides = ([n for n in ordered if s * shares[n] >= _NAMED][:3] for s in (1.0, -1.0))
         return " against ".join(", ".join(f"`{n}`" for n in side) for side in sides if side)
 
 
-class Felt(NamedTuple):
-    """What of the weights the loss feels."""
+class Curvature(NamedTuple):
+    """How the loss is curved in the weights."""
 
-    directions: list[Direction]  # the strongest first, as far as they are felt
+    directions: list[Direction]  # those that matter, the strongest first
     count: int  # of all directions
-    unfelt: list[str]  # weights that change nothing by themselves
+    flat: list[str]  # weights that by themselves do not matter
 
 
 @partial(jax.jit, static_argnums=0)
-def curvature(
+def gauss_newton(
     config: RolloutConfig,
     robot: Robot,
     weights: Weights,
@@ -65,43 +59,53 @@ def curvature(
     effect: jax.tree_util.Partial,
     loss: Loss,
 ) -> tuple[Float[Array, ""], Float[Array, "n n"]]:
-    """The loss of a rollout and its Gauss-Newton matrix in the n `directions` of the weights."""
-    vector, along = weights_to_vector(weights), jnp.asarray(directions(weights))
+    """The loss of a rollout and its Gauss-Newton matrix.
+
+    Args:
+        config, robot, command, anchor, effect: of the rollout.
+        weights: at which it is taken.
+        loss: terms and their weights.
+
+    Returns:
+        L, and the matrix in the n directions of `control.weights.directions`.
+    """
+    count = len(direction_names(weights))
 
     def walk(logs: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
-        moved = vector_to_weights(vector * jnp.exp(logs @ along), weights)
-        moved = moved._replace(others=weights.others)
+        moved = scale_weights(weights, logs)
         walked = rollout(config, robot, moved, command, anchor, effect)
         return (walked.state, walked.command), walked
 
     def move(direction: Float[Array, " n"]) -> tuple:
-        still = jnp.zeros(len(along))
-        return jax.jvp(walk, (still,), (direction,), has_aux=True)
+        return jax.jvp(walk, (jnp.zeros(count),), (direction,), has_aux=True)
 
-    (at, tangents, walked) = jax.vmap(move, out_axes=(None, 0, None))(jnp.eye(len(along)))
+    at, tangents, walked = jax.vmap(move, out_axes=(None, 0, None))(jnp.eye(count))
 
     def objective(of: tuple[State, Wrench]) -> Float[Array, ""]:
         state, commands = of
         return total(loss, losses(loss, walked._replace(state=state, command=commands)))
 
     curved = jax.vmap(lambda tangent: jax.jvp(jax.grad(objective), (at,), (tangent,))[1])(tangents)
-    flat = [
-        jnp.concatenate([x.reshape(len(along), -1) for x in jax.tree.leaves(tree)], axis=1)
+    changes, slopes = (
+        jnp.concatenate([x.reshape(count, -1) for x in jax.tree.leaves(tree)], axis=1)
         for tree in (tangents, curved)
-    ]
-    return objective(at), flat[0] @ flat[1].T
-
-
-def felt(matrix: Float[np.ndarray, "n n"], like: Weights) -> Felt:
-    """What of the weights a loss feels, by its Gauss-Newton matrix as a share of the loss."""
-    names, double = direction_names(like), 0.5 * np.log(2.0) ** 2
-    sizes, vectors = np.linalg.eigh((matrix + matrix.T) / 2.0)
-    strongest = [
-        Direction(double * size, dict(zip(names, vector.tolist(), strict=True)))
-        for size, vector in zip(sizes[::-1], vectors.T[::-1], strict=True)
-        if double * size > _UNFELT
-    ]
-    alone = double * np.diag(matrix)
-    return Felt(
-        strongest, len(names), [n for n, x in zip(names, alone, strict=True) if x < _UNFELT]
     )
+    return objective(at), changes @ slopes.T
+
+
+def main_directions(matrix: Float[np.ndarray, "n n"], like: Weights) -> Curvature:
+    """The eigenvectors that matter of a Gauss-Newton matrix divided by the loss.
+
+    Args:
+        matrix: see `gauss_newton`.
+        like: weights of its shape.
+    """
+    names, doubled = direction_names(like), 0.5 * np.log(2.0) ** 2
+    sizes, vectors = np.linalg.eigh(matrix)
+    strongest = [
+        Direction(doubled * size, dict(zip(names, vector.tolist(), strict=True)))
+        for size, vector in zip(sizes[::-1], vectors.T[::-1], strict=True)
+        if doubled * size > _FLAT
+    ]
+    alone = zip(names, doubled * np.diag(matrix), strict=True)
+    return Curvature(strongest, len(names), [name for name, change in alone if change < _FLAT])

@@ -87,7 +87,7 @@ def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench, weights: W
     """
     commands = jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), last)
     carry = _carry(anchor, measured, commands, NO_DISTURBANCE)
-    return Trace(commands, carry.disturbance, no_tangents(carry, weights))
+    return Trace(commands, NO_DISTURBANCE, no_tangents(carry, weights))
 
 
 def _carry(
@@ -146,11 +146,10 @@ def window_gradient(
         return (then, tangents), (sample, columns)
 
     now, after = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
-    first = jax.tree.map(lambda x: x[0], states)
-    start = _carry(anchor, first, trace.commands, trace.disturbance)
+    begin = jax.tree.map(lambda x: x[0], states), trace.commands, trace.disturbance
     ticks = tick + jnp.arange(len(now.feet.yaw))
     (last, tangents), (samples, columns) = jax.lax.scan(
-        one, (start, trace.tangents), (ticks, weights, now, after)
+        one, (_carry(anchor, *begin), trace.tangents), (ticks, weights, now, after)
     )
     walk, columns = _with_command_before(samples, columns, trace)
     first = jax.tree.map(lambda x: x[0], weights)

@@ -270,7 +270,7 @@ def step_carry(
     here = anchor_at(robot, carry.state, carry.anchor.tick)
     anchor = where(tick == here.tick, here, carry.anchor)
     belief = _believe(carry, tick, variation)
-    planned = plan(
+    planned, disturbance = plan(
         walk,
         robot,
         walk.parameters(weights),
@@ -291,7 +291,7 @@ def step_carry(
     moved = _move(robot, carry, acting, feet.position, ticks.tick, variation)
     fallen = carry.fallen | has_fallen(moved, *robot.description.limits)
     before = None if variation is None else acting
-    after = Carry(moved, feet, commands, anchor, planned.disturbance, fallen, before)
+    after = Carry(moved, feet, commands, anchor, disturbance, fallen, before)
     reference = reference_at(ticks.tick, command, anchor, tick + 1.0)
     return after, _sample(config, robot, carry, after, acting, planned, reference)
 
