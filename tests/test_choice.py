@@ -1,4 +1,4 @@
-"""Which iteration of a tuning is taken."""
+"""Which iteration of a tuning is taken, and which set is the answer of a run."""
 
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -6,10 +6,13 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+import pytest
 from model import CONFIG, ROBOT
 
+from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import named_command
-from hector_jax.control.weights import nominal
+from hector_jax.control.weights import between, expert, nominal
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.robot.description import TuningSettings
 from hector_jax.runs import choice, verdicts
 from hector_jax.runs.metrics import score_like
@@ -63,3 +66,50 @@ def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp
     said = capsys.readouterr().err
     assert "with: iteration 16 of 32 walks best on plants drawn around the hfs: L -39 %" in said
     assert choice.choose(Executor(), CONFIG, ROBOT, tunings, commands, **notes) == {}
+
+
+def _between(sets, config=CONFIG, robot=ROBOT):
+    pair, notes = ("without", "with"), {"seconds": 4.0, "folder": None}
+    commands = (named_command("straight"),)
+    return choice.answer(Executor(), config, robot, sets, pair, 0.25, commands, **notes)
+
+
+def test_the_answer_lies_between_two_tunings_and_plans_with_less_friction():
+    sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
+    found = _between(sets)
+    assert found.others == {"friction": pytest.approx(0.55)}
+    wanted = between(nominal(), expert(), 0.25)
+    jax.tree.map(np.testing.assert_array_equal, found[:2], wanted[:2])
+    tuned = {n: w._replace(others={"friction": np.array(0.4)}) for n, w in sets.items()}
+    assert _between(tuned).others == {"friction": pytest.approx(0.4)}  # it was asked for
+
+
+@pytest.mark.parametrize(("friction", "planned"), [(0.05, 0.1), (1.5, 1.0)])
+def test_the_answer_can_be_read_whatever_the_controllers_friction(tmp_path, friction, planned):
+    sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
+    walk = replace(CONFIG.rollout.walk, mpc=MpcConfig(friction=friction))
+    config = replace(CONFIG, rollout=replace(CONFIG.rollout, walk=walk))
+    save_weights(tmp_path / "best.json", _between(sets, config))
+    assert load_weights(tmp_path / "best.json").others == {"friction": planned}
+
+
+@pytest.mark.parametrize("winner", ["with", "between"])
+def test_a_robot_with_drawn_plants_takes_what_walks_best_there(monkeypatch, capsys, winner):
+    def judge(pool, config, robot, sets, command, plants, seeds, **notes):
+        del pool, config, robot, command, notes
+        assert (len(plants), list(seeds)) == (2, [0, 1])
+        assert list(sets) == ["nominal", "without", "with", "between"]
+        cost = {name: np.array(0.5 if name == winner else 1.0) for name in sets}
+        cost["nominal"] = np.array(0.1)  # what was not tuned is no answer
+        score = score_like(loss=CONFIG.loss)
+        return SimpleNamespace(
+            scores={name: [score._replace(losses={"L": x})] * 2 for name, x in cost.items()}
+        )
+
+    monkeypatch.setattr(verdicts, "judge", judge)
+    description = replace(ROBOT.description, tuning=TuningSettings(choice_plants=2))
+    sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
+    found = _between(sets, robot=ROBOT._replace(description=description))
+    wanted = {"with": expert(), "between": _between(sets)}[winner]
+    jax.tree.map(np.testing.assert_array_equal, found, wanted)
+    assert f"best: {winner} walks best on plants drawn around the hfs" in capsys.readouterr().err

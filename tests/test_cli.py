@@ -27,7 +27,7 @@ from hector_jax.control.weights import (
     weight_names,
     weights_to_vector,
 )
-from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.control.weights_file import best, load_weights, save_weights
 from hector_jax.core.console import exit_code
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm.collection import fingerprint, load_walks
@@ -164,10 +164,19 @@ def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, ca
     assert "nominal, expert, best or a weights file, got 'exprt'; did you mean 'expert'?" in line
 
 
-def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys):
+def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
     robot = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
     line = refused(monkeypatch, capsys, "walk", "--weights", "best", "--robot", robot)
     assert f"there is no {robot.with_name('best.json')}; tune this robot" in line
+    flags = ("--robot", robot, "--start", "best", "--out", tmp_path / "run")
+    assert "there is no" in refused(monkeypatch, capsys, "tune", *flags)
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_name_best_is_the_set_of_the_robot():
+    found = arguments.weights("best", load_robot())
+    jax.tree.map(np.testing.assert_array_equal, found, best())
+    assert found.others == {"friction": pytest.approx(0.55)}
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
@@ -393,6 +402,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     start, flags = run / "weights" / "with.json", ("--seeds", "1", "--iterations", "10")
     several = ("--traj", "straight", "c", "--start", start, "--no-video", "--out", "both")
     several += ("--tune", "turn_lead", "--net", Path("data/grfm.npz"), "--verdict")
+    several += ("--share", "0.25")
     assert call(monkeypatch, "tune", *flags, *several) == 0
     out = capsys.readouterr().out
     assert "change of L against nominal in %" in out
@@ -411,7 +421,13 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         zip(weight_names(), weights_to_vector(load_weights(start)).tolist(), strict=True)
     )
     assert lines[0]["weights"] == pytest.approx(at_start | {"turn_lead": 0.5})
-    assert load_weights(Path("both/weights/with.json")).others["turn_lead"] != 0.5
+    without, tuned, answer = (
+        load_weights(Path(f"both/weights/{name}.json")) for name in ("without", "with", "best")
+    )
+    assert tuned.others["turn_lead"] != 0.5
+    mixed = between(without, tuned, 0.25)
+    mixed = mixed._replace(others={"friction": answer.others["friction"], **mixed.others})
+    jax.tree.map(np.testing.assert_allclose, answer, mixed)
     assert "- turn_lead: 0.5 at the start" in Path("both/report.md").read_text()
     assert "walking: straight, c" in Path("both/report.md").read_text()
 

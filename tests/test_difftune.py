@@ -1,6 +1,7 @@
 """DiffTune: how far it steps, what it refuses, when it stops; on a toy and on the rigid body."""
 
 from dataclasses import replace
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,11 @@ import pytest
 from model import CONFIG as SHORT
 from model import PLAIN
 
+from hector_jax.cli.flags import Tunables
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.mpc import MpcConfig
-from hector_jax.control.parameters import bounds
+from hector_jax.control.parameters import GROUPS, TUNABLES, bounds
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
 from hector_jax.core.inputs import InputError
@@ -430,3 +432,10 @@ def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursi
     result = tune(config, ROBOT, nominal(), STRAIGHT, ANCHOR, PLAIN)
     assert result.history[-1].evaluation.loss < found.loss
     assert set(result.converged.others) == set(OTHERS)
+
+
+def test_the_line_takes_all_numbers_that_a_gradient_can_tune():
+    by_gradient = [name for name, one in TUNABLES.items() if not one.path.startswith("legs.")]
+    assert {*get_args(Tunables)} == {*GROUPS, *by_gradient}
+    for names in GROUPS.values():
+        assert TuneConfig(others=names).others == names

@@ -17,6 +17,7 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
+import scipy.stats
 from table import PROGRAM, SETS
 from table import Flags as Table
 
@@ -320,3 +321,36 @@ def test_the_table_of_more_than_weights_is_that_of_its_walks():
         ]
         numbers = [f"{x:.0f}" for x in changes] + [str(one["falls"]) for one in each.values()]
         assert f"| {name} | {' | '.join(numbers)} |" in page
+
+
+def test_the_falls_of_best_are_those_of_their_file():
+    scenes = json.loads((DOCS / "results/best/falls.json").read_text())["scenes"]
+    page, readme = (DOCS / "results.md").read_text(), (ROOT / "README.md").read_text()
+    for course, each in scenes.items():
+        for scene, one in each.items():
+            names = ("nominal", "best planned with 0.6", "best")
+            nominal, planned, found = (one["falls"].get(name) for name in names)
+            if not max(x or 0 for x in (nominal, planned, found)):
+                continue
+            what = re.sub("push |floor ", "", scene)
+            row = re.search(rf"^\| {course}, {what} \| (.*) \|$", page, re.MULTILINE)
+            if row is None:
+                assert (course, nominal) == ("s", one["walks"]) or scene == "push 50 N", scene
+                continue
+            cells = row[1].replace("*", "").split(" | ")
+            assert cells[:2] == [str(nominal), str(planned)], scene
+            if found is None:
+                assert cells[2].startswith("not walked")
+                continue
+            more = one["fell_where_nominal_did_not"]["best"]
+            fewer = one["nominal_fell_where_it_did_not"]["best"]
+            p = scipy.stats.binomtest(more, more + fewer, alternative="greater").pvalue
+            assert cells[2] == str(found)
+            if cells[3].startswith("<"):
+                assert p < float(cells[3][1:])
+            else:
+                assert float(cells[3]) == pytest.approx(p, abs=0.0051)  # two decimals
+    falls = {course: scenes[course]["push 100 N"]["falls"] for course in scenes}
+    pair = [falls[course]["best"] for course in ("straight", "c")]
+    assert f"({pair[0]} and {pair[1]} of 192, nominal {falls['straight']['nominal']}" in readme
+    assert f"({falls['s']['best']} against {falls['s']['nominal']}, with 75 N" in readme

@@ -183,6 +183,7 @@ def test_a_run_has_the_row_and_its_journal_where_the_robot_asks_for_it(
 
     monkeypatch.setattr(command.tunings, "tune", lambda *_, **__: {"without": there, "with": there})
     monkeypatch.setattr(command.choice, "choose", lambda *_, **__: {})
+    monkeypatch.setattr(command.choice, "answer", lambda *_, **__: nominal())
     monkeypatch.setattr(command, "tune_on_walks", on_walks)
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))

@@ -15,7 +15,7 @@ from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
 from hector_jax.report.motion import COLOURS, motions
 from hector_jax.report.plots import distances
-from hector_jax.report.plots.style import label_of, looks_of
+from hector_jax.report.plots.style import SETS, label_of, looks_of
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning.loss import PAPER_LOSS
 
@@ -228,3 +228,9 @@ def test_the_same_picture_gives_the_same_bytes(tmp_path, walks, ending):
         plots.path_from_above(path, walks)
         pictures.append(path.read_bytes())
     assert pictures[0] == pictures[1]
+
+
+def test_no_two_sets_are_drawn_alike():
+    every = looks_of([*SETS, *(f"mine {i}" for i in range(5))])
+    colors = [look.color for look in every.values()]
+    assert len(set(colors)) == len(colors)

@@ -13,7 +13,7 @@ import table_steps
 from pretend import pretend_history, pretend_walk
 from table import Flags
 
-from hector_jax.cli import flags, tune
+from hector_jax.cli import flags, run_folder, tune
 from hector_jax.cli.parse import as_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
@@ -195,13 +195,13 @@ def test_the_line_that_asks_again_names_what_is_not_default():
 def test_runs_of_the_same_second_have_folders_of_their_own(tmp_path, monkeypatch):
     """Also those that look at the same moment and find nothing there."""
 
-    class Clock(tune.datetime):
+    class Clock(run_folder.datetime):
         @classmethod
         def now(cls):
             return cls(2026, 11, 21, 9, 34, 59)
 
     begun = []
-    monkeypatch.setattr(tune, "datetime", Clock)
+    monkeypatch.setattr(run_folder, "datetime", Clock)
     monkeypatch.setattr(tune, "_tune_in", lambda folder, args: begun.append(folder))
     for _ in range(3):
         tune.tune(flags.Tune(traj=("s",), runs=tmp_path))

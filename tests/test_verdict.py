@@ -314,7 +314,7 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
 def small(folder):
     """The walks that `hector tune --verdict` adds, and their table."""
     robot = load_robot()
-    sets = {name: nominal() for name in ("nominal", "expert", "without_ten", "without", "with")}
+    sets = {name: nominal() for name in ("nominal", "expert", "without_ten", "best", "with")}
     course = NamedCommand("s", named_command("s"))
     with ThreadPoolExecutor(1) as pool:
         inputs = pool, tune_config(robot), robot, sets, course

@@ -146,7 +146,7 @@ class Tune(Configured):
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
-    # of `with` in row `best`; the rest is `without`, which tracks less well and falls less
+    # of `with` (the last refreshed one) in row `best`; the rest is `without`
     share: Annotated[float, Range(0, 1)] = 0.5
     refresh: Annotated[int, Range(0, 100)] = 0  # times to collect at the new weights and repeat
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing

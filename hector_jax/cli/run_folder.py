@@ -11,10 +11,12 @@ from typing import Any
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
+from hector_jax.control.reference import COMMANDS
+from hector_jax.control.trajectories import command_of
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, short_repr
-from hector_jax.robot.model import load_robot
+from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
@@ -123,3 +125,32 @@ def check_agreement(folder: Path, begun: Mapping[str, Any], now: Mapping[str, An
             check_agreement(folder, before, value)
         elif begun.get(name, value) != value:
             raise InputError(f"{folder}: begun with {name} {begun[name]}, here is {value}")
+
+
+def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
+    """The flags of each run by its folder.
+
+    Args:
+        args: of the command.
+        base: the folder that was named, if any.
+        robot: that is tuned.
+
+    Raises:
+        InputError: two trajectories of one name, or of runs that were tuned one by one.
+    """
+    texts = dict.fromkeys(t for one in args.traj for t in (COMMANDS if one == "all" else (one,)))
+    names: dict[str, str] = {}  # texts by name
+    for text in texts:
+        other = names.setdefault(name := command_of(text).name, text)
+        if other != text:
+            raise InputError(f"--traj {other} and {text} are both named {name}")
+    if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
+        raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
+    now = f"{datetime.now():{TIME}}"
+    parent = arguments.folder_of(args.runs, args.robot, robot)
+    # beside --resume a trajectory that was not given is that of the run
+    shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=tuple(texts))
+    if args.each:
+        each = {name: replace(args, traj=(text,)) for name, text in names.items()}
+        return {base / n if base else parent / n / now: one for n, one in each.items()}
+    return {base or parent / "-".join(names) / now: shared}

@@ -2,10 +2,9 @@
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,9 +18,8 @@ from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.control.parameters import tunables
-from hector_jax.control.reference import COMMANDS
-from hector_jax.control.trajectories import NamedCommand, command_of
-from hector_jax.control.weights import Weights, between, expert, nominal
+from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import say
 from hector_jax.core.environment import environment
@@ -47,7 +45,6 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 
-_FRICTION = 11 / 12  # share of the controller's friction with which `best` plans
 _FOLDERS = ("out", "run", "resume")  # flags that name the run folder
 
 
@@ -59,38 +56,19 @@ def tune(args: Tune) -> None:
     if args.video:
         check_film(Path("film.mp4"))
     base, robot = args.resume or args.out or args.run, load_robot(args.robot)
-    runs = _by_folder(args, base, robot)
+    runs = run_folder.by_folder(args, base, robot)
     if args.resume:
         runs = {folder: run_folder.resume(folder, one) for folder, one in runs.items()}
     else:
         for folder, one in runs.items():
             _trajectories(one, robot)
+            arguments.weights(one.start, robot)
             if base and folder.exists():
                 raise run_folder.exists_error(folder)
         runs = {run_folder.begin(folder, one): one for folder, one in runs.items()}
     for folder, one in runs.items():
         with locked(folder):
             _tune_in(folder, one)
-
-
-def _by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
-    """The flags of each run by its folder."""
-    texts = dict.fromkeys(t for one in args.traj for t in (COMMANDS if one == "all" else (one,)))
-    names: dict[str, str] = {}  # texts by name
-    for text in texts:
-        other = names.setdefault(name := command_of(text).name, text)
-        if other != text:
-            raise InputError(f"--traj {other} and {text} are both named {name}")
-    if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
-        raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
-    now = f"{datetime.now():{run_folder.TIME}}"
-    parent = arguments.folder_of(args.runs, args.robot, robot)
-    # beside --resume a trajectory that was not given is that of the run
-    shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=tuple(texts))
-    if args.each:
-        each = {name: replace(args, traj=(text,)) for name, text in names.items()}
-        return {base / n if base else parent / n / now: one for n, one in each.items()}
-    return {base or parent / "-".join(names) / now: shared}
 
 
 def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
@@ -264,12 +242,25 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     return begun | now
 
 
-def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
-    """Tune without and with the net, and again with it refreshed; writes the weights.
+def _refresh(
+    pool: Executor, run: _Run, done: dict[str, tunings.Tuned], step: Callable
+) -> list[dict[str, Any]]:
+    """Train the net anew at the tuned weights and tune through it, into `done`; what shifted."""
+    net, name, shifts = run.net, "with", []
+    for count in range(1, run.args.refresh + 1):
+        config = replace(nets.REFRESH, seed=count, seconds=run.seconds)
+        folder = run.folder / f"refresh-{count}"
+        seen = run.trajectories[0].command, done[name].tuning
+        net, shift = nets.refresh(pool, config, run.robot, *seen, net=net, folder=folder)
+        shifts.append(shift)
+        name = "with_refreshed" + (str(count) if count > 1 else "")
+        problem = {name: run.problems["with"]._replace(params=net.params)}
+        done |= step(problem, title=f"tuning {run.name} with the net refreshed")
+    return shifts
 
-    The set between the two, `best`, is the answer: what each gains by faults of its own model is
-    half lost there, what both gain stays. It plans with less friction than the controller assumes.
-    """
+
+def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
+    """Tune without and with the net, and again with it refreshed; writes the weights."""
     journal = Journal(run.folder / METRICS)
     step = partial(
         tunings.tune,
@@ -283,16 +274,7 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         dumps=run.folder / "dumps",
     )
     done = step(run.problems, title=f"tuning {run.name} without and with GRFM-Net")
-    net, name, shifts = run.net, "with", []
-    for count in range(1, run.args.refresh + 1):
-        config = replace(nets.REFRESH, seed=count, seconds=run.seconds)
-        folder = run.folder / f"refresh-{count}"
-        seen = run.trajectories[0].command, done[name].tuning
-        net, shift = nets.refresh(pool, config, run.robot, *seen, net=net, folder=folder)
-        shifts.append(shift)
-        name = "with_refreshed" + (str(count) if count > 1 else "")
-        problem = {name: run.problems["with"]._replace(params=net.params)}
-        done |= step(problem, title=f"tuning {run.name} with the net refreshed")
+    shifts, name = _refresh(pool, run, done, step), list(done)[-1]
     tuned = {name: one.tuning for name, one in done.items()}
     commands = [one.command for one in run.trajectories]
     notes = {"seconds": run.seconds, "folder": run.artefacts / "choice", "commit": run.commit}
@@ -320,9 +302,11 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         **{name: one.converged for name, one in tuned.items()},
         **{name: one.weights for name, one in choices.items()},
     }
-    half_way = between(sets["without"], sets[name], run.args.share)
-    friction = _FRICTION * run.config.rollout.walk.mpc.friction
-    sets["best"] = half_way._replace(others={"friction": friction, **half_way.others})
+    candidates = {n: sets[n] for n in ("nominal", *tuned)}
+    pair = "without", name
+    sets["best"] = choice.answer(
+        pool, run.config, run.robot, candidates, pair, run.args.share, commands, **notes
+    )
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
     return _Tuned(tuned, shifts, sets, choices)
@@ -351,7 +335,7 @@ def _walk_sets(
 def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
     """Say where what was tuned walks worse than what it was tuned from."""
     L = {each: float(scores[0].L) for each, scores in on_hfs.scores.items()}
-    for each in ("without", "with", "with_walks"):
+    for each in ("without", "with", "with_walks", "best"):
         if L.get(each, 0.0) > L["nominal"]:
             say(
                 f"{name}: on the high-fidelity simulator `{each}` walks with L {L[each] / 1e6:.3g}"

@@ -241,7 +241,7 @@ def small_verdict(
     Returns:
         What prints the table.
     """
-    few = {name: sets[name] for name in ("nominal", "expert", "without", "with")}
+    few = {name: sets[name] for name in ("nominal", "expert", "with", "best")}
     others = list(_installed(lambda text: None).items())[1:4]
     engines = dict(others) or {"c": choose_engine("c")}
     models = {OWN: Model()} if others else {n: Model(mass) for n, mass in _MASSES.items()}

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET, State, Wrench
 from hector_jax.robot.model import Robot
 
@@ -131,9 +132,15 @@ def between(one: Weights, other: Weights, share: float = 0.5) -> Weights:
 
     Numbers beside Q and R, which may be zero, are on the straight line from one to the other.
 
+    Raises:
+        InputError: they do not have the same numbers beside Q and R.
+
     >>> between(nominal(), expert()).Q.euler.round(1).tolist()
     [70.7, 70.7, 111.8]
     """
+    if one.others.keys() != other.others.keys():
+        each = (", ".join(x.others) or "none" for x in (one, other))
+        raise InputError(f"weights to mix have unlike numbers beside Q and R: {' and '.join(each)}")
     Q, R = jax.tree.map(lambda x, y: x ** (1.0 - share) * y**share, one[:2], other[:2])
     line = jax.tree.map(lambda x, y: (1.0 - share) * x + share * y, one.others, other.others)
     return jax.tree.map(np.asarray, Weights(Q, R, line))

@@ -1,4 +1,4 @@
-"""The step `choose`: the iteration of a tuning that walks best on the high-fidelity simulator.
+"""What a run takes of its tunings: an iteration of each (`choose`), and its answer, `best`.
 
 The rigid-body model is wrong in places: from some iteration on a tuning can gain on the model and
 lose on the robot. A few points of the path, its start among them, walk on plants drawn around the
@@ -9,12 +9,13 @@ noisy: a rollout knows its state exactly, so nothing keeps a tuning from gains t
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import Weights
+from hector_jax.control.weights import Weights, between
 from hector_jax.core.console import say
 from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
@@ -24,6 +25,7 @@ from hector_jax.tuning.difftune import TuneConfig, Tuning
 
 # of the accepted iterations: where a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
+_FRICTION = 11 / 12  # share of the controller's friction with which the answer plans
 _FIRST_SEED = 7000  # of the plants, drawn as `hfs-varied` but none of its seeds
 # White noise: encoders of 14 bits; a gyroscope on a vibrating trunk; velocity and position by both
 # over a leg of about 0.7 m.
@@ -52,6 +54,28 @@ def drawn_plants(robot: Robot) -> list[Imperfections]:
     return [plant._replace(estimator=noisy) for plant in drawn]
 
 
+def _ratios(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    sets: Mapping[str, Weights],
+    commands: Sequence[Command],
+    title: str,
+    **notes: Any,
+) -> dict[str, float]:
+    """L of each set against the first one, mean over the drawn plants and the commands."""
+    plants = drawn_plants(robot)
+    title = f"{title} on {plural(len(plants), 'plant')} drawn around the hfs"
+    seeds = range(len(plants))
+    each = [
+        verdicts.judge(pool, config, robot, sets, one, plants, seeds, title=title, **notes).scores
+        for one in commands
+    ]
+    loss = {name: np.array([[one.L for one in scores[name]] for scores in each]) for name in sets}
+    first = loss[next(iter(sets))]
+    return {name: float(np.mean(one / first)) for name, one in loss.items()}
+
+
 def choose(
     pool: Executor,
     config: TuneConfig,
@@ -73,7 +97,7 @@ def choose(
         folder: of the scores, where walks that are there are not walked again.
         commit: to note with what is walked now.
     """
-    if not (count := robot.description.tuning.choice_plants):
+    if not robot.description.tuning.choice_plants:
         return {}
     paths = {name: [i for i in one.history if i.accepted] for name, one in tunings.items()}
     points = {  # of each path, by their labels
@@ -84,17 +108,9 @@ def choose(
         for name, path in paths.items()
     }
     sets = {label: one.weights for each in points.values() for label, one in each.items()}
-    title = f"choosing an iteration on {plural(count, 'plant')} drawn around the hfs"
-    notes = {"title": title, "seconds": seconds, "folder": folder, "commit": commit}
-    plants = drawn_plants(robot), range(count)
-    each = [
-        verdicts.judge(pool, config, robot, sets, command, *plants, **notes).scores
-        for command in commands
-    ]
-    loss = {
-        label: np.array([[one.L for one in scores[label]] for scores in each]) for label in sets
-    }
-    ratio = {label: float(np.mean(loss[label] / loss["start"])) for label in sets}
+    sets = {"start": sets["start"], **sets}
+    notes = {"seconds": seconds, "folder": folder, "commit": commit}
+    ratio = _ratios(pool, config, robot, sets, commands, "choosing an iteration", **notes)
     choices = {}
     for name, labels in points.items():
         *_, last = labels
@@ -107,3 +123,39 @@ def choose(
             f"the hfs: L {change[0]:+.0f} % against the start, the last {change[1]:+.0f} %"
         )
     return choices
+
+
+def answer(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    sets: Mapping[str, Weights],
+    pair: tuple[str, str],
+    share: float,
+    commands: Sequence[Command],
+    **notes: Any,
+) -> Weights:
+    """The set that a run takes for its answer.
+
+    What each of two tunings gains by the faults of its own model is half lost between them, what
+    both gain stays. The set between them plans with less friction than the controller assumes.
+    For a robot that asks for drawn plants one of the tuned sets is taken where it walks better
+    there, because models are further from such robots.
+
+    Args:
+        pool, config, robot, commands, notes: see `choose`.
+        sets: by name: nominal, and all that were tuned.
+        pair: names of the two tunings.
+        share: of the second one.
+    """
+    lower, upper = TUNABLES["friction"].lower, TUNABLES["friction"].upper
+    friction = float(np.clip(_FRICTION * config.rollout.walk.mpc.friction, lower, upper))
+    half_way = between(sets[pair[0]], sets[pair[1]], share)
+    half_way = half_way._replace(others={"friction": friction, **half_way.others})
+    if not robot.description.tuning.choice_plants:
+        return half_way
+    walked = {**sets, "between": half_way}
+    ratio = _ratios(pool, config, robot, walked, commands, "choosing the answer", **notes)
+    best = min((name for name in walked if name != "nominal"), key=ratio.__getitem__)
+    say(f"best: {best} walks best on plants drawn around the hfs")
+    return walked[best]

@@ -22,7 +22,7 @@ SETS = {
     "expert": {"color": BLUE, "linestyle": (0, (5, 1.5))},
     "without": {"color": ORANGE, "linestyle": (0, (4, 1.2, 1, 1.2))},
     "with": {"color": GREEN, "linestyle": "-"},
-    "best": {"color": "#b0186a", "linestyle": "-"},
+    "best": {"color": "#1f2f8f", "linestyle": "-"},
     "searched": {"color": "#a566c7", "linestyle": (0, (1.2, 1.2))},
     "without_ten": {"color": "#ecb27c", "linestyle": (0, (4, 1.2, 1, 1.2)), "linewidth": 0.9},
     "with_ten": {"color": "#63b89f", "linestyle": "-", "linewidth": 0.9},
@@ -48,10 +48,10 @@ CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 MARK = {"color": "0.5", "linestyle": (0, (2, 2)), "linewidth": 0.9, "zorder": 0}
 """A line across a panel: an iteration, or a moment."""
 
-_MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "X"}
+_MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "p"}
 _MARKER |= {"ceiling": "*", "shared_mean": "<", "shared_worst": ">"}
 _SPARE_STYLE = {"linestyle": (0, (2.5, 1, 1, 1, 1, 1)), "linewidth": 1.1}
-_SPARE = (("#b0186a", "s"), ("#6cb0dc", "^"), ("#8a8a00", "h"), ("black", "P"), ("#c07a3a", "X"))
+_SPARE = (("#b8447a", "s"), ("#6cb0dc", "^"), ("#8a8a00", "h"), ("black", "P"), ("#c07a3a", "X"))
 _NAMES = {
     "without": "without (tuned, no net)",
     "with": "with (tuned, net)",
