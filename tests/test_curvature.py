@@ -56,5 +56,5 @@ def test_directions_are_said_with_the_weights_that_matter_in_them():
     (one,) = found.directions
     assert one.text == "`Q_pitch` against `Q_x`"
     assert one.change == pytest.approx(0.5 * np.log(2.0) ** 2 * vector @ vector)
-    assert found.count == 18
+    assert found.number == 18
     assert set(found.flat) == {*NAMES} - {"Q_pitch", "Q_x"}

@@ -45,7 +45,7 @@ class Curvature(NamedTuple):
     """How the loss is curved in the weights."""
 
     directions: list[Direction]  # those that matter, the strongest first
-    count: int  # of all directions
+    number: int  # of all directions
     flat: list[str]  # weights that by themselves do not matter
 
 
