@@ -10,6 +10,7 @@ from hector_jax.cli.flags import View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
+from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand, beyond, limits
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best, load_weights
@@ -151,6 +152,24 @@ def course(text: str, robot: Robot) -> NamedCommand:
     if trajectory.seconds and (excess := beyond(limits(robot, gait), trajectory.command)):
         say(f"warning: {text}: {excess}")
     return trajectory
+
+
+def courses(texts: Sequence[str], robot: Robot, hint: str = "") -> tuple[NamedCommand, ...]:
+    """What one weight set is to walk; `all` are the three of the paper.
+
+    `hint` ends the message where they last differently.
+
+    Raises:
+        InputError: see `course`; or they last differently, or two have one name.
+    """
+    every = dict.fromkeys(t for one in texts for t in (COMMANDS if one == "all" else (one,)))
+    found = tuple(course(text, robot) for text in every)
+    if len({one.seconds or Walk.seconds for one in found}) > 1:
+        lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in found)
+        raise InputError(f"--traj expects trajectories of one length, got {lasts}{hint}")
+    if len({one.name for one in found}) < len(found):
+        raise InputError(f"--traj names two of {', '.join(one.name for one in found)} alike")
+    return found
 
 
 def seconds(flag: float, trajectory: NamedCommand) -> float:

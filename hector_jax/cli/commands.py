@@ -6,7 +6,7 @@ from dataclasses import asdict
 from functools import partial, singledispatch
 from typing import Any
 
-from hector_jax.cli import arguments, doctor, evaluate, flags, tune, verdict, view
+from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS
@@ -22,7 +22,8 @@ from hector_jax.report.compare import compare_runs, print_comparison
 from hector_jax.report.tensorboard import write_events
 from hector_jax.robot.description import description_of
 from hector_jax.robot.model import Robot, load_robot, robot_of
-from hector_jax.robot.propose import as_toml, propose
+from hector_jax.robot.propose import as_toml
+from hector_jax.robot.propose import propose as propose_robot
 from hector_jax.robot.table import mended, remarks, table_of, table_of_survey
 from hector_jax.runs import export, nets, replay, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
@@ -42,6 +43,8 @@ def run(args: Any) -> None:
 
 
 for _command in (doctor.doctor, evaluate.evaluate, evaluate.walk, evaluate.grfm, tune.tune):
+    run.register(_command)
+for _command in (propose.propose, propose.report):
     run.register(_command)
 run.register(verdict.verdict)
 run.register(view.view_run)
@@ -156,7 +159,7 @@ def examine_robot(args: flags.Robot) -> None:
         beside = file.absolute().parent
         if out.absolute().parent.resolve() != beside.resolve():
             raise InputError(f"--out must be beside the model, in {beside}, got {str(out)!r}")
-    proposal = propose(file)
+    proposal = propose_robot(file)
     head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
     wrong = [f"To be mended: {line}" for line in proposal.wrong]
     text = as_toml(proposal.table, [head, *wrong])

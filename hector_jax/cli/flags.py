@@ -158,9 +158,43 @@ class Tune(Configured):
     video: bool = True  # make a film of the nominal and the best weights
     # print up to 12 walks more: in other engines, or else with other masses of the robot
     verdict: bool = False
+    # walks to spend on tuning row `best` further, on the walks themselves (docs/howto/walks.md)
+    walks: Annotated[int, Range(0, 100_000)] = 0
+    walk_plants: Annotated[int, Range(0, 1000)] = 2  # drawn plants of these walks; 0: the simulator
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR
+
+
+@_command
+class Propose:
+    """Say which weights a robot, or a simulator elsewhere, is to walk with next.
+
+    Example: hector propose runs/robot --traj s
+    """
+
+    folder: Folder  # of this tuning; a later call needs no other flag
+    traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
+    start: Weights = "best"  # weights of the first walk: nominal, expert, best or a weights file
+    # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name
+    tune: tuple[Tunables, ...] = ("weights",)
+    seed: Seed = 0  # of the random numbers
+    processes: Processes = 2  # worker processes, one core each
+    json: bool = False  # print JSON instead of text
+    robot: RobotFile = None  # TOML file of another robot; HECTOR by default
+
+
+@_command
+class Report:
+    """Take the logs of the walks with the weights that `hector propose` named.
+
+    Example: hector report runs/robot log.npz
+    """
+
+    folder: Folder  # of `hector propose`
+    logs: tuple[Annotated[Path, Source.FILE], ...]  # one of each trajectory (docs/howto/walks.md)
+    processes: Processes = 2  # worker processes, one core each
+    json: bool = False  # print JSON instead of text
 
 
 @_command

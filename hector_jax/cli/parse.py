@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Source, Tune, command
+from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Propose, Source, Tune, command
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import (
     SEED,
@@ -167,7 +167,7 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         if name == "config":
             raise InputError(f"{path}: config stands on the line only")
         values[name] = value
-    if kind is Tune and isinstance(values.get("traj"), str):
+    if kind in (Tune, Propose) and isinstance(values.get("traj"), str):
         values["traj"] = [values["traj"]]  # older runs were tuned on one
     return from_table(str(path), kind, values)
 

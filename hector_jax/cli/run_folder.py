@@ -2,11 +2,11 @@
 
 import dataclasses
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
@@ -20,6 +20,8 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
+
+Flags = TypeVar("Flags")
 
 TIME = "%Y%m%d-%H%M%S"  # names a run
 _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice", "runs.walks")
@@ -79,7 +81,7 @@ def resume(folder: Path, args: Tune) -> Tune:
         InputError: one line naming the file: no run, one of other flags, other code, another robot,
             or one whose data are not here.
     """
-    path, flags = folder / CONFIG, {}
+    path = folder / CONFIG
     config, made_with = read_object(path), read_object(folder / VERSIONS)
     for name in ("robot", "code", "directory"):
         if not isinstance(config.get(name), str):
@@ -92,16 +94,7 @@ def resume(folder: Path, args: Tune) -> Tune:
             "start a new run"
         )
     check_agreement(folder, config, {"robot": robot_hash(load_robot(begun.robot))})
-    for field in dataclasses.fields(Tune):
-        name = field.name
-        if name in _OF_A_CALL:
-            continue
-        before, given = getattr(begun, name), getattr(args, name)
-        flags[name] = before if given == field.default else given
-        if name not in _FREE and flags[name] != before:
-            before, given = (" ".join(x) if isinstance(x, tuple) else x for x in (before, given))
-            raise InputError(f"{folder}: begun with --{name} {before}, got {given}")
-    now = replace(args, **flags)
+    now = agreed(folder, begun, args, of_a_call=_OF_A_CALL)
     data = arguments.folder_of(now.data, now.robot, load_robot(now.robot))
     if not now.net and not data.exists() and Path(config["directory"]) != Path.cwd():
         raise InputError(
@@ -109,6 +102,30 @@ def resume(folder: Path, args: Tune) -> Tune:
             "or name the folder by --data"
         )
     return now
+
+
+def agreed(folder: Path, begun: Flags, args: Flags, of_a_call: Sequence[str]) -> Flags:
+    """The flags with which a folder was begun; those given beside it have to agree.
+
+    Args:
+        folder: for the message.
+        begun, args: flags of the folder and of this call, where a default counts as not given.
+        of_a_call: names of those that are the call's.
+
+    Raises:
+        InputError: one line with the first flag that differs.
+    """
+    flags = {}
+    for field in dataclasses.fields(begun):  # pyright: ignore[reportArgumentType]
+        name = field.name
+        if name in of_a_call:
+            continue
+        before, given = getattr(begun, name), getattr(args, name)
+        flags[name] = before if given == field.default else given
+        if name not in _FREE and flags[name] != before:
+            before, given = (" ".join(x) if isinstance(x, tuple) else x for x in (before, given))
+            raise InputError(f"{folder}: begun with --{name} {before}, got {given}")
+    return replace(args, **flags)  # pyright: ignore[reportArgumentType]
 
 
 def check_agreement(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:

@@ -37,7 +37,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.verdicts import ScoredWalks
-from hector_jax.runs.walks import tune_on_walks
+from hector_jax.runs.walks import Row, campaign, changes, tune_on_walks
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
@@ -78,11 +78,12 @@ def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
         InputError: there is no such trajectory, they last differently, or --refresh cannot take
             them.
     """
-    courses = tuple(arguments.course(text, robot) for text in args.traj)
+    courses = arguments.courses(args.traj, robot, "; add --each")
     first, pieces = courses[0], len(courses[0].command.duration)
-    if len({one.seconds or Walk.seconds for one in courses}) > 1:
-        lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in courses)
-        raise InputError(f"--traj expects trajectories of one length, got {lasts}; add --each")
+    plants = max(args.walk_plants, 1)
+    if 0 < args.walks < (least := 2 * len(courses) * plants):
+        what = f"{plural(len(courses), 'command')} on {plural(plants, 'plant')}, twice"
+        raise InputError(f"--walks must be 0 or at least {least} ({what}), got {args.walks}")
     if not args.refresh:
         return courses
     if args.net:
@@ -135,6 +136,7 @@ class _Tuned(NamedTuple):
     shifts: list[dict[str, Any]]  # of each refresh
     sets: dict[str, Weights]
     choices: dict[str, choice.Choice]  # empty where the last iterations are taken
+    walked: list[Row]  # empty where no walk was spent on tuning
 
 
 def _tune_in(folder: Path, args: Tune) -> None:
@@ -181,6 +183,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
         curvature=curvature,
         errors=run.net.errors,
         shifts=tuned.shifts,
+        walked=changes(tuned.walked),
+        cases=len(tuned.walked[0].losses) if tuned.walked else 0,
         chosen=result.get("chosen", {}),
         pictures=_draw(run, tuned, standin, on_hfs),
         film=_film(run, standin),
@@ -232,7 +236,6 @@ def _note_settings(run: _Run) -> dict[str, Any]:
         "seconds": run.seconds,
         "start": weights_tree(run.start),
         "choice_plants": run.robot.description.tuning.choice_plants,
-        "walk_rounds": run.robot.description.tuning.walk_rounds,
     }
     here = json.loads(as_json(now))
     run_folder.check_agreement(run.folder, begun, here)
@@ -279,21 +282,6 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     commands = [one.command for one in run.trajectories]
     notes = {"seconds": run.seconds, "folder": run.artefacts / "choice", "commit": run.commit}
     choices = choice.choose(pool, run.config, run.robot, tuned, commands, **notes)
-    if rounds := run.robot.description.tuning.walk_rounds:
-        walked = tune_on_walks(
-            pool,
-            run.config,
-            run.robot,
-            run.start,
-            run.problems["without"],  # grounding tells what the net would
-            choice.drawn_plants(run.robot),
-            run.artefacts,
-            rounds=rounds,
-            seconds=run.seconds,
-            commit=run.commit,
-        )
-        tuned["with_walks"] = walked.tuning
-        journal.write({"with_walks": walked.tuning.history})
     sets = {
         "nominal": nominal(run.robot),
         "expert": expert(run.robot),
@@ -307,9 +295,22 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     sets["best"] = choice.answer(
         pool, run.config, run.robot, candidates, pair, run.args.share, commands, **notes
     )
+    walked: list[Row] = []
+    if run.args.walks:
+        sets["before_walks"] = sets.pop("best")
+        sets["best"], walked = _tune_on_walks(pool, run, sets["before_walks"])
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    return _Tuned(tuned, shifts, sets, choices)
+    return _Tuned(tuned, shifts, sets, choices, walked)
+
+
+def _tune_on_walks(pool: Executor, run: _Run, start: Weights) -> tuple[Weights, list[Row]]:
+    """Spend the walks that were asked for, from the answer of the tunings on."""
+    count = run.args.walk_plants
+    plants = choice.drawn_plants(run.robot, count) if count else [hfs(run.robot.description)]
+    commands = {one.name: one.command for one in run.trajectories}
+    inputs = run.folder / "walks", run.config, run.robot, start, commands, plants
+    return tune_on_walks(pool, campaign(*inputs), run.args.walks)
 
 
 def _walk_sets(
@@ -335,7 +336,7 @@ def _walk_sets(
 def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
     """Say where what was tuned walks worse than what it was tuned from."""
     L = {each: float(scores[0].L) for each, scores in on_hfs.scores.items()}
-    for each in ("without", "with", "with_walks", "best"):
+    for each in ("without", "with", "best"):
         if L.get(each, 0.0) > L["nominal"]:
             say(
                 f"{name}: on the high-fidelity simulator `{each}` walks with L {L[each] / 1e6:.3g}"
@@ -368,6 +369,8 @@ def _result(
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.shifts:
         result["refresh"] = tuned.shifts
+    if tuned.walked:
+        result["walks"] = [one._asdict() for one in changes(tuned.walked)]
     if tuned.choices:
         chosen = tuned.choices.items()
         result["chosen"] = {n: {"iteration": one.iteration, "of": one.of} for n, one in chosen}

@@ -28,6 +28,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
             curvature: of the loss in the starting weights.
             errors: held-out, of `raw`, `linear`, `net`, as `training.report` has them.
             shifts: of each refresh, by `nets.refresh`.
+            walked, cases: `Change`s of the tuning on walks; walks of each weight set.
             chosen: by set, iteration that was taken, where not the last.
             pictures, film: `Picture`s; of the film, or why there is none.
             config, environment: resolved settings, as JSON values, and what it was made with.

@@ -97,12 +97,9 @@ class TuningSettings:
     lead: Annotated[int, NOT_NEGATIVE] = 0  # gait ticks of a rollout in place, before the command
     touchdown_error: bool = False  # whether the net learns how far from the plan the feet land
     choice_plants: Annotated[int, NOT_NEGATIVE] = 0  # on which an iteration is chosen; 0: the last
-    walk_rounds: Annotated[int, NOT_NEGATIVE] = 0  # of the tuning with walks on these plants
 
     def __post_init__(self) -> None:
         check(self)
-        if self.walk_rounds and not self.choice_plants:
-            raise InputError("walk_rounds needs plants to walk on: choice_plants of at least 1")
 
 
 @jax.tree_util.register_static

@@ -46,10 +46,10 @@ class Choice(NamedTuple):
     of: int  # number of the last
 
 
-def drawn_plants(robot: Robot) -> list[Imperfections]:
-    """The plants on which weights of this robot are chosen and tuned on."""
+def drawn_plants(robot: Robot, count: int) -> list[Imperfections]:
+    """The first plants on which weights of a robot are chosen and tuned."""
     noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
-    seeds = range(_FIRST_SEED, _FIRST_SEED + robot.description.tuning.choice_plants)
+    seeds = range(_FIRST_SEED, _FIRST_SEED + count)
     drawn = [hfs_drawn(seed, 0.4, robot.description) for seed in seeds]
     return [plant._replace(estimator=noisy) for plant in drawn]
 
@@ -64,7 +64,7 @@ def _ratios(
     **notes: Any,
 ) -> dict[str, float]:
     """L of each set against the first one, mean over the drawn plants and the commands."""
-    plants = drawn_plants(robot)
+    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
     title = f"{title} on {plural(len(plants), 'plant')} drawn around the hfs"
     seeds = range(len(plants))
     each = [

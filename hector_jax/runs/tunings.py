@@ -214,10 +214,10 @@ def gradient_norms(
         return {name: future.result() for name, future in running.items()}
 
 
-def _gauss_newton_job(
+def gauss_newton_job(
     config: TuneConfig, robot: Robot, start: Weights, problem: Problem
 ) -> Float[np.ndarray, "n n"]:
-    """The matrix divided by the loss, mean over the commands."""
+    """The Gauss-Newton matrix divided by the loss, mean over the commands, in a worker."""
     matrix_of = partial(gauss_newton, config.rollout, robot, start)
     models = _models(config, robot, problem)
     each = [matrix_of(command, anchor, phi, config.loss) for command, anchor, phi in models]
@@ -230,7 +230,7 @@ def curvature(
     """How the loss on the model is curved in the starting weights."""
     with bar("directions of the weights that matter") as tell:
         tell(0, 1, "compiling")
-        matrix = pool.submit(_gauss_newton_job, config, robot, start, problem).result()
+        matrix = pool.submit(gauss_newton_job, config, robot, start, problem).result()
     return main_directions(matrix, start)
 
 

@@ -1,0 +1,138 @@
+"""Proposals for tuning on few walks: from a history alone, on made-up losses."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from hector_jax.core.inputs import InputError
+from hector_jax.search import few_walks
+from hector_jax.search.few_walks import Walked, incumbent, needs_model, propose, space_of
+
+SIZE = 5
+MATRIX = np.diag([4.0, 1.0, 0.25, 0.0])  # of four of the five steps
+SPACE = space_of(MATRIX, np.tile([-3.0, 3.0], (SIZE, 1)))
+GOAL = np.array([0.8, -0.6, 0.5, 0.4, -0.7])  # in steps
+
+
+def bowl(goal, point):
+    """A log-loss with its least value, 0, at a goal, and its gradient."""
+    away = SPACE.to_steps @ point - goal
+    scale = np.append(np.diag(MATRIX), 1.0) + 0.3
+    return 0.5 * away @ (scale * away), SPACE.to_steps.T @ (scale * away)
+
+
+def model(point):
+    """Wrong about where the goal is, and does not feel the last number."""
+    return bowl(GOAL * [0.8, 0.8, 0.5, 0.0, 0.0], point)
+
+
+def walked(proposal, loss, margin=0.1):
+    return Walked(*proposal, loss, margin)
+
+
+def tune(walks, truth=lambda point: bowl(GOAL, point)[0], margin=lambda point: 0.1):
+    history = []
+    for _ in range(walks):
+        proposal = propose(SPACE, history, model)
+        history.append(walked(proposal, truth(proposal.point), margin(proposal.point)))
+    return history
+
+
+@pytest.fixture(scope="module")
+def history():
+    return tune(24)
+
+
+def test_the_metric_makes_the_loss_round_and_leaves_unknown_numbers_alone():
+    curved = SPACE.to_steps.T @ np.pad(MATRIX, (0, 1)) @ SPACE.to_steps
+    np.testing.assert_allclose(curved, np.diag(SPACE.curvature), atol=1e-12)
+    assert SPACE.curvature.max() < 1.0
+    np.testing.assert_allclose(SPACE.to_point @ SPACE.to_steps, np.eye(SIZE), atol=1e-12)
+    np.testing.assert_allclose(SPACE.to_steps[4], np.eye(SIZE)[4])
+
+
+def test_the_model_leads_first_then_the_surrogate_and_each_fourth_walk_evolution(history):
+    methods = [row.method for row in history]
+    turn = methods.index("surrogate")
+    assert methods[0] == "start"
+    assert 2 <= turn - 1 <= 6
+    assert set(methods[1:turn]) == {"model"}
+    evolved = [i for i, method in enumerate(methods) if method == "evolution"]
+    assert len(evolved) >= 3
+    assert set(np.diff(evolved)) == {4}
+    assert [needs_model(history[:i]) for i in (1, evolved[0])] == [True, False]
+
+
+def test_what_the_model_does_not_know_is_found_by_the_walks(history):
+    losses = [row.loss for row in history]
+    turn = [row.method for row in history].index("surrogate")
+    by_model = min(losses[:turn])
+    assert by_model < 0.75 * losses[0]  # a model that is wrong helps
+    assert min(losses) < 0.2 * by_model  # and is not all
+    best = SPACE.to_steps @ history[incumbent(SPACE, history)].point
+    assert abs(best[4] - GOAL[4]) < 0.35  # of which the model feels nothing
+
+
+def test_a_proposal_follows_from_the_history_alone(history):
+    for count in (1, 8, 15, 19):
+        again = propose(SPACE, history[:count], model)
+        np.testing.assert_array_equal(again.point, history[count].point)
+        assert again.predicted == history[count].predicted
+
+
+def test_proposals_stay_in_the_box():
+    narrow = SPACE._replace(box=np.tile([-0.1, 0.1], (SIZE, 1)))
+    history = []
+    for _ in range(8):
+        proposal = propose(narrow, history, model)
+        assert np.abs(narrow.to_steps @ proposal.point).max() <= 0.1 + 1e-12
+        history.append(walked(proposal, bowl(GOAL, proposal.point)[0]))
+    assert min(row.loss for row in history) < history[0].loss
+
+
+def test_a_fall_shrinks_the_region_and_is_not_fitted(history):
+    proposal = propose(SPACE, history[:1], model)
+    fell = [history[0], walked(proposal, np.inf, 1.0)]
+    after = propose(SPACE, fell, model)
+    assert np.linalg.norm(after.point) < 0.7 * np.linalg.norm(proposal.point)
+    assert incumbent(SPACE, fell) == 0
+    late = [*history[:12], history[12]._replace(loss=np.inf, margin=1.0)]
+    assert np.isfinite(propose(SPACE, late, model).point).all()
+    assert incumbent(SPACE, late) != 12
+
+
+def test_where_a_margin_is_short_the_surrogate_does_not_go():
+    """The robot would fall beyond 0.3 of the last number, which is where the loss is least."""
+    towards = lambda point: -(SPACE.to_steps @ point)[4]  # noqa: E731
+    margin = lambda point: float(np.clip(0.1 + 1.2 * towards(point), 0.0, 1.0))  # noqa: E731
+    careful, careless = (tune(24, margin=of) for of in (margin, lambda point: 0.1))
+    beyond = [sum(towards(row.point) > 0.45 for row in one) for one in (careful, careless)]
+    assert beyond[0] < beyond[1] / 2
+
+
+def test_the_luckiest_walk_is_not_believed(history):
+    """One walk is lucky by far more than the walks around it allow."""
+    best = SPACE.to_steps @ history[incumbent(SPACE, history)].point
+    rng, around = np.random.default_rng(0), []
+    for _ in range(12):
+        point = SPACE.to_point @ (best + 0.05 * rng.standard_normal(SIZE))
+        around.append(Walked(point, "surrogate", None, history[-1].loss * 0 + 0.05, 0.1))
+    lucky = [*history, *around]
+    lucky[-1] = lucky[-1]._replace(loss=0.0)
+    losses = [row.loss for row in lucky]
+    lucky[-1] = lucky[-1]._replace(loss=min(losses) - 0.02)
+    assert incumbent(SPACE, lucky) != len(lucky) - 1
+
+
+@pytest.mark.parametrize("package", ["tinygp", "cmaes"])
+def test_a_missing_package_is_named_with_its_extra(monkeypatch, history, package):
+    there = few_walks.find_spec
+    monkeypatch.setattr(
+        few_walks, "find_spec", lambda name: None if name == package else there(name)
+    )
+    methods = [row.method for row in history]
+    count = methods.index({"tinygp": "surrogate", "cmaes": "evolution"}[package])
+    with pytest.raises(InputError, match=rf'{package}: pip install "hector-jax\[search\]"'):
+        propose(SPACE, history[:count], model)
+    assert package in sys.modules or there(package)
