@@ -48,6 +48,8 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         environment=environment(),
         command="make tune TRAJ=straight",
         shifts=(),
+        walked=(),
+        cases=0,
         chosen={},
     )
 
