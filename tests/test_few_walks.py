@@ -28,7 +28,7 @@ def model(point):
 
 
 def walked(proposal, loss, margin=0.1):
-    return Walked(*proposal, loss, margin)
+    return Walked(*proposal, loss=loss, margin=margin)
 
 
 def tune(walks, truth=lambda point: bowl(GOAL, point)[0], margin=lambda point: 0.1):

@@ -220,10 +220,8 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
         if arrays[name].dtype.kind not in "biuf" or not np.isfinite(arrays[name]).all():
             raise InputError(f"{path}: {name} must hold finite numbers")
     rows = np.minimum(np.arange(wanted), count - 1)
-    state, command = (
-        kind(*(arrays[f"{where}.{name}"][rows].astype(float) for name in kind._fields))
-        for kind, where in ((State, "state"), (Wrench, "command"))
-    )
+    state = State(*(arrays[f"state.{name}"][rows].astype(float) for name in State._fields))
+    command = Wrench(*(arrays[f"command.{name}"][rows].astype(float) for name in Wrench._fields))
     down = np.asarray(has_fallen(state, *robot.description.limits))
     fell = np.maximum.accumulate(down | arrays["fallen"][rows].astype(bool))
     return Log(
