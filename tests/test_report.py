@@ -15,6 +15,7 @@ from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import tuning_section, write_report
 from hector_jax.runs.metrics import Verdict
+from hector_jax.runs.walks import Change
 from hector_jax.tuning.curvature import Curvature, Direction
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -219,3 +220,14 @@ def test_the_report_says_what_was_tuned_beside_the_weights():
     text = tuning_section("with", Tuning(history, history[10].weights, end, "12 iterations"))
     assert "- turn_lead: 0.5 at the start, 2.0 at the end" in text
     assert text.count("`turn_lead`") == 1  # at a bound at the end
+
+
+def test_a_tuning_on_walks_shows_each_set_and_its_falls(tmp_path):
+    walked = [Change("start", None, 0.0), Change("model", -12.34, -10), Change("model", -5, None)]
+    report = _report() | {"walked": walked, "cases": 6}
+    text = write_report(tmp_path, **report).read_text()
+    assert "Each weight set was walked 6 times" in text
+    assert "| 0 | start |  | +0.0 |" in text
+    assert "| 1 | model | -12.3 | -10.0 |" in text
+    assert "| 2 | model | -5.0 | fell |" in text
+    assert "Tuning on walks" not in write_report(tmp_path, **_report()).read_text()

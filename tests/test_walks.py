@@ -1,6 +1,8 @@
 """Tuning on walks: the folder, the logs, and files against walks in process."""
 
+import json
 from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -8,23 +10,33 @@ import numpy as np
 import pytest
 from pretend import pretend_history
 
+from hector_jax.cli import propose
 from hector_jax.cli import tune as command
-from hector_jax.cli.flags import Tune
+from hector_jax.cli.flags import Propose, Report, Tune
+from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
-from hector_jax.control.trajectories import NamedCommand
+from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import walks
+from hector_jax.runs import walk_log, walks
 from hector_jax.runs.tunings import Tuned
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.loss import loss_of
 from hector_jax.tuning.rollout import RolloutConfig
 
 COMMAND = {"s": named_command("s")}
+SHORT = """
+name = "short"
+[[segment]]
+seconds = 0.05
+v_x = 0.3
+"""
 CONFIG = TuneConfig(rollout=RolloutConfig(ticks=6))
 
 
@@ -63,7 +75,7 @@ def test_ten_walks_through_files_equal_ten_in_process_to_the_last_bit(
     for number in range(10):
         again = walks.read_history(one)  # as a new process would
         proposal, weights = walks.next_proposal(pool, one, space, again)
-        log = walks.read_log(walked(robot, weights, tmp_path / f"{number}.npz"), robot, 0.06)
+        log = walk_log.read_log(walked(robot, weights, tmp_path / f"{number}.npz"), robot, 0.06)
         again = walks.add_walk(one, again, proposal, walks.see(pool, one, [log]))
     assert len(again) == len(rows) == 10
     for mine, theirs in zip(again, rows, strict=True):
@@ -103,15 +115,15 @@ def arrays(robot, tmp_path):
 def test_a_plain_archive_with_the_least_entries_is_a_log(robot, arrays, tmp_path):
     least = {n: x for n, x in arrays.items() if n.split(".")[0] in ("initial", "state", "command")}
     np.savez(tmp_path / "least.npz", joints=arrays["joints"], **least)
-    log = walks.read_log(tmp_path / "least.npz", robot, 0.06)
+    log = walk_log.read_log(tmp_path / "least.npz", robot, 0.06)
     assert log.joints.shape == (60, 10)
     assert not log.fallen.any()
     # a log that ends early is that of a fall
-    seen = walks._see(
-        CONFIG, robot, COMMAND["s"], walks.read_log(tmp_path / "least.npz", robot, 0.06)
+    seen = walk_log.read_loss(
+        CONFIG, robot, COMMAND["s"], walk_log.read_log(tmp_path / "least.npz", robot, 0.06)
     )
     assert np.isfinite(seen[0].loss)
-    short = walks.read_log(tmp_path / "least.npz", robot, 0.08)
+    short = walk_log.read_log(tmp_path / "least.npz", robot, 0.08)
     assert short.fallen.tolist() == [False] * 60 + [True] * 20
 
 
@@ -129,13 +141,86 @@ def test_a_log_that_is_none_is_refused_in_one_line(robot, arrays, tmp_path, chan
     changed = {n: x for n, x in (arrays | change).items() if x is not None}
     np.savez(tmp_path / "log.npz", **changed)
     with pytest.raises(InputError, match=words):
-        walks.read_log(tmp_path / "log.npz", robot, 0.06)
+        walk_log.read_log(tmp_path / "log.npz", robot, 0.06)
 
 
-def test_what_is_no_archive_is_refused(robot, tmp_path):
-    (tmp_path / "log.npz").write_text("no log")
-    with pytest.raises(InputError, match="not a log"):
-        walks.read_log(tmp_path / "log.npz", robot, 0.06)
+def _cut(arrays, path):
+    np.savez(path, **arrays)
+    path.write_bytes(path.read_bytes()[:-400])
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda arrays, path: path.write_text("no log"),
+        lambda arrays, path: np.save(path.open("wb"), arrays["joints"]),
+        _cut,
+    ],
+)
+def test_what_is_no_whole_archive_is_refused(robot, arrays, tmp_path, write):
+    write(arrays, tmp_path / "log.npz")
+    with pytest.raises(InputError, match=r"not a log \(\.npz\)"):
+        walk_log.read_log(tmp_path / "log.npz", robot, 0.06)
+
+
+def test_the_reference_of_a_log_is_that_of_its_walk(robot):
+    walked = walk(CONFIG.rollout.walk, robot, Job(nominal(robot), COMMAND["s"], hfs(), 0.06))
+    seen, _ = walk_log.read_loss(CONFIG, robot, COMMAND["s"], walk_log.log_of(walked))
+    assert seen.loss == pytest.approx(float(loss_of(CONFIG.loss, walked)), rel=1e-9)
+    assert 0.0 < seen.margin < 0.2
+
+
+def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in_process, tmp_path):
+    """As by a plant on which the answer of the tunings falls: the run goes on without it."""
+    one = campaign(tmp_path, robot, [hfs()])
+    (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
+    fell = walk_log.Seen(np.inf, 1.0)
+    log = walks._empty_log(robot)
+    monkeypatch.setattr(walks, "_walk_job", lambda *_: (fell, log))
+    weights, rows = walks.tune_on_walks(pool, one, 10)
+    assert [change.change for change in walks.changes(rows)] == [None]
+    np.testing.assert_allclose(weights.Q.euler, nominal(robot).Q.euler, rtol=1e-12)
+
+
+def test_the_points_of_a_folder_stay_in_one_metric(monkeypatch, pool, in_process):
+    """Where another release computes another matrix, the walks are still of their weights."""
+    one, _, rows = in_process
+    monkeypatch.setattr(walks.tunings, "gauss_newton_job", None)
+    space = walks.space_of(pool, one)
+    again = walks.weights_at(one, space, rows[-1].point)
+    kept = load_weights(walks.weights_path(one, len(rows) - 1), one.robot)
+    jax.tree.map(np.testing.assert_array_equal, again, kept)
+
+
+def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "short.toml").write_text(SHORT)
+    wrong = nominal(robot)
+    save_weights(tmp_path / "far.json", wrong._replace(Q=wrong.Q._replace(euler=np.full(3, 1e9))))
+    folder, course = tmp_path / "robot", ("short.toml",)
+    with pytest.raises(InputError, match="outside the box"):
+        propose.propose(Propose(folder, course, "far.json", processes=1))
+    # flags that were refused bind nobody
+    propose.propose(Propose(folder, course, "nominal", processes=1, json=True))
+    first = json.loads(capsys.readouterr().out)
+    assert (first["walk"], first["proposed_by"]) == (0, "start")
+    with pytest.raises(InputError, match="begun with --traj short.toml, got s"):
+        propose.propose(Propose(folder, ("s",)))
+    weights = load_weights(Path(first["weights"]), robot)
+    job = Job(weights, command_of("short.toml").command, hfs(), 0.05)
+    save_tree(
+        tmp_path / "log.npz", walk(walk_config(robot), robot, job), kind="trajectory", robot=robot
+    )
+    log = tmp_path / "log.npz"
+    with pytest.raises(InputError, match="a log of each of short, got 2 files"):
+        propose.report(Report(folder, (log, log)))
+    propose.report(Report(folder, (log,), processes=1, json=True))
+    seen = json.loads(capsys.readouterr().out)
+    assert (seen["walk"], seen["best"], seen["change"]) == (0, 0, 0.0)
+    with pytest.raises(InputError, match="no walk is waited for"):
+        propose.report(Report(folder, (log,), processes=1))
+    with pytest.raises(InputError, match="nothing was proposed here"):
+        propose.report(Report(tmp_path / "other", (log,)))
 
 
 def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path):

@@ -154,21 +154,32 @@ def course(text: str, robot: Robot) -> NamedCommand:
     return trajectory
 
 
+def by_name(texts: Sequence[str]) -> dict[str, str]:
+    """Trajectories by their names; `all` are the three of the paper.
+
+    Raises:
+        InputError: two have one name, or there is no such trajectory.
+    """
+    names: dict[str, str] = {}
+    for text in dict.fromkeys(t for one in texts for t in (COMMANDS if one == "all" else (one,))):
+        other = names.setdefault(name := trajectories.command_of(text).name, text)
+        if other != text:
+            raise InputError(f"--traj {other} and {text} are both named {name}")
+    return names
+
+
 def courses(texts: Sequence[str], robot: Robot, hint: str = "") -> tuple[NamedCommand, ...]:
     """What one weight set is to walk; `all` are the three of the paper.
 
     `hint` ends the message where they last differently.
 
     Raises:
-        InputError: see `course`; or they last differently, or two have one name.
+        InputError: see `course` and `by_name`; or they last differently.
     """
-    every = dict.fromkeys(t for one in texts for t in (COMMANDS if one == "all" else (one,)))
-    found = tuple(course(text, robot) for text in every)
+    found = tuple(course(text, robot) for text in by_name(texts).values())
     if len({one.seconds or Walk.seconds for one in found}) > 1:
         lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in found)
         raise InputError(f"--traj expects trajectories of one length, got {lasts}{hint}")
-    if len({one.name for one in found}) < len(found):
-        raise InputError(f"--traj names two of {', '.join(one.name for one in found)} alike")
     return found
 
 

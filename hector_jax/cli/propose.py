@@ -16,7 +16,7 @@ from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import tunings, walks
+from hector_jax.runs import tunings, walk_log, walks
 from hector_jax.runs.folder import CONFIG
 from hector_jax.runs.walks import Campaign
 
@@ -30,10 +30,10 @@ def propose(args: Propose) -> None:
     one = _campaign(args)
     make_folder(args.folder)
     with locked(args.folder), workers(args.processes) as pool:
-        if not path.exists():
-            write_json(path, {"flags": as_table(args)})
         rows, space = walks.read_history(one), walks.space_of(pool, one)
         proposal, _ = walks.next_proposal(pool, one, space, rows)
+        if not path.exists():  # last: flags that were refused can be mended
+            write_json(path, {"flags": as_table(args)})
     number = len(rows)
     weights = walks.weights_path(one, number)
     result = {"walk": number, "weights": str(weights), "proposed_by": proposal.method}
@@ -79,7 +79,7 @@ def _take(pool: Executor, one: Campaign, rows: list[walks.Row], paths: tuple[Pat
     proposal = walks.pending(one, rows)
     if proposal is None:
         raise InputError(f"{one.folder}: no walk is waited for; begin with hector propose")
-    logs = [walks.read_log(path, one.robot, one.seconds) for path in paths]
+    logs = [walk_log.read_log(path, one.robot, one.seconds) for path in paths]
     return walks.add_walk(one, rows, proposal, walks.see(pool, one, logs))
 
 

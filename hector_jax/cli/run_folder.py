@@ -11,8 +11,6 @@ from typing import Any, TypeVar
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.control.reference import COMMANDS
-from hector_jax.control.trajectories import command_of
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, short_repr
@@ -155,18 +153,14 @@ def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
     Raises:
         InputError: two trajectories of one name, or of runs that were tuned one by one.
     """
-    texts = dict.fromkeys(t for one in args.traj for t in (COMMANDS if one == "all" else (one,)))
-    names: dict[str, str] = {}  # texts by name
-    for text in texts:
-        other = names.setdefault(name := command_of(text).name, text)
-        if other != text:
-            raise InputError(f"--traj {other} and {text} are both named {name}")
+    names = arguments.by_name(args.traj)
     if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
         raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
     now = f"{datetime.now():{TIME}}"
     parent = arguments.folder_of(args.runs, args.robot, robot)
     # beside --resume a trajectory that was not given is that of the run
-    shared = args if args.resume and args.traj == Tune.traj else replace(args, traj=tuple(texts))
+    as_before = args.resume and args.traj == Tune.traj
+    shared = args if as_before else replace(args, traj=tuple(names.values()))
     if args.each:
         each = {name: replace(args, traj=(text,)) for name, text in names.items()}
         return {base / n if base else parent / n / now: one for n, one in each.items()}

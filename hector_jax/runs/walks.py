@@ -7,25 +7,24 @@ that they know is in the folder:
 - `walks.jsonl`: settings, then a line for each proposal that was walked.
 - `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval.
 - `proposal.json`: what is to be walked next, until it was.
-- `kept/`: the Gauss-Newton matrix at the start.
+- `metric.npz`: the Gauss-Newton matrix at the start, which all points are in.
 
 A weight set is walked in each case: all commands, on each plant. Its loss is the mean over the
 cases, each divided by its loss at the start, so that all count alike.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from functools import partial
 from itertools import product, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from hector_jax.control.parameters import TUNABLES
-from hector_jax.control.reference import Command, anchor_at, reference_at
+from hector_jax.control.reference import Command
 from hector_jax.control.weights import (
     Weights,
     direction_names,
@@ -33,17 +32,17 @@ from hector_jax.control.weights import (
     weights_to_vector,
 )
 from hector_jax.control.weights_file import save_weights, weights_tree
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, one_line, plural
 from hector_jax.core.settings import read_json
-from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, has_fallen, no_samples
+from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
-from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.runs import tunings
-from hector_jax.runs.cache import content_key, load_or_make, robot_hash
+from hector_jax.runs.cache import content_key, robot_hash
+from hector_jax.runs.walk_log import Log, Seen, bare, log_of, read_loss
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, log_bounds, project, read_journal
 from hector_jax.search.few_walks import Proposal, Space, Walked
@@ -53,30 +52,10 @@ from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig, init, step_status
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding
-from hector_jax.tuning.loss import loss_of
 from hector_jax.tuning.status import StepStatus
 
 _PROPOSAL = "proposal.json"
 _REFUSED = 20.0  # log-loss of what the model cannot walk
-_CODE = ("tuning.curvature",)  # decides the metric
-
-
-class Log(NamedTuple):
-    """What is measured on a walk: the entries of this name in the file of `hector walk --out`."""
-
-    initial: State  # at t = 0, when the command begins
-    state: State  # (T, 3) each, at the end of each sample
-    joints: Float[Any, "T joints"]  # [rad] leg by leg
-    command: Wrench  # (T, feet, 3) each, held over the sample [N, N m]
-    fallen: Bool[Any, " T"]
-    residual: Float[Any, " T"]  # of the plans
-
-
-class Seen(NamedTuple):
-    """What the log of a case says."""
-
-    loss: float
-    margin: float  # share of the way to a fall, of tilt and height; 1 where it fell
 
 
 class Row(NamedTuple):
@@ -171,103 +150,6 @@ def _moved(start: Weights, weights: Weights) -> str:
     return ", ".join(f"{names[i]} {np.exp(logs[i]):.2g} times" for i in order)
 
 
-# Logs
-
-
-def log_of(walked: Trajectory) -> Log:
-    """What is read of a walk."""
-    return Log(*(getattr(walked, name) for name in Log._fields))
-
-
-def read_log(path: Path, robot: Robot, seconds: float) -> Log:
-    """The log of a walk: an .npz with the entries of `Log`, such as `hector walk --out` writes.
-
-    `fallen` and `residual` may be left out. A log that ends early is that of a fall.
-
-    Args:
-        path: of the file.
-        robot: that walked.
-        seconds: that it should have walked; samples are of 1 ms.
-
-    Raises:
-        InputError: one line naming the file and the entry that is missing, of another shape, or not
-            of finite numbers; or it is not a log of 1 ms.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files if name != "card"}
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
-    wanted, joints, feet = round(seconds / TIME_STEP), len(robot.joint_lower), len(robot.foot_point)
-    if "period" in arrays and not np.isclose(arrays["period"], TIME_STEP, rtol=1e-6):
-        raise InputError(f"{path}: samples must be of {TIME_STEP} s, got {arrays['period']}")
-    count = len(arrays.get("joints", ()))
-    if not 1 <= count <= wanted:
-        raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
-    row = {"fallen": (), "residual": (), "joints": (joints,)}
-    shapes = {
-        **{f"initial.{name}": (3,) for name in State._fields},
-        **{f"state.{name}": (count, 3) for name in State._fields},
-        **{f"command.{name}": (count, feet, 3) for name in Wrench._fields},
-        **{name: (count, *rest) for name, rest in row.items()},
-    }
-    arrays = {"fallen": np.zeros(count, bool), "residual": np.zeros(count), **arrays}
-    for name, shape in shapes.items():
-        if name not in arrays:
-            raise InputError(f"{path}: {name} is missing; expected {', '.join(shapes)}")
-        if (got := arrays[name].shape) != shape:
-            raise InputError(f"{path}: {name} must have shape {shape}, got {got}")
-        if arrays[name].dtype.kind not in "biuf" or not np.isfinite(arrays[name]).all():
-            raise InputError(f"{path}: {name} must hold finite numbers")
-    rows = np.minimum(np.arange(wanted), count - 1)
-    state = State(*(arrays[f"state.{name}"][rows].astype(float) for name in State._fields))
-    command = Wrench(*(arrays[f"command.{name}"][rows].astype(float) for name in Wrench._fields))
-    down = np.asarray(has_fallen(state, *robot.description.limits))
-    fell = np.maximum.accumulate(down | arrays["fallen"][rows].astype(bool))
-    return Log(
-        State(*(arrays[f"initial.{name}"].astype(float) for name in State._fields)),
-        state,
-        arrays["joints"][rows].astype(float),
-        command,
-        fell | (np.arange(wanted) >= count),
-        arrays["residual"][rows].astype(float),
-    )
-
-
-@partial(jax.jit, static_argnums=0)
-def _references(tick: float, robot: Robot, command: Command, initial: State, ticks: Any) -> State:
-    anchor = anchor_at(robot, initial, 0)
-    return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
-
-
-def _bare(log: Log, period: float) -> Trajectory:
-    """A trajectory of what a log holds; all else is empty."""
-    empty = no_samples(log.joints.shape[1], log.command.force.shape[1])
-    return empty._replace(period=np.asarray(period), **log._asdict())
-
-
-def _see(config: TuneConfig, robot: Robot, command: Command, log: Log) -> tuple[Seen, Log]:
-    """What a log of 1 ms says, and the log at the plan interval."""
-    tick, count = config.rollout.walk.gait.tick, len(log.fallen)
-    each = round(tick / TIME_STEP)
-    ticks = (np.arange(count) + 1.0) / each
-    reference = _references(tick, robot, command, log.initial, ticks)
-    loss = float(loss_of(config.loss, _bare(log, TIME_STEP)._replace(reference=reference)))
-    least, most = robot.description.limits
-    stood = ~log.fallen
-    tilt = np.abs(log.state.euler[stood, :2]).max(initial=0.0) / most
-    standing = float(robot.standing_height)
-    sunk = (standing - log.state.position[stood, 2].min(initial=standing)) / (standing - least)
-    bad = log.fallen.any() or not log.residual.max() <= SOLVED
-    seen = Seen(np.inf, 1.0) if bad else Seen(loss, float(max(tilt, sunk)))
-    thin = {name: jax.tree.map(lambda x: x[each - 1 :: each], part) for name, part in _samples(log)}
-    return seen, log._replace(**thin)
-
-
-def _samples(log: Log) -> Iterator[tuple[str, Any]]:
-    return ((name, part) for name, part in log._asdict().items() if name != "initial")
-
-
 # Jobs of worker processes
 
 
@@ -278,7 +160,7 @@ def _walk_job(one: Campaign, weights: Weights, case: int) -> tuple[Seen, Log]:
     walked = walk(
         one.config.rollout.walk, one.robot, Job(weights, command, plant, one.seconds, case)
     )
-    return _see(one.config, one.robot, command, jax.tree.map(np.asarray, log_of(walked)))
+    return read_loss(one.config, one.robot, command, jax.tree.map(np.asarray, log_of(walked)))
 
 
 def _effect(one: Campaign) -> jax.tree_util.Partial:
@@ -287,7 +169,7 @@ def _effect(one: Campaign) -> jax.tree_util.Partial:
 
 
 def _ground_job(one: Campaign, weights: Weights, name: str, log: Log) -> Grounding:
-    walked = _bare(log, one.config.rollout.walk.gait.tick)
+    walked = bare(log, one.config.rollout.walk.gait.tick)
     inputs = one.config.rollout, one.robot, weights, one.commands[name], _effect(one), walked
     return jax.device_get(fit_grounding(*inputs))
 
@@ -301,23 +183,19 @@ def _evaluate_job(one: Campaign, weights: Weights, name: str, grounding: Groundi
 
 
 def space_of(pool: Executor, one: Campaign) -> Space:
-    """The coordinates of a campaign, from the model at its start."""
-    problem = tunings.Problem(*_first_and_others(one.commands))
-    key = content_key(one.config, one.robot, one.start, *problem, code=_CODE)
-    path = one.folder / "kept" / f"metric-{key}.npz"
+    """The coordinates of a campaign, from the model at its start; kept, as all points are in them.
 
-    def make(*_: Any) -> Iterator[tuple[str, Any]]:
-        inputs = one.config, one.robot, one.start, problem
-        yield "matrix", {"matrix": pool.submit(tunings.gauss_newton_job, *inputs).result()}
-
-    like = {"matrix": np.zeros((0, 0))}
-    made = load_or_make({"matrix": path}, make, like=lambda _: like, kind="metric", robot=one.robot)
-    return few_walks.space_of(made["matrix"]["matrix"], _box(one))
-
-
-def _first_and_others(commands: Mapping[str, Command]) -> tuple[Command, None, tuple]:
-    first, *others = commands.values()
-    return first, None, tuple(others)
+    Raises:
+        InputError: the file of the matrix is damaged, or of another robot.
+    """
+    path, like = one.folder / "metric.npz", {"matrix": np.zeros((0, 0))}
+    if not path.exists():
+        first, *others = one.commands.values()
+        inputs = one.config, one.robot, one.start, tunings.Problem(first, None, tuple(others))
+        matrix = pool.submit(tunings.gauss_newton_job, *inputs).result()
+        save_tree(path, {"matrix": matrix}, kind="metric", robot=one.robot)
+    tree, _ = load_tree(path, like, kind="metric", robot=one.robot)
+    return few_walks.space_of(tree["matrix"], _box(one))
 
 
 def read_history(one: Campaign) -> list[Row]:
@@ -370,7 +248,7 @@ def next_proposal(
         InputError: the start fell, the file of the proposal is damaged, or packages of the extra
             `search` are missing.
     """
-    if rows and not np.isfinite(rows[0].losses).all():
+    if rows and not _stood(rows[0]):
         raise InputError(f"{one.folder}: the start fell, or a QP was not solved; tune from another")
     if (given := pending(one, rows)) is not None:
         return given, weights_at(one, space, given.point)
@@ -411,7 +289,7 @@ def weights_path(one: Campaign, number: int) -> Path:
 def see(pool: Executor, one: Campaign, logs: Sequence[Log]) -> list[tuple[Seen, Log]]:
     """What the logs of all cases say, and they at the plan interval."""
     commands = [one.commands[name] for _, name in one.cases]
-    return list(pool.map(_see, repeat(one.config), repeat(one.robot), commands, logs))
+    return list(pool.map(read_loss, repeat(one.config), repeat(one.robot), commands, logs))
 
 
 def _model(pool: Executor, one: Campaign, space: Space, rows: Sequence[Row]) -> few_walks.Model:
@@ -480,20 +358,26 @@ def tune_on_walks(pool: Executor, one: Campaign, walks: int) -> tuple[Weights, l
         walks: to spend; whole rounds of all cases are walked, at least the start.
 
     Returns:
-        The weights to believe in, and all that was walked.
+        The weights to believe in, and all that was walked. A start that falls is not tuned from.
 
     Raises:
         InputError: see `next_proposal` and `read_history`.
     """
-    space, rows, cases = space_of(pool, one), read_history(one), len(one.cases)
+    rows, space, cases = read_history(one), space_of(pool, one), len(one.cases)
     with bar(f"tuning with {plural(walks, 'walk')}") as tell:
-        while not rows or (len(rows) + 1) * cases <= walks:
+        while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
             tell(len(rows) * cases, walks, _progress(one, space, rows))
             proposal, weights = next_proposal(pool, one, space, rows)
             seen = list(pool.map(_walk_job, repeat(one), repeat(weights), range(cases)))
             rows = add_walk(one, rows, proposal, seen)
         tell(len(rows) * cases, walks, _progress(one, space, rows))
+    if not _stood(rows[0]):
+        say("the set from which to tune on walks fell, or a QP was not solved; it is kept as it is")
     return answer(one, space, rows)[0], rows
+
+
+def _stood(row: Row) -> bool:
+    return bool(np.isfinite(row.losses).all())
 
 
 class Change(NamedTuple):
