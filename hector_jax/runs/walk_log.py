@@ -60,7 +60,7 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
     except Exception as error:  # whoever made the archive chose what goes wrong
         raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
     wanted, joints, feet = round(seconds / TIME_STEP), len(robot.joint_lower), len(robot.foot_point)
-    count = next(iter(np.shape(arrays.get("joints"))), 0)
+    count = next(iter(arrays.get("joints", np.zeros(())).shape), 0)
     if not 1 <= count <= wanted:
         raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
     shapes = {

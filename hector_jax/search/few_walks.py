@@ -18,7 +18,6 @@ alone; nothing else is remembered.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -215,46 +214,45 @@ def _minimise_in(
 # The surrogate
 
 
-def _process(theta: Any, X: Any, used: Any, tail: Any) -> Any:
-    """Gaussian process on a history that is filled up with rows that are not `used`."""
+class _Fitted(NamedTuple):
+    """A Gaussian process with its numbers, fitted to a history; factored once."""
+
+    process: Any  # tinygp's, of the values less `offset` and `_bowl`
+    y: Array
+    curvature: Array
+    offset: float
+
+
+def _process(theta: Any, X: Any, used: Any) -> Any:
+    """Process on a history that is filled up with rows that are not `used`."""
     from tinygp import GaussianProcess, kernels
 
     amplitude, length, noise = jnp.exp(theta)
-    near = kernels.RationalQuadratic(
-        scale=length, distance=kernels.distance.L2Distance(), alpha=2.0
-    )
+    distance = kernels.distance.L2Distance()
+    near = kernels.RationalQuadratic(scale=length, distance=distance, alpha=2.0)
     # a slope is as large as the loss itself where nothing was walked
     kernel = amplitude**2 * near + kernels.DotProduct() + kernels.Constant(1.0)
-    return GaussianProcess(
-        kernel, X, diag=jnp.where(used, noise**2, 1e8), mean=partial(_bowl, tail)
-    )
+    return GaussianProcess(kernel, X, diag=jnp.where(used, noise**2, 1e8))
+
+
+_factored = jax.jit(_process)
 
 
 def _bowl(curvature: Any, x: Any) -> Any:
-    return 0.5 * jnp.dot(curvature * x, x)
+    """What the metric says of the log-loss at points x (..., n)."""
+    return 0.5 * (curvature * x**2).sum(axis=-1)
 
 
 @jax.jit
-def _misfit(theta: Array, X: Array, y: Array, used: Array, curvature: Array) -> tuple[Array, Array]:
+def _misfit(theta: Array, X: Array, used: Array, y: Array) -> tuple[Array, Array]:
     """Negative log posterior of the process's numbers, and its gradient."""
     mean, deviation = map(jnp.asarray, _PRIOR)
 
     def objective(theta: Array) -> Array:
         prior = 0.5 * jnp.sum(((theta - mean) / deviation) ** 2)
-        return prior - _process(theta, X, used, curvature).log_probability(y)
+        return prior - _process(theta, X, used).log_probability(y)
 
     return jax.value_and_grad(objective)(theta)
-
-
-class _Fitted(NamedTuple):
-    """A process with its numbers, fitted to a history."""
-
-    theta: Array
-    X: Array
-    y: Array
-    used: Array
-    curvature: Array
-    offset: float  # taken off the values; `_posterior` is without it
 
 
 def _fit(
@@ -264,31 +262,31 @@ def _fit(
 ) -> _Fitted:
     count, offset = len(values), float(np.mean(values))
     more = -count % _ROWS
-    X = jnp.asarray(np.pad(points, ((0, more), (0, 0))))
-    y, used = jnp.asarray(np.pad(values - offset, (0, more))), jnp.arange(count + more) < count
-    rows = X, y, used, jnp.asarray(curvature)
+    X, used = jnp.asarray(np.pad(points, ((0, more), (0, 0)))), jnp.arange(count + more) < count
+    y = jnp.asarray(np.pad(values - offset - _bowl(curvature, points), (0, more)))
     mean, deviation = _PRIOR
 
     def misfit(theta: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
-        value, gradient = _misfit(jnp.asarray(theta), *rows)
+        value, gradient = _misfit(jnp.asarray(theta), X, used, y)
         return float(value), np.asarray(gradient, float)
 
     box = np.stack([mean - 3 * deviation, mean + 3 * deviation], axis=1)
     found = minimize(misfit, mean, jac=True, method="L-BFGS-B", bounds=box)
-    return _Fitted(jnp.asarray(found.x), *rows, offset)
+    process = _factored(jnp.asarray(found.x), X, used)
+    return _Fitted(process, y, jnp.asarray(curvature), offset)
 
 
 def _posterior(fitted: _Fitted, point: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation at a point, without the offset."""
-    process = _process(fitted.theta, fitted.X, fitted.used, fitted.curvature)
-    there = process.condition(fitted.y, point[None]).gp
-    return there.loc[0], jnp.sqrt(jnp.maximum(there.variance[0], 1e-12))
+    """Mean and standard deviation at a point."""
+    there = fitted.process.condition(fitted.y, point[None]).gp
+    mean = there.loc[0] + _bowl(fitted.curvature, point) + fitted.offset
+    return mean, jnp.sqrt(jnp.maximum(there.variance[0], 1e-12))
 
 
 _means = jax.jit(jax.vmap(lambda fitted, point: _posterior(fitted, point)[0], (None, 0)))
 
 
-def _log_improvement(mean: Array, deviation: Array, low: Array) -> Array:
+def _log_improvement(mean: Array, deviation: Array, low: Array | float) -> Array:
     """Log of the expected improvement on `low`, by its asymptote where it underflows."""
     u = (low - mean) / deviation
     normal = jax.scipy.stats.norm
@@ -299,7 +297,7 @@ def _log_improvement(mean: Array, deviation: Array, low: Array) -> Array:
 
 @jax.jit
 def _acquisition(
-    losses: _Fitted, margins: _Fitted, low: Array, most: Array, point: Array
+    losses: _Fitted, margins: _Fitted, low: Array | float, most: Array | float, point: Array
 ) -> tuple[Array, Array]:
     """Negative log of expected improvement times the probability of a margin, and its gradient."""
 
@@ -320,7 +318,7 @@ def _fit_losses(space: Space, history: Sequence[Walked]) -> tuple[_Fitted, int, 
     stood = [i for i, row in enumerate(history) if np.isfinite(row.loss)]
     points = np.array([history[i].point for i in stood])
     fitted = _fit(points, np.array([history[i].loss for i in stood]), space.curvature)
-    means = np.asarray(_means(fitted, fitted.X))[: len(stood)]
+    means = np.asarray(_means(fitted, fitted.process.X))[: len(stood)]
     which = int(np.argmin(means))
     return fitted, stood[which], float(means[which])
 
@@ -330,16 +328,13 @@ def _improve(
 ) -> Proposal:
     """Point of the largest expected improvement that keeps a margin."""
     losses, which, low = _fit_losses(space, history)
-    margins = np.array([row.margin for row in history])
-    points, flat = np.array([row.point for row in history]), np.zeros(len(space.box))
-    kept = _fit(points, margins, flat)
-    # half of what the start had left may be used up
-    most = 0.5 * (1.0 + margins[0]) - kept.offset
-    inputs = losses, kept, low, most
+    points = np.array([row.point for row in history])
+    margins = _fit(points, np.array([row.margin for row in history]), np.zeros(len(space.box)))
+    most = 0.5 * (1.0 + history[0].margin)  # half of what the start had left may be used up
     center = history[which].point
 
     def objective(x: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
-        value, gradient = _acquisition(*inputs, jnp.asarray(x))
+        value, gradient = _acquisition(losses, margins, low, most, jnp.asarray(x))
         return float(value), np.asarray(gradient, float)
 
     found = []
@@ -349,7 +344,7 @@ def _improve(
         found.append(_minimise_in(space, center, radius, objective, first, 40))
     point = space.clip(min(found, key=lambda one: one[1])[0])
     mean, _ = _posterior(losses, jnp.asarray(point))
-    return Proposal(point, "surrogate", float(mean) + losses.offset)
+    return Proposal(point, "surrogate", float(mean))
 
 
 # The evolution strategy
