@@ -112,7 +112,8 @@ COUNTS = [
 def test_every_number_has_an_upper_bound_that_is_told(monkeypatch, capsys, kind, name):
     """Nothing is made of the number before: a list of 10**12 jobs would take all memory."""
     types = {field.name: field.type for field in fields(kind)}
-    positional = ["." for field in fields(kind) if field.default is MISSING]
+    required = [field.name for field in fields(kind) if field.default is MISSING]
+    positional = [__file__ if each == "logs" else "." for each in required]
     words = [kind.__name__.lower(), *positional]
     line = refused(monkeypatch, capsys, *words, f"--{name.replace('_', '-')}", 10**12)
     rule = get_args(types[name])[1]
