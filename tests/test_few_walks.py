@@ -72,6 +72,23 @@ def test_what_the_model_does_not_know_is_found_by_the_walks(history):
     assert abs(best[4] - GOAL[4]) < 0.35  # of which the model feels nothing
 
 
+def test_a_model_that_repeats_itself_gives_way_to_the_surrogate_nearby():
+    """Its predictions made the region large, which the surrogate has not earned."""
+    history = []
+    for _ in range(10):
+        proposal = propose(SPACE, history, lambda point: bowl(0.5 * GOAL, point))
+        if proposal.method == "surrogate":
+            break
+        history.append(walked(proposal, bowl(0.5 * GOAL, proposal.point)[0]))
+    assert proposal.method == "surrogate"
+    points = [row.point for row in history]
+    apart = [np.linalg.norm(x - y) for i, x in enumerate(points) for y in points[:i]]
+    assert min(apart) > 0.02
+    center = history[incumbent(SPACE, history)].point
+    assert np.linalg.norm(proposal.point - center) < 1.02
+    assert not needs_model([*history, walked(proposal, 0.1)])
+
+
 def test_a_proposal_follows_from_the_history_alone(history):
     for count in (1, 8, 15, 19):
         again = propose(SPACE, history[:count], model)

@@ -28,6 +28,9 @@ def _printed(verdict, **options):
     return out.getvalue()
 
 
+WALKED = [Change("start", None, 0.0), Change("model", -12.34, -10), Change("model", -5, None)]
+
+
 def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device)"):
     history = pretend_history(14, refused=(3, 12))
     history[12] = history[12]._replace(status=np.array(StepStatus.UNSOLVED))
@@ -189,7 +192,8 @@ def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_
 
 
 def test_every_table_of_the_report_is_well_formed(tmp_path):
-    text = write_report(tmp_path, **_report(pretend_verdict(fallen={("with", 1)}))).read_text()
+    report = _report(pretend_verdict(fallen={("with", 1)})) | {"walked": WALKED, "cases": 6}
+    text = write_report(tmp_path, **report).read_text()
     for block in text.split("\n\n"):
         rows = [row for row in block.splitlines() if row.startswith("|")]
         assert len({row.count("|") for row in rows}) <= 1, block
@@ -223,11 +227,10 @@ def test_the_report_says_what_was_tuned_beside_the_weights():
 
 
 def test_a_tuning_on_walks_shows_each_set_and_its_falls(tmp_path):
-    walked = [Change("start", None, 0.0), Change("model", -12.34, -10), Change("model", -5, None)]
-    report = _report() | {"walked": walked, "cases": 6}
+    report = _report() | {"walked": WALKED, "cases": 6}
     text = write_report(tmp_path, **report).read_text()
     assert "Each weight set was walked 6 times" in text
-    assert "| 0 | start |  | +0.0 |" in text
-    assert "| 1 | model | -12.3 | -10.0 |" in text
-    assert "| 2 | model | -5.0 | fell |" in text
+    assert "| 0, start |  | +0.0 |" in text
+    assert "| 1, model | -12.3 | -10.0 |" in text
+    assert "| 2, model | -5.0 | fell |" in text
     assert "Tuning on walks" not in write_report(tmp_path, **_report()).read_text()

@@ -99,13 +99,15 @@ class _Region(NamedTuple):
 
     center: int  # of the history
     radius: float
-    stalled_at: int | None  # length of the history when the model stalled
+    stalled_at: int | None  # length of the history when the model gave way to the surrogate
 
 
 def _region(history: Sequence[Walked]) -> _Region:
     """Walk through a history; see the module's docstring."""
     best, radius, stalls, stalled_at = 0, _FIRST, 0, None
     for i, row in enumerate(history[1:], 1):
+        if row.method == "surrogate" and stalled_at is None:  # the model had nothing new to say
+            stalled_at, radius = i, _FIRST
         low = history[best].loss
         gain = low - row.loss
         if row.predicted is not None:
@@ -169,7 +171,7 @@ def propose(
         point = space.clip(point)
         if min(np.linalg.norm(point - row.point) for row in history) > _SAME:
             return Proposal(point, "model", float(predicted))
-        # the model has nothing new to say
+        region = region._replace(radius=_FIRST)
     elif (len(history) - region.stalled_at) % _EVERY == _EVERY - 1:
         return Proposal(space.clip(_evolved(history, region, seed)), "evolution", None)
     return _improve(space, history, region.radius, np.random.default_rng([seed, len(history)]))
