@@ -135,7 +135,7 @@ def tune(
         InputError: the nominal weights are refused, so there is nothing to compare with.
     """
     config = TuneConfig(iterations=flags.iterations)
-    with bar(f"{title}: {len(problems)} tunings on {len(jax.devices())} devices") as tell:
+    with bar(f"{title}: {len(problems)} tunings") as tell:
         tunings = tune_batch(config, robot, stack(problems), effects, tell=tell)
     if np.any(np.asarray(tunings.stop)[nominal_rows] == Stop.BAD_START):
         raise InputError(

@@ -18,7 +18,15 @@ from hector_jax.core.tree import stack
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning import batch, difftune
-from hector_jax.tuning.batch import PER_CALL, Problem, Scenario, lanes_of, tail_weights, tune_batch
+from hector_jax.tuning.batch import (
+    PER_CALL,
+    Problem,
+    Scenario,
+    choose_devices,
+    lanes_of,
+    tail_weights,
+    tune_batch,
+)
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
@@ -160,6 +168,19 @@ def test_the_tail_is_the_mean_over_the_worst_share(tail, expected):
 
 def test_a_cpu_walks_them_one_by_one_and_others_all_at_once():
     assert (lanes_of("cpu"), lanes_of("gpu")) == (1, 0)
+
+
+def test_beside_a_gpu_few_rollouts_take_the_cores_and_many_take_it(monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: ["gpu"])
+    monkeypatch.setattr(jax, "local_devices", lambda backend: [f"{backend} {i}" for i in range(3)])
+    assert choose_devices(3) == ["cpu 0", "cpu 1", "cpu 2"]
+    assert choose_devices(4) == ["gpu"]
+
+    def none(backend):
+        raise RuntimeError(f"no {backend}")
+
+    monkeypatch.setattr(jax, "local_devices", none)
+    assert choose_devices(1) == ["gpu"]
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,22 @@ def lanes_of(backend: str) -> int:
     return 1 if backend == "cpu" else 0
 
 
+def choose_devices(rollouts: int) -> list[jax.Device]:
+    """Devices for some rollouts at once: a core each where there are enough, else all devices.
+
+    A GPU waits in each of a tick's many small steps: one rollout takes it almost as long as a
+    hundred, and longer than a CPU core (docs/performance.md).
+    """
+    devices = jax.devices()
+    if jax.process_count() > 1:
+        return devices
+    try:
+        cores = jax.local_devices(backend="cpu")
+    except RuntimeError:  # JAX_PLATFORMS leaves the CPU out
+        return devices
+    return cores if rollouts <= len(cores) else devices
+
+
 def _over(lanes: int, one: Callable, several: Any) -> Any:
     count = len(jax.tree.leaves(several)[0])
     if lanes == 1:
@@ -210,7 +226,7 @@ def tune_batch(
         robot: the body that the controllers believe in.
         problems: stacked, see `stack`; the same on every host.
         effects: phis stacked likewise, of which the scenarios name theirs by number.
-        devices: what to walk on; None takes all devices of all hosts.
+        devices: what to walk on; None takes `choose_devices`.
         lanes: problems side by side on a device, 0 for all; None takes `lanes_of` the backend.
         tell: told of problems that have ended, of how many, and a remark; see `console.bar`.
 
@@ -221,9 +237,11 @@ def tune_batch(
     Raises:
         ValueError: no problem, or one that asks for a phi, delay or share that there is not.
     """
-    devices = jax.devices() if devices is None else list(devices)
-    lanes = lanes_of(devices[0].platform) if lanes is None else lanes
     count = _check_problems(config, problems, effects)
+    devices = (
+        choose_devices(np.size(problems.scenarios.scale)) if devices is None else list(devices)
+    )
+    lanes = lanes_of(devices[0].platform) if lanes is None else lanes
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
     config = replace(config, loss=PAPER_LOSS)  # the scenarios' counts: no program for each
@@ -235,7 +253,7 @@ def tune_batch(
     filled, states = _place(mesh, filled), _place(mesh, states)
 
     histories, left = [], count
-    tell(0, count, "compiling")
+    tell(0, count, f"compiling for {len(devices)} devices ({devices[0].device_kind})")
     while left:
         states, history = _advance(config, lanes, mesh, robot, effects, filled, states)
         stop, loss = _fetch((states.stop, states.loss))
