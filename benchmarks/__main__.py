@@ -1,5 +1,7 @@
 """Run the sections, print one table, and write it as JSON to runs/bench/<time>.json.
 
+Times and ratios are compared with the last run in that folder on the same kind of machine.
+
 python -m benchmarks                     everything that this machine can run
 python -m benchmarks qp_layer realtime   some sections
 python -m benchmarks --quick             small sizes, to see that everything runs
@@ -11,10 +13,11 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
-from benchmarks.measuring import Check, Report, child
+from benchmarks.measuring import Check, Report, child, compare, last_run
 from hector_jax.core.console import say
 
 SECTIONS = ("qp_layer", "closed_loop", "realtime", "collection", "batch", "throughput")
@@ -28,11 +31,7 @@ QUICK = {
 }
 
 
-def _has_accelerator() -> bool:
-    return child("benchmarks.device")["platform"] != "cpu"
-
-
-def _print_report(report: Report) -> None:
+def _print_report(report: Report, before: Mapping[str, float]) -> None:
     cells = [list(report.columns), *report.rows]
     widths = [max(len(row[i]) for row in cells) for i in range(len(report.columns))]
     print(f"\n{report.title}")
@@ -43,7 +42,8 @@ def _print_report(report: Report) -> None:
         verdict = ""
         if check.bar is not None:
             verdict = f"{'meets' if check.value <= check.bar else 'MISSES'} {check.bar:.3g}"
-        print(f"  {check.what:<58} {check.value:>10.3g} {check.unit:<5} {verdict}".rstrip())
+        text = f"{check.what:<58} {check.value:>10.3g} {check.unit:<5} {verdict:<15}"
+        print(f"  {text} {compare(check.value, before.get(check.what))}".rstrip())
     for note in report.notes:
         print(f"  ({note})")
 
@@ -59,7 +59,8 @@ def main(arguments: list[str]) -> int:
     if unknown:
         parser.error(f"unknown section {unknown[0]!r}; there are: {', '.join(SECTIONS)}")
     names = chosen.sections or list(SECTIONS)
-    if "throughput" in names and not chosen.sections and not _has_accelerator():
+    device = child("benchmarks.device")
+    if "throughput" in names and not chosen.sections and device["platform"] == "cpu":
         say("throughput: no accelerator here, left out")
         names.remove("throughput")
 
@@ -67,13 +68,15 @@ def main(arguments: list[str]) -> int:
         "time": time.strftime("%Y-%m-%dT%H:%M:%S"),
         "platform": platform.platform(),
         "cores": os.cpu_count(),
+        "device": device["kind"],
+        "quick": chosen.quick,
         "load": list(os.getloadavg()),
         "python": platform.python_version(),
         "jax": version("jax"),
     }
     load = machine["load"][0]
     print(f"{machine['cores']} cores, load {load:.1f}, jax {machine['jax']}")
-    reports, failed = {}, False
+    reports, failed, before = {}, False, last_run(chosen.out, machine)
     for name in names:
         say(f"{name} ...")
         try:
@@ -83,7 +86,7 @@ def main(arguments: list[str]) -> int:
             failed = True
             continue
         reports[name] = found
-        _print_report(Report(**found))
+        _print_report(Report(**found), before.get(name, {}))
         sys.stdout.flush()
     chosen.out.mkdir(parents=True, exist_ok=True)
     path = chosen.out / f"{machine['time'].replace(':', '-')}.json"

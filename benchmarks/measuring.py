@@ -11,7 +11,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,35 @@ class Report(NamedTuple):
     rows: Sequence[Sequence[str]]
     checks: Sequence[Check]
     notes: Sequence[str] = ()
+
+
+SLOWER = 1.1  # by the last run
+TIMES = ("us", "ms", "s", "s CPU", "x")
+SAME = ("platform", "cores", "device", "quick")  # what runs must share to be compared
+
+
+def last_run(folder: Path, machine: Mapping[str, Any]) -> dict[str, dict[str, float]]:
+    """Times and ratios of each section's last run on such a machine, by their names."""
+    found = {}
+    for path in sorted(folder.glob("*.json")):
+        run = json.loads(path.read_text())
+        if all(run["machine"].get(key) == machine[key] for key in SAME):
+            for section, report in run["sections"].items():
+                checks = [Check(*values) for values in report["checks"]]
+                found[section] = {c.what: c.value for c in checks if c.unit in TIMES}
+    return found
+
+
+def compare(value: float, before: float | None) -> str:
+    """What to print of a time beside that of the last run.
+
+    >>> compare(1.2, 1.0), compare(1.05, 1.0), compare(1.0, None)
+    ('1.20 of the last run SLOWER', '1.05 of the last run', '')
+    """
+    if not before:
+        return ""
+    ratio = value / before
+    return f"{ratio:.2f} of the last run{' SLOWER' if ratio > SLOWER else ''}"
 
 
 def pin_one_core() -> None:

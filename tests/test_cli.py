@@ -167,7 +167,7 @@ def test_weights_of_an_unknown_name_are_refused_with_the_nearest(monkeypatch, ca
 def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
     robot = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
     line = refused(monkeypatch, capsys, "walk", "--weights", "best", "--robot", robot)
-    assert f"there is no {robot.with_name('best.json')}; tune this robot" in line
+    assert f"there is no {robot.with_name('robot-best.json')}; tune this robot" in line
     flags = ("--robot", robot, "--start", "best", "--out", tmp_path / "run")
     assert "there is no" in refused(monkeypatch, capsys, "tune", *flags)
     assert not (tmp_path / "run").exists()

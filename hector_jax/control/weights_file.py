@@ -44,7 +44,7 @@ def save_weights(path: Path, weights: Weights, schema: str | None = None) -> Non
 
 
 def best(robot: Robot | None = None) -> Weights:
-    """The tuned weights that are shipped with a robot: `best.json` beside its TOML.
+    """The tuned weights that are shipped with a robot: `ROBOT-best.json` beside its ROBOT.toml.
 
     Those of HECTOR, which are the default, are the row `best` of `hector tune --traj all`, the
     friction with which to plan included (docs/results.md).
@@ -52,7 +52,8 @@ def best(robot: Robot | None = None) -> Weights:
     Raises:
         InputError: one line, where the robot has no such file or it is none of weights.
     """
-    path = (HECTOR if robot is None else robot.description).path.with_name("best.json")
+    toml = (HECTOR if robot is None else robot.description).path
+    path = toml.with_name(f"{toml.stem}-best.json")
     if not path.exists():
         raise InputError(
             f"weights best: there is no {path}; tune this robot and name a file of its run"
