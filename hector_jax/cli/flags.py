@@ -32,21 +32,10 @@ Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]
 Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper, of which it tells
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
-Tunables = Literal[
-    "weights",
-    "footsteps",
-    "integral",
-    "all",
-    "footstep_feedback",
-    "footstep_width",
-    "turn_lead",
-    "effort_reference",
-    "friction",
-    "horizontal_gain",
-    "height_gain",
-    "tilt_gain",
-    "yaw_gain",
-]
+Footsteps = Literal["footstep_feedback", "footstep_width", "turn_lead"]
+Gains = Literal["horizontal_gain", "height_gain", "tilt_gain", "yaw_gain"]
+Groups = Literal["weights", "footsteps", "integral", "all"]
+Tunables = Literal[Groups, Footsteps, "effort_reference", "friction", Gains]
 Variant = Literal["residual", "paper"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
 Engine = Literal["auto", OneEngine]

@@ -173,18 +173,15 @@ def _tune_in(folder: Path, args: Tune) -> None:
     result, by_name = _result(run, tuned, walks)
     seconds = f"{time.monotonic() - begun:.0f}"
     write_json(folder / VERSIONS, made_with | {"seconds": seconds})
-    verdict, (standin, on_hfs) = by_name[run.name], walks[trajectories[0].name]
+    standin, on_hfs = walks[trajectories[0].name]
     report = write_report(
         folder,
         trajectory=run.name,
-        verdict=verdict,
-        tunings=tuned.tunings,
+        verdict=by_name[run.name],
         norms=norms,
         curvature=curvature,
         errors=run.net.errors,
-        shifts=tuned.shifts,
-        walked=changes(tuned.walked),
-        cases=len(tuned.walked[0].losses) if tuned.walked else 0,
+        **_of_tunings(tuned),
         chosen=result.get("chosen", {}),
         pictures=_draw(run, tuned, standin, on_hfs),
         film=_film(run, standin),
@@ -201,6 +198,13 @@ def _tune_in(folder: Path, args: Tune) -> None:
 
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, in_words)
     say(f"the report is {report}")
+
+
+def _of_tunings(tuned: _Tuned) -> dict[str, Any]:
+    """What the report tells of the tunings themselves."""
+    cases = len(tuned.walked[0].losses) if tuned.walked else 0
+    walks = {"walked": changes(tuned.walked), "cases": cases}
+    return {"tunings": tuned.tunings, "shifts": tuned.shifts, **walks}
 
 
 def _net(pool: Executor, args: Tune, robot: Robot) -> nets.TrainedNet:

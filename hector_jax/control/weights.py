@@ -151,3 +151,17 @@ def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]
     draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(direction_names(weights))))
     scaled = [scale_weights(weights, np.log(factor) * row) for row in draws]
     return jax.device_get(scaled)
+
+
+def moved_most(start: Weights, weights: Weights) -> str:
+    """The three directions in which weights lie farthest from a start, as text.
+
+    >>> moved_most(nominal(), scale_weights(nominal(), 0.5 * np.eye(18)[1]))
+    'Q_pitch 1.6 times, Q_roll 1 times, Q_yaw 1 times'
+    """
+    sizes = [np.asarray(weights_to_vector(one)) for one in (start, weights)]
+    farthest = directions(start).argmax(axis=1)  # of the first foot
+    logs = np.log(sizes[1] / sizes[0])[farthest]
+    order = sorted(range(len(logs)), key=lambda i: -abs(logs[i]))[:3]
+    names = direction_names(start)
+    return ", ".join(f"{names[i]} {np.exp(logs[i]):.2g} times" for i in order)

@@ -29,6 +29,7 @@ from hector_jax.control.weights import (
     Weights,
     direction_names,
     directions,
+    moved_most,
     weights_to_vector,
 )
 from hector_jax.control.weights_file import save_weights, weights_tree
@@ -138,16 +139,6 @@ def _slope(one: Campaign, space: Space, weights: Weights, gradient: Weights) -> 
     by_log = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
     others = [float(gradient.others[name]) * _unit(name) for name in one.config.others]
     return space.to_steps.T @ np.append(directions(weights) @ by_log, others)
-
-
-def _moved(start: Weights, weights: Weights) -> str:
-    """The three weights that moved farthest: "Q_x 1.8 times, ..."."""
-    sizes = [np.asarray(weights_to_vector(w)) for w in (start, weights)]
-    farthest = directions(start).argmax(axis=1)  # of the first foot
-    logs = np.log(sizes[1] / sizes[0])[farthest]
-    order = sorted(range(len(logs)), key=lambda i: -abs(logs[i]))[:3]
-    names = direction_names(start)
-    return ", ".join(f"{names[i]} {np.exp(logs[i]):.2g} times" for i in order)
 
 
 # Jobs of worker processes
@@ -296,7 +287,7 @@ def _model(pool: Executor, one: Campaign, space: Space, rows: Sequence[Row]) -> 
     """The model grounded on the best walk: its loss there is that of the walk."""
     best = few_walks.best_walk(_walked(rows))
     weights, names = weights_at(one, space, rows[best].point), [name for _, name in one.cases]
-    like = _empty_log(one.robot)
+    like = log_of(no_samples(len(one.robot.joint_lower), len(one.robot.foot_point)))
     logs = [
         load_tree(_log_path(one, best, case), like, kind="log", robot=one.robot)[0]
         for case in range(len(names))
@@ -320,10 +311,6 @@ def _model(pool: Executor, one: Campaign, space: Space, rows: Sequence[Row]) -> 
         return float(np.log(loss)), np.asarray(slope)
 
     return model
-
-
-def _empty_log(robot: Robot) -> Log:
-    return log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
 
 
 def _log_path(one: Campaign, number: int, case: int) -> Path:
@@ -406,6 +393,6 @@ def _progress(one: Campaign, space: Space, rows: Sequence[Row]) -> str:
         return "compiling"
     history = _walked(rows)
     best = few_walks.best_walk(history)
-    moved = _moved(one.start, weights_at(one, space, rows[best].point))
+    moved = moved_most(one.start, weights_at(one, space, rows[best].point))
     change = changes(rows)[best].change or 0.0
     return f"best L {change:+.0f} % against the start" + (f"; {moved}" if best else "")
