@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -171,16 +172,17 @@ def test_a_cpu_walks_them_one_by_one_and_others_all_at_once():
 
 
 def test_beside_a_gpu_few_rollouts_take_the_cores_and_many_take_it(monkeypatch):
-    monkeypatch.setattr(jax, "devices", lambda: ["gpu"])
-    monkeypatch.setattr(jax, "local_devices", lambda backend: [f"{backend} {i}" for i in range(3)])
-    assert choose_devices(3) == ["cpu 0", "cpu 1", "cpu 2"]
-    assert choose_devices(4) == ["gpu"]
+    gpu, *cores = (Mock(spec=jax.Device) for _ in range(4))
+    monkeypatch.setattr(jax, "devices", lambda: [gpu])
+    monkeypatch.setattr(jax, "local_devices", lambda backend: cores)
+    assert choose_devices(3) == cores
+    assert choose_devices(4) == [gpu]
 
     def none(backend):
         raise RuntimeError(f"no {backend}")
 
     monkeypatch.setattr(jax, "local_devices", none)
-    assert choose_devices(1) == ["gpu"]
+    assert choose_devices(1) == [gpu]
 
 
 @pytest.mark.parametrize(
