@@ -92,7 +92,7 @@ def lanes_of(backend: str) -> int:
     return 1 if backend == "cpu" else 0
 
 
-def choose_devices(rollouts: int) -> list[jax.Device]:
+def choose_devices(rollouts: int) -> list[Any]:
     """Devices for some rollouts at once: a core each where there are enough, else all devices.
 
     A GPU waits in each of a tick's many small steps: one rollout takes it almost as long as a
