@@ -19,6 +19,7 @@ from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import walk_log, walks
@@ -175,7 +176,7 @@ def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in
     one = campaign(tmp_path, robot, [hfs()])
     (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
     fell = walk_log.Seen(np.inf, 1.0)
-    log = walks._empty_log(robot)
+    log = walk_log.log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
     monkeypatch.setattr(walks, "_walk_job", lambda *_: (fell, log))
     weights, rows = walks.tune_on_walks(pool, one, 10)
     assert [change.change for change in walks.changes(rows)] == [None]
