@@ -1,8 +1,8 @@
-"""How well a model's gradient agrees with the simulator's: numbers and tables of transfer.py.
+"""Agreement of a model's gradient with the simulator's: numbers and tables of transfer.py.
 
 All gradients are those of L in the logarithms of 18 weights: each of Q, and each of R, which the
 two feet share. Rows of a matrix are start phases. Two gradients are compared by the cosine between
-their means over phases; intervals redraw the phases, the same ones for model and simulator. With a
+their means over phases; intervals redraw the same phases for model and simulator. With a
 handful of phases such an interval is narrow rather than wide, and it says nothing of other
 commands.
 """
@@ -26,7 +26,7 @@ STEP = float(np.log(1.05))  # of the central differences, in log-weights
 
 
 class Row(NamedTuple):
-    """One phi against the simulator, at one weight set and trajectory."""
+    """A phi against the simulator, at a weight set and trajectory."""
 
     cosine: Interval
     beyond_sag: Interval  # cosine without the directions of SAG
@@ -36,27 +36,27 @@ class Row(NamedTuple):
     share: float  # of the squared distance between the unit gradients, due to that weight
     entries: tuple[float, float]  # of that weight, in the unit gradients of model and simulator
     sizes: tuple[float, float]  # norms of the mean gradients of model and simulator
-    phases: int  # with finite gradients of all that is compared
+    phases: int  # with finite gradients in all
 
 
 Rows = Mapping[tuple[str, str], Row | None]  # by trajectory and phi, of one weight set
 
 
 def as_directions(weights: Weights, gradient: Weights) -> Float[np.ndarray, "18"]:
-    """Turn a gradient in weights into one in the 18 directions."""
+    """Convert a gradient in weights to the 18 directions."""
     logs = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
     return directions() @ logs
 
 
 def slopes(losses: Float[np.ndarray, "*batch 18 2"]) -> Float[np.ndarray, "*batch 18"]:
-    """Central differences of losses a STEP up and a STEP down."""
+    """Compute central differences of losses a STEP up and a STEP down."""
     return (losses[..., 0] - losses[..., 1]) / (2.0 * STEP)
 
 
 def cosine(
     a: Float[np.ndarray, "*batch n"], b: Float[np.ndarray, "*batch n"]
 ) -> np.ndarray | float:
-    """Cosine of the angle between vectors."""
+    """Compute the cosine of the angle between vectors."""
     return np.sum(a * b, axis=-1) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1))
 
 
@@ -67,15 +67,15 @@ def compare(
 ) -> Row | None:
     """Compare a model's gradients with the simulator's, and with those of the command itself.
 
-    Phases with a number that is not finite are left out for all.
+    Phases with a number that is not finite are left out in all.
 
     Args:
         model: through a phi.
-        command: through the command itself; None where the model is that.
+        command: through the command itself; None if this is the model.
         simulator: central differences.
 
     Returns:
-        The row, or None where no phase is left.
+        The row, or None if no phase is left.
     """
     base = model if command is None else command
     finite = np.isfinite(model + base + simulator).all(axis=1)
@@ -90,20 +90,20 @@ def compare(
         return agreement(m, s) - agreement(b, s)
 
     cosines, gains = [], []
-    for chosen in (np.ones(len(direction_names()), bool), BEYOND_SAG):
-        m, b, s = model[:, chosen], base[:, chosen], simulator[:, chosen]
+    for mask in (np.ones(len(direction_names()), bool), BEYOND_SAG):
+        m, b, s = model[:, mask], base[:, mask], simulator[:, mask]
         cosines.append(bootstrap(agreement, m, s))
         gains.append(None if command is None else bootstrap(gain, m, b, s))
     means = model.mean(axis=0), simulator.mean(axis=0)
     sizes = float(np.linalg.norm(means[0])), float(np.linalg.norm(means[1]))
     a, b = means[0] / sizes[0], means[1] / sizes[1]
-    apart = (a - b) ** 2  # sums to 2 (1 - cosine)
-    worst = int(np.argmax(apart))
+    distances = (a - b) ** 2  # sums to 2 (1 - cosine)
+    worst = int(np.argmax(distances))
     return Row(
         *cosines,
         *gains,
         wrong=direction_names()[worst],
-        share=float(apart[worst] / max(apart.sum(), 1e-12)),
+        share=float(distances[worst] / max(distances.sum(), 1e-12)),
         entries=(float(a[worst]), float(b[worst])),
         sizes=sizes,
         phases=int(finite.sum()),
@@ -113,7 +113,7 @@ def compare(
 def rank_correlation(
     model: Float[np.ndarray, " sets"], simulator: Float[np.ndarray, " sets"]
 ) -> float:
-    """Spearman's, over the weight sets with a finite loss in both; NaN for fewer than three."""
+    """Return Spearman's, over weight sets with a finite loss in both; NaN for fewer than three."""
     finite = np.isfinite(model + simulator)
     if finite.sum() < 3:
         return float("nan")
@@ -126,7 +126,7 @@ def _text(value: Interval | None) -> str:
 
 
 def gradient_table(rows: Rows) -> str:
-    """The rows of one weight set, by trajectory and phi."""
+    """Return the table of a weight set, by trajectory and phi."""
     head = ("trajectory", "phi", "cosine", "without z, R_Fz", "more than command")
     head += ("more, without z, R_Fz", "most wrong")
     lines = []
@@ -140,7 +140,7 @@ def gradient_table(rows: Rows) -> str:
 
 
 def wrong_sentence(trajectory: str, kind: str, row: Row) -> str:
-    """Which weight's gradient is wrong, and by how much."""
+    """Name the weight with the most wrong gradient, and its error."""
     model, simulator = row.entries
     sign = "too weakly" if abs(model) < abs(simulator) else "too strongly"
     if model * simulator < 0.0:
@@ -154,7 +154,7 @@ def wrong_sentence(trajectory: str, kind: str, row: Row) -> str:
 
 
 def rank_table(ranks: Mapping[tuple[str, str], Mapping[str, float]]) -> str:
-    """Rank correlations by trajectory and phi, and by the factor within which sets were drawn."""
+    """Return the table of rank correlations, by trajectory and phi, and by factor of the draws."""
     factors = next(iter(ranks.values()), {})
     rows = [(*key, *(f"{value:.3f}" for value in row.values())) for key, row in ranks.items()]
     head = ("trajectory", "phi", *(f"within x/{factor}" for factor in factors))
@@ -162,21 +162,21 @@ def rank_table(ranks: Mapping[tuple[str, str], Mapping[str, float]]) -> str:
 
 
 def summary(rows: Rows, kind: str) -> str:
-    """Whether the gradients through a phi point better than those through the command."""
+    """Compare the cosines of the gradients through a phi with those through the command."""
     gains = {t: row for (t, k), row in rows.items() if k == kind and row is not None and row.gain}
     if not gains:
         return f"No comparison of {kind} with the command could be made."
     better = sum(row.gain is not None and row.gain.low > 0.0 for row in gains.values())
     least = min(row.cosine.value for row in gains.values())
-    each = "; ".join(f"{t} {_text(row.gain)}" for t, row in gains.items())
+    texts = "; ".join(f"{t} {_text(row.gain)}" for t, row in gains.items())
     return (
-        f"Cosine with the {kind} less that with the command itself: {each}. The interval is above "
+        f"Cosine with the {kind} less that with the command itself: {texts}. The interval is above "
         f"zero on {better} of {len(gains)}; the least cosine is {least:.2f}."
     )
 
 
 def as_result(row: Row | None) -> dict[str, Any] | None:
-    """A row as names and values."""
+    """Return a row as JSON values."""
     if row is None:
         return None
     return {k: v._asdict() if isinstance(v, Interval) else v for k, v in row._asdict().items()}

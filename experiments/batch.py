@@ -48,17 +48,17 @@ from hector_jax.tuning.loss import PAPER_LOSS, Terms, with_alphas
 from hector_jax.tuning.rollout import Variation, no_variation
 from hector_jax.tuning.status import Stop
 
-HELD_BACK = Command(  # ahead, aside and into turns of another rate: no tuning walks it
+HELD_BACK = Command(  # forward, sideways and turns of another rate; used by no tuning
     np.array([1.0, 1.0, 2.0]),
     np.array([[0.4, 0.0], [0.3, 0.1], [0.25, 0.0]]),
     np.array([0.0, -0.3 * np.pi, 0.4 * np.pi]),
 )
-TAIL = 0.25  # share of the worst variations, and plants, that a CVaR counts
+TAIL = 0.25  # share of the variations and plants, worst first, of a CVaR
 
 
 @dataclass(frozen=True)
 class Flags:
-    """What all sub-commands ask."""
+    """Flags of all sub-commands that tune."""
 
     net: Path | None = None  # GRFM-Net to tune through; none: the plain rigid body
     iterations: Annotated[int, AT_LEAST_ONE] = 100  # at most
@@ -135,8 +135,8 @@ def tune(
         InputError: the nominal weights are refused, so there is nothing to compare with.
     """
     config = TuneConfig(iterations=flags.iterations)
-    with bar(f"{title}: {len(problems)} tunings") as tell:
-        tunings = tune_batch(config, robot, stack(problems), effects, tell=tell)
+    with bar(f"{title}: {len(problems)} tunings") as progress:
+        tunings = tune_batch(config, robot, stack(problems), effects, report_progress=progress)
     if np.any(np.asarray(tunings.stop)[nominal_rows] == Stop.BAD_START):
         raise InputError(
             f"{title}: the nominal weights are refused at their first walk: a fall, a plan that is "
@@ -146,7 +146,7 @@ def tune(
 
 
 def whole_net(flags: Flags, robot: Robot) -> jax.tree_util.Partial:
-    """The phi to tune through, as a batch takes it."""
+    """Return the phi to tune through, in the form of `tune_batch`."""
     return last_command if flags.net is None else stack([as_effect(load_net(flags.net, robot)[0])])
 
 
@@ -159,42 +159,47 @@ def scenario(
     effect: int = 0,
     variation: Variation | None = None,
 ) -> Scenario:
-    """A walk from standing, its tracking priced `tracking` times as in the paper."""
+    """Return a walk from standing, with the paper's weights of tracking times `tracking`."""
     loss = with_alphas({t.name: tracking * t.weight for t in PAPER_LOSS[:2]})
-    anchor, which = standing_anchor(robot), np.asarray(effect)
-    return Scenario(command, anchor, which, loss, np.asarray(scale), variation)
+    anchor, index = standing_anchor(robot), np.asarray(effect)
+    return Scenario(command, anchor, index, loss, np.asarray(scale), variation)
 
 
 def problem(start: Weights, scenarios: Sequence[Scenario], tail: float = 1.0) -> Problem:
-    """A weight set to be tuned on scenarios."""
+    """Return the problem of tuning a weight set on scenarios."""
     return Problem(start, stack(scenarios), np.asarray(tail))
 
 
 def first_host() -> bool:
-    """Whether this host judges and writes; the others of a cluster may end before it is done."""
+    """Return True on the host that evaluates and writes; the others of a cluster end earlier."""
     first = jax.process_index() == 0
     if jax.distributed.is_initialized():
-        jax.distributed.shutdown()  # at exit it would wait for the first host, and give up
+        jax.distributed.shutdown()  # at exit it would wait for the first host until a timeout
     return first
 
 
-def one_of(tree: Any, row: int) -> Any:
-    """One problem's share of a batch's results."""
+def row_of(tree: Any, row: int) -> Any:
+    """Return the results of one problem of a batch."""
     return jax.tree.map(lambda x: np.asarray(x)[row], tree)
 
 
+def accepted(tunings: Tunings) -> np.ndarray:
+    """Return the mask (problems, iterations) of the accepted iterations."""
+    mask = tunings.history.accepted
+    return mask & (np.arange(mask.shape[1]) <= np.asarray(tunings.iterations)[:, None])
+
+
 def final_terms(tunings: Tunings) -> Terms:
-    """Terms of the loss on the model of each converged set."""
-    rows = np.arange(tunings.history.evaluation.loss.shape[1])
-    ran = rows <= np.asarray(tunings.iterations)[:, None]
-    last = np.max(np.where(ran & tunings.history.accepted, rows, 0), axis=1)
+    """Return the terms of the loss on the model of each converged set."""
+    mask = accepted(tunings)
+    last = np.max(np.where(mask, np.arange(mask.shape[1]), 0), axis=1)
     return jax.tree.map(lambda x: x[np.arange(len(last)), last], tunings.history.evaluation.terms)
 
 
 def end_of(flags: Flags, tunings: Tunings, row: int) -> str:
-    """Why a tuning ended, and when."""
-    words = stop_reason(TuneConfig(iterations=flags.iterations), Stop(int(tunings.stop[row])))
-    return f"{words} (after {tunings.iterations[row]})"
+    """Describe why a tuning ended, and when."""
+    reason = stop_reason(TuneConfig(iterations=flags.iterations), Stop(int(tunings.stop[row])))
+    return f"{reason} (after {tunings.iterations[row]})"
 
 
 def scores_on(
@@ -206,14 +211,14 @@ def scores_on(
     title: str,
     first_seed: int = 0,
 ) -> dict[str, Score]:
-    """Scores of weight sets on plants, stacked over these."""
+    """Return the scores of weight sets, stacked over the plants."""
     seeds = range(first_seed, first_seed + len(plants))
     judgement = verdicts.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title=title)
     return {name: stack(scores) for name, scores in judgement.scores.items()}
 
 
 def million(x: Any) -> str:
-    """A loss in 1e6."""
+    """Format a loss in 1e6."""
     return f"{float(x) / 1e6:.3f}"
 
 
@@ -224,12 +229,12 @@ def write(
     paragraphs: Sequence[str],
     picture: tuple[str, str],
 ) -> None:
-    """Write weights, numbers and report; the first paragraph is its title."""
+    """Write weights, numbers and report; the first paragraph is the title."""
     out = flags.out  # pyright: ignore
     make_folder(out / "weights")
     for name, weights in sets.items():
         save_weights(out / "weights" / f"{name.replace(' ', '-')}.json", weights)
-    plain = {name: str(x) if isinstance(x, Path) else x for name, x in vars(flags).items()}
+    settings = {name: str(x) if isinstance(x, Path) else x for name, x in vars(flags).items()}
     model = f"through {flags.net.name}" if flags.net else "on the plain rigid body"
     about = f"Tuned {model}, at most {flags.iterations} iterations. Losses in 1e6."
     title, *rest = paragraphs
@@ -237,7 +242,7 @@ def write(
         out / "report.md",
         title,
         [about, *rest],
-        numbers={"flags": plain, **numbers},
+        numbers={"flags": settings, **numbers},
         json_name="result.json",
         pictures=dict([picture]),
     )
@@ -245,7 +250,7 @@ def write(
 
 
 def shared(flags: Shared) -> None:
-    """(a) One weight set for many trajectories, against one for each."""
+    """Compare one weight set for many trajectories with one for each (question a)."""
     robot, names = load_robot(), flags.trajectories
     effects, commands = whole_net(flags, robot), {n: named_command(n) for n in names}
     problems = [problem(nominal(), [scenario(robot, c)]) for c in commands.values()]
@@ -259,8 +264,8 @@ def shared(flags: Shared) -> None:
         return
 
     sets = {"nominal": nominal(), "expert": expert()}
-    sets |= {f"{n} alone": one_of(alone.converged, i) for i, n in enumerate(names)}
-    sets |= {n: one_of(together.converged, i) for i, n in enumerate(tails)}
+    sets |= {f"{n} alone": row_of(alone.converged, i) for i, n in enumerate(names)}
+    sets |= {n: row_of(together.converged, i) for i, n in enumerate(tails)}
     with workers(flags.processes) as pool:
         scores = {
             name: scores_on(pool, robot, sets, command, [hfs()], f"{name} on the hfs")
@@ -274,8 +279,8 @@ def shared(flags: Shared) -> None:
             f"{million(x)} ({100 * (x / loss['nominal'][c] - 1):+.0f} %)"
             for c, x in loss[name].items()
         ]
-        beside = [100 * (loss[name][c] / loss[f"{c} alone"][c] - 1) for c in names]
-        return [name, *cells, f"{max(beside):+.0f} %", ", ".join(falls[name]) or "none"]
+        changes = [100 * (loss[name][c] / loss[f"{c} alone"][c] - 1) for c in names]
+        return [name, *cells, f"{max(changes):+.0f} %", ", ".join(falls[name]) or "none"]
 
     head = ["set", *scores, "worst, to the set tuned singly", "falls"]
     base = np.array(list(loss["nominal"].values()))
@@ -295,19 +300,19 @@ def shared(flags: Shared) -> None:
     write(flags, sets, {"hfs": loss, "falls": falls}, text, ("shared.png", caption))
 
 
-def drawn_variations(count: int, noise: bool) -> list[Variation]:
-    """Bodies and grounds around the model, by the widths of hfs-varied where it has them."""
+def draw_variations(count: int, noise: bool) -> list[Variation]:
+    """Draw bodies and grounds around the model, with the widths of hfs-varied if it has them."""
     rng = np.random.default_rng(0)
     sigmas = (5e-3, 3e-3, 3e-2, 3e-2) if noise else (0.0,) * 4  # rad, m, rad/s, m/s
-    like = no_variation()
+    none = no_variation()
     return [
-        like._replace(
+        none._replace(
             mass=np.asarray(1 + rng.uniform(-0.04, 0.04)),
             inertia=np.asarray(1 + rng.uniform(-0.2, 0.2)),
             com=rng.uniform(-0.01, 0.01, 3),
             friction=np.asarray(rng.uniform(0.6, 1.0)),
             delay=np.asarray(rng.uniform(0.0, 5e-3)),
-            noise=type(like.noise)(*(np.full(3, sigma) for sigma in sigmas)),
+            noise=type(none.noise)(*(np.full(3, sigma) for sigma in sigmas)),
             seed=np.asarray(seed),
         )
         for seed in range(count)
@@ -315,15 +320,15 @@ def drawn_variations(count: int, noise: bool) -> list[Variation]:
 
 
 def robust(flags: Robust) -> None:
-    """(b) Weights that bear with variations, judged on plants drawn around the hfs."""
+    """Tune weights for variations, evaluated on plants drawn around the hfs (question b)."""
     robot, command = load_robot(), named_command(flags.traj)
     effects, members = last_command, 1
-    if flags.net is not None:  # another variant's net is refused before anything is tuned
+    if flags.net is not None:  # a net of another variant is refused before any tuning
         effects = as_effect(member_params(load_net(flags.net, robot, "residual")[0]))
         members = len(jax.tree.leaves(effects)[0])
     problems = [problem(nominal(), [scenario(robot, command)])]
     plain = tune(flags, robot, whole_net(flags, robot), problems, "the model as it is")
-    variations = drawn_variations(flags.variations, flags.noise)
+    variations = draw_variations(flags.variations, flags.noise)
     walks = [
         scenario(robot, command, effect=i % members, variation=variation)
         for i, variation in enumerate(variations)
@@ -334,25 +339,21 @@ def robust(flags: Robust) -> None:
     if not first_host():
         return
 
-    sets = {"nominal": nominal(), "expert": expert(), "as it is": one_of(plain.converged, 0)}
-    sets |= {n: one_of(varied.converged, i) for i, n in enumerate(tails)}
+    sets = {"nominal": nominal(), "expert": expert(), "as it is": row_of(plain.converged, 0)}
+    sets |= {n: row_of(varied.converged, i) for i, n in enumerate(tails)}
     plants = [hfs_varied(seed) for seed in range(flags.plants)]
     with workers(flags.processes) as pool:
         scores = scores_on(pool, robot, sets, command, plants, "plants around the hfs")
     make_folder(flags.out)
     caption = plots.by_plant(flags.out / "robust.png", {n: s.L for n, s in scores.items()})
+    ensemble = ", members of the net's ensemble in turn (`as it is`: through the mean of them all)"
+    ensemble *= members > 1
     text = [
         f"Tuned over variations of the model: {flags.traj}",
         f"{flags.variations} variations: mass within 4 %, inertia 20 %, centre of mass 1 cm, "
-        "friction 0.6 to 1, effects late by up to 5 ms"
-        + (
-            ", members of the net's ensemble in turn (`as it is`: through the mean of them all)"
-            if members > 1
-            else ""
-        )
-        + (", a noisy estimate" if flags.noise else "")
-        + f". CVaR: mean over the worst {TAIL:.0%}. Judged on {flags.plants} plants drawn around "
-        "the hfs (hfs-varied).",
+        f"friction 0.6 to 1, effects late by up to 5 ms{ensemble}"
+        f"{', a noisy estimate' if flags.noise else ''}. CVaR: mean over the worst {TAIL:.0%}. "
+        f"Judged on {flags.plants} plants drawn around the hfs (hfs-varied).",
         plant_table(scores, "as it is"),
         "\n".join(
             f"- {n}: {end_of(flags, tunings, i)}"
@@ -363,7 +364,7 @@ def robust(flags: Robust) -> None:
 
 
 def plant_table(scores: Mapping[str, Score], base: str) -> str:
-    """Weight sets over plants: falls, mean, tail, and the paired ratio to one of them."""
+    """Return a table of weight sets over plants: falls, mean, tail, and paired ratio to a set."""
     rows = []
     for name, score in scores.items():
         change = 100 * (np.median(score.L / scores[base].L) - 1)
@@ -376,19 +377,19 @@ def plant_table(scores: Mapping[str, Score], base: str) -> str:
 
 
 def as_numbers(scores: Mapping[str, Score]) -> dict[str, Any]:
-    """Scores for JSON."""
+    """Return scores as JSON values."""
     return {n: {"L": s.L.tolist(), "fallen": s.fallen.tolist()} for n, s in scores.items()}
 
 
 def front(flags: Front) -> None:
-    """(c) Tracking against smoothness."""
+    """Trade tracking against smoothness (question c)."""
     robot, command = load_robot(), named_command(flags.traj)
     prices = 10.0 ** np.linspace(-flags.decades, flags.decades, flags.points)
     problems = [problem(nominal(), [scenario(robot, command, tracking=p)]) for p in prices]
     tunings = tune(flags, robot, whole_net(flags, robot), problems, "prices of tracking")
     if not first_host():
         return
-    sets = {f"tracking x{p:.3g}": one_of(tunings.converged, i) for i, p in enumerate(prices)}
+    sets = {f"tracking x{p:.3g}": row_of(tunings.converged, i) for i, p in enumerate(prices)}
     all_sets = {"nominal": nominal(), "expert": expert(), **sets}
     with workers(flags.processes) as pool:
         scores = scores_on(pool, robot, all_sets, command, [hfs()], "on the hfs")
@@ -398,63 +399,54 @@ def front(flags: Front) -> None:
 
     terms = final_terms(tunings)
     model = np.stack([tracking(terms), terms["L_ctrl"]], axis=1)
-    there = {
+    on_hfs = {
         n: (float(tracking(s.losses)[0]), float(s.losses["L_ctrl"][0])) for n, s in scores.items()
     }
     rows = []
-    for name, (track, control) in there.items():
-        own = list(sets).index(name) if name in sets else None
-        cells = (
-            ["", "", ""]
-            if own is None
-            else [*map(million, model[own]), end_of(flags, tunings, own)]
-        )
+    for name, losses in on_hfs.items():
+        cells, end = ["", ""], ""
+        if name in sets:
+            i = list(sets).index(name)
+            cells, end = [*map(million, model[i])], end_of(flags, tunings, i)
         fell = "yes" if scores[name].fallen.any() else "no"
-        rows.append([name, *cells[:2], million(track), million(control), fell, cells[2]])
+        rows.append([name, *cells, *map(million, losses), fell, end])
     make_folder(flags.out)
     caption = plots.front(
         flags.out / "front.png",
         prices,
-        {"rigid body": model, "hfs": np.array([there[n] for n in sets])},
-        {n: there[n] for n in ("nominal", "expert")},
+        {"rigid body": model, "hfs": np.array([on_hfs[n] for n in sets])},
+        {n: on_hfs[n] for n in ("nominal", "expert")},
     )
-    head = [
-        "set",
-        "tracking, model",
-        "L_ctrl, model",
-        "tracking, hfs",
-        "L_ctrl, hfs",
-        "fell",
-        "end",
-    ]
+    head = ["set", *(f"{x}, {world}" for world in ("model", "hfs") for x in ("tracking", "L_ctrl"))]
     text = [
         f"Tracking against smoothness: {flags.traj}",
         "Both alphas are multiplied by one price; tracking is alpha_1 L_Eul + alpha_2 L_pos with "
         "the paper's alphas, whatever the price.",
-        markdown_table(head, rows),
+        markdown_table([*head, "fell", "end"], rows),
     ]
-    numbers = {"prices": prices.tolist(), "model": model.tolist(), "hfs": there}
+    numbers = {"prices": prices.tolist(), "model": model.tolist(), "hfs": on_hfs}
     write(flags, sets, numbers, text, ("front.png", caption))
 
 
 def starts(flags: Starts) -> None:
-    """(d) How far the end depends on the start."""
+    """Tune from many starts (question d)."""
     robot, command = load_robot(), named_command(flags.traj)
-    begin = [nominal(), *sample_weights(nominal(), flags.factor, flags.starts - 1)]
-    problems = [problem(w, [scenario(robot, command)]) for w in begin]
+    initial = [nominal(), *sample_weights(nominal(), flags.factor, flags.starts - 1)]
+    problems = [problem(w, [scenario(robot, command)]) for w in initial]
     tunings = tune(flags, robot, whole_net(flags, robot), problems, "starts", slice(1))
     if not first_host():
         return
-    sound = np.asarray(tunings.stop) != Stop.BAD_START
-    first, last = tunings.history.evaluation.loss[sound, 0], tunings.loss[sound]
-    accepted = tunings.history.accepted
-    ran = np.arange(accepted.shape[1]) <= np.asarray(tunings.iterations)[:, None]
-    curves = np.where(accepted & ran, tunings.history.evaluation.loss, np.nan)[sound]
-    at = lambda x: [million(q) for q in np.quantile(x, (0, 0.25, 0.5, 0.75, 1))]  # noqa: E731
-    rows = [["at the start", *at(first)], ["at the end", *at(last)]]
-    best = np.flatnonzero(sound)[np.argsort(last)[:3]]
-    sets = {"from nominal": one_of(tunings.converged, 0)}
-    sets |= {f"best {i + 1}": one_of(tunings.converged, row) for i, row in enumerate(best)}
+    usable = np.asarray(tunings.stop) != Stop.BAD_START
+    losses = tunings.history.evaluation.loss
+    first, last = losses[usable, 0], tunings.loss[usable]
+    curves = np.where(accepted(tunings), losses, np.nan)[usable]
+    rows = [
+        [f"at the {end}", *map(million, np.quantile(x, (0, 0.25, 0.5, 0.75, 1)))]
+        for end, x in (("start", first), ("end", last))
+    ]
+    best = np.flatnonzero(usable)[np.argsort(last)[:3]]
+    sets = {"from nominal": row_of(tunings.converged, 0)}
+    sets |= {f"best {i + 1}": row_of(tunings.converged, row) for i, row in enumerate(best)}
     with workers(flags.processes) as pool:
         scores = scores_on(pool, robot, sets, command, [hfs()], "on the hfs")
     make_folder(flags.out)
@@ -462,7 +454,7 @@ def starts(flags: Starts) -> None:
     text = [
         f"How much the start matters: {flags.traj}",
         f"{flags.starts} starts, the first at nominal, the others log-uniform within "
-        f"x/{flags.factor:g} of it; {int((~sound).sum())} are refused at their "
+        f"x/{flags.factor:g} of it; {int((~usable).sum())} are refused at their "
         "first walk: a fall, a plan that is not solved, or numbers that are not finite.",
         markdown_table(["L on the model", "least", "25 %", "median", "75 %", "most"], rows),
         f"From nominal: {million(last[0])}, {int(np.sum(last < last[0]))} of the others end lower.",
@@ -471,7 +463,7 @@ def starts(flags: Starts) -> None:
             [[n, million(s.L[0]), "yes" if s.fallen.any() else "no"] for n, s in scores.items()],
         ),
     ]
-    numbers = {"first": first.tolist(), "last": last.tolist(), "refused": int((~sound).sum())}
+    numbers = {"first": first.tolist(), "last": last.tolist(), "refused": int((~usable).sum())}
     write(flags, sets, numbers | {"hfs": as_numbers(scores)}, text, ("starts.png", caption))
 
 
@@ -500,14 +492,14 @@ def verdict(flags: Verdict) -> None:
 
 
 def main() -> None:
-    """Do what one sub-command asks."""
-    does = {Shared: shared, Robust: robust, Front: front, Starts: starts, Verdict: verdict}
+    """Run a sub-command."""
+    commands = {Shared: shared, Robust: robust, Front: front, Starts: starts, Verdict: verdict}
     flags = tyro.extras.subcommand_cli_from_dict(
-        {kind.__name__.lower(): kind for kind in does}, description=__doc__
+        {kind.__name__.lower(): kind for kind in commands}, description=__doc__
     )
     setup_jax()
     all_devices()
-    does[type(flags)](flags)
+    commands[type(flags)](flags)
 
 
 if __name__ == "__main__":

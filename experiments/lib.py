@@ -1,4 +1,4 @@
-"""What the experiments share: walks that are kept in groups, and how a report is written."""
+"""Shared functions of the experiments: cached groups of walks, and the writing of reports."""
 
 import shlex
 import sys
@@ -33,7 +33,7 @@ def write_report(
     Args:
         path: the report.
         title: its heading; commit and command follow.
-        paragraphs: its text.
+        paragraphs: its text, in Markdown.
         numbers: JSON values; `environment` is added.
         json_name: name of the JSON file, in the report's folder.
         pictures: captions by the names of files in the report's folder.
@@ -50,7 +50,7 @@ def write_report(
 
 
 def check_names(flag: str, names: Iterable[str], choices: Collection[str]) -> None:
-    """Check that all names given to a flag are among those there are.
+    """Check that all names of a flag are valid choices.
 
     Raises:
         InputError: one line naming the flag, the name and the choices.
@@ -61,10 +61,10 @@ def check_names(flag: str, names: Iterable[str], choices: Collection[str]) -> No
 
 
 def made_at(environment: Mapping[str, str]) -> str:
-    """Line of a report that tells where it comes from: the commit, and the script with its flags.
+    """Return the line of a report that names the commit, and the script with its flags.
 
     Args:
-        environment: see `core.environment`; without a commit outside of a checkout.
+        environment: see `core.environment`; without a commit outside a checkout.
     """
     script = "/".join(Path(sys.argv[0]).resolve().parts[-2:])
     command = shlex.join(["python", script, *sys.argv[1:]])
@@ -83,18 +83,18 @@ def walk_groups(
     settings: tuple[Any, ...],
     title: str = "",
 ) -> dict[str, Tree]:
-    """Scores of the walks of groups of jobs, stacked by group; whole groups are kept.
+    """Return the scores of groups of walks, stacked by group; whole groups are cached in files.
 
     Args:
-        groups: of jobs, by a name that may stand in a file's.
+        groups: jobs by the name of the group, which is part of the file's name.
         walk: walks jobs, in their order.
-        score: of a walk, a NamedTuple of arrays.
-        like: such a tuple, stacked.
+        score: returns the score of a walk, a NamedTuple of arrays.
+        like: a stacked score.
         kind: of the files.
         robot: the body.
         folder: of the files.
-        settings: what the walks follow from beside the jobs, see `content_key`; noted in the files.
-        title: for the person who waits, after the number of walks.
+        settings: on which the walks depend beside the jobs, see `content_key`; noted in the files.
+        title: of the progress bar, after the number of walks.
     """
     code = ("sim.walk", "sim.parallel", "runs.metrics")
     paths = {
@@ -104,15 +104,15 @@ def walk_groups(
 
     def make(missing: list[str], _: Mapping[str, Tree]) -> Iterator[tuple[str, Tree]]:
         jobs = [job for name in missing for job in groups[name]]
-        with bar(f"{plural(len(jobs), 'walk')}{title}") as tell:
-            tell(0, len(jobs), "compiling")
+        with bar(f"{plural(len(jobs), 'walk')}{title}") as report_progress:
+            report_progress(0, len(jobs), "compiling")
             walks, done = walk(jobs), 0
             for name in missing:
                 rows = []
                 for _job in groups[name]:
                     rows.append(score(next(walks)))
                     done += 1
-                    tell(done, len(jobs), name)
+                    report_progress(done, len(jobs), name)
                 yield name, stack(rows)
 
     about = {"settings": [repr(part) for part in settings]}

@@ -1,8 +1,8 @@
-"""Optimizers in lock-step: in every round all walk at once what each asked for.
+"""Optimizers in lock-step: in every round the proposals of all are walked in parallel.
 
 The journal is one file: a line of settings, the loss of the start, then a line per round with each
-optimizer's steps, their losses and the seconds that it thought. A benchmark that finds its journal
-goes on where that ends. The start is walked once for all and counts for none.
+optimizer's steps, their losses and its computing time [s]. A benchmark with a journal continues
+after its last line. The start is walked once for all and counts for none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,24 +22,24 @@ START = "start"
 
 
 class Round(NamedTuple):
-    """What an optimizer did in a round."""
+    """A round of an optimizer."""
 
-    walked: Generation
-    seconds: float  # of thinking
+    generation: Generation
+    seconds: float  # of computing
 
 
 class BenchmarkResult(NamedTuple):
-    """A whole benchmark."""
+    """Result of a benchmark."""
 
     start: float  # loss
     rounds: dict[str, list[Round]]  # by optimizer
 
 
-Think = Callable[
+Propose = Callable[
     [Mapping[str, tuple[Optimizer, Weights, Sequence[Generation]]]],
     Mapping[str, tuple[Steps, float]],
 ]
-"""Steps that each optimizer asks for, and the seconds it took."""
+"""Function that returns the next steps of each optimizer, and its computing time [s]."""
 
 
 def benchmark(
@@ -47,33 +47,33 @@ def benchmark(
     start: Weights,
     rollouts: int,
     *,
-    think: Think,
+    propose: Propose,
     walk: Walk,
     path: Path,
     about: Mapping[str, Any],
     on_round: Callable[[BenchmarkResult], None] = lambda result: None,
 ) -> BenchmarkResult:
-    """Compare optimizers in lock-step, taking up the journal.
+    """Compare optimizers in lock-step, continuing the journal.
 
     Args:
         optimizers: by name.
         start: of all.
-        rollouts: walks of each, at most.
-        think: asks them.
+        rollouts: largest number of walks of each.
+        propose: computes the next steps of each.
         walk: the objective; a loss that is not finite counts as infinite.
         path: of the journal.
-        about: JSON values on which all depends; kept in the journal and held to.
-        on_round: called once the journal is read and after each round.
+        about: JSON values on which the result depends; a journal with other values is refused.
+        on_round: called after the journal is read and after each round.
 
     Raises:
-        InputError: a rollout too few, a start without a loss, a journal of another race or a
-            damaged one, or what an optimizer raises.
+        InputError: no rollout, a start without a loss, a journal that is damaged or of another
+            race, or an error of an optimizer.
         WriteError: the journal cannot be written.
     """
     if rollouts < 1:
         raise InputError(f"a race needs at least one rollout, got {rollouts}")
     head = {"format": FORMAT, "rollouts": rollouts, "rivals": sorted(optimizers), **about}
-    rows: list[Any] = read_journal(path, head, what="race", parse=_round_of_each)
+    rows: list[Any] = read_journal(path, head, what="race", parse=_parse_row)
     if not rows:
         loss = float(walk({START: [start]})[START][0])
         if not np.isfinite(loss):
@@ -83,48 +83,48 @@ def benchmark(
     first = to_generation(np.zeros((1, DIM)), [rows[0][START]])
     result = BenchmarkResult(rows[0][START], {name: [] for name in optimizers})
     for row in rows[1:]:
-        for name, one in row.items():
-            result.rounds[name].append(one)
+        for name, one_round in row.items():
+            result.rounds[name].append(one_round)
     on_round(result)
     while True:
-        left = {name: rollouts - walks(rounds) for name, rounds in result.rounds.items()}
-        thought = think(
+        budget = {name: rollouts - walks(rounds) for name, rounds in result.rounds.items()}
+        proposals = propose(
             {
-                name: (optimizer, start, [first, *(one.walked for one in result.rounds[name])])
+                name: (optimizer, start, [first, *(r.generation for r in result.rounds[name])])
                 for name, optimizer in optimizers.items()
-                if left[name] > 0
+                if budget[name] > 0
             }
         )
-        thought = {n: (s[: left[n]], seconds) for n, (s, seconds) in thought.items() if len(s)}
-        if not thought:
+        proposals = {n: (s[: budget[n]], t) for n, (s, t) in proposals.items() if len(s)}
+        if not proposals:
             return result
-        losses = walk({n: [project(start, s) for s in steps] for n, (steps, _) in thought.items()})
+        losses = walk({n: [project(start, x) for x in s] for n, (s, _) in proposals.items()})
         row = {
             name: {"steps": steps.tolist(), "losses": losses[name].tolist(), "seconds": seconds}
-            for name, (steps, seconds) in thought.items()
+            for name, (steps, seconds) in proposals.items()
         }
         add_row(path, row)
-        for name, one in _round_of_each(row).items():
-            result.rounds[name].append(one)
+        for name, one_round in _parse_row(row).items():
+            result.rounds[name].append(one_round)
         on_round(result)
 
 
-def _round_of_each(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of the journal: the round of each optimizer, or the loss of the start."""
+def _parse_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the round of each optimizer, or the loss of the start, of a row of the journal."""
     if START in row:
         return {START: float(row[START])}
     return {
-        name: Round(to_generation(one["steps"], one["losses"]), one["seconds"])
-        for name, one in row.items()
+        name: Round(to_generation(cell["steps"], cell["losses"]), cell["seconds"])
+        for name, cell in row.items()
     }
 
 
 def walks(rounds: Sequence[Round]) -> int:
-    """Number of walks in some rounds."""
-    return sum(len(one.walked.losses) for one in rounds)
+    """Return the number of walks in some rounds."""
+    return sum(len(r.generation.losses) for r in rounds)
 
 
-def lowest(start: float, rounds: Sequence[Round]) -> Float[np.ndarray, " walked"]:
-    """The lowest loss after each walk, that of the start first."""
-    losses = [one.walked.losses for one in rounds]
+def lowest(start: float, rounds: Sequence[Round]) -> Float[np.ndarray, " walks"]:
+    """Return the lowest loss after each walk, first that of the start."""
+    losses = [r.generation.losses for r in rounds]
     return np.minimum.accumulate(np.concatenate([[start], *losses]))

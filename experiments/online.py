@@ -15,6 +15,7 @@ Walks are kept under OUT/walks and taken up again. `--standin` adds plants of th
 for a verdict; nothing here was chosen by them.
 """
 
+import itertools
 import math
 import sys
 import time
@@ -56,7 +57,7 @@ from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner
 
-CODE = ("tuning.online", "grfm.network", "sim.walk")  # that decides the numbers
+CODE = ("tuning.online", "grfm.network", "sim.walk")  # modules that decide the numbers
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] of the losses along a walk
 
@@ -105,24 +106,24 @@ class Flags:
 
 
 class Case(NamedTuple):
-    """One walk."""
+    """A walk."""
 
     plant: str
     trajectory: str
-    which: str  # start weights
+    start: str  # name of the start weights
     arm: str
 
 
 class Walked(NamedTuple):
-    """What there is to say about it."""
+    """Results of a walk."""
 
-    halves: np.ndarray  # (2,) L before the change and after
-    parts: np.ndarray  # (2, 3) its parts
+    halves: np.ndarray  # (2,) L before and after the change
+    parts: np.ndarray  # (2, 3) terms of L
     loss: np.ndarray  # (windows,) L of each 0.4 s
     height: np.ndarray  # (2,) [m] mean error of the centre of mass
     fallen: np.ndarray
     residual: np.ndarray  # largest relative KKT residual of a plan
-    weights: np.ndarray  # (steps, 24) in force at the end of each window
+    weights: np.ndarray  # (steps, 24) in use at the end of each window
     refused: np.ndarray  # (steps,)
     seconds: np.ndarray  # (steps,) [s] of processor time that a window's gradient and step took
 
@@ -146,9 +147,9 @@ def _walk_case(
     moment: float,
     arm: str,
 ) -> Walked:
-    """One walk of an arm; in a worker."""
+    """Walk a case of an arm; in a worker."""
     steps: list[Iteration] = []
-    spent: list[float] = []
+    seconds: list[float] = []
     online = retuner(config, robot, job.weights, job.command, effect, steps.append)
     last_tick = round(moment / config.tune.rollout.walk.gait.tick)
 
@@ -158,7 +159,7 @@ def _walk_case(
         count, start = len(steps), time.process_time()
         carry, weights = online.step(carry, tick, *measured)
         if len(steps) > count:
-            spent.append(time.process_time() - start)
+            seconds.append(time.process_time() - start)
         return carry, weights
 
     retune = None if arm == "fixed" else online._replace(step=step)
@@ -177,28 +178,25 @@ def _walk_case(
         residual=np.asarray(trajectory.residual.max()),
         weights=np.array(weights).reshape(-1, len(weight_names())),
         refused=np.array([not s.accepted for s in steps], bool),
-        seconds=np.array(spent),
+        seconds=np.array(seconds),
     )
 
 
 def plants(flags: Flags) -> dict[str, tuple[Imperfections, int]]:
-    """Plants by name, and the seeds of their estimators."""
+    """Return the plants by name, and the seeds of their estimators."""
     varied = {f"hfs-varied {seed}": (named_world("hfs-varied", seed), 0) for seed in flags.varied}
-    return (
-        {"hfs": (named_world("hfs"), 0)}
-        | varied
-        | {f"stand-in {seed}": (standin(seed), seed) for seed in flags.standin}
-    )
+    standins = {f"stand-in {seed}": (standin(seed), seed) for seed in flags.standin}
+    return {"hfs": (named_world("hfs"), 0), **varied, **standins}
 
 
-def start_weights(flags: Flags, trajectory: str, which: str) -> Weights:
-    """Start weights by name.
+def start_weights(flags: Flags, trajectory: str, name: str) -> Weights:
+    """Return start weights by name.
 
     Raises:
-        InputError: tuned ones without a file.
+        InputError: no file of the tuned weights.
     """
-    if which != "tuned":
-        return {"nominal": nominal, "expert": expert}[which]()
+    if name != "tuned":
+        return {"nominal": nominal, "expert": expert}[name]()
     if trajectory not in flags.tuned:
         raise InputError(f"--tuned: no weights file for {trajectory}, which --sets asks for")
     return load_weights(flags.tuned[trajectory])
@@ -211,46 +209,40 @@ def walk_cases(
     effects: Mapping[str, jax.tree_util.Partial],
     starts: Mapping[tuple[str, str], Weights],
 ) -> dict[Case, Walked]:
-    """All walks, from start weights by trajectory and set; those that are on disk are taken."""
-    config = OnlineConfig(window=flags.window, late=flags.late)
+    """Walk from start weights by trajectory and set; walks that are on disk are read."""
+    default = OnlineConfig(window=flags.window, late=flags.late)
     changes = (Change(start=flags.change, payload=flags.payload),)
     host = partial(jax.tree.map, np.asarray)
-    cases: dict[Case, tuple] = {}
-    for plant, (imperfections, seed) in plants(flags).items():
-        for trajectory in flags.trajectories:
-            for which in flags.sets:
-                weights = host(starts[trajectory, which])
-                for arm in flags.arms:
-                    estimator = arm if arm in ("cut", "model") else "carried"
-                    effect = effects["command" if arm == "plain" else "net"]
-                    job = Job(
-                        weights,
-                        host(named_command(trajectory)),
-                        host(imperfections),
-                        flags.seconds,
-                        seed,
-                        changes=changes,
-                    )
-                    how = replace(config, estimator=estimator)
-                    what = how, robot, job, effect, flags.change, arm
-                    cases[Case(plant, trajectory, which, arm)] = what
+    by_name = plants(flags)
+    inputs: dict[Case, tuple] = {}
+    for case in itertools.starmap(
+        Case, itertools.product(by_name, flags.trajectories, flags.sets, flags.arms)
+    ):
+        imperfections, seed = by_name[case.plant]
+        weights = host(starts[case.trajectory, case.start])
+        walked = weights, host(named_command(case.trajectory)), host(imperfections)
+        job = Job(*walked, flags.seconds, seed, changes=changes)
+        estimator = case.arm if case.arm in ("cut", "model") else "carried"
+        config = replace(default, estimator=estimator)
+        effect = effects["command" if case.arm == "plain" else "net"]
+        inputs[case] = config, robot, job, effect, flags.change, case.arm
 
     def path(case: Case) -> Path:
-        how, _, job, effect, moment, arm = cases[case]
+        config, _, job, effect, moment, arm = inputs[case]
         name = "-".join(case).replace(" ", "")
-        ending = content_key(how, robot, job, (effect,), moment, arm, code=CODE)
+        ending = content_key(config, robot, job, (effect,), moment, arm, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
-    def walked(missing: Sequence[Case], _: Mapping[Case, Walked]) -> Iterator[tuple[Case, Walked]]:
-        running = {case: pool.submit(_walk_case, *cases[case]) for case in missing}
-        with bar("walks on plants that change") as tell:
+    def make(missing: Sequence[Case], _: Mapping[Case, Walked]) -> Iterator[tuple[Case, Walked]]:
+        running = {case: pool.submit(_walk_case, *inputs[case]) for case in missing}
+        with bar("walks on plants that change") as report_progress:
             for done, (case, future) in enumerate(running.items(), 1):
                 yield case, future.result()
-                tell(done, len(running), " ".join(case))
+                report_progress(done, len(running), " ".join(case))
 
     like = Walked(*(np.zeros((0,) * n) for n in (1, 2, 1, 1, 0, 0, 2, 1, 1)))
-    paths = {case: path(case) for case in cases}
-    return load_or_make(paths, walked, like=lambda _: like, kind="online", robot=robot)
+    paths = {case: path(case) for case in inputs}
+    return load_or_make(paths, make, like=lambda _: like, kind="online", robot=robot)
 
 
 def main() -> None:
@@ -278,9 +270,10 @@ SPANS: dict[str, Callable[[Walked], float]] = {
 def _changes(
     walks: Mapping[Case, Walked], cases: Sequence[Case], span: str, against: str
 ) -> np.ndarray:
-    """By how many % L of a span is above that of the same walks by another arm."""
-    of = SPANS[span]
-    return np.array([100 * (of(walks[c]) / of(walks[c._replace(arm=against)]) - 1) for c in cases])
+    """Return the change of L [%] over a span, against the same walks by another arm."""
+    loss = SPANS[span]
+    pairs = ((walks[case], walks[case._replace(arm=against)]) for case in cases)
+    return np.array([100 * (loss(row) / loss(other) - 1) for row, other in pairs])
 
 
 def _median(values: np.ndarray) -> str:
@@ -290,28 +283,26 @@ def _median(values: np.ndarray) -> str:
 
 
 def table(flags: Flags, walks: Mapping[Case, Walked]) -> str:
-    """L before and after the change by trajectory, start weights and arm."""
+    """Return a table of L before and after the change by trajectory, start weights and arm."""
     names = list(plants(flags))
     head = ("trajectory", "start", "arm", "L before, 1e6", "L after, 1e6")
     head += ("before, % against fixed", "after, % against fixed", "z after, cm", "falls", "refused")
     lines = []
-    for trajectory in flags.trajectories:
-        for which in flags.sets:
-            for arm in flags.arms:
-                cases = [Case(plant, trajectory, which, arm) for plant in names]
-                rows = [walks[case] for case in cases]
-                halves = np.median([row.halves for row in rows], axis=0) / 1e6
-                change = [
-                    _median(_changes(walks, cases, span, "fixed"))
-                    if arm != "fixed" and "fixed" in flags.arms
-                    else ""
-                    for span in ("before", "after")
-                ]
-                height = 100.0 * np.median([row.height[1] for row in rows])
-                falls = sum(bool(row.fallen) for row in rows)
-                refused = sum(int(row.refused.sum()) for row in rows)
-                line = [trajectory, which, arm, *(f"{half:.2f}" for half in halves), *change]
-                lines.append([*line, f"{height:+.1f}", f"{falls} of {len(rows)}", str(refused)])
+    for group in itertools.product(flags.trajectories, flags.sets, flags.arms):
+        cases = [Case(plant, *group) for plant in names]
+        rows = [walks[case] for case in cases]
+        halves = np.median([row.halves for row in rows], axis=0) / 1e6
+        change = [
+            _median(_changes(walks, cases, span, "fixed"))
+            if group[-1] != "fixed" and "fixed" in flags.arms
+            else ""
+            for span in ("before", "after")
+        ]
+        height = 100.0 * np.median([row.height[1] for row in rows])
+        falls = sum(bool(row.fallen) for row in rows)
+        refused = sum(int(row.refused.sum()) for row in rows)
+        line = [*group, *(f"{half:.2f}" for half in halves), *change]
+        lines.append([*line, f"{height:+.1f}", f"{falls} of {len(rows)}", str(refused)])
     return markdown_table(head, lines, words=3)
 
 
@@ -323,7 +314,7 @@ def _spread(values: np.ndarray) -> str:
 
 
 def verdicts(flags: Flags, walks: Mapping[Case, Walked]) -> list[str]:
-    """What each arm did after the change, over all walks, in a sentence each."""
+    """Describe the result of each arm after the change, over all walks, in a sentence."""
     sentences = []
     for arm in flags.arms:
         if arm == "fixed" or "fixed" not in flags.arms:
@@ -348,11 +339,12 @@ def report(flags: Flags, walks: Mapping[Case, Walked]) -> Path:
     """Write the report with its pictures and its numbers as JSON.
 
     Args:
-        flags: what was asked for.
+        flags: the flags.
         walks: the walks.
     """
     names = list(plants(flags))
-    spent = np.concatenate([row.seconds for row in walks.values()] or [np.zeros(0)])
+    seconds = np.concatenate([row.seconds for row in walks.values()] or [np.zeros(0)])
+    times = 1e3 * seconds
     window = flags.window * TuneConfig().rollout.walk.gait.tick
     counts = {"plant": len(names), "trajectory": len(flags.trajectories), "start": len(flags.sets)}
     plural = {"plant": "plants", "trajectory": "trajectories", "start": "starts"}
@@ -369,11 +361,11 @@ def report(flags: Flags, walks: Mapping[Case, Walked]) -> Path:
         f"The {math.prod(counts.values())} walks of an arm are {crossed}, not independent of each "
         "other:",
         "\n".join(verdicts(flags, walks)),
-        f"A gradient over {window:g} s of walking with its step took {1e3 * np.median(spent):.0f} "
-        f"ms of processor time in the median, {1e3 * np.percentile(spent, 5):.0f} to "
-        f"{1e3 * np.percentile(spent, 95):.0f} ms from the 5th to the 95th percentile; the first "
+        f"A gradient over {window:g} s of walking with its step took {np.median(times):.0f} "
+        f"ms of processor time in the median, {np.percentile(times, 5):.0f} to "
+        f"{np.percentile(times, 95):.0f} ms from the 5th to the 95th percentile; the first "
         "of a process is compiled."
-        if len(spent)
+        if len(seconds)
         else "No arm was tuned.",
         "Before is the walk until the change and after the rest; where there are several plants, "
         "medians over them, and in brackets the least and the largest.",
@@ -388,8 +380,8 @@ def report(flags: Flags, walks: Mapping[Case, Walked]) -> Path:
             " / ".join(case): {name: value.tolist() for name, value in row._asdict().items()}
             for case, row in walks.items()
         },
-        "seconds": {"median": float(np.median(spent)), "least": float(spent.min())}
-        if len(spent)
+        "seconds": {"median": float(np.median(seconds)), "least": float(seconds.min())}
+        if len(seconds)
         else None,
     }
     return write_report(
@@ -405,30 +397,26 @@ def report(flags: Flags, walks: Mapping[Case, Walked]) -> Path:
 def _draw(
     flags: Flags, walks: Mapping[Case, Walked], names: Sequence[str], window: float
 ) -> dict[str, str]:
-    """Captions of the pictures by their names."""
+    """Draw the pictures; returns their captions by name."""
     times = WINDOW * (np.arange(round(flags.seconds / WINDOW)) + 0.5)
     arms = [arm for arm in plots.ARM_LINES if arm in flags.arms]
     curves = {
-        (trajectory, which): {
-            arm: np.stack([walks[Case(p, trajectory, which, arm)].loss for p in names])
-            for arm in arms
-        }
-        for trajectory in flags.trajectories
-        for which in flags.sets
+        group: {arm: np.stack([walks[Case(p, *group, arm)].loss for p in names]) for arm in arms}
+        for group in itertools.product(flags.trajectories, flags.sets)
     }
     caption = plots.while_walking(flags.out / "loss.png", flags.change, times, curves)
     captions = {"loss.png": caption}
-    for which in flags.sets if "carried" in flags.arms else ():
-        rows = {t: walks[Case(names[0], t, which, "carried")].weights for t in flags.trajectories}
+    for start in flags.sets if "carried" in flags.arms else ():
+        rows = {t: walks[Case(names[0], t, start, "carried")].weights for t in flags.trajectories}
         histories = {t: weights / weights[0] for t, weights in rows.items() if len(weights)}
         if not histories:  # no window ended within a walk
             continue
         ends = window * np.arange(1, 1 + max(map(len, histories.values())))
-        file = f"weights-{which}.png"
+        file = f"weights-{start}.png"
         caption = plots.weight_histories(
             flags.out / file, flags.change, ends, weight_names(), histories
         )
-        captions[file] = f"Start: {which}, plant {names[0]}. {caption}"
+        captions[file] = f"Start: {start}, plant {names[0]}. {caption}"
     return captions
 
 

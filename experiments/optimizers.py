@@ -1,15 +1,17 @@
-"""Ways to tune the weights with walks on a simulator, each asked in rounds what it walks next.
+"""Optimizers of the weights by walks on a simulator, which propose the walks of each round.
 
-An optimizer is a pure function of what was walked: the start alone, then a `Generation` for each of
-its rounds. So a benchmark can be cut and taken up, optimizers go in lock-step and think in other
-processes. All move in 18 log-weights inside the box, from one start. Those that follow the gradient
-of a model learn nothing from the walks: theirs is a `Given` list of weights, which is only judged.
+An optimizer is a pure function of the walks so far: the start alone, then a `Generation` for each
+of its rounds. So a benchmark can be interrupted and continued, optimizers run in lock-step and
+compute in other processes. All move in 18 log-weights inside the box, from one start. Methods that
+follow the gradient of a model learn nothing from the walks: they are a `Given` list of weights,
+which is only evaluated.
 """
 
 import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from typing import Any, Protocol, runtime_checkable
 
@@ -34,39 +36,39 @@ from hector_jax.search.cmaes import CmaSearch, Generation, SearchConfig, log_bou
 from hector_jax.tuning.difftune import Iteration, TuneConfig, step_status, step_weights, tune_step
 
 DIM = len(direction_names())
-Steps = Float[np.ndarray, "walks 18"]  # log-weights, less those of the start
+Steps = Float[np.ndarray, "walks 18"]  # log-weights less those of the start
 
 
 @runtime_checkable
 class Optimizer(Protocol):
-    """Chooses what is walked next."""
+    """Method that proposes the next walks."""
 
     @property
     def most(self) -> int:
-        """Walks in a round, at most."""
+        """Largest number of walks in a round."""
         ...
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
-        """What to walk next; nothing once it has ended. `past` begins with the start itself."""
+        """Return the steps to walk next, none after the end. `past` begins with the start."""
         ...
 
 
 def steps_to(start: Weights, weights: Weights) -> Float[np.ndarray, "18"]:
-    """Steps in log-weights from a start to weights whose feet share one R."""
+    """Return the steps in log-weights from a start to weights whose feet share one R."""
     flat = [np.asarray(weights_to_vector(w), float) for w in (weights, start)]
     return np.log(flat[0] / flat[1])[directions().argmax(axis=1)]
 
 
 @dataclass(frozen=True)
 class Random:
-    """Draws about the start, whatever came."""
+    """Random draws about the start."""
 
     seed: int = 0
     spread: float = 1.0  # standard deviation of each log-weight
     most: int = 10
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
-        """The next draws, those outside the box moved to its edge."""
+        """Return the next draws, clipped to the box."""
         draws = np.random.default_rng([self.seed, len(past)]).normal(size=(self.most, DIM))
         return np.clip(self.spread * draws, *log_bounds(start).T)
 
@@ -79,11 +81,11 @@ class CmaEs:
 
     @property
     def most(self) -> int:
-        """Its population."""
+        """Population of the search."""
         return self.config.population
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
-        """Its next generation."""
+        """Return the next generation."""
         search = CmaSearch(self.config, start)
         search.replay(past[1:])
         return np.zeros((0, DIM)) if search.stop else search.ask()
@@ -94,8 +96,8 @@ class Bayes:
     """Bayesian optimisation: the largest expected improvement under a Gaussian process.
 
     The process is fitted to log L with a Matern 5/2 kernel that has a length for each weight, and
-    noise. The first round is that of `Random`; later ones are chosen one by one, what is chosen
-    being taken for the best loss so far until it is walked (constant liar).
+    noise. The first round is that of `Random`; in later rounds the points are chosen one by one,
+    and until a chosen point is walked its loss is assumed to be the best so far (constant liar).
     """
 
     seed: int = 0
@@ -104,7 +106,7 @@ class Bayes:
     most: int = 10
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
-        """The next round.
+        """Return the next round.
 
         Raises:
             InputError: scikit-learn, of the extra `race`, is not installed.
@@ -121,7 +123,7 @@ class Bayes:
             return np.clip(first, *box.T)
         rng = np.random.default_rng([self.seed, len(past)])
         with threadpool_limits(1), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # lengths at their bounds
+            warnings.simplefilter("ignore")  # of lengths at their bounds
             return self._choose(rng, box, past)
 
     def _choose(
@@ -134,7 +136,7 @@ class Bayes:
         losses = np.concatenate([generation.losses for generation in past])
         losses = np.where(np.isfinite(losses), losses, losses[np.isfinite(losses)].max())
         logs = np.log(losses)
-        lengths: Any = np.full(DIM, 3.0)  # the stubs say float, the page of the class an array too
+        lengths: Any = np.full(DIM, 3.0)  # the stubs say float, the documentation also an array
         matern = Matern(lengths, length_scale_bounds=(0.3, 100.0), nu=2.5)
         kernel = ConstantKernel(1.0, (1e-2, 1e2)) * matern + WhiteKernel(1e-2, (1e-6, 1.0))
         fitted = GaussianProcessRegressor(
@@ -143,15 +145,14 @@ class Bayes:
             n_restarts_optimizer=1,
             random_state=int(rng.integers(2**31)),
         ).fit(steps, logs)
-        keep: Any = None  # the kernel; the stubs do not know that it can be None
-        process = GaussianProcessRegressor(fitted.kernel_, optimizer=keep, normalize_y=True)
+        fixed: Any = None  # no fit of the kernel; the stubs do not know that it can be None
+        process = GaussianProcessRegressor(fitted.kernel_, optimizer=fixed, normalize_y=True)
         for _ in range(self.most):
             process.fit(steps, logs)
             near = steps[np.argsort(logs)[:5]]
-            spot = _most_promising(
-                rng, box, near, lambda x: process.predict(x, return_std=True), logs.min()
-            )
-            steps, logs = np.vstack([steps, spot]), np.append(logs, logs.min())
+            predict = partial(process.predict, return_std=True)
+            point = _most_promising(rng, box, near, predict, logs.min())
+            steps, logs = np.vstack([steps, point]), np.append(logs, logs.min())
         return steps[-self.most :]
 
 
@@ -162,31 +163,31 @@ def _most_promising(
     predict: Callable,
     least: float,
 ) -> Float[np.ndarray, "18"]:
-    """Where the expected improvement is largest: draws all over, about the best, then refined."""
+    """Maximise the expected improvement: draws in the box and near the best, then refined."""
 
-    def gain(at: np.ndarray) -> np.ndarray:
-        mean, deviation = predict(at)
+    def gain(points: np.ndarray) -> np.ndarray:
+        mean, deviation = predict(points)
         z = (least - mean) / np.maximum(deviation, 1e-12)
         return deviation * (z * norm.cdf(z) + norm.pdf(z))
 
     low, high = box.T
     width = np.exp(rng.uniform(np.log(0.03), 0.0, (2048, 1)))
     about = near[rng.integers(len(near), size=2048)] + width * rng.normal(size=(2048, DIM))
-    tried = np.clip(np.vstack([rng.uniform(low, high, (2048, DIM)), about]), low, high)
-    gains = gain(tried)
+    points = np.clip(np.vstack([rng.uniform(low, high, (2048, DIM)), about]), low, high)
+    gains = gain(points)
     for width in (0.3, 0.2, 0.1, 0.05, 0.02):
-        best, most = tried[gains.argmax()], gains.max()
+        best, most = points[gains.argmax()], gains.max()
         around = np.clip(best + width * rng.normal(size=(256, DIM)), low, high)
-        tried, gains = np.vstack([best, around]), np.append(most, gain(around))
-    return tried[gains.argmax()]
+        points, gains = np.vstack([best, around]), np.append(most, gain(around))
+    return points[gains.argmax()]
 
 
 @dataclass(frozen=True)
 class Differences:
-    """DiffTune's step along a gradient of the simulator itself, by forward differences.
+    """DiffTune's step along a gradient of the simulator, by forward differences.
 
-    A round of 18 walks makes a gradient, one more walk judges the step; a step that raises the loss
-    is halved and tried again along the same gradient.
+    A round of 18 walks gives a gradient, one more walk evaluates the step; a step that raises the
+    loss is halved and tried again along the same gradient.
     """
 
     tune: TuneConfig
@@ -194,46 +195,46 @@ class Differences:
     most: int = DIM
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
-        """The 18 neighbours of where it is, or the next step."""
+        """Return the 18 neighbours of the current point, or the next step."""
         box = log_bounds(start)
-        at, loss = past[0].steps[0], past[0].losses[0]
-        share, gradient, offsets = 1.0, None, self._offsets(box, at)
+        point, loss = past[0].steps[0], past[0].losses[0]
+        scale, gradient, offsets = 1.0, None, self._offsets(box, point)
         for generation in past[1:]:
             if gradient is None:
                 slopes = (generation.losses - loss) / offsets
                 gradient = np.where(np.isfinite(slopes), slopes, 0.0)
             elif generation.losses[0] < loss:
-                at, loss = generation.steps[0], generation.losses[0]
-                share, gradient, offsets = min(1.0, 2.0 * share), None, self._offsets(box, at)
+                point, loss = generation.steps[0], generation.losses[0]
+                scale, gradient, offsets = min(1.0, 2.0 * scale), None, self._offsets(box, point)
             else:
-                share /= 2.0
+                scale /= 2.0
         if gradient is None:
-            return np.asarray(at + np.diag(offsets))
-        if share < self.tune.smallest_step:
+            return np.asarray(point + np.diag(offsets))
+        if scale < self.tune.smallest_step:
             return np.zeros((0, DIM))
-        return self._step_from(start, at, gradient, share)[None]
+        return self._step_from(start, point, gradient, scale)[None]
 
-    def _offsets(self, box: np.ndarray, at: np.ndarray) -> Float[np.ndarray, "18"]:
-        return np.where(at + self.step > box[:, 1], -self.step, self.step)
+    def _offsets(self, box: np.ndarray, point: np.ndarray) -> Float[np.ndarray, "18"]:
+        return np.where(point + self.step > box[:, 1], -self.step, self.step)
 
     def _step_from(
-        self, start: Weights, at: np.ndarray, gradient: np.ndarray, share: float
+        self, start: Weights, point: np.ndarray, gradient: np.ndarray, scale: float
     ) -> Float[np.ndarray, "18"]:
-        weights = project(start, at)
+        weights = project(start, point)
         flat = (gradient @ directions()) / np.asarray(weights_to_vector(weights))
         tree = jax.tree.map(np.asarray, vector_to_weights(jnp.asarray(flat)))
-        return steps_to(start, step_weights(self.tune, weights, tree, share))
+        return steps_to(start, step_weights(self.tune, weights, tree, scale))
 
 
 @dataclass(frozen=True)
 class Given:
-    """Weights that were found elsewhere, in their order."""
+    """Weights from elsewhere, in their order."""
 
     steps: tuple[tuple[float, ...], ...]
     most: int = 10
 
     def ask(self, start: Weights, past: Sequence[Generation]) -> Steps:
-        """The next of them."""
+        """Return the next weights."""
         done = sum(len(generation.losses) for generation in past[1:])
         return np.array(self.steps[done : done + self.most], float).reshape(-1, DIM)
 
@@ -248,14 +249,15 @@ def adam(
     effect: jax.tree_util.Partial,
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
 ) -> list[Iteration]:
-    """Adam in log-weights on the model, the feet sharing one R, projected onto the box.
+    """Run Adam in log-weights on the model with one R for all feet, projected onto the box.
+
+    Weights that fall or cannot be solved are rejected: the step is undone and the rate halved.
 
     Args:
-        config: rollouts, loss, how many iterations, and what is refused: weights that fall or
-            cannot be solved, from which it goes back and halves its rate.
+        config: rollouts, loss, number of iterations and limits of the rejection.
         rate: of Adam, in log-weights.
-        robot, weights, command, anchor, effect: as of `difftune.tune`.
-        on_iteration: called after each iteration, the start being iteration 0.
+        robot, weights, command, anchor, effect: see `difftune.tune`.
+        on_iteration: called after each iteration; the start is iteration 0.
 
     Raises:
         InputError: the starting weights fall or cannot be solved on the model.
@@ -263,29 +265,29 @@ def adam(
     optimiser, box = optax.adam(1.0), log_bounds(weights)
     history: list[Iteration] = []
 
-    def look(steps: np.ndarray, share: float) -> Iteration:
-        at = project(weights, steps)
-        evaluation = jax.tree.map(np.asarray, tune_step(config, robot, at, command, anchor, effect))
-        row = len(history), at, evaluation, step_status(config, evaluation), share
+    def evaluate(steps: np.ndarray, scale: float) -> Iteration:
+        trial = project(weights, steps)
+        evaluation = jax.device_get(tune_step(config, robot, trial, command, anchor, effect))
+        row = len(history), trial, evaluation, step_status(config, evaluation), scale
         iteration = Iteration(*jax.tree.map(np.asarray, row))
         history.append(iteration)
         on_iteration(iteration)
         return iteration
 
-    at = np.zeros(DIM)
-    best, state, share = look(at, 0.0), optimiser.init(at), 1.0
+    steps = np.zeros(DIM)
+    best, state, scale = evaluate(steps, 0.0), optimiser.init(steps), 1.0
     if not best.accepted:
         raise InputError(f"the starting weights cannot be tuned from: {best.reason}")
     for _ in range(config.iterations):
-        flat = jax.tree.map(np.multiply, best.evaluation.gradient, best.weights)
-        gradient = directions() @ np.asarray(weights_to_vector(flat))
-        update, later = optimiser.update(gradient, state)
-        trial = np.clip(at + share * rate * np.asarray(update), *box.T)
-        iteration = look(trial, share)
+        logs = jax.tree.map(np.multiply, best.evaluation.gradient, best.weights)
+        gradient = directions() @ np.asarray(weights_to_vector(logs))
+        update, next_state = optimiser.update(gradient, state)
+        trial = np.clip(steps + scale * rate * np.asarray(update), *box.T)
+        iteration = evaluate(trial, scale)
         if iteration.accepted:
-            at, best, state, share = trial, iteration, later, min(1.0, 2.0 * share)
+            steps, best, state, scale = trial, iteration, next_state, min(1.0, 2.0 * scale)
         else:
-            share /= 2.0
-        if share < config.smallest_step:
+            scale /= 2.0
+        if scale < config.smallest_step:
             break
     return history

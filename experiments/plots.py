@@ -65,7 +65,7 @@ def front(
         path: file to write.
         prices: factors of the paper's loss weights.
         worlds: by name, tracking and L_ctrl by price.
-        others: the same of other weight sets, in the world named last.
+        others: tracking and L_ctrl of other weight sets, in the last world.
     """
     with drawing(path, 4.0 * len(worlds), 3.6) as figure:
         panels = figure.subplots(1, len(worlds), squeeze=False)[0]
@@ -93,11 +93,11 @@ def front(
 
 
 def starts(path: Path, curves: Float[np.ndarray, "starts iterations"]) -> str:
-    """Draw the loss by iteration from several starts, and where they end.
+    """Draw the loss by iteration from several starts, and the final losses.
 
     Args:
         path: file to write.
-        curves: losses that were accepted, NaN elsewhere; the first row starts at nominal.
+        curves: accepted losses, NaN elsewhere; the first row starts at nominal.
     """
     with drawing(path, 7.5, 3.4) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True)
@@ -139,8 +139,8 @@ def while_walking(
 
     Args:
         path: file to write.
-        change: when the plant changes [s].
-        times: middles of the windows of which the losses are [s].
+        change: time of the change of the plant [s].
+        times: middles of the windows of the losses [s].
         curves: losses by trajectory and start weights, the columns and rows of panels, and by arm.
     """
     columns, rows = (list(dict.fromkeys(key[i] for key in curves)) for i in (0, 1))
@@ -166,29 +166,24 @@ def weight_histories(
     names: Sequence[str],
     histories: Mapping[str, Float[np.ndarray, "steps weights"]],
 ) -> str:
-    """Draw the weights that moved most while walking, as ratios to where they started.
+    """Draw the weights that changed most while walking, as ratios to their start.
 
     Args:
         path: file to write.
-        change: when the plant changes [s].
+        change: time of the change of the plant [s].
         times: of the steps [s].
         names: of the weights.
         histories: ratios by trajectory; a walk that ended early has fewer steps.
     """
-    looks = list(
-        zip(
-            (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, "0.35", "black"),
-            "osD^vP",
-            strict=True,
-        )
-    )
+    colors = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, "0.35", "black")
+    looks = list(zip(colors, "osD^vP", strict=True))
     single = [i for i, name in enumerate(names) if not name.endswith("_right")]
     with drawing(path, 3.3 * len(histories) + 0.2, 3.4, legend_columns=0) as figure:
         panels = figure.subplots(1, len(histories), squeeze=False)[0]
         for panel, (trajectory, ratios) in zip(panels, histories.items(), strict=True):
             panel.axvline(change, **style.MARK)
-            moved = np.abs(np.log(ratios[:, single])).max(axis=0)
-            for i, (color, mark) in zip(np.argsort(-moved), looks, strict=False):
+            change_of = np.abs(np.log(ratios[:, single])).max(axis=0)
+            for i, (color, mark) in zip(np.argsort(-change_of), looks, strict=False):
                 label = style.weight_label(names[single[int(i)]].removesuffix("_left"))
                 look = {"color": color, "marker": mark, "markersize": 2.6, "label": label}
                 panel.plot(times[: len(ratios)], ratios[:, single[i]], **look)
@@ -200,7 +195,7 @@ def weight_histories(
     return f"The {len(looks)} weights that moved most; both feet share one R."
 
 
-METHODS = {  # words for the ways of tuning that race
+METHODS = {  # labels of the methods
     "without": "DiffTune without net",
     "with": "DiffTune with net",
     "adam": "Adam with net",
@@ -228,12 +223,12 @@ def race(
     curves: Mapping[str, Sequence[tuple[Float[np.ndarray, " walks"], Float[np.ndarray, " walks"]]]],
     abscissa: str,
 ) -> str:
-    """Draw the lowest loss so far of each way of tuning: its repeats, and their median.
+    """Draw the lowest loss so far of each method: its repeats, and their median.
 
     Args:
         path: file to write.
         curves: by method, abscissa and loss of each repeat.
-        abscissa: what the losses are drawn against.
+        abscissa: label of the abscissa.
     """
     with drawing(path, 7.0, 4.4, legend_columns=3) as figure:
         axes = figure.subplots()
@@ -255,7 +250,7 @@ def race(
 
 
 def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Draw the loss against the baseline and the share of walks without a fall, a row each.
+    """Draw the loss against the baseline and the share of walks without a fall, by disturbance.
 
     Args:
         path: file to write.
@@ -269,8 +264,8 @@ def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
         for i, (name, look) in enumerate(looks.items()):
             y = at + 0.25 * ((len(looks) - 1) / 2 - i)
             ratio = np.array([row[name].ratio for row in rows.values()])
-            stood = 100 * np.array([row[name].survived for row in rows.values()])
-            for panel, (value, low, high) in zip(panels, (ratio.T, stood.T), strict=True):
+            survived = 100 * np.array([row[name].survived for row in rows.values()])
+            for panel, (value, low, high) in zip(panels, (ratio.T, survived.T), strict=True):
                 panel.plot(value, y, **look.dot, label=label_of(name))
                 panel.hlines(y, low, high, color=look.color, linewidth=1.2)
         panels[0].axvline(1.0, color="black", linewidth=0.8, zorder=1)
@@ -285,19 +280,19 @@ def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:
     )
 
 
-def push_directions(path: Path, endured: Mapping[str, Float[np.ndarray, "8"]]) -> str:
-    """Draw the largest push survived, by the direction in which it pushes.
+def push_directions(path: Path, pushes: Mapping[str, Float[np.ndarray, "8"]]) -> str:
+    """Draw the largest push survived, by its direction.
 
     Args:
         path: file to write.
-        endured: [N] by set, in steps of 45 degrees to the left, the first ahead.
+        pushes: [N] by set, in steps of 45 degrees to the left, the first ahead.
     """
     angles = np.deg2rad(45.0 * np.arange(9))
     with drawing(path, 4.6, 4.4, legend_columns=3) as figure:
         axes: Any = figure.subplots(subplot_kw={"projection": "polar", "theta_offset": np.pi / 2})
-        for name, look in looks_of(endured).items():
+        for name, look in looks_of(pushes).items():
             line = {"marker": look.marker, "label": label_of(name), **look.line}
-            forces = np.append(endured[name], endured[name][0])
+            forces = np.append(pushes[name], pushes[name][0])
             axes.plot(angles, forces, markersize=3.5, **line)
         axes.set_rmin(0.0)
         axes.set_rlabel_position(22.5)
@@ -330,8 +325,8 @@ def gradients(
     Args:
         path: file to write.
         names: of the weights.
-        simulator: those of the hfs by start phase.
-        models: those of the model likewise, by the name of a phi.
+        simulator: gradients on the hfs by start phase.
+        models: gradients on the model by phi, then by start phase.
     """
     at, width = np.arange(len(names)), 0.8 / len(models)
     with drawing(path, 10.0, 4.2, legend_columns=3) as figure:
@@ -371,8 +366,8 @@ def ranks(
     Args:
         path: file to write.
         simulator: losses on the hfs by trajectory and factor, the rows and columns of panels.
-        models: losses on the model, likewise and by the name of a phi.
-        correlations: of ranks, likewise.
+        models: losses on the model by trajectory and factor, then by phi.
+        correlations: rank correlations by trajectory and factor, then by phi.
     """
     trajectories, factors = (list(dict.fromkeys(k[i] for k in simulator)) for i in (0, 1))
     size = (3.3 * len(trajectories) + 0.2, 3.0 * len(factors) + 0.4)

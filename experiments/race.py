@@ -55,13 +55,13 @@ from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
-MARKS = (25, 50, 100, 200)  # walks after which the table has the lowest loss
+MARKS = (25, 50, 100, 200)  # the table has the lowest loss after so many walks
 ON_MODEL = ("without", "with", "adam")
 WITH_NET = ("with", "adam")
-NEAR = 3.0  # log-weights: a factor of 20 either way
+NEAR = 3.0  # log-weights: a factor of 20 up and down
 # modules that decide the numbers
 CODE = ("search.cmaes", "tuning.difftune", "grfm.network", "sim.walk", "sim.parallel")
-OPTIMIZERS = Path(optimizers.__file__).read_text()  # likewise
+OPTIMIZERS = Path(optimizers.__file__).read_text()  # part of the cache keys, as CODE
 RATE = 0.05  # of Adam, in log-weights: DiffTune's step in Q
 
 
@@ -80,46 +80,46 @@ class Flags:
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:
-        one = AT_LEAST_ONE
-        check(self, rollouts=one, repeats=one, ticks=one, batch=Range(4), processes=one)
+        count = AT_LEAST_ONE
+        check(self, rollouts=count, repeats=count, ticks=count, batch=Range(4), processes=count)
 
 
 class ModelRun(NamedTuple):
-    """Weights that a method found on the model, one after the other, without those rejected."""
+    """Accepted weights of a method on the model, in their order."""
 
     steps: list[list[float]]  # in 18 log-weights
-    seconds: list[float]  # on the model, until each; what was rejected is paid for too
-    compiling: float  # [s], before
-    iterations: int  # of the model, rejected ones too
-    iteration: float  # [s] each
+    seconds: list[float]  # computing time until each, including rejected iterations
+    compiling: float  # [s], not in `seconds`
+    iterations: int  # number, including the rejected
+    iteration: float  # [s] mean time
 
 
 class Prices(NamedTuple):
-    """Seconds of one core, measured here."""
+    """Seconds of one core, measured on this machine."""
 
-    walk: float  # on the hfs in MuJoCo C, as long as those of the race
-    iterations: dict[str, float]  # on the model with its gradient, by method
-    collection: float  # for the net: its walks, and the plain tunings that they follow
-    training: float  # of the net; zero where it was made before
+    walk: float  # of a walk of the race on the hfs, in MuJoCo C
+    iterations: dict[str, float]  # of an iteration on the model with its gradient, by method
+    collection: float  # of the walks for the net, and of the plain tunings before them
+    training: float  # of the net; zero if the net was given
 
 
 class Repeat(NamedTuple):
-    """One repeat of a method."""
+    """A repeat of a method."""
 
     rounds: list[Round]
-    lowest: np.ndarray  # loss after each walk, that of the start first
-    seconds: np.ndarray  # of one core after each of them
+    lowest: np.ndarray  # loss after each walk, first that of the start
+    seconds: np.ndarray  # of one core after each walk
 
 
 class Results(NamedTuple):
-    """What the report is made of."""
+    """Contents of the report."""
 
     engine: str
     start: float  # loss
     methods: dict[str, list[Repeat]]
     model: dict[str, ModelRun]
     prices: Prices
-    took: dict[str, float] | None  # [s] collection and training here; None where made before
+    took: dict[str, float] | None  # [s] collection and training; None if the net was given
 
 
 def _model_job(
@@ -131,11 +131,11 @@ def _model_job(
     jax.block_until_ready(first)
     compiled = time.monotonic()
     rows: list[tuple[Iteration, float]] = []
-    note = lambda iteration: rows.append((iteration, time.monotonic() - compiled))  # noqa: E731
+    record = lambda iteration: rows.append((iteration, time.monotonic() - compiled))  # noqa: E731
     if method == "adam":
-        adam(config, RATE, robot, start, command, anchor, effect, note)
+        adam(config, RATE, robot, start, command, anchor, effect, record)
     else:
-        difftune.tune(config, robot, start, command, anchor, effect, note)
+        difftune.tune(config, robot, start, command, anchor, effect, record)
     accepted = [(i.weights, seconds) for i, seconds in rows[1:] if i.accepted]
     return ModelRun(
         [steps_to(start, weights).tolist() for weights, _ in accepted],
@@ -147,7 +147,7 @@ def _model_job(
 
 
 def _price_job(config: TuneConfig, robot: Robot, command: Command) -> float:
-    """Seconds of a walk, the mean of three, when all is compiled."""
+    """Measure the seconds of a compiled walk, as the mean of three."""
     seconds = config.rollout.ticks * config.rollout.walk.gait.tick
     job = Job(nominal(), command, hfs(), seconds)
     walk(config.rollout.walk, robot, job)
@@ -157,7 +157,7 @@ def _price_job(config: TuneConfig, robot: Robot, command: Command) -> float:
     return (time.monotonic() - begin) / 3
 
 
-def _think_job(
+def _propose_job(
     optimizer: Optimizer, start: Weights, past: Sequence[Generation]
 ) -> tuple[Steps, float]:
     begin = time.monotonic()
@@ -165,19 +165,19 @@ def _think_job(
 
 
 def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[str, float] | None]:
-    """The net, and how long it took [s] where it was made here."""
+    """Return the net, and the times of its making [s]; None if the net was given."""
     if flags.net is not None:
         return load_net(flags.net, robot, TrainConfig().variant)[0], None
     folder, part = flags.out / "data", flags.out / "data.part"
     if not folder.exists():
-        shutil.rmtree(part, ignore_errors=True)  # a cut would leave its seconds unknown
+        shutil.rmtree(part, ignore_errors=True)  # after an interruption its seconds are unknown
         begin = time.monotonic()
         nets.collect(pool, nets.CollectConfig(), robot, part / "walks")  # see `load_or_train`
         collected = time.monotonic()
         path = nets.net_path(part, TrainConfig().variant)
         nets.train(TrainConfig(), robot, part / "walks", path)
-        took = {"collection": collected - begin, "training": time.monotonic() - collected}
-        write_json(part / "seconds.json", took)
+        seconds = {"collection": collected - begin, "training": time.monotonic() - collected}
+        write_json(part / "seconds.json", seconds)
         part.rename(folder)
     took = read_json(folder / "seconds.json", "the seconds of a collection and a training")
     return nets.load_or_train(pool, robot, folder).params, took
@@ -191,20 +191,19 @@ def on_model(
     command: Command,
     params: Params,
 ) -> tuple[dict[str, ModelRun], float]:
-    """Runs of the methods that follow the model, and the seconds of a walk; kept under OUT."""
-    # seconds are kept too: they are of this code and so many at once
-    made = flags.processes, environment().get("commit")
-    key = content_key(config, RATE, command, params, robot, repr(made), OPTIMIZERS, code=CODE)
+    """Run the methods on the model and measure the seconds of a walk; cached under OUT."""
+    # the seconds depend on the commit and on the number of processes
+    about = repr((flags.processes, environment().get("commit")))
+    key = content_key(config, RATE, command, params, robot, about, OPTIMIZERS, code=CODE)
     path = flags.out / f"model-{key}.json"
     if not path.exists():
-        with bar("tuning on the model, and the price of a walk") as tell:
-            tell(0, len(ON_MODEL), "compiling")
+        with bar("tuning on the model, and the price of a walk") as report_progress:
+            report_progress(0, len(ON_MODEL), "compiling")
             price = pool.submit(_price_job, config, robot, command).result()
-            through = {name: params if name in WITH_NET else None for name in ON_MODEL}
-            running = {
-                name: pool.submit(_model_job, name, config, robot, command, net)
-                for name, net in through.items()
-            }
+            running = {}
+            for name in ON_MODEL:
+                net = params if name in WITH_NET else None
+                running[name] = pool.submit(_model_job, name, config, robot, command, net)
             runs = {name: future.result()._asdict() for name, future in running.items()}
         write_json(path, {"walk": price, "courses": runs})
     data = read_json(path, "runs on the model")
@@ -214,10 +213,10 @@ def on_model(
 def all_contestants(
     flags: Flags, config: TuneConfig, model: Mapping[str, ModelRun]
 ) -> dict[str, dict[str, Optimizer]]:
-    """All who race, by method and repeat."""
+    """Return all optimizers, by method and repeat."""
     size, seeds = flags.batch, range(flags.repeats)
     budget = max(flags.rollouts // size, 1) * size
-    drawn = {
+    random = {
         "cma-es": lambda seed: CmaEs(SearchConfig(budget, size, seed)),
         "bayes near": lambda seed: Bayes(seed, NEAR, most=size),
         "bayes": lambda seed: Bayes(seed, most=size),
@@ -226,7 +225,7 @@ def all_contestants(
     return {
         **{n: {n: Given(tuple(map(tuple, run.steps)), size)} for n, run in model.items()},
         "differences": {"differences": Differences(config)},
-        **{name: {f"{name} {i}": make(i) for i in seeds} for name, make in drawn.items()},
+        **{name: {f"{name} {i}": make(i) for i in seeds} for name, make in random.items()},
     }
 
 
@@ -239,8 +238,8 @@ def race(
     engine: Engine,
     contestants: Mapping[str, Optimizer],
 ) -> BenchmarkResult:
-    """The race, taking up its journal."""
-    size = sum(one.most for one in contestants.values())
+    """Run the race, continuing its journal."""
+    size = sum(optimizer.most for optimizer in contestants.values())
     about = {
         "trajectory": flags.traj,
         "engine": engine.name,
@@ -254,10 +253,10 @@ def race(
         "settings": content_key(sorted(contestants.items()), OPTIMIZERS, code=CODE),
     }
 
-    def think(
-        waiting: Mapping[str, tuple[Optimizer, Weights, Sequence[Generation]]],
+    def propose(
+        inputs: Mapping[str, tuple[Optimizer, Weights, Sequence[Generation]]],
     ) -> dict[str, tuple[Steps, float]]:
-        running = {name: pool.submit(_think_job, *one) for name, one in waiting.items()}
+        running = {name: pool.submit(_propose_job, *row) for name, row in inputs.items()}
         return {name: future.result() for name, future in running.items()}
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
@@ -266,20 +265,20 @@ def race(
             pool, config, robot, sets, engine=engine, at_once=size, commands=commands
         )
 
-    with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as tell:
+    with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as report_progress:
 
         def on_round(result: BenchmarkResult) -> None:
             done = sum(map(walks, result.rounds.values()))
             best = {n: lowest(result.start, rounds)[-1] for n, rounds in result.rounds.items()}
             first = min(best, key=best.__getitem__)
-            remark = f"first {first}, L {best[first] / 1e6:.3f}e6" if done else "compiling"
-            tell(done, flags.rollouts * len(contestants), remark)
+            message = f"first {first}, L {best[first] / 1e6:.3f}e6" if done else "compiling"
+            report_progress(done, flags.rollouts * len(contestants), message)
 
         return benchmark(
             contestants,
             nominal(),
             flags.rollouts,
-            think=think,
+            propose=propose,
             walk=walk,
             path=flags.out / "race.jsonl",
             about=about,
@@ -290,14 +289,14 @@ def race(
 def seconds_spent(
     name: str, rounds: Sequence[Round], model: Mapping[str, ModelRun], prices: Prices
 ) -> np.ndarray:
-    """Seconds of one core after each walk, that of the start first."""
+    """Return the seconds of one core after each walk, first that of the start."""
     if name in model:
-        thought = np.diff([0.0, *model[name].seconds[: walks(rounds)]])
+        computing = np.diff([0.0, *model[name].seconds[: walks(rounds)]])
     else:
-        each = [np.full(len(r.walked.losses), r.seconds / len(r.walked.losses)) for r in rounds]
-        thought = np.concatenate([np.zeros(0), *each])
+        parts = [np.full(n := len(r.generation.losses), r.seconds / n) for r in rounds]
+        computing = np.concatenate([np.zeros(0), *parts])
     before = prices.collection + prices.training if name in WITH_NET else 0.0
-    return before + np.concatenate([[0.0], np.cumsum(thought + prices.walk)])
+    return before + np.concatenate([[0.0], np.cumsum(computing + prices.walk)])
 
 
 def main() -> None:
@@ -315,9 +314,9 @@ def main() -> None:
         params = jax.tree.map(np.asarray, params)
         model, walk = on_model(pool, flags, config, robot, command, params)
         methods = all_contestants(flags, config, model)
-        every = {name: one for each in methods.values() for name, one in each.items()}
-        result = race(pool, flags, config, robot, command, engine, every)
-    full = RolloutConfig().ticks / flags.ticks  # data are walked, and their tunings run, 4 s each
+        contestants = {k: v for repeats in methods.values() for k, v in repeats.items()}
+        result = race(pool, flags, config, robot, command, engine, contestants)
+    full = RolloutConfig().ticks / flags.ticks  # walks and tunings of the collection have 4 s
     plain = model["without"]
     prices = Prices(
         walk,
@@ -328,38 +327,40 @@ def main() -> None:
 
     def repeat(method: str, name: str) -> Repeat:
         rounds = result.rounds[name]
-        spent = seconds_spent(method, rounds, model, prices)
-        return Repeat(rounds, lowest(result.start, rounds), spent)
+        seconds = seconds_spent(method, rounds, model, prices)
+        return Repeat(rounds, lowest(result.start, rounds), seconds)
 
-    repeats = {method: [repeat(method, name) for name in each] for method, each in methods.items()}
+    repeats = {m: [repeat(m, name) for name in contestants] for m, contestants in methods.items()}
     path = report(flags, Results(engine.name, result.start, repeats, model, prices, took))
     say(f"the report is {path}")
 
 
 def _millions(losses: Sequence[float]) -> str:
-    """Median of losses and, of several, their range [1e6]."""
-    middle = f"{statistics.median(losses) / 1e6:.3f}"
+    """Format the median of losses and, of several, their range [1e6]."""
+    median = f"{statistics.median(losses) / 1e6:.3f}"
     if len(losses) == 1:
-        return middle
-    return f"{middle} [{min(losses) / 1e6:.3f}, {max(losses) / 1e6:.3f}]"
+        return median
+    return f"{median} [{min(losses) / 1e6:.3f}, {max(losses) / 1e6:.3f}]"
 
 
 def as_numbers(flags: Flags, results: Results) -> dict[str, dict[str, Any]]:
-    """Numbers of the methods, for race.json."""
+    """Return the numbers of the methods for race.json."""
     marks = [mark for mark in MARKS if mark < flags.rollouts] + [flags.rollouts]
     return {
         method: {
             "best": {
-                str(mark): [float(one.lowest[min(mark, len(one.lowest) - 1)]) for one in each]
+                str(mark): [float(r.lowest[min(mark, len(r.lowest) - 1)]) for r in repeats]
                 for mark in marks
             },
-            "walks": [walks(one.rounds) for one in each],
-            "seconds": [float(one.seconds[-1]) for one in each],
-            "losses": [[x for r in one.rounds for x in r.walked.losses.tolist()] for one in each],
-            "spent": [one.seconds.tolist() for one in each],
-            "last": [float(one.rounds[-1].walked.losses[-1]) for one in each if one.rounds],
+            "walks": [walks(r.rounds) for r in repeats],
+            "seconds": [float(r.seconds[-1]) for r in repeats],
+            "losses": [
+                [x for part in r.rounds for x in part.generation.losses.tolist()] for r in repeats
+            ],
+            "spent": [r.seconds.tolist() for r in repeats],
+            "last": [float(r.rounds[-1].generation.losses[-1]) for r in repeats if r.rounds],
         }
-        for method, each in results.methods.items()
+        for method, repeats in results.methods.items()
     }
 
 
@@ -380,13 +381,13 @@ def report(flags: Flags, results: Results) -> Path:
     marks = next(iter(numbers.values()))["best"]
     head = ["method", "repeats", *(f"after {m}" for m in marks), "its own last", "walks", "s"]
     by_walks, by_seconds = (
-        {m: [(x(one), one.lowest) for one in each] for m, each in results.methods.items()}
-        for x in (lambda one: np.arange(len(one.lowest), dtype=float), lambda one: one.seconds)
+        {m: [(x(r), r.lowest) for r in repeats] for m, repeats in results.methods.items()}
+        for x in (lambda r: np.arange(len(r.lowest), dtype=float), lambda r: r.seconds)
     )
     out = flags.out
-    what = "walks on the high-fidelity simulator"
+    abscissa = "walks on the high-fidelity simulator"
     captions = {
-        "rollouts.png": plots.race(out / "rollouts.png", by_walks, what),
+        "rollouts.png": plots.race(out / "rollouts.png", by_walks, abscissa),
         "seconds.png": plots.race(out / "seconds.png", by_seconds, "seconds of one core")
         + " The methods with the net begin after its walks and its training.",
     }

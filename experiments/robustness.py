@@ -89,15 +89,15 @@ class Result(NamedTuple):
 
 
 def weight_sets(named: Sequence[str], robot: Robot | None = None) -> dict[str, Weights]:
-    """Nominal, expert and the files of NAME=FILE.
+    """Return nominal, expert and the weights of the files of NAME=FILE.
 
     Raises:
-        InputError: no NAME=FILE, a name that is taken, or a file that holds no weights.
+        InputError: no NAME=FILE, a name in use, or a file without weights.
     """
     sets = {BASELINE: nominal(robot), "expert": expert(robot)}
     for text in named:
         name, _, file = text.partition("=")
-        # names are parts of files' names, where other characters might make two of them one
+        # names are part of file names, where other characters might make two of them equal
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or not file or name in sets:
             raise InputError(
                 f"--set must be NAME=FILE, a new NAME of letters, digits and _, got {text!r}"
@@ -158,7 +158,7 @@ def main() -> None:
     }
     loss = loss_of_robot(body)
     with workers(flags.processes) as pool:
-        walked = walk_groups(
+        by_group = walk_groups(
             groups,
             partial(MUJOCO_C.walk, pool, config, robot),
             partial(metrics.score, loss),
@@ -169,7 +169,7 @@ def main() -> None:
             settings=(config, repr(loss)),
         )
     scores = {
-        (level, name): stack([walked[group(level, name, seed)] for seed in seeds])
+        (level, name): stack([by_group[group(level, name, seed)] for seed in seeds])
         for level in scenes
         for name in sets
     }

@@ -1,4 +1,4 @@
-"""Walks with something in the way, and what they tell of a weight set.
+"""Walks with disturbances, and the robustness of a weight set in them.
 
 Scenes have a kind and a level: a push of 50 N, a floor of friction 0.4. The scenes of one level
 differ in direction and gait phase; every set walks all of them on every plant. Two numbers describe
@@ -25,13 +25,13 @@ from hector_jax.sim.changes import TRUNK_TOP, Change
 from hector_jax.sim.world import NO_PUSH, Push
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
-PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk goes on until the robot has settled
-SLIPPERY = 1.0, 3.0  # [s] from when to when a floor is slippery
-PAYLOAD, PAYLOAD_LATE = 2.0, 2.0  # [kg], [s] when it is put on during a walk
+PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk includes the recovery
+SLIPPERY = 1.0, 3.0  # [s] start and end of a slippery floor
+PAYLOAD, PAYLOAD_LATE = 2.0, 2.0  # [kg]; [s] when it is put on in a walk
 SLOPE = np.deg2rad(3.0)
 _GAIT = GaitConfig()
 SLOPES = {"up": (SLOPE, 0.0), "down": (-SLOPE, 0.0), "left": (0.0, SLOPE), "right": (0.0, -SLOPE)}
-"""Where the floor rises, seen from the walk's start."""
+"""Slopes by the side to which the floor rises, seen from the walk's start."""
 
 
 class Scene(NamedTuple):
@@ -44,26 +44,26 @@ class Scene(NamedTuple):
 
 
 class Level(NamedTuple):
-    """What the scenes of a group have in common."""
+    """Kind and size of the disturbance of a group of scenes."""
 
     kind: str  # calm, push, friction, slope, payload or command
-    size: float | str  # [N] of a push, friction of a floor; else which
+    size: float | str  # [N] of a push, friction of a floor; else a name
 
     @property
     def name(self) -> str:
-        """Row name in a table."""
+        """Name of the row in a table."""
         size = self.size if isinstance(self.size, str) else f"{self.size:g}"
         return f"{self.kind} {size}" + (" N" if self.kind == "push" else "")
 
 
 class Cell(NamedTuple):
-    """One weight set in the scenes of a level."""
+    """Results of a weight set in the scenes of a level."""
 
     survived: Interval  # share of the walks without a fall
     ratio: Interval  # median of L / L of the baseline
     falls: int
     walks: int
-    counts: bool  # neither set falls more often than the other allows, see metrics
+    counts: bool  # the falls of both sets allow a comparison, see metrics
 
 
 @dataclass(frozen=True)
@@ -90,18 +90,18 @@ class SceneConfig:
 def make_scenes(
     config: SceneConfig, gait: GaitConfig = _GAIT, sizes: PlantSizes = HECTOR.plants
 ) -> dict[Level, list[Scene]]:
-    """All scenes by level; those of a push are ordered by direction, then by phase.
+    """Return all scenes by level; those of a push are ordered by direction, then by phase.
 
     Args:
-        config: which.
+        config: the scenes.
         gait: of the robot.
-        sizes: of its pushes, payloads and lengths.
+        sizes: of the robot's pushes, payloads and lengths.
     """
     command = named_command(config.traj)
     # t = 0 begins a cycle
-    later = gait.tick * gait.cycle * np.arange(config.phases) / config.phases
+    delays = gait.tick * gait.cycle * np.arange(config.phases) / config.phases
     angles = np.deg2rad(DIRECTIONS)
-    ways = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    directions = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
     start, end = SLIPPERY
 
     def pushed(force: np.ndarray, t: float) -> Scene:
@@ -114,11 +114,11 @@ def make_scenes(
     scenes = {Level("calm", config.traj): [Scene(command)]}
     for force in sizes.push * np.array(config.forces):
         scenes[Level("push", float(force))] = [
-            pushed(force * way, t) for way in ways for t in later
+            pushed(force * direction, t) for direction in directions for t in delays
         ]
     for friction in config.frictions:
         scenes[Level("friction", friction)] = [
-            changed(Change(start + t, end + t, floor_friction=friction)) for t in later
+            changed(Change(start + t, end + t, floor_friction=friction)) for t in delays
         ]
     for side, rise in SLOPES.items():
         scenes[Level("slope", side)] = [changed(Change(slope=rise))]
@@ -138,7 +138,7 @@ def evaluate_level(scores: Score, baseline: Score) -> Cell:
 
     Args:
         scores: (plants, scenes) each.
-        baseline: the same of the baseline, on the same plants and scenes; may be the same set.
+        baseline: (plants, scenes) on the same plants and scenes; may be the same set.
     """
     return Cell(
         survived=bootstrap(partial(np.mean, axis=(-2, -1)), ~scores.fallen),
@@ -152,20 +152,20 @@ def evaluate_level(scores: Score, baseline: Score) -> Cell:
 def largest_pushes(
     fallen: Mapping[float, Bool[np.ndarray, "plants scenes"]],
 ) -> Float[np.ndarray, "8"]:
-    """Largest force [N] survived by direction, all smaller ones too; mean over plants and phases.
+    """Return the force [N] survived with all smaller ones, by direction; mean of plants, phases.
 
     Args:
         fallen: by force, in the order of `make_scenes`.
     """
     forces = np.array(sorted(fallen))
-    stood = np.stack([~fallen[force] for force in forces])
-    count = np.logical_and.accumulate(stood, axis=0).sum(axis=0)  # of the forces
+    upright = np.stack([~fallen[force] for force in forces])
+    count = np.logical_and.accumulate(upright, axis=0).sum(axis=0)  # of the forces
     largest = np.append(0.0, forces)[count].reshape(count.shape[0], len(DIRECTIONS), -1)
     return largest.mean(axis=(0, 2))
 
 
 def table(cells: Mapping[Level, Mapping[str, Cell]], losses: Mapping[Level, float]) -> str:
-    """A row per level: the baseline's falls and L, the other sets' falls and ratios to it.
+    """Return a table of levels: the baseline's falls and L, the others' falls and ratios to it.
 
     Args:
         cells: by level and set, the baseline first.
@@ -186,5 +186,5 @@ def table(cells: Mapping[Level, Mapping[str, Cell]], losses: Mapping[Level, floa
 
 
 def as_result(cell: Cell) -> dict[str, Any]:
-    """A cell as JSON values."""
+    """Return a cell as JSON values."""
     return cell._asdict() | {"survived": cell.survived._asdict(), "ratio": cell.ratio._asdict()}

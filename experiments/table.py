@@ -52,7 +52,7 @@ SETS = (
 )
 CEILING = "ceiling"
 
-# what `quick` cuts down to, so that all is done in some minutes on two cores
+# limits of `quick`, for a trial of some minutes on two cores
 _QUICK = {"seeds": 4, "rollouts": 10, "iterations": 20, "steps": 2, "step_plants": 2}
 
 
@@ -89,7 +89,7 @@ class Flags(Configured):
 
 
 class Files(NamedTuple):
-    """What the flags name, read before anything is computed."""
+    """Contents of the files in the flags, read before any computation."""
 
     sets: Mapping[str, Mapping[str, Weights]]  # the ceiling and extra ones, by trajectory
     ceilings: Mapping[str, Search]  # the long searches, by trajectory
@@ -113,18 +113,17 @@ def main() -> None:
 def make_table(
     flags: Flags, plants: Callable[[range], list[Imperfections]]
 ) -> tuple[Path, dict[str, Verdict]]:
-    """Everything from the net to the files.
+    """Make the table, from the net to the files.
 
     Args:
-        flags: what to make.
-        plants: those of the verdict, by their seeds.
+        flags: the flags.
+        plants: returns the plants of the verdict, by their seeds.
 
     Returns:
         report.md, and the verdict of each trajectory.
 
     Raises:
-        InputError: the flags ask for what cannot be, or a file is damaged, or the folder cannot be
-            written.
+        InputError: a flag has a wrong value, a file is damaged, or the folder cannot be written.
     """
     command, out = as_command(PROGRAM, flags), flags.out
     if flags.quick:
@@ -192,30 +191,30 @@ def _make_table(
             name: steps.tune(bench, name, flags.steps, flags.step_plants)
             for name in flags.trajectories
         }
-        # nothing that tunes or searches runs once the plants of the verdict are known
+        # no tuning or search may run after the plants of the verdict are made
         standins, walks = plants(flags.plants), {}
         for name, extra in files.sets.items():
             sets = _rows(tunings[name], searches[name], extra)
             walks[name] = steps.judge(bench, name, sets, standins, flags.plants)
-            for one, weights in sets.items():
-                save_weights(out / "weights" / one / f"{name}.json", weights)
+            for key, weights in sets.items():
+                save_weights(out / "weights" / key / f"{name}.json", weights)
     by_trajectory = {
-        name: metrics.make_verdict(config.loss, flags.plants, one.scores)
-        for name, one in walks.items()
+        name: metrics.make_verdict(config.loss, flags.plants, scored.scores)
+        for name, scored in walks.items()
     }
-    commits = {one.commit for each in tunings.values() for one in each.values()}
-    commits |= {w.commit for one in walks.values() for each in one.walks.values() for w in each}
+    commits = {tuned.commit for by_set in tunings.values() for tuned in by_set.values()}
+    commits |= {w.commit for scored in walks.values() for ws in scored.walks.values() for w in ws}
     settings = {"flags": as_table(flags), "tune": config.as_table(), "search": asdict(budget)}
     content = Table(
         by_trajectory,
-        falls=[fall for name, one in walks.items() for fall in _falls(name, one, flags.plants)],
-        tunings={n: {k: t.tuning for k, t in each.items()} for n, each in tunings.items()},
+        falls=[fall for name, w in walks.items() for fall in _falls(name, w, flags.plants)],
+        tunings={n: {k: t.tuning for k, t in by_set.items()} for n, by_set in tunings.items()},
         searches={
-            name: Search(len(one.history) * budget.population, one.walk, one.loss, one.stop)
-            for name, one in searches.items()
+            name: Search(len(s.history) * budget.population, s.walk, s.loss, s.stop)
+            for name, s in searches.items()
         },
         ceilings=files.ceilings,
-        pictures=draw(out, robot, by_trajectory, {n: one.first for n, one in walks.items()}),
+        pictures=draw(out, robot, by_trajectory, {n: w.first for n, w in walks.items()}),
         config=settings,
         environment=about,
         commits=sorted(commits),
@@ -229,13 +228,13 @@ def _make_table(
 def _rows(
     tunings: Mapping[str, Tuned], search: SearchResult, extra: Mapping[str, Weights]
 ) -> dict[str, Weights]:
-    """All weight sets of a trajectory, in the order of the table."""
+    """Return all weight sets of a trajectory, in the order of the table."""
     return {
         "nominal": nominal(),
         "expert": expert(),
         "searched": search.weights,
         **{f"{name}_ten": tunings[name].tuning.ten for name in DIFFTUNE},
-        **{name: one.tuning.converged for name, one in tunings.items()},
+        **{name: tuned.tuning.converged for name, tuned in tunings.items()},
         **extra,
     }
 
@@ -250,8 +249,8 @@ def _falls(trajectory: str, walks: ScoredWalks, seeds: Sequence[int]) -> list[Fa
             float(walk.last.position[2]),
             *(float(angle) for angle in walk.last.euler[:2]),
         )
-        for name, each in walks.walks.items()
-        for seed, walk in zip(seeds, each, strict=True)
+        for name, scored in walks.walks.items()
+        for seed, walk in zip(seeds, scored, strict=True)
         if walk.score.fallen
     ]
 

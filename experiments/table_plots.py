@@ -19,7 +19,7 @@ from hector_jax.report.video import VideoConfig, VideoUnavailable, write_strip
 from hector_jax.robot.model import Robot
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 
-_MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be told apart
+_MAIN = ("nominal", "expert", "without", "with")  # more lines cannot be distinguished
 _BEST = "ceiling"
 _SNAPSHOTS = VideoConfig(height=360)
 
@@ -34,7 +34,7 @@ def draw(
 
     Args:
         out: the folder.
-        robot: the body that walked.
+        robot: the body.
         verdicts: by trajectory.
         walks: on the first plant, by trajectory and set.
     """
@@ -58,7 +58,7 @@ def draw(
 
 
 def _snapshots(path: Path, robot: Robot, walks: Mapping[str, Trajectory]) -> Path | None:
-    """A strip of two walks; None, with one line, where nothing can be drawn here."""
+    """Draw a strip of two walks; None, with a message, if there is no renderer."""
     pair = {name: walks[name] for name in ("nominal", "with")}
     try:
         write_strip(path, robot, motions(robot, pair), _SNAPSHOTS)
@@ -78,8 +78,8 @@ def changes(
         verdicts: by trajectory.
         paper: the paper's change [%] by trajectory, set and baseline.
     """
-    every = dict.fromkeys(name for verdict in verdicts.values() for name in verdict.scores)
-    names = [name for name in every if name not in BASELINES]
+    names = dict.fromkeys(name for verdict in verdicts.values() for name in verdict.scores)
+    names = [name for name in names if name not in BASELINES]
     size = (3.3 * len(verdicts) + 1.2, 2 * (0.27 * len(names) + 0.75) + 0.3)
     diamond = {"linestyle": "none", "marker": "D", "color": "black", "markerfacecolor": "white"}
     diamond |= {"markersize": 5, "zorder": 4, "label": "the paper, on the robot"}
@@ -117,7 +117,7 @@ def _draw_changes(panel: Axes, verdict: Verdict, names: Sequence[str], baseline:
             edge = {"transform": panel.get_yaxis_transform(), "ha": "right", "va": "center"}
             panel.text(0.99, row, f"{falls} fell", color=color, **edge)
         value, low, high = (1 + x / 100 for x in compare(verdict, name, baseline).change["L"])
-        if len(ratio):  # an interval that falls widen shall not squeeze the axis
+        if len(ratio):  # limit the axis if falls widen the interval
             high = min(high, 1.1 * max(*ratio, value))
         panel.hlines(row, low, high, color=color, linewidth=2.2, zorder=3)
         panel.plot(value, row, "|", color=color, markersize=11, mew=2.2, zorder=3)
@@ -130,9 +130,9 @@ def collective(path: Path, walks: Mapping[str, Trajectory], snapshots: Path | No
     Args:
         path: file to write.
         walks: by weight set, on the same plant and command. Drawn are nominal, expert, without and
-            with, of which there is at least one, and, on the path only, the ceiling. The footprints
-            are those of `with`, or of the last.
-        snapshots: picture of the walk, two rows of tiles; None where there is none.
+            with, at least one of them, and, on the path only, the ceiling. The footprints are those
+            of `with`, or of the last.
+        snapshots: picture of the walk, two rows of tiles, or None.
     """
     walks = {name: walks[name] for name in sorted(walks, key="with".__eq__)}
     main = {name: walk for name, walk in walks.items() if name in _MAIN}

@@ -1,8 +1,8 @@
 """The four files of the table: report.md, table.csv, table.json and table.tex.
 
-Each has all sets on all trajectories, with intervals and falls, beside the paper's own losses. The
-paper measured on a robot with other errors, so its losses are not to be compared with ours, but its
-changes in % are.
+Each has all sets on all trajectories, with intervals and falls, beside the paper's losses. The
+paper measured on a robot with other errors, so that only its changes in % can be compared with
+ours, not its losses.
 """
 
 import csv
@@ -19,14 +19,7 @@ from jinja2 import ChoiceLoader, FileSystemLoader
 from hector_jax.core.files import write_file, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.settings import read_json
-from hector_jax.report.report import (
-    TEMPLATES,
-    Picture,
-    change_text,
-    column,
-    seeds_text,
-    wins_text,
-)
+from hector_jax.report.report import TEMPLATES, Picture, change_text, column, seeds_text, wins_text
 from hector_jax.report.run import tuning_section
 from hector_jax.runs import metrics
 from hector_jax.runs.metrics import BASELINES, Comparison, Summary, Verdict
@@ -56,7 +49,7 @@ PAPER = {
 
 PARTS = ("L_Eul", "L_pos", "L_ctrl", "L")  # in that order
 TITLES = {"straight": "Straight line", "c": "C curve", "s": "S curve"}
-OTHERS = {  # sets that a set is compared with besides the baselines
+OTHERS = {  # further sets to compare a set with, besides the baselines
     "with": ("without", "searched", "ceiling"),
     "with_ten": ("without_ten",),
     "with_walks": ("with", "ceiling"),
@@ -86,59 +79,59 @@ class Search(NamedTuple):
     """A search without derivatives."""
 
     walks: int  # on the high-fidelity simulator
-    best_at: int  # the walk that was the best
-    loss: float  # of it
+    best_at: int  # number of the best walk
+    loss: float  # of the best walk
     stop: str
 
 
 class Earlier(NamedTuple):
-    """An earlier table, on other plants, to hold the order of the sets against."""
+    """Order of the sets in an earlier table, on other plants."""
 
     plants: str  # family and seeds
     rankings: Mapping[str, Sequence[str]]  # by trajectory, best first
 
 
 class Table(NamedTuple):
-    """All that the four files contain."""
+    """Contents of the four files."""
 
     verdicts: Mapping[str, Verdict]  # by trajectory
     falls: Sequence[Fall]
     tunings: Mapping[str, Mapping[str, Tuning]]  # by trajectory and set
     searches: Mapping[str, Search]  # by trajectory
-    ceilings: Mapping[str, Search]  # long ones, by trajectory, where there are any
+    ceilings: Mapping[str, Search]  # long searches, by trajectory, if any
     pictures: Sequence[Picture]
     config: Mapping[str, Any]  # resolved, as JSON values
     environment: Mapping[str, str]
-    commits: Sequence[str]  # at which the results were made
+    commits: Sequence[str]  # of the results
     command: str  # that makes this table again
     earlier: Earlier | None = None
     family: str = "standin"  # of the plants
 
     @property
     def seeds(self) -> np.ndarray:
-        """Of the plants, the same on all trajectories."""
+        """Seeds of the plants, the same on all trajectories."""
         return next(iter(self.verdicts.values())).seeds
 
     @property
     def units(self) -> dict[str, str]:
-        """Of the terms of the loss."""
+        """Units of the terms of the loss."""
         return {term.name: term.unit for term in next(iter(self.verdicts.values())).loss}
 
 
 def paper_change(trajectory: str, name: str, baseline: str, part: str = "L") -> float | None:
-    """Change [%] of a part of the loss in the paper's table, from its rounded losses.
+    """Return the change [%] of a part of the loss in the paper's table, from its rounded losses.
 
     None for a baseline against itself, and for a set that is not in that table.
     """
     sets = PAPER.get(trajectory, {})
     if name == baseline or name not in sets:
         return None
-    at = PARTS.index(part)
-    return 100.0 * (sets[name][at] / sets[baseline][at] - 1.0)
+    index = PARTS.index(part)
+    return 100.0 * (sets[name][index] / sets[baseline][index] - 1.0)
 
 
 def summaries(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Summary]:
-    """Each set on each trajectory, against the baselines and its `OTHERS`."""
+    """Summarize each set on each trajectory, against the baselines and its `OTHERS`."""
     return {
         (trajectory, name): metrics.summarize(verdict, name, (*BASELINES, *OTHERS.get(name, ())))
         for trajectory, verdict in verdicts.items()
@@ -147,13 +140,13 @@ def summaries(verdicts: Mapping[str, Verdict]) -> dict[tuple[str, str], Summary]
 
 
 def ranking(verdict: Verdict) -> list[str]:
-    """The sets from the best to the worst, by the median over seeds of L against nominal."""
+    """Sort the sets from best to worst, by the median over seeds of L against nominal."""
     base = verdict.scores["nominal"].L
     return sorted(verdict.scores, key=lambda name: float(np.median(verdict.scores[name].L / base)))
 
 
 def plants_text(seeds: str, family: str) -> str:
-    """Which plants a table has: their seeds, and their family where it is not the first one."""
+    """Name the plants of a table: their seeds, and their family if it is not `standin`."""
     return f"seeds {seeds}" + ("" if family == "standin" else f" of the family {family}")
 
 
@@ -161,12 +154,12 @@ def load_earlier(path: Path, seeds: Sequence[int], family: str = "standin") -> E
     """Read the order of the sets from a table.json of other plants than those of `seeds`.
 
     Raises:
-        InputError: one line naming the file, where it cannot be read, is no such file, or is of the
-            same plants, on which the order would be the same by itself.
+        InputError: one line naming the file, if it cannot be read, is no table.json, or is of the
+            same plants, on which the order is always the same.
     """
     table = read_json(path, "a table.json", 100_000_000)
     try:
-        rankings = {name: list(one["ranking"]) for name, one in table["trajectories"].items()}
+        rankings = {name: list(row["ranking"]) for name, row in table["trajectories"].items()}
         plants = plants_text(str(table["seeds"]), table.get("family", "standin"))
         earlier = Earlier(plants, rankings)
     except (TypeError, KeyError, AttributeError) as error:
@@ -182,13 +175,16 @@ def load_earlier(path: Path, seeds: Sequence[int], family: str = "standin") -> E
 def swapped_sets(
     verdicts: Mapping[str, Verdict], earlier: Earlier
 ) -> dict[str, list[tuple[str, str]] | None]:
-    """Pairs of sets in another order than in an earlier table, by trajectory; None: not there."""
+    """Return pairs of sets whose order differs from an earlier table's, by trajectory.
+
+    None for a trajectory that the earlier table does not have.
+    """
     pairs: dict[str, list[tuple[str, str]] | None] = dict.fromkeys(verdicts)
     for trajectory in verdicts.keys() & earlier.rankings.keys():
-        now = ranking(verdicts[trajectory])
-        before = [name for name in earlier.rankings[trajectory] if name in now]
+        names = ranking(verdicts[trajectory])
+        before = [name for name in earlier.rankings[trajectory] if name in names]
         couples = itertools.combinations(before, 2)
-        pairs[trajectory] = [(a, b) for a, b in couples if now.index(a) > now.index(b)]
+        pairs[trajectory] = [(a, b) for a, b in couples if names.index(a) > names.index(b)]
     return pairs
 
 
@@ -196,8 +192,8 @@ def write_table(folder: Path, table: Table) -> Path:
     """Write report.md, table.csv, table.json and table.tex, each whole or not at all.
 
     Args:
-        folder: where the pictures are.
-        table: its contents.
+        folder: with the pictures.
+        table: the contents.
 
     Returns:
         report.md.
@@ -232,9 +228,9 @@ def _report(table: Table, sets: Summaries) -> str:
         wins_text=wins_text,
         count=len(table.seeds),
         others=[
-            (trajectory, name, other, one)
+            (trajectory, name, other, comparison)
             for (trajectory, name), summary in sets.items()
-            for other, one in summary.against.items()
+            for other, comparison in summary.against.items()
             if other not in BASELINES
         ],
         residual=f"{max(float(score.residual.max()) for score in scores):.0e}",
@@ -246,7 +242,7 @@ def _report(table: Table, sets: Summaries) -> str:
 
 
 def _csv(table: Table, sets: Summaries) -> str:
-    """One row per trajectory, set and part of the loss; changes in %."""
+    """Return a row per trajectory, set and part of the loss; changes in %."""
     others = list(dict.fromkeys((*BASELINES, *itertools.chain(*OTHERS.values()))))
     head = ["trajectory", "set", "part", "unit", "mean", "mean_low", "mean_high", "falls", "seeds"]
     for other in others:
@@ -258,9 +254,9 @@ def _csv(table: Table, sets: Summaries) -> str:
             row = [trajectory, name, part, table.units.get(part, ""), *summary.means[part]]
             row += [summary.falls, len(table.seeds)]
             for other in others:
-                one = summary.against.get(other)
-                wins = one.wins if one and part == "L" else ""
-                row += [*one.change[part], wins, one.counts] if one else [""] * 5
+                pair = summary.against.get(other)
+                wins = pair.wins if pair and part == "L" else ""
+                row += [*pair.change[part], wins, pair.counts] if pair else [""] * 5
             row.append(paper[PARTS.index(part)] if paper else "")
             row += [paper_change(trajectory, name, baseline, part) for baseline in BASELINES]
             rows.append([_csv_number(cell) if isinstance(cell, float) else cell for cell in row])
@@ -274,7 +270,7 @@ def _csv_number(x: float) -> str:
 
 
 def _result(table: Table, sets: Summaries) -> dict[str, Any]:
-    """The table as JSON values, with every score by seed."""
+    """Return the table as JSON values, with every score by seed."""
     trajectories = {}
     for trajectory, verdict in table.verdicts.items():
         result: dict[str, Any] = {**metrics.as_result(verdict), "family": table.family}
@@ -283,9 +279,9 @@ def _result(table: Table, sets: Summaries) -> dict[str, Any]:
             by_seed["fallen"] = score.fallen.astype(bool).tolist()
             result["sets"][name]["standin"]["by_seed"] = by_seed
         result["against"] = {
-            f"{name} against {other}": metrics.change_result(one)
+            f"{name} against {other}": metrics.change_result(comparison)
             for name in verdict.scores
-            for other, one in sets[trajectory, name].against.items()
+            for other, comparison in sets[trajectory, name].against.items()
             if other not in BASELINES
         }
         result["ranking"] = ranking(verdict)
@@ -323,12 +319,12 @@ _ESCAPES = {
 
 
 def tex(text: str) -> str:
-    """Escape words for LaTeX."""
+    """Escape text for LaTeX."""
     return "".join(_ESCAPES.get(character, character) for character in text)
 
 
 def _tex_number(x: float) -> str:
-    """Three significant digits, without a power of ten."""
+    """Format three significant digits, without a power of ten."""
     digits = 2 - math.floor(math.log10(x)) if x > 0.0 else 0
     return f"{x:.{max(digits, 0)}f}"
 
@@ -340,15 +336,15 @@ def _tex_change(comparison: Comparison) -> str:
 
 
 def _tex(table: Table, sets: Summaries) -> str:
-    """A tabular that needs no package; the smallest mean of a trajectory is bold."""
+    """Return a tabular that needs no package; the smallest mean of a trajectory is bold."""
     count = len(table.seeds)
     powers = {p: column(p, max(s.means[p].value for s in sets.values())).power for p in PARTS}
     sections = {}
     for trajectory, verdict in table.verdicts.items():
-        of = {name: sets[trajectory, name] for name in verdict.scores}
-        least = {part: min(s.means[part].value for s in of.values()) for part in PARTS}
+        by_name = {name: sets[trajectory, name] for name in verdict.scores}
+        least = {part: min(s.means[part].value for s in by_name.values()) for part in PARTS}
         rows = []
-        for name, summary in of.items():
+        for name, summary in by_name.items():
             cells = [tex(name)]
             for part in PARTS:
                 value = summary.means[part].value
@@ -356,10 +352,10 @@ def _tex(table: Table, sets: Summaries) -> str:
                 cells.append(rf"\textbf{{{text}}}" if value == least[part] else text)
             cells.append(f"{summary.falls}/{count}")
             for baseline in BASELINES:
-                one = summary.against.get(baseline)
-                wins = wins_text(one, count).replace(" ", "") if one else "--"
+                pair = summary.against.get(baseline)
+                wins = wins_text(pair, count).replace(" ", "") if pair else "--"
                 paper = paper_change(trajectory, name, baseline)
-                cells += [_tex_change(one) if one else "--", wins]
+                cells += [_tex_change(pair) if pair else "--", wins]
                 cells.append("--" if paper is None else f"${paper:+.1f}$")
             rows.append(cells)
         sections[tex(TITLES.get(trajectory, trajectory))] = rows

@@ -1,6 +1,6 @@
 """The steps of the table: search, tune, tune along walks, and walk for the verdict.
 
-Each keeps its results as artefacts and reads those that are there.
+Each stores its results and reads existing results.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
+from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.measured import evaluate_walk, tune_measured
 
@@ -36,14 +36,14 @@ WALKS_CODE = (*tunings.TUNING_CODE, "tuning.measured", "sim.walk")
 
 
 class Bench(NamedTuple):
-    """What the steps share."""
+    """Inputs of all steps."""
 
     pool: Executor
     tune: TuneConfig
     robot: Robot
     params: Params  # of the net
     folder: Path  # of the artefacts
-    commit: str  # to note with them
+    commit: str  # noted in the results
 
 
 def search(
@@ -51,7 +51,7 @@ def search(
 ) -> dict[str, SearchResult]:
     """Search without derivatives from nominal, for all trajectories in lock-step."""
     engine, tune = choose_engine("auto"), bench.tune
-    settings = replace(config, budget=config.population)  # a record serves any budget
+    settings = replace(config, budget=config.population)  # a record continues to any budget
     model = engine.name, tune.rollout, repr(tune.loss)
     key = content_key(*model, settings, bench.robot, hfs(), nominal(), code=SEARCH_CODE)
     return searches.search(
@@ -83,18 +83,18 @@ def tune(bench: Bench, name: str, steps: int, plants: int) -> dict[str, Tuned]:
 
 
 def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants: int) -> Tuned:
-    """Tune on along walks on the high-fidelity simulator, one on each plant for every step.
+    """Tune along walks on the high-fidelity simulator, a walk on each plant for every step.
 
     Args:
         bench: its net's Jacobian is used.
         name: of the trajectory.
         start: weights of a tuning on the model.
-        steps: most of them.
-        plants: how many: the hfs, and others drawn around it; verdicts are on others.
+        steps: largest number of steps.
+        plants: number: the hfs, and others drawn around it; verdicts are on other plants.
 
     Raises:
-        InputError: a walk with the starting weights falls or cannot be believed; the folder cannot
-            be written.
+        InputError: a walk with the starting weights falls or is not solved; the folder cannot be
+            written.
     """
     config = TuneConfig(iterations=PAPER_ITERATIONS + steps)
     problem = Problem(named_command(name), bench.params)
@@ -104,18 +104,17 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
     job = partial(_walk_job, config, bench.robot, problem)
 
     def make(missing: list[str], _: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
-        with bar(f"tuning {name} further, along walks on the simulator") as tell:
-            tell(0, config.iterations, "compiling")
-            tuning = tune_measured(
-                config,
-                start,
-                lambda trial: list(bench.pool.map(job, repeat(trial), simulators)),
-                lambda one: tell(
-                    int(one.iteration),
-                    config.iterations,
-                    f"L {float(one.evaluation.loss) / 1e6:.3f}e6",
-                ),
-            )
+        with bar(f"tuning {name} further, along walks on the simulator") as report_progress:
+            report_progress(0, config.iterations, "compiling")
+
+            def evaluate(trial: Weights) -> list[Evaluation]:
+                return list(bench.pool.map(job, repeat(trial), simulators))
+
+            def on_iteration(iteration: Iteration) -> None:
+                message = f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6"
+                report_progress(int(iteration.iteration), config.iterations, message)
+
+            tuning = tune_measured(config, start, evaluate, on_iteration)
         yield "walks", Tuned(tuning, bench.commit)
 
     paths = {"walks": bench.folder / name / f"tuning-walks-{key}.npz"}
@@ -127,9 +126,9 @@ def _walk_job(
 ) -> Evaluation:
     controller, command = config.rollout.walk, problem.command
     seconds = config.rollout.ticks * controller.gait.tick
-    walked = walk(controller, robot, Job(weights, command, plant, seconds))
+    trajectory = walk(controller, robot, Job(weights, command, plant, seconds))
     effect = effect_of(problem.params, controller.gait)
-    return evaluate_walk(config, robot, weights, command, effect, walked)
+    return evaluate_walk(config, robot, weights, command, effect, trajectory)
 
 
 def judge(

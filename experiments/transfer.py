@@ -66,7 +66,7 @@ from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 PUBLISHED = {"nominal": nominal, "expert": expert}
 SETS = (*PUBLISHED, "tuned")
-FACTORS = (1.5, 3.0)  # within which the weight sets of the rank correlation lie
+FACTORS = (1.5, 3.0)  # largest factors of the weight sets of the rank correlation
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Flags:
 
 
 class Walked(NamedTuple):
-    """Walks on the hfs: what is stored of them."""
+    """Stored results of walks on the hfs."""
 
     loss: np.ndarray
     fallen: np.ndarray
@@ -108,7 +108,7 @@ class Result(NamedTuple):
     """
 
     engine: str  # of the walks on the hfs
-    walked: Mapping[str, Walked]  # these, by group
+    walked: Mapping[str, Walked]  # walks on the hfs, by group
     truth: np.ndarray  # gradients on the hfs
     gradients: Mapping[str, np.ndarray]
     hfs_losses: np.ndarray
@@ -116,7 +116,7 @@ class Result(NamedTuple):
 
 
 class Point(NamedTuple):
-    """Where a gradient or a loss is evaluated."""
+    """Point of evaluation of a gradient or a loss."""
 
     weights: Weights
     command: Command
@@ -124,14 +124,14 @@ class Point(NamedTuple):
 
 
 def _without_legs(effect: jax.tree_util.Partial, window: Window) -> Effect:
-    whole = effect(window)
-    return whole._replace(legs=Load(*(0.0 * part for part in whole.legs)))
+    loads = effect(window)
+    return loads._replace(legs=Load(*(0.0 * part for part in loads.legs)))
 
 
 def phis(
     pool: Executor, config: TuneConfig, robot: Robot, data: Path
 ) -> tuple[dict, Params | None]:
-    """Each phi by name, and the parameters of the default net; None for another's data."""
+    """Return each phi by name, and the parameters of the default net; None for other data."""
     walks = data / "walks"
     effects = {"command": last_command}
     if (walks / "card.json").exists():
@@ -149,7 +149,7 @@ def phis(
         "net": default,
         "net without legs": jax.tree_util.Partial(_without_legs, default),
     }
-    host = partial(jax.tree.map, np.asarray)  # what a process is sent must not sit on a device
+    host = partial(jax.tree.map, np.asarray)  # inputs of a process must not be on a device
     return {name: host(effect) for name, effect in effects.items()}, net.params
 
 
@@ -159,18 +159,18 @@ def tuned_sets(
     config: TuneConfig,
     robot: Robot,
     params: Params | None,
-    given: Mapping[str, Weights],
+    loaded: Mapping[str, Weights],
 ) -> dict[str, Weights]:
-    """Weights after the paper's ten iterations by trajectory: given, stored or tuned now."""
+    """Return the weights after the paper's ten iterations by trajectory; tune if necessary."""
     problems = {
         name: Problem(named_command(name), params)
         for name in flags.trajectories
-        if name not in given
+        if name not in loaded
     }
     commit = environment().get("commit", "")
     title = "tuning, ten iterations"
     results = tunings.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
-    return {**given, **{name: tuned.tuning.ten for name, tuned in results.items()}}
+    return {**loaded, **{name: tuned.tuning.ten for name, tuned in results.items()}}
 
 
 def _walked(walk: Trajectory) -> Walked:
@@ -185,7 +185,7 @@ def walk_groups(
     groups: Mapping[str, Sequence[Job]],
     folder: Path,
 ) -> tuple[dict[str, Walked], str]:
-    """Walks of groups of jobs on the hfs, and their engine; a group that is on disk is taken."""
+    """Walk groups of jobs on the hfs; returns the results and the engine. Groups are cached."""
     engine = choose_engine("auto")
     walked = lib.walk_groups(
         groups,
@@ -202,7 +202,7 @@ def walk_groups(
 
 
 def gradient_jobs(point: Point, phases: Sequence[int]) -> list[Job]:
-    """Walks whose losses make the gradients at a weight set: phases, directions, both sides."""
+    """Return the walks of the gradients at a weight set: by phase, direction and side."""
     steps = alignment.STEP * np.eye(len(direction_names()))
     return [
         Job(
@@ -230,7 +230,7 @@ def _model_job(
     points: Sequence[Point],
     others: Sequence[Point],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients at points, NaN where refused, and losses at others; in a worker."""
+    """Compute gradients at points, NaN if rejected, and losses at others; in a worker."""
     rows = []
     for weights, command, tick in points:
         anchor = standing_anchor(robot, tick)
@@ -244,7 +244,7 @@ def _model_job(
     return np.array(rows), np.array(losses)
 
 
-def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
+def measure(flags: Flags, loaded: Mapping[str, Weights]) -> Result:
     """Evaluate gradients and losses on the model and on the hfs."""
     robot = jax.tree.map(np.asarray, load_robot())
     walk = WalkConfig(
@@ -272,7 +272,7 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
         effects, params = phis(pool, configs[""], robot, flags.data)
         sets = {which: dict.fromkeys(commands, w()) for which, w in PUBLISHED.items()}
         if "tuned" in flags.sets:
-            sets["tuned"] = tuned_sets(pool, flags, configs[""], robot, params, given)
+            sets["tuned"] = tuned_sets(pool, flags, configs[""], robot, params, loaded)
         starts = {
             f"{which}-{name}": Point(sets[which][name], command, 0)
             for which in flags.sets
@@ -281,18 +281,18 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
         groups = {key: gradient_jobs(start, flags.phases) for key, start in starts.items()}
         for key, points in sampled.items():
             groups[key] = [Job(p.weights, p.command, hfs(), start_tick=p.tick) for p in points]
-        places = [start._replace(tick=tick) for start in starts.values() for tick in flags.phases]
+        anchored = [start._replace(tick=tick) for start in starts.values() for tick in flags.phases]
         others = [point for points in sampled.values() for point in points]
         # An accelerator walks while the processes differentiate; without one the walks come after.
         running = {
-            name + ending: pool.submit(_model_job, config, robot, effect, places, others)
+            name + ending: pool.submit(_model_job, config, robot, effect, anchored, others)
             for ending, config in configs.items()
             for name, effect in effects.items()
         }
         walked, engine = walk_groups(pool, walk, robot, groups, flags.out / "hfs")
-        with bar("gradients on the rigid body") as on:
+        with bar("gradients on the rigid body") as report_progress:
             for done, _ in enumerate(as_completed(running.values()), 1):
-                on(done, len(running), "")
+                report_progress(done, len(running), "")
     shape = len(flags.sets), len(commands), len(flags.phases)
     losses = [np.where(walked[key].fallen, np.nan, walked[key].loss) for key in starts]
     clouds = len(commands), len(FACTORS), flags.ranks, len(flags.phases)
@@ -307,7 +307,7 @@ def measure(flags: Flags, given: Mapping[str, Weights]) -> Result:
 
 
 def compare_gradients(flags: Flags, result: Result) -> dict[str, alignment.Rows]:
-    """The rows of the report's tables by weight set, then by trajectory and phi."""
+    """Return the rows of the report's tables by weight set, then by trajectory and phi."""
     rows = {}
     for i, which in enumerate(flags.sets):
         rows[which] = {}
@@ -322,9 +322,9 @@ def compare_gradients(flags: Flags, result: Result) -> dict[str, alignment.Rows]
 
 
 def compare_orders(flags: Flags, result: Result) -> dict[tuple[str, str], dict[str, float]]:
-    """Rank correlations by trajectory and phi, then by factor."""
+    """Return rank correlations by trajectory and phi, then by factor."""
     pairs = {kind: (losses, result.hfs_losses) for kind, losses in result.losses.items()}
-    if len(flags.phases) > 1:  # how well the simulator agrees with itself
+    if len(flags.phases) > 1:  # agreement of the simulator with itself
         pairs["hfs, other phases"] = result.hfs_losses[..., ::2], result.hfs_losses[..., 1::2]
     return {
         (name, kind): {
@@ -343,15 +343,15 @@ def report(flags: Flags, result: Result) -> Path:
     fell = {name: int(w.fallen.sum()) for name, w in result.walked.items() if w.fallen.any()}
     residual = max(float(walks.residual.max()) for walks in result.walked.values())
     paragraphs = _introduction(flags, result, fell, residual)
-    for which, of_set in rows.items():
+    for which, set_rows in rows.items():
         paragraphs += [f"## {which.capitalize()} weights"]
-        paragraphs += [alignment.summary(of_set, "net")] if "net" in result.gradients else []
+        paragraphs += [alignment.summary(set_rows, "net")] if "net" in result.gradients else []
         sentences = [
             f"- {alignment.wrong_sentence(name, kind, row)}"
-            for (name, kind), row in of_set.items()
+            for (name, kind), row in set_rows.items()
             if row is not None and kind in ("command", "net")
         ]
-        paragraphs += [alignment.gradient_table(of_set), "\n".join(sentences)]
+        paragraphs += [alignment.gradient_table(set_rows), "\n".join(sentences)]
     if ranks:
         paragraphs += [
             "## Order of weight sets",
@@ -366,8 +366,8 @@ def report(flags: Flags, result: Result) -> Path:
         "engine": result.engine,
         "weights": direction_names(),
         "rows": {
-            which: {": ".join(key): alignment.as_result(row) for key, row in of_set.items()}
-            for which, of_set in rows.items()
+            which: {": ".join(key): alignment.as_result(row) for key, row in set_rows.items()}
+            for which, set_rows in rows.items()
         },
         "ranks": {": ".join(key): row for key, row in ranks.items()},
         "fell": fell,
@@ -416,7 +416,7 @@ def _introduction(
 def _draw(
     flags: Flags, result: Result, ranks: Mapping[tuple[str, str], Mapping[str, float]]
 ) -> dict[str, str]:
-    """Captions of the pictures by their names; all are without lead."""
+    """Draw the pictures, all without lead; returns their captions by name."""
     plain = [kind for kind in result.gradients if "," not in kind]
     captions = {}
     for j, name in enumerate(flags.trajectories):
@@ -450,9 +450,9 @@ def main() -> None:
     """Write report.md, transfer.json and the pictures."""
     flags = tyro.cli(Flags)
     setup_jax()
-    given = {name: load_weights(path) for name, path in flags.tuned.items()}
+    loaded = {name: load_weights(path) for name, path in flags.tuned.items()}
     make_folder(flags.out)
-    print(report(flags, measure(flags, given)))
+    print(report(flags, measure(flags, loaded)))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import pytest
 
 from hector_jax.core.inputs import InputError
 from hector_jax.search import few_walks
-from hector_jax.search.few_walks import Walked, incumbent, needs_model, propose, space_of
+from hector_jax.search.few_walks import WalkResult, incumbent, needs_model, propose, space_of
 
 SIZE = 5
 MATRIX = np.diag([4.0, 1.0, 0.25, 0.0])  # of four of the five steps
@@ -26,7 +26,7 @@ def model(point):
 
 
 def walked(proposal, loss, margin=0.1):
-    return Walked(*proposal, loss=loss, margin=margin)
+    return WalkResult(*proposal, loss=loss, margin=margin)
 
 
 def tune(walks, truth=lambda point: bowl(GOAL, point)[0], margin=lambda point: 0.1):
@@ -130,7 +130,7 @@ def test_the_luckiest_walk_is_not_believed(history):
     """One walk is lucky by far more than the walks around it allow."""
     best = SPACE.to_steps @ history[incumbent(SPACE, history)].point
     away = 0.05 * np.random.default_rng(0).standard_normal((12, SIZE))
-    around = [Walked(SPACE.to_point @ (best + x), "surrogate", None, 0.05, 0.1) for x in away]
+    around = [WalkResult(SPACE.to_point @ (best + x), "surrogate", None, 0.05, 0.1) for x in away]
     lucky = min(row.loss for row in history) - 0.02
     walks = [*history, *around[:-1], around[-1]._replace(loss=lucky)]
     assert incumbent(SPACE, walks) != len(walks) - 1

@@ -160,7 +160,9 @@ def test_a_plant_has_its_own_sizes(monkeypatch, arms):
     sizes = replace(arms.description, plants=PlantSizes(joint_friction=2.0))
     plant = arms._replace(description=sizes)
     args = arguments.Walk()
-    job = arguments.job_of(args, ROBOT, arguments.course("straight", ROBOT), nominal(), plant)
+    job = arguments.job_of(
+        args, ROBOT, arguments.load_trajectory("straight", ROBOT), nominal(), plant
+    )
     assert job.imperfections.joint_friction == 2.0 * hfs().joint_friction
 
 

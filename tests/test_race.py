@@ -44,7 +44,7 @@ def think(asked):
 def run(folder, optimizers=OPTIMIZERS, rollouts=60, think=think, walk=bowl):
     path = folder / "race.jsonl"
     return benchmark(
-        optimizers, nominal(), rollouts, think=think, walk=walk, path=path, about=ABOUT
+        optimizers, nominal(), rollouts, propose=think, walk=walk, path=path, about=ABOUT
     )
 
 

@@ -324,7 +324,7 @@ def edited(tmp_path, monkeypatch):
     [
         ("control.footstep", "stance / 2 * state.velocity", "stance / 3 * state.velocity", False),
         ("control.footstep", "    points = (", "    # a comment\n    points = (", True),
-        ("control.footstep", "Where the feet come down next", "Another docstring", True),
+        ("control.footstep", "Next touchdown of each foot", "Another docstring", True),
         ("core.console", "_QUIET = 15.0", "_QUIET = 16.0", True),
         ("runs.export", "TOLERANCE = 1e-6", "TOLERANCE = 1e-7", True),
     ],

@@ -64,10 +64,14 @@ def write_metrics(folder, iterations, refused=()):
     (folder / "metrics.jsonl").write_text("".join(lines))
 
 
-def test_an_arrow_has_the_length_and_the_direction_of_its_force(robot):
+@pytest.mark.parametrize("size", [1.0, 2.0])
+def test_an_arrow_has_the_direction_of_its_force_and_the_scale_of_its_robot(robot, size):
+    """The weight is drawn five sixths of the standing height long, whatever the robot's size."""
+    robot = robot._replace(mass=size**3 * robot.mass, standing_height=size * robot.standing_height)
+    weight, height = float(robot.mass * robot.gravity[2]), float(robot.standing_height)
     one = viewed(seconds=0.5)
     ends = arrows(motion(robot, *one), "force", "measured")
-    expected = one.walk.effect.force * 0.35 / 120.0
+    expected = one.walk.effect.force / weight * 5 / 6 * height
     found = ends[:, :, 1] - ends[:, :, 0]
     np.testing.assert_allclose(found[..., 2], expected[..., 2])
     np.testing.assert_allclose(found, expected, atol=0.01)  # the pretended yaw sways a little
@@ -80,13 +84,15 @@ def test_an_arrow_has_the_length_and_the_direction_of_its_force(robot):
 def test_wrenches_of_the_yaw_frame_are_turned_into_the_world(robot):
     walk = pretend_walk(seconds=2.0, turn=np.pi / 4)
     force = np.zeros((200, 2, 3))
-    force[..., 0] = 120.0  # ahead
+    force[..., 0] = weight = float(robot.mass * robot.gravity[2])  # ahead
     found = motion(robot, walk, {"predicted": walk.effect._replace(force=force)})
     yaw = walk.state.euler[-2, 2]
     ahead = [np.cos(yaw), np.sin(yaw), 0.0]
-    np.testing.assert_allclose(found.wrenches["predicted"].force[-1, 0] / 120.0, ahead, atol=1e-9)
+    there = found.wrenches["predicted"].force[-1, 0]
+    np.testing.assert_allclose(there / weight, ahead, atol=1e-9)
     ends = arrows(found, "force", "predicted")[-1, 0]
-    np.testing.assert_allclose((ends[1] - ends[0]) / 0.35, ahead, atol=1e-9)
+    drawn = (ends[1] - ends[0]) / float(robot.standing_height)
+    np.testing.assert_allclose(drawn, 5 / 6 * np.array(ahead), atol=1e-9)
 
 
 def test_each_touchdown_leaves_one_sole_of_the_feet_length(robot):

@@ -2,6 +2,7 @@
 
 import json
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -53,7 +54,7 @@ def pool():
 
 
 def campaign(folder, robot, plants=(None,), seed=0):
-    return walks.campaign(folder, CONFIG, robot, nominal(robot), COMMAND, plants, seed)
+    return walks.Campaign(folder, CONFIG, robot, nominal(robot), COMMAND, plants, seed)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def test_ten_walks_through_files_equal_ten_in_process_to_the_last_bit(
         again = walks.read_history(one)  # as a new process would
         proposal, weights = walks.next_proposal(pool, one, space, again)
         log = walk_log.read_log(walked(robot, weights, tmp_path / f"{number}.npz"), robot, 0.06)
-        again = walks.add_walk(one, again, proposal, walks.see(pool, one, [log]))
+        again = walks.add_walk(one, again, proposal, walks.evaluate_logs(pool, one, [log]))
     assert len(again) == len(rows) == 10
     for mine, theirs in zip(again, rows, strict=True):
         np.testing.assert_array_equal(mine.point, theirs.point)
@@ -94,7 +95,7 @@ def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
 
 
 def test_the_record_of_another_tuning_is_refused(robot, in_process):
-    one = in_process[0]._replace(seed=1)
+    one = replace(in_process[0], seed=1)
     with pytest.raises(InputError, match=r"its seed is 0, expected 1"):
         walks.read_history(one)
 
@@ -120,7 +121,7 @@ def test_a_plain_archive_with_the_least_entries_is_a_log(robot, arrays, tmp_path
     assert log.joints.shape == (60, 10)
     assert not log.fallen.any()
     # a log that ends early is that of a fall
-    seen = walk_log.read_loss(
+    seen = walk_log.evaluate_log(
         CONFIG, robot, COMMAND["s"], walk_log.read_log(tmp_path / "least.npz", robot, 0.06)
     )
     assert np.isfinite(seen[0].loss)
@@ -166,7 +167,7 @@ def test_what_is_no_whole_archive_is_refused(robot, arrays, tmp_path, write):
 
 def test_the_reference_of_a_log_is_that_of_its_walk(robot):
     walked = walk(CONFIG.rollout.walk, robot, Job(nominal(robot), COMMAND["s"], hfs(), 0.06))
-    seen, _ = walk_log.read_loss(CONFIG, robot, COMMAND["s"], walk_log.log_of(walked))
+    seen, _ = walk_log.evaluate_log(CONFIG, robot, COMMAND["s"], walk_log.log_of(walked))
     assert seen.loss == pytest.approx(float(loss_of(CONFIG.loss, walked)), rel=1e-9)
     assert 0.0 < seen.margin < 0.2
 
@@ -175,7 +176,7 @@ def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in
     """As by a plant on which the answer of the tunings falls: the run goes on without it."""
     one = campaign(tmp_path, robot, [hfs()])
     (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
-    fell = walk_log.Seen(np.inf, 1.0)
+    fell = walk_log.LogScore(np.inf, 1.0)
     log = walk_log.log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
     monkeypatch.setattr(walks, "_walk_job", lambda *_: (fell, log))
     weights, rows = walks.tune_on_walks(pool, one, 10)

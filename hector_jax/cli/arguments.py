@@ -1,4 +1,4 @@
-"""What commands share: weights, robots, plants and trajectories of flags, and how they answer."""
+"""Shared parts of the commands: weights, robots, plants and trajectories of flags, and printing."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -33,7 +33,7 @@ from hector_jax.tuning.difftune import TuneConfig
 
 
 def weights(text: str, robot: Robot) -> Weights:
-    """A weight set by its name, or from a file.
+    """Return a weight set by its name, or from a file.
 
     Raises:
         InputError: the file holds none.
@@ -43,70 +43,70 @@ def weights(text: str, robot: Robot) -> Weights:
 
 
 def short_names(texts: Sequence[str]) -> dict[str, str]:
-    """Names of weight sets for a table: of a file as much of its path as tells it from the others.
+    """Return names of weight sets for a table; for a file, the shortest unique end of its path.
 
     >>> short_names(["nominal", "runs/a/weights/with.json", "runs/b/other.json"])
     {'nominal': 'nominal', 'runs/a/weights/with.json': 'with', 'runs/b/other.json': 'other'}
     """
     parts = {text: Path(text).with_suffix("").parts for text in texts}
     names = {}
-    for text, own in parts.items():
-        others = [part for other, part in parts.items() if other != text]
-        tails = (own[-k:] for k in range(1, len(own) + 1))
-        unique = (tail for tail in tails if not any(o[-len(tail) :] == tail for o in others))
+    for text, path in parts.items():
+        others = [other for other_text, other in parts.items() if other_text != text]
+        ends = (path[-k:] for k in range(1, len(path) + 1))
+        unique = (end for end in ends if not any(other[-len(end) :] == end for other in others))
         names[text] = "/".join(next(unique, (text,)))
     return names
 
 
-def print_result(json: bool, result: Any, in_words: Callable[[], None], **form: Any) -> None:
-    """Print the result of a command: as JSON where --json asks for it, else in words."""
+def print_result(json: bool, result: Any, print_text: Callable[[], None], **options: Any) -> None:
+    """Print the result of a command: as JSON if --json is set, else as text."""
     if json:
-        print(as_json(result, **form))
+        print(as_json(result, **options))
     else:
-        in_words()
+        print_text()
 
 
 def print_errors(errors: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print the errors of nets, as `training.report` gives them."""
+    """Print the errors of nets, as `training.report` returns them."""
     print("mean square errors on held-out walks")
-    for name, of in errors.items():
-        print(f"{name:9s} force {of['force']:8.2f} N^2   moment {of['moment']:7.4f} (N m)^2")
+    for name, error in errors.items():
+        print(f"{name:9s} force {error['force']:8.2f} N^2   moment {error['moment']:7.4f} (N m)^2")
 
 
-def folder_of(folder: Path, path: Path | None, robot: Robot) -> Path:
-    """Another robot than the packaged one, so one with a `path`, has its own folder in there."""
+def robot_folder(folder: Path, path: Path | None, robot: Robot) -> Path:
+    """Return the folder, or its subfolder for a robot from a TOML file at `path`."""
     return folder if path is None else folder / robot.description.name
 
 
-def robot_of(run: Path, begun: RunRequest) -> Robot:
-    """The robot that a run was tuned for.
+def robot_of(run: Path, request: RunRequest) -> Robot:
+    """Load the robot that a run was tuned for.
 
     Raises:
-        InputError: its files say something else now.
+        InputError: its files have changed since.
     """
-    robot = load_robot(begun.robot)
-    if begun.body not in (None, robot_hash(robot)):
+    robot = load_robot(request.robot)
+    if request.body not in (None, robot_hash(robot)):
         path = robot.description.path
         raise InputError(f"{run} was tuned for another robot: {path} or its MJCF has changed")
     return robot
 
 
-def default_of(flag: Path, usual: Path, path: Path | None, robot: Robot) -> Path:
-    """A folder as it was given; where it was not, that of the robot: DATA/NAME for DATA/..."""
-    if path is None or flag != usual:
+def flag_folder(flag: Path, default: Path, path: Path | None, robot: Robot) -> Path:
+    """Return the folder of a flag; for another robot its default DATA/... is DATA/NAME/..."""
+    if path is None or flag != default:
         return flag
-    return folder_of(Path(usual.parts[0]), path, robot).joinpath(*usual.parts[1:])
+    return robot_folder(Path(default.parts[0]), path, robot).joinpath(*default.parts[1:])
 
 
 def plants(world: str, seeds: range, description: Description) -> list[Imperfections]:
-    """One plant of a world for each seed, sized for the robot of a description."""
+    """Draw one plant of a world for each seed, sized for the robot of a description."""
     family = family_of(world)
     draw = FAMILIES[family] if family else partial(named_world, world)
     return [draw(seed, description) for seed in seeds]
 
 
 def plant_of(path: Path | None, robot: Robot) -> Robot | None:
-    """The model of the robot that is walked on, where it is another.
+    """Load the plant's model of the robot; None without a file.
 
     Raises:
         InputError: its file is wrong, or its joints are not the robot's.
@@ -119,10 +119,10 @@ def plant_of(path: Path | None, robot: Robot) -> Robot | None:
 
 
 def with_gait(robot: Robot, name: str) -> Robot:
-    """The robot with a gait; `own` is that of its file.
+    """Return the robot with a named gait; `own` is the gait of its file.
 
     Raises:
-        InputError: it has other feet than the gait.
+        InputError: its number of feet does not match the gait.
     """
     if name == "own":
         return robot
@@ -135,10 +135,15 @@ def with_gait(robot: Robot, name: str) -> Robot:
     return robot._replace(description=replace(description, control=tuple(control.items())))
 
 
-def course(text: str, robot: Robot) -> NamedCommand:
-    """What to walk; one line says where a file asks for more than the robot may be able to.
+def expand_all(texts: Sequence[str]) -> list[str]:
+    """Replace `all` by the three trajectories of the paper; drop repetitions."""
+    return list(dict.fromkeys(t for text in texts for t in (COMMANDS if text == "all" else [text])))
 
-    A robot whose feet all stand stays where it is.
+
+def load_trajectory(text: str, robot: Robot) -> NamedCommand:
+    """Load a trajectory by name or file; one line warns if it may exceed the robot's limits.
+
+    A robot whose feet all stand stays in place.
 
     Raises:
         InputError: there is no such trajectory, or its file is wrong.
@@ -146,48 +151,51 @@ def course(text: str, robot: Robot) -> NamedCommand:
     trajectory, gait = trajectories.command_of(text), walk_config(robot).gait
     if gait.swing == 0:
         say(f"{text} is not walked: all feet stand")
-        moves = trajectory.command
-        still = moves._replace(velocity=0.0 * moves.velocity, yaw_rate=0.0 * moves.yaw_rate)
+        command = trajectory.command
+        still = command._replace(velocity=0.0 * command.velocity, yaw_rate=0.0 * command.yaw_rate)
         return trajectory._replace(command=still)
     if trajectory.seconds and (excess := beyond(limits(robot, gait), trajectory.command)):
         say(f"warning: {text}: {excess}")
     return trajectory
 
 
-def by_name(texts: Sequence[str]) -> dict[str, str]:
-    """Trajectories by their names; `all` are the three of the paper.
+def trajectories_by_name(texts: Sequence[str]) -> dict[str, str]:
+    """Return the texts of the trajectories by name; `all` are the three of the paper.
 
     Raises:
         InputError: two have one name, or there is no such trajectory.
     """
     names: dict[str, str] = {}
-    for text in dict.fromkeys(t for one in texts for t in (COMMANDS if one == "all" else (one,))):
+    for text in expand_all(texts):
         other = names.setdefault(name := trajectories.command_of(text).name, text)
         if other != text:
             raise InputError(f"--traj {other} and {text} are both named {name}")
     return names
 
 
-def courses(texts: Sequence[str], robot: Robot, hint: str = "") -> tuple[NamedCommand, ...]:
-    """What one weight set is to walk; `all` are the three of the paper.
+def load_trajectories(
+    texts: Sequence[str], robot: Robot, hint: str = ""
+) -> tuple[NamedCommand, ...]:
+    """Load the trajectories of one weight set; `all` are the three of the paper.
 
-    `hint` ends the message where they last differently.
+    `hint` ends the error message about different lengths.
 
     Raises:
-        InputError: see `course` and `by_name`; or they last differently.
+        InputError: see `load_trajectory` and `trajectories_by_name`; or their lengths differ.
     """
-    found = tuple(course(text, robot) for text in by_name(texts).values())
-    if len({one.seconds or Walk.seconds for one in found}) > 1:
-        lasts = ", ".join(f"{one.name} {one.seconds or Walk.seconds:g} s" for one in found)
+    loaded = tuple(load_trajectory(text, robot) for text in trajectories_by_name(texts).values())
+    lengths = {trajectory.name: trajectory.seconds or Walk.seconds for trajectory in loaded}
+    if len(set(lengths.values())) > 1:
+        lasts = ", ".join(f"{name} {seconds:g} s" for name, seconds in lengths.items())
         raise InputError(f"--traj expects trajectories of one length, got {lasts}{hint}")
-    return found
+    return loaded
 
 
-def seconds(flag: float, trajectory: NamedCommand) -> float:
-    """Length of a walk [s]: what the trajectory's file says, else what the flag does.
+def walk_seconds(flag: float, trajectory: NamedCommand) -> float:
+    """Return the length of a walk [s]: from the trajectory's file if it has one, else the flag.
 
     Raises:
-        InputError: both say one.
+        InputError: both set a length.
     """
     if trajectory.seconds is None:
         return flag
@@ -200,7 +208,7 @@ def seconds(flag: float, trajectory: NamedCommand) -> float:
 
 
 def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
-    """The tuning with rollouts as long as the trajectory, where its file says how long."""
+    """Return the tuning with rollouts as long as the trajectory, if its file sets a length."""
     if trajectory.seconds is None:
         return config
     ticks = round(trajectory.seconds / config.rollout.walk.gait.tick)
@@ -210,24 +218,24 @@ def with_length(config: TuneConfig, trajectory: NamedCommand) -> TuneConfig:
 def walk_once(
     args: Walk | View,
     robot: Robot,
-    course: NamedCommand,
+    trajectory: NamedCommand,
     weights: Weights,
     plant: Robot | None,
     engine: Engine = MUJOCO_C,
 ) -> Trajectory:
-    """One walk in the world of the flags; `plant` is another model of the robot."""
+    """Walk once in the world of the flags; `plant` is another model of the robot."""
     if args.world == "srbm":
-        lasts = seconds(args.seconds, course)
-        return verdicts.walk_rigid_body(robot, weights, course.command, lasts)
-    jobs = [job_of(args, robot, course, weights, plant)]
-    return next(engine.walk(None, walk_config(robot), robot, jobs))
+        seconds = walk_seconds(args.seconds, trajectory)
+        return verdicts.walk_rigid_body(robot, weights, trajectory.command, seconds)
+    job = job_of(args, robot, trajectory, weights, plant)
+    return next(engine.walk(None, walk_config(robot), robot, [job]))
 
 
 def job_of(
-    args: Walk | View, robot: Robot, course: NamedCommand, weights: Weights, plant: Robot | None
+    args: Walk | View, robot: Robot, trajectory: NamedCommand, weights: Weights, plant: Robot | None
 ) -> Job:
-    """The walk of the flags in a world of MuJoCo; `plant` is another model of the robot."""
+    """Return the walk of the flags in a world of MuJoCo; `plant` is another model of the robot."""
     body = (plant or robot).description
     (imperfections,) = plants(args.world, range(args.seed, args.seed + 1), body)
-    lasts = seconds(args.seconds, course)
-    return Job(weights, course.command, imperfections, lasts, args.seed, plant=plant)
+    seconds = walk_seconds(args.seconds, trajectory)
+    return Job(weights, trajectory.command, imperfections, seconds, args.seed, plant=plant)

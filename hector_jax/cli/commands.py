@@ -1,4 +1,4 @@
-"""What each command of `hector` does with its flags (flags.py)."""
+"""The function of each command of `hector`; its flags are in flags.py."""
 
 import shlex
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,6 @@ from typing import Any
 from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
-from hector_jax.control.reference import COMMANDS
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import Broken, say
@@ -24,7 +23,7 @@ from hector_jax.robot.description import description_of
 from hector_jax.robot.model import Robot, load_robot, robot_of
 from hector_jax.robot.propose import as_toml
 from hector_jax.robot.propose import propose as propose_robot
-from hector_jax.robot.table import mended, remarks, table_of, table_of_survey
+from hector_jax.robot.table import changes, remarks, table_of, table_of_survey
 from hector_jax.runs import export, nets, replay, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
 from hector_jax.search.cmaes import SearchConfig
@@ -34,7 +33,7 @@ from hector_jax.tuning.loss import alphas, loss_of_robot
 
 @singledispatch
 def run(args: Any) -> None:
-    """Do what the flags of a command ask for.
+    """Run a command with its flags.
 
     Raises:
         InputError: one line that says what is wrong with the input.
@@ -44,18 +43,16 @@ def run(args: Any) -> None:
 
 for _command in (doctor.doctor, evaluate.evaluate, evaluate.walk, evaluate.grfm, tune.tune):
     run.register(_command)
-for _command in (propose.propose, propose.report):
+for _command in (propose.propose, propose.report, verdict.verdict, view.view_run):
     run.register(_command)
-run.register(verdict.verdict)
-run.register(view.view_run)
 
 
 @run.register
 def collect(args: flags.Collect) -> None:
-    """Walk on the simulator with chance, and keep the walks."""
+    """Walk on the simulator with random plants and commands, and save the walks."""
     config = nets.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     robot = load_robot(args.robot)
-    out = arguments.default_of(args.out, flags.Collect.out, args.robot, robot)
+    out = arguments.flag_folder(args.out, flags.Collect.out, args.robot, robot)
     with workers(args.processes) as pool:
         nets.collect(pool, config, robot, out)
     say(f"the walks are in {out}")
@@ -66,7 +63,7 @@ def train(args: flags.Train) -> None:
     """Train a net on walks."""
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     robot = load_robot(args.robot)
-    data = arguments.default_of(args.data, flags.Train.data, args.robot, robot)
+    data = arguments.flag_folder(args.data, flags.Train.data, args.robot, robot)
     path = args.out or nets.net_path(data.parent, args.variant)
     errors = nets.train(config, robot, data, path).errors
     result = {"net": str(path), "errors": errors}
@@ -78,32 +75,32 @@ def train(args: flags.Train) -> None:
 def search(args: flags.Search) -> None:
     """Search for weights on the simulator, without gradients."""
     robot = load_robot(args.robot)
-    texts = COMMANDS if args.traj == "all" else (args.traj,)
-    courses = [arguments.course(text, robot) for text in texts]
-    commands = {one.name: one.command for one in courses}
+    texts = arguments.expand_all([args.traj])
+    trajectories = [arguments.load_trajectory(text, robot) for text in texts]
+    commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = choose_engine(args.engine)
-    tuning = arguments.with_length(tunings.tune_config(robot), courses[0])
+    tuning = arguments.with_length(tunings.tune_config(robot), trajectories[0])
     start = arguments.weights(args.start, robot)
-    out = arguments.default_of(args.out, flags.Search.out, args.robot, robot)
+    out = arguments.flag_folder(args.out, flags.Search.out, args.robot, robot)
     make_folder(out)
     shared: dict[str, Any] = {"commands": commands, "engine": engine}
     with workers(args.processes) as pool:
         inputs = pool, config, tuning, robot, start
         results = searches.search(*inputs, folder=args.record or out, **shared)
         say("walking with the start, expert and best weights")
-        sets = {name: [start, expert(robot), one.weights] for name, one in results.items()}
+        sets = {name: [start, expert(robot), result.weights] for name, result in results.items()}
         at_once = config.population * len(commands)
-        compared = searches.losses_on_hfs(pool, tuning, robot, sets, at_once=at_once, **shared)
+        losses = searches.losses_on_hfs(pool, tuning, robot, sets, at_once=at_once, **shared)
     cards = {}
-    for name, one in results.items():
-        at_start, at_expert, again = compared[name].tolist()
+    for name, result in results.items():
+        at_start, at_expert, again = losses[name].tolist()
         cards[name] = {
             "trajectory": name,
-            "L": {"start": at_start, "best": one.loss, "best_again": again, "expert": at_expert},
-            "walks": len(one.history) * config.population,
-            "best_at": one.walk,
-            "stop": one.stop,
+            "L": {"start": at_start, "best": result.loss, "best_again": again, "expert": at_expert},
+            "walks": len(result.history) * config.population,
+            "best_at": result.walk,
+            "stop": result.stop,
             "search": asdict(config),
             "start": args.start,
             "engine": engine.name,
@@ -111,7 +108,7 @@ def search(args: flags.Search) -> None:
             "loss": alphas(tuning.loss),
             "versions": versions(),
         }
-        save_weights(out / f"{name}.json", one.weights)
+        save_weights(out / f"{name}.json", result.weights)
         write_json(out / f"{name}-card.json", cards[name])
     print_result(args.json, {"weights": str(out), "cards": cards}, partial(_print_search, cards))
     say(f"the weights are in {out}")
@@ -143,7 +140,7 @@ def examine_robot(args: flags.Robot) -> None:
     """Check a robot's TOML, or propose one for its model.
 
     Raises:
-        InputError: the robot cannot be used as it is; the one line says what is to be mended.
+        InputError: the robot cannot be used; one line says what must be corrected.
     """
     file, out = args.file, args.out
     if file.suffix == ".toml":
@@ -156,9 +153,9 @@ def examine_robot(args: flags.Robot) -> None:
             raise InputError(f"--out must end in .toml, got {str(out)!r}")
         if out.exists():
             raise InputError(f"--out must be a new file, and {out} exists")
-        beside = file.absolute().parent
-        if out.absolute().parent.resolve() != beside.resolve():
-            raise InputError(f"--out must be beside the model, in {beside}, got {str(out)!r}")
+        folder = file.absolute().parent
+        if out.absolute().parent.resolve() != folder.resolve():
+            raise InputError(f"--out must be beside the model, in {folder}, got {str(out)!r}")
     proposal = propose_robot(file)
     head = f"Proposed by `hector robot {file.name}`; rules: docs/howto/robot.md."
     wrong = [f"To be mended: {line}" for line in proposal.wrong]
@@ -173,25 +170,24 @@ def examine_robot(args: flags.Robot) -> None:
         print(f"\n{text}", end="")
         return
     try:
-        with out.open("x", encoding="utf-8") as opened:
-            opened.write(text)
+        with out.open("x", encoding="utf-8") as stream:
+            stream.write(text)
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from None
     say(f"the proposal is in {out}; walk with it: hector walk --robot {out}")
 
 
 def _print_robot(robot: Robot, wrong: Sequence[str]) -> None:
-    """Print what a robot holds, once the controller and the loss have read what they need of it."""
+    """Print a robot's data, after checking that the controller and the loss can read it."""
     walk_config(robot)
     loss_of_robot(robot.description)
     wrong = [*wrong, *remarks(robot)]
-    print("\n".join([*table_of(robot), *_list("mended", mended(robot)), *_list("wrong", wrong)]))
+    print("\n".join([*table_of(robot), *_list("mended", changes(robot)), *_list("wrong", wrong)]))
 
 
 def _list(title: str, lines: Sequence[str]) -> list[str]:
-    """Lines under a title."""
-    each = lines or ["nothing"]
-    return [f"{title if i == 0 else '':8s} {line}" for i, line in enumerate(each)]
+    """Format lines under a title."""
+    return [f"{'' if i else title:8s} {line}" for i, line in enumerate(lines or ["nothing"])]
 
 
 @run.register
@@ -201,15 +197,16 @@ def export_controller(args: flags.Export) -> None:
     if is_run and args.robot:
         raise InputError(f"--robot is for weights files; the run {args.run} names its own robot")
     path, config = export.find_weights(args.run, args.set)
-    begun = read_request(args.run) if is_run else None
-    robot = arguments.robot_of(args.run, begun) if begun else load_robot(args.robot)
-    course = arguments.course(args.traj or (begun.trajectory if begun else "straight"), robot)
+    request = read_request(args.run) if is_run else None
+    robot = arguments.robot_of(args.run, request) if request else load_robot(args.robot)
+    text = args.traj or (request.trajectory if request else "straight")
+    trajectory = arguments.load_trajectory(text, robot)
     name = f"{args.run.resolve().name}/{path.stem}" if is_run else path.stem
     folder = args.out or (args.run if is_run else args.run.parent) / "export"
     weights, about = load_weights(path, robot), {"name": name, "seconds": args.seconds}
     say("exporting the controller and comparing it with the live one on a walk")
     with locked(folder):
-        inputs = config or walk_config(robot), robot, weights, course.command
+        inputs = config or walk_config(robot), robot, weights, trajectory.command
         card = export.export(*inputs, folder, **about)
     print_result(args.json, card, lambda: _print_check(card["check"]))
     say(f"the export is in {folder}")
@@ -218,17 +215,17 @@ def export_controller(args: flags.Export) -> None:
 def _print_check(check: Mapping[str, Any]) -> None:
     differences = "{force:.1e} N, {moment:.1e} N m, {torque:.1e} N m at the joints"
     print(f"largest difference from the live controller: {differences.format(**check)}")
-    for what, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
-        times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
-        print(f"a call {text} [ms]: {times.format(**check[what])}")
+    times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
+    for key, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
+        print(f"a call {text} [ms]: {times.format(**check[key])}")
 
 
 @run.register
 def replay_dump(args: flags.Replay) -> None:
-    """Do a dumped iteration again.
+    """Repeat a dumped iteration.
 
     Raises:
-        Broken: it does not come out the same.
+        Broken: its result differs.
     """
     replayed = replay.replay(args.dump)
     print_result(args.json, replayed._asdict(), lambda: print(replay.in_words(replayed)), indent=2)

@@ -1,4 +1,4 @@
-"""The command `hector doctor`: what this machine has, and whether the program works on it."""
+"""The command `hector doctor`: list versions and devices of this machine, and test it."""
 
 import os
 import tempfile
@@ -29,7 +29,7 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import named_world
 
-_EXTRAS = {  # by name, the package that it needs and what it is for
+_EXTRAS = {  # name: (package that it needs, what needs it)
     "export": ("flatbuffers", "hector export"),
     "race": ("sklearn", "experiments/race.py"),
     "search": ("cmaes", "hector search, experiments/table.py"),
@@ -39,10 +39,10 @@ _EXTRAS = {  # by name, the package that it needs and what it is for
 
 
 def doctor(args: Doctor) -> None:
-    """Tell what is installed here, and whether it works.
+    """Report what is installed on this machine and test it.
 
     Raises:
-        Broken: something does not.
+        Broken: a test failed.
     """
     say("testing this machine: two short walks and a film")
     facts, faults = examine()
@@ -53,17 +53,17 @@ def doctor(args: Doctor) -> None:
 
 
 def examine() -> tuple[dict[str, str], list[str]]:
-    """Examine the machine, and walk a little on it.
+    """Examine the machine and run two short walks.
 
     Returns:
-        Facts, a line by name, and faults, empty on a sound machine. A missing extra or video back
-        end is a fact, not a fault: runs go on without.
+        Facts, one line by name, and faults, empty on a working machine. A missing extra or video
+        back end is a fact, not a fault, because runs work without it.
     """
     faults: list[str] = []
     facts = {name: text for name, text in environment().items() if name != "device"}
     if facts.get("mujoco") != facts.get("mujoco-mjx"):
         faults.append("mujoco and mujoco-mjx are of different releases")
-    facts["devices"] = ", ".join(f"{one} ({one.device_kind})" for one in jax.devices())
+    facts["devices"] = ", ".join(f"{device} ({device.device_kind})" for device in jax.devices())
     if jnp.asarray(0.0).dtype != jnp.float64:
         faults.append("JAX computes in 32 bits")
     facts["cache"] = str(cache_folder())
@@ -92,13 +92,13 @@ def examine() -> tuple[dict[str, str], list[str]]:
         facts["video"] = f"works ({_film(robot, walks['ideal'])})"
     except VideoUnavailable as error:
         facts["video"] = str(error)
-        if "MUJOCO_GL" in os.environ:  # a back end was asked for
+        if "MUJOCO_GL" in os.environ:  # the user chose a back end
             faults.append(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}")
     return facts, faults
 
 
 def _walks(robot: Robot) -> dict[str, Trajectory]:
-    """Two seconds on the rigid body; in MuJoCo the start and a little more."""
+    """Walk two seconds on the rigid body, and 0.2 s after the start-up in MuJoCo."""
     command = named_command("straight")
     job = Job(expert(), command, named_world("ideal"), 0.2)
     return {
@@ -108,7 +108,7 @@ def _walks(robot: Robot) -> dict[str, Trajectory]:
 
 
 def _film(robot: Robot, trajectory: Trajectory) -> str:
-    """Draw a film; the back end that drew it."""
+    """Draw a film; return the back end that drew it."""
     with tempfile.TemporaryDirectory() as folder:
         pair = motions(robot, {"one": trajectory, "other": trajectory})
         return write_film(Path(folder) / "film.mp4", robot, pair, VideoConfig(rate=2))

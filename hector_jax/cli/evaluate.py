@@ -1,4 +1,4 @@
-"""What weight sets are worth on walks, and nets on the ground forces of walks they never saw."""
+"""Evaluate weight sets on walks, and nets on the ground forces of held-out walks."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -43,9 +43,10 @@ from hector_jax.tuning.loss import Loss, loss_of_robot
 def evaluate(args: Evaluate) -> None:
     """Evaluate weight sets on the plants of a world."""
     robot = arguments.with_gait(load_robot(args.robot), args.gait)
-    plant, course = arguments.plant_of(args.plant, robot), arguments.course(args.traj, robot)
-    seconds = arguments.seconds(args.seconds, course)
-    # ideal and hfs are one plant each, without chance
+    plant = arguments.plant_of(args.plant, robot)
+    trajectory = arguments.load_trajectory(args.traj, robot)
+    seconds = arguments.walk_seconds(args.seconds, trajectory)
+    # ideal and hfs have one plant each and nothing random
     count = args.seeds if args.world not in ("ideal", "hfs") else 1
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights(text, robot) for text in args.weights}
@@ -53,29 +54,27 @@ def evaluate(args: Evaluate) -> None:
     config, engine = tunings.tune_config(robot), choose_engine(args.engine)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        inputs = pool, config, robot, sets, course.command, plants, seeds
+        inputs = pool, config, robot, sets, trajectory.command, plants, seeds
         walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
-    result, what = (
-        metrics.as_result(verdict, args.world),
-        f"{course.name}, {plural(count, 'plant')}",
-    )
-    result["engine"] = engine.name
+    title = f"{trajectory.name}, {plural(count, 'plant')}"
+    result = metrics.as_result(verdict, args.world) | {"engine": engine.name}
     if plant is not None:
         result["plant"] = plant.description.name
-        what += f" of {plant.description.name}"
+        title += f" of {plant.description.name}"
     if args.out is not None:
         write_json(args.out, result)
     names = arguments.short_names(args.weights)
-    named = verdict._replace(scores={names[n]: s for n, s in verdict.scores.items()})
-    print_result(args.json, result, partial(print_table, named, what, args.world))
+    scores = {names[text]: score for text, score in verdict.scores.items()}
+    print_text = partial(print_table, verdict._replace(scores=scores), title, args.world)
+    print_result(args.json, result, print_text)
 
 
 def walk(args: Walk) -> None:
-    """Walk once and report on it.
+    """Walk once and report losses and errors.
 
     Raises:
-        Broken: QPs of the walk were not solved.
+        Broken: the solver failed on QPs of the walk.
     """
     if args.video is not None:
         check_film(args.video)
@@ -86,49 +85,51 @@ def walk(args: Walk) -> None:
     if args.world == "srbm" and args.engine != "c":
         raise InputError(f"--engine {args.engine} needs a world with a plant, got --world srbm")
     engine = choose_engine(args.engine)
-    weights, course = arguments.weights(args.weights, robot), arguments.course(args.traj, robot)
+    weights = arguments.weights(args.weights, robot)
+    command = arguments.load_trajectory(args.traj, robot)
     loss, config = loss_of_robot(robot.description), walk_config(robot)
     say("compiling (only the first time on a machine) and walking")
-    once = partial(arguments.walk_once, args, robot, course, plant=plant, engine=engine)
-    trajectory = once(weights)
+    walk_with = partial(arguments.walk_once, args, robot, command, plant=plant, engine=engine)
+    trajectory = walk_with(weights)
     score = metrics.score(loss, trajectory)
     upright, startup = float(trajectory.period * np.sum(~np.asarray(trajectory.fallen))), None
-    # a fall in the start-up is walked once more, in MuJoCo C
+    # a fall in the start-up is simulated again in MuJoCo C to find its cause
     if upright == 0.0 and args.world != "srbm" and not engine.differs:
-        startup = startup_fall(config, robot, arguments.job_of(args, robot, course, weights, plant))
-    samples = round(config.gait.tick / float(trajectory.period))  # of each plan
-    plans = np.asarray(trajectory.residual)[::samples]
-    unsolved = int(np.sum(~(plans <= SOLVED)))
+        job = arguments.job_of(args, robot, command, weights, plant)
+        startup = startup_fall(config, robot, job)
+    samples = round(config.gait.tick / float(trajectory.period))  # per plan
+    residuals = np.asarray(trajectory.residual)[::samples]
+    unsolved = int(np.sum(~(residuals <= SOLVED)))
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
-    what = f"{course.name} in {args.world}"
+    title = f"{command.name} in {args.world}"
     if engine is not MUJOCO_C:
-        what += f" in engine {engine.name}"
+        title += f" in engine {engine.name}"
     result: dict[str, Any] = {
         "engine": engine.name,
         "seconds": upright if startup is None else startup.time,
-        "fell": bool(score.fallen)
-        and not unsolved,  # without a plan it is no fall of these weights
+        # without a plan, the fall is not due to the weights
+        "fell": bool(score.fallen) and not unsolved,
     }
     if startup is not None:
         result["startup"] = startup._asdict()
     if plant is not None:
         result["plant"] = plant.description.name
-        what += f" on {plant.description.name}"
+        title += f" on {plant.description.name}"
     result |= {part: float(value) for part, value in score.losses.items()}
-    # a walk that falls at once has no errors
+    # the errors of a walk that falls at once are NaN
     result |= {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
-    result |= {"plans": len(plans), "unsolved": unsolved, "residual": float(score.residual)}
-    what += f", {printable(args.weights)} weights"
-    in_words = partial(_print_walk, what, result, score, loss, startup)
-    print_result(args.json, result, in_words)
+    result |= {"plans": len(residuals), "unsolved": unsolved, "residual": float(score.residual)}
+    title += f", {printable(args.weights)} weights"
+    print_result(args.json, result, partial(_print_walk, title, result, score, loss, startup))
     if unsolved:
         raise Broken(
-            f"{unsolved} of {plural(len(plans), 'QP')} were not solved (largest relative residual "
-            f"{float(score.residual):.0e}, expected at most {SOLVED:.0e}): this walk is no result"
+            f"{unsolved} of {plural(len(residuals), 'QP')} were not solved (largest relative "
+            f"residual {float(score.residual):.0e}, expected at most {SOLVED:.0e}): this walk is "
+            "no result"
         )
     if args.video is not None:
-        _film(args.video, Path(args.weights).stem, trajectory, robot, once)
+        _film(args.video, Path(args.weights).stem, trajectory, robot, walk_with)
 
 
 def _film(
@@ -136,24 +137,25 @@ def _film(
     name: str,
     trajectory: Trajectory,
     robot: Robot,
-    once: Callable[[Weights], Trajectory],
+    walk_with: Callable[[Weights], Trajectory],
 ) -> None:
-    """Film a walk beside that with nominal weights, or with the expert's if it has those itself.
+    """Film a walk beside a walk with nominal weights, or expert weights if its own are nominal.
 
-    `once` walks again with given weights.
+    `walk_with` walks with other weights.
     """
-    beside, other = ("expert", expert) if name == "nominal" else ("nominal", nominal)
-    say(f"walking with {beside} weights for the other half of the film")
-    pictures.film(path, robot, {beside: once(other(robot)), name: trajectory})
+    baseline, make_weights = ("expert", expert) if name == "nominal" else ("nominal", nominal)
+    say(f"walking with {baseline} weights for the other half of the film")
+    walks = {baseline: walk_with(make_weights(robot)), name: trajectory}
+    pictures.film(path, robot, walks)
 
 
 def _print_walk(
-    what: str, result: dict[str, Any], score: metrics.Score, loss: Loss, startup: StartupFall | None
+    text: str, result: dict[str, Any], score: metrics.Score, loss: Loss, startup: StartupFall | None
 ) -> None:
     end = "fell after" if result["fell"] else "ended after" if score.fallen else "walked"
     end = f"{end} {result['seconds']:.2f} s" if startup is None else str(startup)
-    terms = ", ".join(f"{t.name} {score.losses[t.name]:.4g} {t.unit}" for t in loss)
-    print(f"{what}: {end}; L {score.L / 1e6:.3f}e6 ({terms})")
+    terms = ", ".join(f"{term.name} {score.losses[term.name]:.4g} {term.unit}" for term in loss)
+    print(f"{text}: {end}; L {score.L / 1e6:.3f}e6 ({terms})")
     if result["seconds"] > 0.0:
         x, y, z = 100 * score.rms_position
         roll, pitch, yaw = np.degrees(score.rms_euler)
@@ -162,7 +164,7 @@ def _print_walk(
 
 
 def grfm(args: Grfm) -> None:
-    """Report on the predictions of each net, with pictures."""
+    """Report the prediction errors of each net, with pictures."""
     robot, config = load_robot(), TuneConfig()
     make_folder(args.out)
     with workers(args.processes) as pool:
@@ -180,31 +182,31 @@ def grfm(args: Grfm) -> None:
         "gated": as_effect(net.params.linear),
     }
     result, drifts = {}, {}
-    with bar("predicting the ground forces of the walks") as tell:
+    with bar("predicting the ground forces of the walks") as report_progress:
         for done, (world, walks) in enumerate(worlds.items()):
-            tell(3 * done, 3 * len(worlds), f"{world}: errors")
+            report_progress(3 * done, 3 * len(worlds), f"{world}: errors")
             start, push = walks.job.start_tick, walks.job.push
             samples, _ = make_dataset(robot, walks.trajectory, start, push=push)
             errors = training.report(effects, samples)
-            tell(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
+            report_progress(3 * done + 1, 3 * len(worlds), f"{world}: errors by phase")
             phases = fidelity.by_phase(effects, samples)
-            tell(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
-            calm = ~np.any(push.force, axis=(1, 2))  # a push from outside is in no model
-            quiet = jax.tree.map(lambda x, calm=calm: x[calm], walks)
-            drifts[world] = fidelity.drifts(robot, effects, quiet.trajectory, quiet.job.start_tick)
+            report_progress(3 * done + 2, 3 * len(worlds), f"{world}: open loop")
+            unpushed = ~np.any(push.force, axis=(1, 2))  # no model contains external pushes
+            calm = jax.tree.map(lambda x, unpushed=unpushed: x[unpushed], walks)
+            drifts[world] = fidelity.drifts(robot, effects, calm.trajectory, calm.job.start_tick)
             result[world] = fidelity.as_result(errors, phases, drifts[world])
     curves = fidelity.curves(robot, worlds["hfs"].trajectory, effects)
-    trainings = {"training": net.course, "training_paper": paper.course}
+    trainings = {"training": net.history, "training_paper": paper.history}
     tick = config.rollout.walk.gait.tick
-    drawn = pictures.of_nets(args.out, tick, curves, drifts, trainings)
-    report = fidelity.write_report(args.out, result, drawn)
-    in_words = partial(arguments.print_errors, result["hfs"]["errors"])
-    print_result(args.json, {"report": str(report), "worlds": result}, in_words)
+    drawings = pictures.of_nets(args.out, tick, curves, drifts, trainings)
+    report = fidelity.write_report(args.out, result, drawings)
+    print_text = partial(arguments.print_errors, result["hfs"]["errors"])
+    print_result(args.json, {"report": str(report), "worlds": result}, print_text)
     say(f"the report is {report}")
 
 
 def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -> Walks:
-    """Walks of the three trajectories with nominal and expert weights, for information only."""
+    """Walk the three trajectories with nominal and expert weights, for information only."""
     jobs = [
         Job(weights, named_command(name), plant, seed=seed)
         for weights in (nominal(robot), expert(robot))

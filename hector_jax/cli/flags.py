@@ -1,4 +1,4 @@
-"""The flags of each command; a field's comment is its help text, its range stands in its type."""
+"""The flags of each command; a field's comment is its help text, its type contains its range."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -15,11 +15,11 @@ NAMED_WEIGHTS = (*BASELINES, "best")
 
 
 class Source(Enum):
-    """What a flag names; it is looked for before the slow imports."""
+    """What a flag names; its existence is checked before the slow imports."""
 
     FILE = "a file"
     RUN = "the folder of a run of `hector tune`"
-    FOLDER = "a folder"  # which may be missing
+    FOLDER = "a folder"  # may not exist yet
     EXPORTABLE = "a run folder or a weights file"
     WEIGHTS = "nominal, expert, best or a weights file"
     SETS = "nominal, expert, best, a weights file, or a folder of one for each trajectory"
@@ -30,7 +30,7 @@ class Source(Enum):
 Processes = Annotated[int, Range(1, 1024)]
 Plants = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, SEED]
-Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper, of which it tells
+Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper, which are reported
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Footsteps = Literal["footstep_feedback", "footstep_width", "turn_lead"]
 Gains = Literal["horizontal_gain", "height_gain", "tilt_gain", "yaw_gain"]
@@ -39,7 +39,7 @@ Tunables = Literal[Groups, Footsteps, "effort_reference", "friction", Gains]
 Variant = Literal["residual", "paper"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
 Engine = Literal["auto", OneEngine]
-# MJX is MuJoCo C's physics and walks no plant whose estimator errs
+# without MJX: it has the physics of MuJoCo C and no plants with estimator errors
 JudgingEngine = Literal["c", "drake", "pinocchio", "all"]
 Gait = Literal["own", "walk", "trot", "pace", "crawl", "stand"]
 Family = Literal["standin", "even"]
@@ -47,7 +47,7 @@ PlantWorld = Literal["ideal", "hfs", "hfs-varied", "standin", "standin-even"]
 World = Literal["srbm", PlantWorld]
 RobotFile = Annotated[Path | None, Source.ROBOT]
 Weights = Annotated[str, Source.WEIGHTS]
-WeightSets = Annotated[str, Source.SETS]  # NAME= may stand before it
+WeightSets = Annotated[str, Source.SETS]  # with an optional prefix NAME=
 Trajectory = Annotated[str, Source.TRAJECTORY]
 Trajectories = tuple[Trajectory, ...]
 Run = Annotated[Path, Source.RUN]
@@ -378,7 +378,7 @@ class Replay:
 
 
 def command(word: str) -> type[Any]:
-    """The flags of a command.
+    """Return the class of a command's flags.
 
     Raises:
         InputError: there is no such command.

@@ -1,9 +1,9 @@
-"""The console script `hector`: flags in, exit code out.
+"""The console script `hector`: run a command and return its exit code.
 
-Results go to stdout, everything said while waiting to stderr. Exit codes: 0 done; 1 something is
-broken: `hector doctor` found it, a worker process was killed, a disk is full, or a fault of this
-program with its traceback; 2 bad input: one line says what came, where, and what was expected; 130
-interrupted; 141 nobody reads standard output any more; 143 terminated.
+Results go to stdout, progress messages to stderr. Exit codes: 0 done; 1 something is broken:
+`hector doctor` found it, a worker process was killed, a disk is full, or a fault of this program
+with its traceback; 2 bad input: one line gives the value, its place and what was expected; 130
+interrupted; 141 standard output was closed; 143 terminated.
 """
 
 import json
@@ -19,7 +19,7 @@ from hector_jax.core.runtime import cache_folder, check_jax, home_cache, setup_j
 
 
 def main() -> int:
-    """Entry of the console script."""
+    """Run the console script and return its exit code."""
     return exit_code("hector", lambda: _run(sys.argv[1:]))
 
 
@@ -28,10 +28,10 @@ def _run(words: Sequence[str]) -> None:
     check(args)
     if isinstance(args, Completion):
         all_commands("--tyro-print-completion", args.shell)
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of its own cache
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about its cache
     try:
-        if (cache := cache_folder()) != (usual := home_cache()):
-            say(f"{usual} cannot be written: compiled programs are kept in {cache}")
+        if (cache := cache_folder()) != (default := home_cache()):
+            say(f"{default} cannot be written: compiled programs are kept in {cache}")
         with say_if_slow("loading JAX and MuJoCo"):
             check_jax(on_cpu=isinstance(args, Export))  # see hector_jax.runs.export_controller
             setup_jax()

@@ -1,7 +1,7 @@
-"""A command with its flags from the words of a line or from a file, checked, and written again.
+"""Read the flags of a command from the command line or a file, check them, and write them again.
 
-tyro reads the line; a TOML file, or the `config.json` of a run, has the same flags by name. All of
-it happens before the slow imports: a wrong word ends in one line at once.
+tyro reads the command line; a TOML file, or the `config.json` of a run, has the same flags by name.
+All of this happens before the slow imports, so that a wrong word is reported at once.
 """
 
 import io
@@ -46,13 +46,13 @@ Flags = TypeVar("Flags")
 
 
 def from_line(words: Sequence[str]) -> Any:
-    """A command with its flags, as the words after `hector` give them.
+    """Read a command and its flags from the words after `hector`.
 
     Flags that are not on the line come from the file of `--config`, else from their defaults. Help
-    is printed, and ends in SystemExit.
+    is printed and exits by SystemExit.
 
     Raises:
-        InputError: one line with the word that is unknown, given twice, missing, too much or of the
+        InputError: one line with the word that is unknown, repeated, missing, unexpected or of the
             wrong type.
     """
     others = [word for word in words if word not in _HELP]
@@ -64,7 +64,7 @@ def from_line(words: Sequence[str]) -> Any:
 
 
 def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
-    """The flags of a program, as the words after its name give them; see `from_line`."""
+    """Read the flags of a program from the words after its name; see `from_line`."""
     wants_help = any(word in _HELP for word in words)
     options: dict[str, Any] = {"prog": program}
     words = [word for word in words if word not in _HELP]
@@ -76,19 +76,19 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
         if flags.count(name) > 1:
             raise InputError(f"--{name} is given twice")
     if "config" in flags:
-        given: Any = _quietly(kind, words, **options)
-        options["default"] = from_file(kind, given.config)
+        flags_of_line: Any = _quietly(kind, words, **options)
+        options["default"] = from_file(kind, flags_of_line.config)
     return _tyro(kind, ["--help"], **options) if wants_help else _quietly(kind, words, **options)
 
 
 def all_commands(*words: str) -> Any:
-    """Give tyro's own words to all commands, such as --help; leaves by SystemExit."""
+    """Run tyro's own flags, such as --help, on all commands; exits by SystemExit."""
     kinds = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()]
     return _tyro(Union[tuple(kinds)], words, prog="hector", description=_ABOUT)  # noqa: UP007
 
 
 def _quietly(kind: type, words: Sequence[str], **options: Any) -> Any:
-    """Parse; what tyro would draw a box around is an InputError of one line."""
+    """Parse; raise an InputError of one line where tyro would print a box."""
     text = io.StringIO()
     try:
         with redirect_stdout(text), redirect_stderr(text):
@@ -115,7 +115,7 @@ def _tyro(kind: Any, words: Sequence[str], **options: Any) -> Any:
 
 
 def _scalar(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """A number, or a flag that may be left out; help shows PATH, not Python's `{None}|PATH`."""
+    """Parse a number or an optional flag; help shows PATH, not Python's `{None}|PATH`."""
     optional = info.type_origin in (Union, UnionType) and NoneType in get_args(info.type)
     kind = next(x for x in get_args(info.type) if x is not NoneType) if optional else info.type
     if not optional and kind not in _NUMBERS:
@@ -140,17 +140,17 @@ def _scalar(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 def from_file(kind: type[Flags], path: Path) -> Flags:
-    """Flags of a command as a file gives them, others at their default.
+    """Read flags of a command from a file; the others keep their defaults.
 
     Args:
         kind: the command, a dataclass of `flags`.
-        path: TOML whose keys are flags (`first-seed` or `first_seed`), or the `config.json` that a
-            run leaves, of which `flags` are read. Paths inside are relative to where the command
-            is called, as on its line.
+        path: TOML whose keys are flags (`first-seed` or `first_seed`), or the `config.json` of a
+            run, whose `flags` are read. Paths inside are relative to the working directory, as on
+            the command line.
 
     Raises:
-        InputError: one line naming file and key, for one that is unknown, with the nearest known
-            name, of a wrong type or out of range; or the file, where it cannot be read.
+        InputError: one line naming file and key, if a key is unknown (with the nearest valid name),
+            of a wrong type or out of range; or naming the file, if it cannot be read.
     """
     if path.suffix == ".json":
         content = read_json(path, "flags as JSON", _MAX_BYTES)
@@ -168,20 +168,20 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
             raise InputError(f"{path}: config stands on the line only")
         values[name] = value
     if kind in (Tune, Propose) and isinstance(values.get("traj"), str):
-        values["traj"] = [values["traj"]]  # older runs were tuned on one
+        values["traj"] = [values["traj"]]  # older runs were tuned on one trajectory
     return from_table(str(path), kind, values)
 
 
 def as_table(flags: Any) -> dict[str, Any]:
-    """The flags as values of JSON, those that came from a file included; `from_file` reads them."""
+    """Return the flags as JSON values, including those from a file; `from_file` reads them."""
     table = {name: value for name, value in to_table(flags).items() if name != "config"}
     if isinstance(table.get("traj"), list | tuple) and len(table["traj"]) == 1:
-        (table["traj"],) = table["traj"]  # a word, as it was when only one could be tuned on
+        (table["traj"],) = table["traj"]  # a word, as in older runs
     return table
 
 
 def as_command(program: str, flags: Any) -> str:
-    """The line that gives these flags to a program, those at their default left out."""
+    """Return the command line of a program with these flags, without those at their default."""
     words = program.split()
     for field in fields(flags):
         value, flag = getattr(flags, field.name), field.name.replace("_", "-")
@@ -198,10 +198,10 @@ def as_command(program: str, flags: Any) -> str:
 
 
 def check(flags: Any) -> None:
-    """Check the types and ranges of flags, and that the files are there that they name.
+    """Check the types and ranges of flags, and that the files that they name exist.
 
     Raises:
-        InputError: one line with the flag, what was expected and what came.
+        InputError: one line with the flag, the expected value and the actual value.
     """
     for field in fields(flags):
         value, label = getattr(flags, field.name), _label(field)
@@ -209,12 +209,12 @@ def check(flags: Any) -> None:
             raise InputError(f"{label} {error}")
         if value == () != field.default:
             raise InputError(f"{label} expects a value, got none")
-        each = value if isinstance(value, tuple) else (value,)
-        for i, one in enumerate(each):
-            if one in each[:i]:
-                raise InputError(f"{label} names {short_repr(str(one))} twice")
-            if one is not None and (source := _source(field.type)):
-                _check_source(label, one, source)
+        items = value if isinstance(value, tuple) else (value,)
+        for i, item in enumerate(items):
+            if item in items[:i]:
+                raise InputError(f"{label} names {short_repr(str(item))} twice")
+            if item is not None and (source := _source(field.type)):
+                _check_source(label, item, source)
     if hasattr(flags, "first_seed") and flags.first_seed + flags.seeds - 1 not in SEED:
         raise InputError(
             f"--first-seed {flags.first_seed} and --seeds {flags.seeds} reach beyond the largest "
@@ -223,7 +223,7 @@ def check(flags: Any) -> None:
 
 
 def _label(field: Any) -> str:
-    """How a message calls a flag; one without a default stands on the line without its name."""
+    """Return the flag's name in messages; a positional argument is in capitals."""
     name = field.name.replace("_", "-")
     return name.upper() if field.default is MISSING else f"--{name}"
 
@@ -235,24 +235,24 @@ def _source(kind: Any) -> Source | None:
 
 
 def _check_source(label: str, value: Path | str, source: Source) -> None:
-    """Raises InputError where a file or folder is missing that a flag names."""
-    path, hint, fine = Path(value), "", True
+    """Check that a flag names a file or folder of its source that exists; else InputError."""
+    path, hint, valid = Path(value), "", True
     named, is_dir = value in NAMED_WEIGHTS, os.path.isdir(path)
     if source is Source.RUN:
-        fine = is_dir
+        valid = is_dir
     elif source is Source.FOLDER:
-        fine = os.path.isdir(next(x for x in (path, *path.parents) if os.path.exists(x)))
+        valid = os.path.isdir(next(x for x in (path, *path.parents) if os.path.exists(x)))
     elif source is Source.ROBOT:
-        fine = path.suffix == ".toml"
+        valid = path.suffix == ".toml"
     elif source is Source.WEIGHTS:
-        fine = named or path.suffix or os.path.lexists(path)
+        valid = named or path.suffix or os.path.lexists(path)
         hint = did_you_mean(str(value), NAMED_WEIGHTS)
     elif source is Source.SETS:
         path = Path(str(value).rpartition("=")[2])
         named, is_dir = str(path) in NAMED_WEIGHTS, os.path.isdir(path)
-        fine = named or is_dir or path.suffix
+        valid = named or is_dir or path.suffix
         hint = did_you_mean(str(path), NAMED_WEIGHTS)
-    if not fine:
+    if not valid:
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
     if (
         source in (Source.FILE, Source.ROBOT)
@@ -265,7 +265,7 @@ def _check_source(label: str, value: Path | str, source: Source) -> None:
 
 
 def resolve_latest(flags: Flags) -> Flags:
-    """The flags with the newest run under `runs/` wherever `latest` stands for a run folder.
+    """Replace `latest` in the flags of run folders by the newest run under `runs/`.
 
     Raises:
         InputError: there is no run.
@@ -283,6 +283,6 @@ def resolve_latest(flags: Flags) -> Flags:
     for field in fields(flags):  # pyright: ignore[reportArgumentType]
         value = getattr(flags, field.name)
         if value is not None and _source(field.type) in (Source.RUN, Source.EXPORTABLE):
-            several = isinstance(value, tuple)
-            values[field.name] = tuple(map(newest, value)) if several else newest(value)
+            is_tuple = isinstance(value, tuple)
+            values[field.name] = tuple(map(newest, value)) if is_tuple else newest(value)
     return replace(flags, **values)  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""The folder of a run of `hector tune`: begun with its flags, and resumed by them."""
+"""The folder of a run of `hector tune`: create it with its flags, and resume it."""
 
 import dataclasses
 import tempfile
@@ -24,34 +24,34 @@ Flags = TypeVar("Flags")
 TIME = "%Y%m%d-%H%M%S"  # names a run
 _CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice", "runs.walks")
 # flags of a call, not of the run that it begins or resumes
-_OF_A_CALL = ("config", "each", "out", "resume", "run", "runs")
-_FREE = ("data", "json", "processes", "verdict", "video")  # may be others when a run is resumed
+_CALL_FLAGS = ("config", "each", "out", "resume", "run", "runs")
+_FREE_FLAGS = ("data", "json", "processes", "verdict", "video")  # may change when a run is resumed
 
 
 def exists_error(folder: Path) -> InputError:
-    """The error of a run folder that exists."""
+    """Return the error for a run folder that exists."""
     return InputError(
         f"run folder {folder} exists; continue it with --resume or name another with --out"
     )
 
 
-def as_begun(args: Tune) -> Tune:
-    """The flags of one run, without the folders: in another folder they ask for the same."""
+def run_flags(args: Tune) -> Tune:
+    """Return the flags of one run without its folders, which do not change the results."""
     return replace(args, each=False, out=None, run=None, resume=None)
 
 
 def begin(folder: Path, args: Tune) -> Path:
-    """Make the folder of a new run, at once with its flags: one that is there can be resumed.
+    """Create the folder of a new run with its flags in one step, so that it can be resumed.
 
     Returns:
-        The folder; if nobody named it and it is there, that of the next free second.
+        The folder; if its name was not set by a flag and exists, that of the next free second.
     """
     make_folder(folder.parent)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
         new = Path(part) / "run"
         write_json(new / VERSIONS, environment())
         config = {
-            "flags": as_table(as_begun(args)),
+            "flags": as_table(run_flags(args)),
             "directory": str(Path.cwd()),
             "robot": robot_hash(load_robot(args.robot)),
             "code": code_hash(*_CODE),
@@ -70,14 +70,14 @@ def begin(folder: Path, args: Tune) -> Path:
 
 
 def resume(folder: Path, args: Tune) -> Tune:
-    """The flags of the run in `folder`; those given beside --resume have to agree.
+    """Return the flags of the run in `folder`; the flags of this call must agree with them.
 
-    A flag at its default counts as not given. Of those that change no number the given one is
-    taken.
+    A flag at its default counts as not set. Flags that change no number may differ; this call's
+    value is used.
 
     Raises:
-        InputError: one line naming the file: no run, one of other flags, other code, another robot,
-            or one whose data are not here.
+        InputError: one line naming the file: no run, other flags, other code, another robot, or
+            no data in this directory.
     """
     path = folder / CONFIG
     config, made_with = read_object(path), read_object(folder / VERSIONS)
@@ -92,23 +92,23 @@ def resume(folder: Path, args: Tune) -> Tune:
             "start a new run"
         )
     check_agreement(folder, config, {"robot": robot_hash(load_robot(begun.robot))})
-    now = agreed(folder, begun, args, of_a_call=_OF_A_CALL)
-    data = arguments.folder_of(now.data, now.robot, load_robot(now.robot))
-    if not now.net and not data.exists() and Path(config["directory"]) != Path.cwd():
+    flags = merge_flags(folder, begun, args, call_flags=_CALL_FLAGS)
+    data = arguments.robot_folder(flags.data, flags.robot, load_robot(flags.robot))
+    if not flags.net and not data.exists() and Path(config["directory"]) != Path.cwd():
         raise InputError(
             f"{data}: no data here; the run was begun in {config['directory']}: resume it there, "
             "or name the folder by --data"
         )
-    return now
+    return flags
 
 
-def agreed(folder: Path, begun: Flags, args: Flags, of_a_call: Sequence[str]) -> Flags:
-    """The flags with which a folder was begun; those given beside it have to agree.
+def merge_flags(folder: Path, begun: Flags, args: Flags, call_flags: Sequence[str]) -> Flags:
+    """Merge the flags of a folder with those of this call, which must agree.
 
     Args:
         folder: for the message.
-        begun, args: flags of the folder and of this call, where a default counts as not given.
-        of_a_call: names of those that are the call's.
+        begun, args: flags of the folder and of this call, where a default counts as not set.
+        call_flags: names of the flags that are taken from this call alone.
 
     Raises:
         InputError: one line with the first flag that differs.
@@ -116,52 +116,51 @@ def agreed(folder: Path, begun: Flags, args: Flags, of_a_call: Sequence[str]) ->
     flags = {}
     for field in dataclasses.fields(begun):  # pyright: ignore[reportArgumentType]
         name = field.name
-        if name in of_a_call:
+        if name in call_flags:
             continue
-        before, given = getattr(begun, name), getattr(args, name)
-        flags[name] = before if given == field.default else given
-        if name not in _FREE and flags[name] != before:
-            before, given = (" ".join(x) if isinstance(x, tuple) else x for x in (before, given))
-            raise InputError(f"{folder}: begun with --{name} {before}, got {given}")
+        old, new = getattr(begun, name), getattr(args, name)
+        flags[name] = old if new == field.default else new
+        if name not in _FREE_FLAGS and flags[name] != old:
+            old, new = (" ".join(x) if isinstance(x, tuple) else x for x in (old, new))
+            raise InputError(f"{folder}: begun with --{name} {old}, got {new}")
     return replace(args, **flags)  # pyright: ignore[reportArgumentType]
 
 
-def check_agreement(folder: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Hold what a run follows from against what it followed from when it was begun.
+def check_agreement(folder: Path, recorded: Mapping[str, Any], current: Mapping[str, Any]) -> None:
+    """Compare the settings of a run with those recorded when it was begun.
 
     Raises:
         InputError: one line naming the folder and the first setting that differs.
     """
-    for name, value in now.items():
+    for name, value in current.items():
         if isinstance(value, dict):
-            before = begun.get(name, {})
-            if not isinstance(before, dict):
-                raise InputError(f"{folder / CONFIG}: {name}: no settings: {before!r}")
-            check_agreement(folder, before, value)
-        elif begun.get(name, value) != value:
-            raise InputError(f"{folder}: begun with {name} {begun[name]}, here is {value}")
+            old = recorded.get(name, {})
+            if not isinstance(old, dict):
+                raise InputError(f"{folder / CONFIG}: {name}: no settings: {old!r}")
+            check_agreement(folder, old, value)
+        elif recorded.get(name, value) != value:
+            raise InputError(f"{folder}: begun with {name} {recorded[name]}, here is {value}")
 
 
 def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
-    """The flags of each run by its folder.
+    """Return the flags of each run by its folder.
 
     Args:
-        args: of the command.
-        base: the folder that was named, if any.
-        robot: that is tuned.
+        args: flags of the command.
+        base: folder from a flag, if any.
+        robot: robot to tune.
 
     Raises:
-        InputError: two trajectories of one name, or of runs that were tuned one by one.
+        InputError: two trajectories have one name, or --resume lacks --each.
     """
-    names = arguments.by_name(args.traj)
+    names = arguments.trajectories_by_name(args.traj)
     if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
         raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
     now = f"{datetime.now():{TIME}}"
-    parent = arguments.folder_of(args.runs, args.robot, robot)
-    # beside --resume a trajectory that was not given is that of the run
-    as_before = args.resume and args.traj == Tune.traj
-    shared = args if as_before else replace(args, traj=tuple(names.values()))
+    parent = arguments.robot_folder(args.runs, args.robot, robot)
     if args.each:
-        each = {name: replace(args, traj=(text,)) for name, text in names.items()}
-        return {base / n if base else parent / n / now: one for n, one in each.items()}
-    return {base or parent / "-".join(names) / now: shared}
+        folders = {name: base / name if base else parent / name / now for name in names}
+        return {folders[name]: replace(args, traj=(text,)) for name, text in names.items()}
+    if not (args.resume and args.traj == Tune.traj):  # with --resume, the default is the run's
+        args = replace(args, traj=tuple(names.values()))
+    return {base or parent / "-".join(names) / now: args}

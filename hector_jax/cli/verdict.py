@@ -1,7 +1,7 @@
-"""What weight sets are worth in several engines and models of the robot."""
+"""`hector verdict`: evaluate weight sets in several engines and models of the robot."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,6 @@ from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, JudgingEngine, Verdict
 from hector_jax.cli.parse import as_command, as_table
-from hector_jax.control.reference import COMMANDS
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import say
@@ -28,88 +27,89 @@ from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import TuneConfig
 
-_ENGINES = get_args(JudgingEngine)[:-1]  # all but `all`
-_MASSES = {LIGHT: 0.9, HEAVY: 1.1}  # times those of a plant, of the robot's own model
+_ENGINES = get_args(JudgingEngine)[:-1]  # without `all`
 
 
 class Model(NamedTuple):
-    """A model of the robot, of which the plants are."""
+    """A model of the robot that plants are drawn from."""
 
-    mass: float = 1.0  # times that of each plant
-    plant: Robot | None = None  # None: the robot's own
+    mass: float = 1.0  # factor of the mass of each plant
+    plant: Robot | None = None  # None: the robot's own model
+
+
+_OTHER_MASSES = {LIGHT: Model(mass=0.9), HEAVY: Model(mass=1.1)}
 
 
 class Plan(NamedTuple):
-    """What is to be walked."""
+    """The walks of a verdict."""
 
     robot: Robot
     family: str
-    courses: dict[str, tuple[NamedCommand, float]]  # and how long [s], by the trajectory's name
+    trajectories: dict[str, tuple[NamedCommand, float]]  # by name, with the length of walks [s]
     sets: dict[str, dict[str, Weights]]  # by trajectory and set
     models: dict[str, Model]
-    columns: dict[Column, range]  # and the seeds of its plants
+    columns: dict[Column, range]  # with the seeds of its plants
     engines: dict[str, Engine]
 
     @property
     def differs(self) -> dict[str, str]:
-        """What plants have otherwise in each engine than in MuJoCo C."""
+        """Differences of the plants in each engine from those in MuJoCo C."""
         return {name: engine.differs for name, engine in self.engines.items() if engine.differs}
 
 
 def verdict(args: Verdict) -> None:
-    """Walk weight sets in several engines and models, and report what may be claimed."""
+    """Walk weight sets in several engines and models, and report which claims hold."""
     plan = plan_of(args)
-    say(_in_words(plan))
+    say(_plan_text(plan))
     make_folder(args.out)
-    about, config = environment(), tunings.tune_config(plan.robot)
+    made_with, config = environment(), tunings.tune_config(plan.robot)
     with workers(args.processes) as pool:
-        cells = walk_cells(pool, config, plan, args.out / "scores", about.get("commit", ""))
+        cells = walk_cells(pool, config, plan, args.out / "scores", made_with.get("commit", ""))
     result = report.write_report(
         args.out,
         cells,
         family=args.family,
         differs=plan.differs,
         config={"flags": as_table(args)},
-        environment=about,
+        environment=made_with,
         command=as_command("hector verdict", args),
     )
     path = args.out / "report.md"
-    in_words = partial(report.print_verdict, cells, plan.differs, args.family)
-    print_result(args.json, {"report": str(path), **result}, in_words)
+    print_text = partial(report.print_verdict, cells, plan.differs, args.family)
+    print_result(args.json, {"report": str(path), **result}, print_text)
     say(f"the report is {path}")
 
 
 def plan_of(args: Verdict) -> Plan:
-    """What the flags ask for, checked before anything is walked.
+    """Make the plan of the flags, checked before any walk.
 
     Raises:
         InputError: one line with the flag or the file.
     """
     robot = load_robot(args.robot)
-    texts = dict.fromkeys(t for one in args.traj for t in (COMMANDS if one == "all" else (one,)))
-    courses = {}
-    for text in texts:
-        course = arguments.course(text, robot)
-        if course.name in courses:
-            raise InputError(f"--traj names two trajectories {course.name}")
-        courses[course.name] = course, arguments.seconds(args.seconds, course)
-    models = {OWN: Model()}
-    if args.light_heavy:
-        models |= {name: Model(mass) for name, mass in _MASSES.items()}
+    trajectories = {}
+    for text in arguments.expand_all(args.traj):
+        trajectory = arguments.load_trajectory(text, robot)
+        if trajectory.name in trajectories:
+            raise InputError(f"--traj names two trajectories {trajectory.name}")
+        seconds = arguments.walk_seconds(args.seconds, trajectory)
+        trajectories[trajectory.name] = trajectory, seconds
+    models = {OWN: Model()} | (_OTHER_MASSES if args.light_heavy else {})
     for path in args.plant:
         plant = arguments.plant_of(path, robot)
-        assert plant is not None  # there is a path
+        assert plant is not None  # the path is set
         if (name := plant.description.name) in models:
             raise InputError(f"--plant {path}: there is a model {name!r} already")
         models[name] = Model(plant=plant)
-    engines = _engines(args.engine)
+    names = args.engine
+    engines = _installed(say) if "all" in names else {name: choose_engine(name) for name in names}
     columns = {
         Column(engine, model): _seeds(args, first=engine == next(iter(engines)), own=model == OWN)
         for engine in engines
         for model in models
     }
-    sets = _sets(args, robot, courses)
-    return Plan(robot, args.family, courses, sets, models, columns, engines)
+    sets = _sets(args, robot, trajectories)
+    return Plan(robot, args.family, trajectories, sets, models, columns, engines)
 
 
 def _seeds(args: Verdict, *, first: bool, own: bool) -> range:
@@ -119,40 +119,31 @@ def _seeds(args: Verdict, *, first: bool, own: bool) -> range:
     return range(args.first_seed, args.first_seed + count)
 
 
-def _engines(names: Sequence[str]) -> dict[str, Engine]:
-    """The engines of the flag; `all` are those that can be used here.
-
-    Raises:
-        InputError: an engine that is named cannot be used.
-    """
-    if "all" not in names:
-        return {name: choose_engine(name) for name in names}
-    return _installed(say)
-
-
-def _installed(tell: Callable[[str], None]) -> dict[str, Engine]:
-    """The engines that can be used here; tells of the others why not."""
+def _installed(report_missing: Callable[[str], None]) -> dict[str, Engine]:
+    """Return the engines installed on this machine; report the reason for each missing engine."""
     engines = {}
     for name in _ENGINES:
         try:
             engines[name] = choose_engine(name)
         except InputError as error:
-            tell(f"left out: {error}")
+            report_missing(f"left out: {error}")
     return engines
 
 
-def _sets(args: Verdict, robot: Robot, courses: Mapping[str, Any]) -> dict[str, dict[str, Weights]]:
-    """The weight sets of each trajectory; a folder has a file for each.
+def _sets(
+    args: Verdict, robot: Robot, trajectories: Iterable[str]
+) -> dict[str, dict[str, Weights]]:
+    """Load the weight sets of each trajectory; a folder has one file per trajectory.
 
     Raises:
-        InputError: a name that cannot be part of a file's, or is taken; a file that is no set.
+        InputError: a name is not valid in a file name, or is repeated; a file is not a weight set.
     """
     paths: dict[str, Path] = {}
     for text in args.weights:
         name, _, file = text.rpartition("=")
         path = Path(file)
         name = name or path.stem
-        # names are parts of files' names, where other characters might make two of them one
+        # names become parts of file names, where other characters might not stay distinct
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
             raise InputError(
                 f"--weights {text}: {name!r} is no name of letters, digits and _; give it one: "
@@ -164,51 +155,51 @@ def _sets(args: Verdict, robot: Robot, courses: Mapping[str, Any]) -> dict[str, 
     if "nominal" not in paths or len(paths) < 2:
         raise InputError("--weights must be nominal, which changes are against, and other sets")
 
-    def load(path: Path, course: str) -> Weights:
-        file = path / f"{course}.json" if path.is_dir() else path
+    def load(path: Path, trajectory: str) -> Weights:
+        file = path / f"{trajectory}.json" if path.is_dir() else path
         return arguments.weights(str(file), robot)
 
     return {
-        course: {name: load(path, course) for name, path in paths.items()} for course in courses
+        trajectory: {name: load(path, trajectory) for name, path in paths.items()}
+        for trajectory in trajectories
     }
 
 
-def _in_words(plan: Plan) -> str:
-    """How many walks there are to be, and what engines cannot have."""
-    each = len(plan.courses) * len(next(iter(plan.sets.values())))
+def _plan_text(plan: Plan) -> str:
+    """Describe the number of walks, the plants, and the differences between engines."""
+    per_plant = sum(map(len, plan.sets.values()))
+    walks = plural(per_plant * sum(map(len, plan.columns.values())), "walk")
     texts = [f"{report.title_of(column)} ({len(seeds)})" for column, seeds in plan.columns.items()]
-    text = f"{plural(each * sum(map(len, plan.columns.values())), 'walk')}: {each} on each plant"
-    text += f"; plants: {', '.join(texts)}"
-    for name, what in plan.differs.items():
-        text += f"; in {report.TITLES[name]} {what}"
-    return text
+    parts = [f"{walks}: {per_plant} on each plant", f"plants: {', '.join(texts)}"]
+    parts += [f"in {report.TITLES[name]} {differs}" for name, differs in plan.differs.items()]
+    return "; ".join(parts)
 
 
 def walk_cells(
     pool: Executor, config: TuneConfig, plan: Plan, folder: Path, commit: str = ""
 ) -> Cells:
-    """All walks, engine by engine; those whose scores are in the folder are not walked again."""
-    scores: dict[tuple[Column, str, str, int], verdicts.ScoredWalk] = {}
+    """Do all walks, engine by engine; walks whose scores are in the folder are not repeated."""
+    scored: dict[tuple[Column, str, str, int], verdicts.ScoredWalk] = {}
+    options: dict[str, Any] = {"folder": folder, "commit": commit}
     for name, engine in plan.engines.items():
         jobs, title = _jobs(plan, name), f"walking in {report.TITLES[name]}"
         inputs = pool, config, plan.robot, {case: job for case, job in jobs.values()}
-        found = verdicts.score_jobs(
-            *inputs, title=title, folder=folder, commit=commit, engine=engine
-        )
-        scores |= {key: found[case][0] for key, (case, _) in jobs.items()}
+        by_case = verdicts.score_jobs(*inputs, title=title, engine=engine, **options)
+        scored |= {key: by_case[case][0] for key, (case, _) in jobs.items()}
     cells = {}
     for column, seeds in plan.columns.items():
-        for course, sets in plan.sets.items():
-            walks = {name: [scores[column, course, name, s] for s in seeds] for name in sets}
-            where = report.cell_text((column, course))
-            verdicts.say_faults({f"{name} on {where}": each for name, each in walks.items()})
-            each = {name: [walk.score for walk in of] for name, of in walks.items()}
-            cells[column, course] = metrics.make_verdict(config.loss, seeds, each)
+        for trajectory, sets in plan.sets.items():
+            cell = column, trajectory
+            walks = {name: [scored[*cell, name, seed] for seed in seeds] for name in sets}
+            where = report.cell_text(cell)
+            verdicts.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
+            scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
+            cells[cell] = metrics.make_verdict(config.loss, seeds, scores)
     return cells
 
 
 def _jobs(plan: Plan, engine: str) -> dict[tuple[Column, str, str, int], tuple[verdicts.Case, Job]]:
-    """The walks of an engine with the case that each is stored as."""
+    """Return the walks of an engine, each with the case under which it is stored."""
     jobs, world = {}, "standin" if plan.family == "standin" else f"standin-{plan.family}"
     for column, seeds in plan.columns.items():
         if column.engine != engine:
@@ -217,11 +208,11 @@ def _jobs(plan: Plan, engine: str) -> dict[tuple[Column, str, str, int], tuple[v
         body = (model.plant or plan.robot).description
         for seed, drawn in zip(seeds, arguments.plants(world, seeds, body), strict=True):
             plant = drawn._replace(mass=model.mass * drawn.mass)
-            for course, (command, seconds) in plan.courses.items():
-                for name, weights in plan.sets[course].items():
+            for trajectory, (command, seconds) in plan.trajectories.items():
+                for name, weights in plan.sets[trajectory].items():
                     job = Job(weights, command.command, plant, seconds, seed, plant=model.plant)
-                    case = f"{engine}-{column.model}-{course}-{name}", seed
-                    jobs[column, course, name, seed] = case, job
+                    case = f"{engine}-{column.model}-{trajectory}-{name}", seed
+                    jobs[column, trajectory, name, seed] = case, job
     return jobs
 
 
@@ -230,23 +221,23 @@ def small_verdict(
     config: TuneConfig,
     robot: Robot,
     sets: Mapping[str, Weights],
-    course: NamedCommand,
+    trajectory: NamedCommand,
     seconds: float,
     folder: Path,
 ) -> Callable[[], None]:
-    """At most twelve walks of a run's sets on one plant, where the run itself has not walked.
+    """Do at most twelve walks of a run's sets on one plant, in engines or models new to the run.
 
-    Those are the other engines that are installed, or else the robot with other masses.
+    Those are the other installed engines, or, without any, the robot with other masses.
 
     Returns:
-        What prints the table.
+        The function that prints the table.
     """
-    few = {name: sets[name] for name in ("nominal", "expert", "with", "best")}
-    others = list(_installed(lambda text: None).items())[1:4]
+    others = list(_installed(lambda message: None).items())[1:4]
     engines = dict(others) or {"c": choose_engine("c")}
-    models = {OWN: Model()} if others else {n: Model(mass) for n, mass in _MASSES.items()}
+    models = {OWN: Model()} if others else _OTHER_MASSES
     columns = {Column(engine, model): range(1) for engine in engines for model in models}
-    walks = {course.name: (course, seconds)}, {course.name: few}
-    plan = Plan(robot, "standin", *walks, models, columns, engines)
+    walks = {trajectory.name: (trajectory, seconds)}
+    few = {trajectory.name: {name: sets[name] for name in ("nominal", "expert", "with", "best")}}
+    plan = Plan(robot, "standin", walks, few, models, columns, engines)
     cells = walk_cells(pool, config, plan, folder)
     return partial(report.print_verdict, cells, plan.differs, plan.family)

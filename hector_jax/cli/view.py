@@ -1,4 +1,4 @@
-"""A run to look at: on a page, or as a film and pictures."""
+"""`hector view`: show a run on a web page, or as a film and pictures."""
 
 import jax
 import numpy as np
@@ -22,51 +22,51 @@ from hector_jax.runs.folder import read_histories, read_request, weights_of
 
 
 def view_run(args: View) -> None:
-    """Show a run on a page, or leave its film and pictures."""
+    """Show a run on a page, or write its film and pictures."""
     folder = args.out or (args.run / "view" if args.headless else None)
     if folder is None:
         view.check_viser()
     else:
         check_film(folder / "film.mp4")
-    begun = read_request(args.run)
-    robot = arguments.robot_of(args.run, begun)
-    course = arguments.course(begun.trajectory, robot)
+    request = read_request(args.run)
+    robot = arguments.robot_of(args.run, request)
+    command = arguments.load_trajectory(request.trajectory, robot)
     if folder is not None:
         if folder.resolve() == args.run.resolve():
             raise InputError(f"--out must not be the folder of the run, got {folder}")
         make_folder(folder)
     sets = {name: weights_of(args.run, name, robot) for name in args.sets}
-    data = arguments.folder_of(args.data or begun.data, begun.robot, robot)
-    net = begun.net if args.data is None and begun.net else nets.net_path(data, begun.variant)
+    data = arguments.robot_folder(args.data or request.data, request.robot, robot)
+    net = request.net if args.data is None and request.net else nets.net_path(data, request.variant)
     effects = {}
     if net.exists():
-        effects["residual"] = as_effect(load_net(net, robot, begun.variant)[0])
+        effects["residual"] = as_effect(load_net(net, robot, request.variant)[0])
     else:
         say(f"no net at {net}, so its predictions are not shown; --data names another folder")
 
     def walk() -> tuple[dict[str, view.ViewedWalk], str]:
-        """The walks of both sets, and what is to be said of them, in Markdown."""
-        place, walks = WORLDS.get(args.world, args.world), {}
-        lines = [f"**{begun.trajectory}** in {place}, seed {args.seed}"]
+        """Walk with both sets; return the walks and their description in Markdown."""
+        world, walks = WORLDS.get(args.world, args.world), {}
+        lines = [f"**{request.trajectory}** in {world}, seed {args.seed}"]
         say(f"walking in {args.world}, seed {args.seed}")
         for when, (name, (weights, words)) in zip(("before", "after"), sets.items(), strict=True):
-            trajectory = arguments.walk_once(args, robot, course, weights, None)
-            loss = metrics.score(begun.loss, trajectory).L / 1e6
+            trajectory = arguments.walk_once(args, robot, command, weights, None)
+            loss = metrics.score(request.loss, trajectory).L / 1e6
             lines.append(f"{when}: {words}, L {loss:.3f}e6 in this walk")
             say(f"  {lines[-1]}")
             trajectory = at_interval(trajectory, walk_config(robot).gait.tick)
-            stacked = jax.tree.map(lambda x: np.asarray(x)[None], trajectory)
-            walks[name] = view.ViewedWalk(trajectory, fidelity.curves(robot, stacked, effects))
+            batch = jax.tree.map(lambda x: np.asarray(x)[None], trajectory)
+            walks[name] = view.ViewedWalk(trajectory, fidelity.curves(robot, batch, effects))
         return walks, "\n\n".join(lines)
 
     def motions() -> tuple[dict[str, Motion], str]:
-        walks, story = walk()
-        return titled({name: motion(robot, *one) for name, one in walks.items()}), story
+        walks, description = walk()
+        return titled({name: motion(robot, *viewed) for name, viewed in walks.items()}), description
 
     if folder is not None:
-        pictures.of_view(folder, robot, read_histories(args.run), begun.loss, walk()[0])
+        pictures.of_view(folder, robot, read_histories(args.run), request.loss, walk()[0])
         say(f"the film and the pictures are in {folder}")
         return
     on_open = lambda address: say(f"open {address} in a browser; Ctrl-C ends it")  # noqa: E731
-    where = {"host": args.host, "port": args.port}
-    view.serve(motions, compile_model(robot.description), args.run, on_open, **where)
+    address = {"host": args.host, "port": args.port}
+    view.serve(motions, compile_model(robot.description), args.run, on_open, **address)

@@ -1,8 +1,8 @@
-"""The walking controller, in pure JAX: from a command and the state to wrench and joint torques.
+"""The walking controller in pure JAX: from command and state to wrench and joint torques.
 
-`reference` integrates the command, `gait` says which feet stand, `footstep` where they land, `mpc`
-plans the wrench under the `contact` constraints, `legs` turn it into torques, and `controller`
-calls them in turn. `parameters` has their numbers in one tree and which of them are tuned.
+`reference` integrates the command, `gait` schedules the contacts, `footstep` places the feet, `mpc`
+plans the wrench under the `contact` constraints, `legs` converts it into torques, and `controller`
+calls them in turn. `parameters` holds their numbers in one tree and lists which can be tuned.
 """
 
 from hector_jax.control.contact import (
@@ -40,42 +40,12 @@ from hector_jax.control.reference import (
 from hector_jax.control.trajectories import NamedCommand, command_of
 from hector_jax.control.weights import Weights, expert, nominal
 
+# fmt: off
 __all__ = [
-    "FootstepConfig",
-    "GaitConfig",
-    "LegConfig",
-    "LINE_FOOT",
-    "Anchor",
-    "Command",
-    "Contact",
-    "ContactModel",
-    "Horizon",
-    "InputConstraint",
-    "Measurement",
-    "Memory",
-    "MpcConfig",
-    "MpcProblem",
-    "NamedCommand",
-    "Parameters",
-    "Plan",
-    "Retune",
-    "Rows",
-    "StateConstraint",
-    "Step",
-    "Tunable",
-    "WalkConfig",
-    "Weights",
-    "actuate",
-    "build_qp",
-    "command_of",
-    "expert",
-    "init_memory",
-    "named_command",
-    "nominal",
-    "plan",
-    "reference_at",
-    "solve_mpc",
-    "standing_anchor",
-    "step_plan",
-    "walk_config",
+    "FootstepConfig", "GaitConfig", "LegConfig", "LINE_FOOT", "Anchor", "Command", "Contact",
+    "ContactModel", "Horizon", "InputConstraint", "Measurement", "Memory", "MpcConfig",
+    "MpcProblem", "NamedCommand", "Parameters", "Plan", "Retune", "Rows", "StateConstraint", "Step",
+    "Tunable", "WalkConfig", "Weights", "actuate", "build_qp", "command_of", "expert",
+    "init_memory", "named_command", "nominal", "plan", "reference_at", "solve_mpc",
+    "standing_anchor", "step_plan", "walk_config",
 ]

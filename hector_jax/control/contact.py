@@ -1,38 +1,38 @@
-"""What a stance foot can exert, and what the MPC must keep within bounds.
+"""Contact models of stance feet, and the constraints of the MPC.
 
-A `ContactModel` says which components of its wrench a stance foot has: those are the inputs of the
-MPC, five for a line foot (no M_x), and the others are zero, as is all of a foot in the air, which
-has no inputs. A `Constraint` is lower <= A z <= upper on the inputs of each contact or on the
-states of each step; `MpcConfig.constraints` holds as many as are wanted. One of one's own, by which
-no foot twists by more than 2 N m:
+A `ContactModel` lists the wrench components that a stance foot can exert: they are the inputs of
+the MPC, five for a line foot (no M_x). The others are zero, and so is the whole wrench of a foot in
+the air, which has no inputs. A `Constraint` is lower <= A z <= upper on the inputs of each contact
+or on the states of each step; `MpcConfig.constraints` holds any number of them. A custom one that
+limits the yaw moment of each foot to 2 N m:
 
 >>> def twist(contact: Contact) -> Rows:
 ...     return Rows(contact.moment[2:], -2.0, 2.0)
 >>> TWIST = InputConstraint("twist", of=twist)
 
-Those of the paper (Eq. 4), for each stance foot:
+Constraints of the paper (Eq. 4), for each stance foot:
 
     |F_x| + |F_y| <= mu F_z                    FRICTION
     0 <= F_z <= F_max                          UNILATERAL_FORCE
     -l_t F_z <= M_y <= l_h F_z                 LINE_PRESSURE, foot's yaw frame
     |F_y| <= mu' F_z at toe and heel each      LINE_FRICTION, foot's yaw frame
 
-Those of a flat foot, beside the first three, with w its half width:
+Constraints of a flat foot, in addition to the first three, with half width w:
 
     |M_x| <= w F_z                             SIDE_PRESSURE
     |M_z| <= mu' r / 2 F_z                     TORSION, r from the foot's middle to a corner
 
-and instead of TORSION, for feet that have to turn hard, CORNER_FRICTION: the wrench is a sum of
-forces at the four corners, each within the square that fits into their pyramids along the foot
+and instead of TORSION, for feet that need large yaw moments, CORNER_FRICTION: the wrench is a sum
+of forces at the four corners, each within the foot-aligned square inscribed in the friction pyramid
 (Caron, Pham, Nakamura 2015).
 
-Where this leaves the paper: toe and heel of the line foot are in their physical places (pressure at
-the toe gives M_y = -l_t F_z; the paper prints them swapped); toe and heel hold by friction each, or
-the foot would turn on the spot when the pressure is all at one end. Friction is the pyramid of the
-plants, MuJoCo's, whose base is a square on its corner in world axes: the paper's |F_x|, |F_y| <= mu
-F_z would ask for sqrt 2 times as much along a diagonal, more than some floors hold. mu' =
-mu max(|cos yaw|, |sin yaw|) is the most that it holds across a foot, whatever toe and heel push
-against each other along it.
+Differences from the paper: toe and heel of the line foot are in their physical places (pressure at
+the toe gives M_y = -l_t F_z; the paper prints them swapped). Toe and heel each satisfy friction,
+otherwise the foot would turn on the spot when all pressure is at one end. Friction is MuJoCo's
+pyramid, as in the plants; its base is a square with its corners on the world axes. The paper's
+|F_x|, |F_y| <= mu F_z would allow sqrt 2 times as much along a diagonal, more than some floors
+hold. mu' = mu max(|cos yaw|, |sin yaw|) is the largest friction coefficient across a foot, whatever
+forces along the foot toe and heel exert against each other.
 """
 
 from collections.abc import Callable
@@ -53,9 +53,9 @@ class ContactModel(Part):
     """A kind of foot.
 
     Attributes:
-        components: of (F_x, F_y, F_z, M_x, M_y, M_z) those that a stance foot can exert, F in the
-            world, M in the foot's yaw frame.
-        constraints: that hold it, where a config names no others.
+        components: indices into (F_x, F_y, F_z, M_x, M_y, M_z) that a stance foot can exert, F in
+            the world, M in the foot's yaw frame.
+        constraints: its default constraints, unless a config names others.
     """
 
     components: tuple[int, ...]
@@ -63,22 +63,22 @@ class ContactModel(Part):
 
     @property
     def inputs(self) -> int:
-        """Inputs of a stance foot."""
+        """Number of inputs of a stance foot."""
         return len(self.components)
 
     @property
     def selection(self) -> Float[np.ndarray, "6 inputs"]:
-        """The six components from the inputs."""
+        """Matrix from the inputs to the six wrench components."""
         return np.eye(6)[:, list(self.components)]
 
     def wrench(self, yaw: Float[Array, ""]) -> tuple[Array, Array]:
-        """Force and moment in the world, (3, inputs) each, that the inputs of a foot exert."""
+        """Return the matrices (3, inputs) from a foot's inputs to force and moment, world frame."""
         selection = jnp.asarray(self.selection, jnp.result_type(yaw))
         return selection[:3], rot_z(yaw) @ selection[3:]
 
 
 class Contact(NamedTuple):
-    """A stance foot, as its constraints see it: rows that read its wrench from its inputs."""
+    """Arguments of a constraint on a stance foot: matrices from its inputs to its wrench."""
 
     force: Float[Array, "3 inputs"]  # in the world [N]
     moment: Float[Array, "3 inputs"]  # in the foot's yaw frame [N m]
@@ -89,16 +89,16 @@ class Contact(NamedTuple):
 
 
 class Step(NamedTuple):
-    """The end of an MPC step, as its constraints see it."""
+    """Arguments of a constraint on the state at the end of an MPC step."""
 
-    state: State  # rows (3, 12) that read each part of the state
-    reference: State  # where it should be
-    contact: Bool[Array, " feet"]  # which stood in the step
-    lever: Float[Array, "feet 3"]  # foot points from the centre of mass as planned [m]
+    state: State  # matrices (3, 12) that select each part of the state
+    reference: State  # desired state
+    contact: Bool[Array, " feet"]  # stance feet of the step
+    lever: Float[Array, "feet 3"]  # planned centre of mass to foot points [m]
 
 
 class Rows(NamedTuple):
-    """Bounds lower <= A z <= upper; a bound is one number or one for each row."""
+    """Bounds lower <= A z <= upper; a bound is a number or has an entry for each row."""
 
     A: Float[Array, "rows z"]
     lower: Any
@@ -106,7 +106,7 @@ class Rows(NamedTuple):
 
 
 class Constraint(Part):
-    """Rows of the MPC."""
+    """Constraint rows of the MPC."""
 
     on: ClassVar[str]
     of: Callable[..., Rows]
@@ -121,23 +121,24 @@ class InputConstraint(Constraint):
 class StateConstraint(Constraint):
     """Rows on the state at the end of each step, `of(step: Step)`.
 
-    They make A dense, which costs speed, and may leave no solution.
+    They make A dense, which is slower, and may make the QP infeasible.
     """
 
     on = "states"
 
 
-def rows(constraint: Constraint, of: Contact | Step, like: Array) -> Rows:
-    """Rows of a constraint for one contact or step, with a bound for each row, as `like`."""
-    A, lower, upper = constraint.of(of)
+def rows(constraint: Constraint, argument: Contact | Step, like: Array) -> Rows:
+    """Return the rows of a constraint on a contact or step, bounds per row, dtype as `like`."""
+    A, lower, upper = constraint.of(argument)
     bounds = (jnp.broadcast_to(jnp.asarray(b, like.dtype), A.shape[:1]) for b in (lower, upper))
     return Rows(jnp.asarray(A, like.dtype), *bounds)
 
 
 def _by_sign(signs: list[int], A: list[Array]) -> Rows:
-    """Rows that are in turn at least zero (sign 1) and at most zero (-1)."""
-    above = np.tile(signs, len(A) // 2) > 0
-    return Rows(jnp.stack(A), np.where(above, 0.0, -np.inf), np.where(above, np.inf, 0.0))
+    """Return rows that are alternately at least zero (sign 1) and at most zero (-1)."""
+    nonnegative = np.tile(signs, len(A) // 2) > 0
+    lower, upper = np.where(nonnegative, 0.0, -np.inf), np.where(nonnegative, np.inf, 0.0)
+    return Rows(jnp.stack(A), lower, upper)
 
 
 def _friction(contact: Contact) -> Rows:
@@ -156,10 +157,9 @@ def _line_pressure(contact: Contact) -> Rows:
 
 
 def _grip(contact: Contact) -> Array:
-    """The most that friction holds across the foot, for 1 N of F_z."""
-    return contact.friction * jnp.maximum(
-        jnp.abs(jnp.cos(contact.yaw)), jnp.abs(jnp.sin(contact.yaw))
-    )
+    """Return mu', the largest friction force across the foot per unit of F_z."""
+    sin, cos = jnp.sin(contact.yaw), jnp.cos(contact.yaw)
+    return contact.friction * jnp.maximum(jnp.abs(cos), jnp.abs(sin))
 
 
 def _line_friction(contact: Contact) -> Rows:
@@ -180,14 +180,14 @@ def _side_pressure(contact: Contact) -> Rows:
 
 
 def _half_sides(robot: Robot) -> tuple[Any, Any]:
-    """Half length and half width of the sole [m]."""
+    """Return half length and half width of the sole [m]."""
     return 0.5 * (robot.toe + robot.heel), robot.half_width
 
 
 def _torsion(contact: Contact) -> Rows:
     fz, mz = contact.force[2], contact.moment[2]
-    most = 0.5 * _grip(contact) * jnp.hypot(*_half_sides(contact.robot)) * fz
-    return _by_sign([1, -1], [mz + most, mz - most])
+    limit = 0.5 * _grip(contact) * jnp.hypot(*_half_sides(contact.robot)) * fz
+    return _by_sign([1, -1], [mz + limit, mz - limit])
 
 
 def _corner_friction(contact: Contact) -> Rows:
@@ -200,7 +200,7 @@ def _corner_friction(contact: Contact) -> Rows:
     middle = 0.5 * (contact.robot.toe - contact.robot.heel)
     my, mz = my + middle * fz, mz - middle * across
     load = mu * (X + Y) * fz
-    A = [one + sign * mu * fz for one in (along, across) for sign in (1, -1)]
+    A = [force + sign * mu * fz for force in (along, across) for sign in (1, -1)]
     for a in (1, -1):
         for b in (1, -1):
             low = a * (Y * along - mu * mx) + b * (X * across - mu * my)
@@ -220,10 +220,10 @@ _POINT = (FRICTION, UNILATERAL_FORCE)
 _LINE = (*_POINT, LINE_PRESSURE, LINE_FRICTION)
 _FLAT = (*_POINT, LINE_PRESSURE, SIDE_PRESSURE, TORSION)
 CONSTRAINTS = (*_LINE, SIDE_PRESSURE, TORSION, CORNER_FRICTION)
-"""Those that a file can name."""
+"""Constraints that a file can name."""
 
 POINT_FOOT = ContactModel("point", components=(0, 1, 2), constraints=_POINT)
 LINE_FOOT = ContactModel("line", components=(0, 1, 2, 4, 5), constraints=_LINE)
 FLAT_FOOT = ContactModel("flat", components=(0, 1, 2, 3, 4, 5), constraints=_FLAT)
 CONTACT_MODELS = (POINT_FOOT, LINE_FOOT, FLAT_FOOT)
-"""Those that a file can name."""
+"""Contact models that a file can name."""

@@ -1,8 +1,8 @@
-"""The whole controller: `plan` decides the wrench, `actuate` turns it into joint torques.
+"""The whole controller: `plan` computes the wrench, `actuate` converts it into joint torques.
 
-One controller in all worlds: the rigid-body rollout calls `plan` with the feet that it carries
-along; the MuJoCo worlds call `step_plan` and `actuate` with what they measure. The controller knows
-the nominal robot only, never the plant's own numbers.
+All worlds share it: the rigid-body rollout calls `plan` with the feet of its own state; the MuJoCo
+worlds call `step_plan` and `actuate` with measurements. The controller knows only the nominal
+robot, never the parameters of the plant.
 """
 
 from collections.abc import Callable, Iterable
@@ -15,15 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from hector_jax.control import gait, legs
+from hector_jax.control import footstep, gait, legs
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, integrate_error
-from hector_jax.control.footstep import (
-    Feet,
-    FootstepConfig,
-    FootstepParameters,
-    feet_where,
-    touchdown_points,
-)
+from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
 from hector_jax.control.gait import PATTERNS, GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
@@ -42,7 +36,7 @@ from hector_jax.robot.model import Robot
 
 @dataclass(frozen=True)
 class WalkConfig:
-    """What the walking controller is compiled for."""
+    """Static configuration of the walking controller."""
 
     gait: GaitConfig = GaitConfig()
     mpc: MpcConfig = MpcConfig()
@@ -58,7 +52,7 @@ class WalkConfig:
             )
 
     def parameters(self, weights: Weights) -> Parameters:
-        """The controller's numbers, to be traced: those of the weights, else of this config."""
+        """Return the traced numbers of the controller, from the weights, else from this config."""
         mpc = self.mpc.parameters(weights._replace(others={}))
         parameters = Parameters(mpc, self.footstep.parameters, self.legs.parameters)
         for name, value in weights.others.items():
@@ -66,11 +60,11 @@ class WalkConfig:
         return parameters
 
     def with_others(self, weights: Weights, names: Iterable[str]) -> Weights:
-        """The weights with `others` of these names, from this config where they have none."""
+        """Return the weights with `others` of these names added from this config if missing."""
         parameters = self.parameters(weights)
         missing = [name for name in names if name not in weights.others]
-        more = {name: np.asarray(TUNABLES[name].read(parameters), float) for name in missing}
-        return weights._replace(others={**weights.others, **more})
+        added = {name: np.asarray(TUNABLES[name].read(parameters), float) for name in missing}
+        return weights._replace(others={**weights.others, **added})
 
     @property
     def mpc_step(self) -> float:
@@ -79,25 +73,25 @@ class WalkConfig:
 
     @property
     def touchdowns(self) -> int:
-        """Most touchdowns of one foot within the horizon."""
+        """Largest number of touchdowns of one foot within the horizon."""
         return -(-self.mpc.horizon * self.mpc.step_ticks // self.gait.cycle)
 
 
 def walk_config(robot: Robot) -> WalkConfig:
-    """The controller that a robot's description asks for, and its feet.
+    """Return the controller configuration from a robot's description and its feet.
 
     Raises:
         InputError: one line naming the file, the key and what was expected.
     """
     path = str(robot.description.path)
-    given = {name: dict(section) for name, section in robot.description.control}
-    given["mpc"] = {"contact": robot.structure.contact, **given.get("mpc", {})}
-    config = from_table(path, WalkConfig, given)
+    table = {name: dict(section) for name, section in robot.description.control}
+    table["mpc"] = {"contact": robot.structure.contact, **table.get("mpc", {})}
+    config = from_table(path, WalkConfig, table)
     feet = len(robot.foot_point)
     if len(config.gait.offsets) != feet:
-        fitting = [name for name, offsets in PATTERNS.items() if len(offsets) == feet]
+        patterns = [name for name, offsets in PATTERNS.items() if len(offsets) == feet]
         raise InputError(
-            f"{path}: gait.pattern must be one of {feet} feet ({', '.join(fitting)}, or {feet} "
+            f"{path}: gait.pattern must be one of {feet} feet ({', '.join(patterns)}, or {feet} "
             f"numbers), got {short_repr(config.gait.pattern)}"
         )
     try:
@@ -108,33 +102,33 @@ def walk_config(robot: Robot) -> WalkConfig:
 
 
 class Memory(NamedTuple):
-    """What the controller remembers: where each foot last stood, and what its model lacks."""
+    """State of the controller between ticks: last stance of each foot, and the disturbance."""
 
     liftoff: Feet
     disturbance: Disturbance
 
 
 class Plan(NamedTuple):
-    """What holds over a tick."""
+    """Output of the planner, constant over a tick."""
 
     wrench: Wrench  # commanded, world frame
     contact: Bool[Array, "*batch feet"]
-    touchdown: Feet  # where each foot next comes down
+    touchdown: Feet  # next touchdown of each foot
     swing_ticks: Int[Array, "*batch feet"]  # since lift-off
-    residual: Float[Array, "*batch"]  # worst relative KKT residual of the QP
+    residual: Float[Array, "*batch"]  # largest relative KKT residual of the QP
     status: Int[Array, "*batch"]  # of the QP, see `qp.Status`
 
 
 class Retune(NamedTuple):
-    """Weights that change while they walk: a carry, and what gives those of the next tick."""
+    """Weights that change during a walk: a carry, and the function for the weights of a tick."""
 
     init: Any  # carry before t = 0
-    # carry, gait tick, anchor, what is measured, wrench commanded over the tick before
+    # carry, gait tick, anchor, measurement, wrench commanded over the previous tick
     step: Callable[[Any, int, Anchor, Measurement, Wrench], tuple[Any, Weights]]
 
 
 def contacts_needed(config: WalkConfig, tick: int) -> int:
-    """Feet that may stand at once in a plan: all of them before the gait starts."""
+    """Return the largest number of stance feet in a plan: all feet before the gait starts."""
     gait = config.gait
     return len(gait.offsets) if tick < gait.first_tick else gait.most_contacts
 
@@ -150,30 +144,30 @@ def plan_horizon(
     state: State,
     feet: Feet,
 ) -> tuple[Horizon, Feet]:
-    """What the MPC is to plan about, and where each foot next comes down.
+    """Return the horizon of the MPC and the next touchdown of each foot.
 
     Args:
         config, robot, parameters: the controller.
-        command, anchor: what to walk.
-        tick: gait tick now.
-        state: base now.
-        feet: foot points now; of a foot in the air they are not used.
+        command, anchor: the commanded motion.
+        tick: current gait tick.
+        state: current base state.
+        feet: current foot points; those of feet in the air are not used.
 
     Source: Eq. 6, 14-16.
     """
     ticks = config.gait
     steps = tick + config.mpc.step_ticks * jnp.arange(config.mpc.horizon + 1)
     reference = jax.vmap(lambda t: reference_at(ticks.tick, command, anchor, t))(steps)
-    now = jax.tree.map(lambda r: r[0], reference)
+    current = jax.tree.map(lambda r: r[0], reference)
 
-    # The contact of step 0 is the present one, of a later step that at the middle of its interval.
+    # Step 0 takes the current contact, a later step the contact at the middle of its interval.
     middles = jnp.concatenate([tick[None], steps[1:-1] + config.mpc.step_ticks // 2])
     count = gait.touchdowns(ticks, tick, middles)
     wait = gait.ticks_to_touchdown(ticks, tick)
     times = {"stance": ticks.tick * ticks.stance, "swing": ticks.tick * ticks.swing}
-    touch = partial(touchdown_points, config.footstep, robot, parameters, **times)
+    touch = partial(footstep.touchdown_points, config.footstep, robot, parameters, **times)
     touchdowns = [
-        touch(state=state, reference=now, remaining=ticks.tick * (wait + number * ticks.cycle))
+        touch(state=state, reference=current, remaining=ticks.tick * (wait + number * ticks.cycle))
         for number in range(config.touchdowns)
     ]
     foot_points, foot_yaw = feet
@@ -182,11 +176,11 @@ def plan_horizon(
         foot_points = jnp.where(landed[..., None], touchdown.position, foot_points)
         foot_yaw = jnp.where(landed, touchdown.yaw, foot_yaw)
 
-    # Linearised about the reference's motion carried on from where the robot is: levers stay true
+    # Linearise about the reference motion shifted to the current pose, so that the levers are right
     # under a tracking error.
     start = jax.tree.map(lambda r: r[:-1], reference)
-    path = state.position + start.position - now.position
-    heading = state.euler[2] + start.euler[:, 2] - now.euler[2]
+    path = state.position + start.position - current.position
+    heading = state.euler[2] + start.euler[:, 2] - current.euler[2]
     horizon = Horizon(
         reference=jax.tree.map(lambda r: r[1:], reference),
         euler=jnp.zeros_like(start.euler).at[:, 2].set(heading),
@@ -214,11 +208,11 @@ def plan(
 
     Args:
         config, robot, parameters: the controller.
-        command, anchor: what to walk.
-        tick: gait tick now.
-        state: base now.
-        feet: foot points now; of a foot in the air they are not used.
-        disturbance: of the plan before.
+        command, anchor: the commanded motion.
+        tick: current gait tick.
+        state: current base state.
+        feet: current foot points; those of feet in the air are not used.
+        disturbance: from the previous plan.
         max_contacts: from `contacts_needed` (static).
 
     Returns:
@@ -236,29 +230,29 @@ def plan(
         state=state,
         feet=feet,
     )
-    here, dt = reference_at(config.gait.tick, command, anchor, tick), config.gait.tick
-    disturbance = integrate_error(parameters.mpc.integral, disturbance, state, here, dt)
+    dt = config.gait.tick
+    reference = reference_at(dt, command, anchor, tick)
+    disturbance = integrate_error(parameters.mpc.integral, disturbance, state, reference, dt)
     problem = MpcProblem(robot, parameters.mpc, state, horizon, disturbance)
     wrench, solution = solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
     residual = jnp.maximum(solution.primal_residual, solution.dual_residual)
     residual = jnp.maximum(residual, solution.gap)
-    stands, since = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
-    planned = Plan(wrench, stands, touchdown, since, residual, solution.status)
-    return planned, disturbance
+    contact, swing_ticks = gait.contact(config.gait, tick), gait.swing_ticks(config.gait, tick)
+    return Plan(wrench, contact, touchdown, swing_ticks, residual, solution.status), disturbance
 
 
 def measured_feet(robot: Robot, measurement: Measurement) -> Feet:
-    """Foot points in the world, from the estimate and the encoders."""
+    """Return the foot points in the world, from the state estimate and the encoders."""
     R_wb = rotation_from_euler(measurement.state.euler)
     local = foot_poses(robot, measurement.joints)
-    axes = R_wb @ local.rotation[:, :, 0].T  # the feet's x axes, as columns
+    axes = R_wb @ local.rotation[:, :, 0].T  # x axes of the feet as columns
     offset = wrap_angle(jnp.arctan2(axes[1], axes[0]) - measurement.state.euler[2])
     position = legs.trunk_position(robot, measurement.state) + local.position @ R_wb.T
     return Feet(position, measurement.state.euler[2] + offset)
 
 
 def init_memory(robot: Robot, measurement: Measurement) -> Memory:
-    """Memory of a robot that stands."""
+    """Return the memory of a standing robot."""
     return Memory(measured_feet(robot, measurement), NO_DISTURBANCE)
 
 
@@ -274,7 +268,7 @@ def step_plan(
     measurement: Measurement,
     max_contacts: int = 1,
 ) -> tuple[Memory, Plan]:
-    """`plan` from what is measured; remembers where the standing feet are. Once a tick."""
+    """Run `plan` on a measurement and remember the stance feet; call once a tick."""
     feet = measured_feet(robot, measurement)
     planned, disturbance = plan(
         config,
@@ -288,7 +282,8 @@ def step_plan(
         disturbance=memory.disturbance,
         max_contacts=max_contacts,
     )
-    return Memory(feet_where(planned.contact, feet, memory.liftoff), disturbance), planned
+    liftoff = footstep.feet_where(planned.contact, feet, memory.liftoff)
+    return Memory(liftoff, disturbance), planned
 
 
 def actuate(
@@ -301,13 +296,13 @@ def actuate(
     substep: Int[Array, ""],
     measurement: Measurement,
 ) -> Float[Array, " joints"]:
-    """Joint torque commands [N m] of a millisecond.
+    """Return the joint torque commands [N m] for a millisecond.
 
     Args:
         config, robot, parameters: the controller.
-        plan, memory: of the tick.
+        plan, memory: plan and memory of the tick.
         substep: whole milliseconds since the plan.
-        measurement: of this millisecond.
+        measurement: measurement in this millisecond.
 
     Source: Eq. 5.
     """
@@ -318,7 +313,7 @@ def actuate(
         start=memory.liftoff,
         end=plan.touchdown,
         elapsed=plan.swing_ticks * config.gait.tick + TIME_STEP * substep,
-        swing=config.gait.tick * max(config.gait.swing, 1),  # at 0 no foot follows its path
+        swing=config.gait.tick * max(config.gait.swing, 1),  # with swing 0 no foot follows its path
     )
     return legs.joint_torques(
         robot,

@@ -1,8 +1,9 @@
-"""Where the feet come down next, those in the air and those that still stand.
+"""Next touchdown of each foot, whether it is in the air or still in stance.
 
-The paper's rule p_c + v dt/2 (Eq. 6) knows neither the hips nor the speed error; it is kept as
-`rule="paper"`. The rule that walks adds the lateral offset of the hip, the travel until touchdown,
-a velocity feedback and the lean of a turn (Raibert's rule with the capture-point turn term).
+The paper's rule p_c + v dt/2 (Eq. 6) ignores the hips and the velocity error; it is available as
+`rule="paper"`. The default rule, which walks, adds the lateral offset of the hip, the travel until
+touchdown, a velocity feedback and the lean in a turn (Raibert's rule with the capture-point turn
+term).
 """
 
 from dataclasses import dataclass
@@ -20,32 +21,32 @@ from hector_jax.robot.model import Robot
 
 
 class Feet(NamedTuple):
-    """Foot points in the world and where they point."""
+    """Foot points and headings of the feet in the world."""
 
     position: Float[Array, "*batch feet 3"]  # [m]
     yaw: Float[Array, "*batch feet"]  # [rad]
 
 
-def feet_where(stands: Bool[Array, " feet"], yes: Feet, no: Feet) -> Feet:
-    """`yes` for the feet that stand, `no` for the others."""
-    position = jnp.where(stands[:, None], yes.position, no.position)
-    return Feet(position, jnp.where(stands, yes.yaw, no.yaw))
+def feet_where(contact: Bool[Array, " feet"], yes: Feet, no: Feet) -> Feet:
+    """Select `yes` for the feet in contact and `no` for the others."""
+    position = jnp.where(contact[:, None], yes.position, no.position)
+    return Feet(position, jnp.where(contact, yes.yaw, no.yaw))
 
 
 class FootstepParameters(NamedTuple):
-    """Numbers of the rule."""
+    """Traced numbers of the rule."""
 
-    width: Any  # [m] each foot beside the middle
+    width: Any  # [m] lateral distance of each foot from the middle
     feedback: Any  # [s] k_v, on the velocity error
     turn: Any  # share of the lean (z/g) v x omega
 
 
 @dataclass(frozen=True)
 class FootstepConfig:
-    """The rule, and its numbers where no others are given."""
+    """The rule and the defaults of its numbers."""
 
     rule: str = "raibert"  # or "paper"
-    width: float = 0.08  # [m] each foot beside the middle
+    width: float = 0.08  # [m] lateral distance of each foot from the middle
     feedback: float = 0.12  # [s] k_v, on the velocity error
     turn: float = 0.5  # share of the lean (z/g) v x omega
 
@@ -54,7 +55,7 @@ class FootstepConfig:
 
     @property
     def parameters(self) -> FootstepParameters:
-        """The numbers, to be traced."""
+        """The traced numbers."""
         return FootstepParameters(self.width, self.feedback, self.turn)
 
 
@@ -69,14 +70,14 @@ def touchdown_points(
     stance: float,
     swing: float,
 ) -> Feet:
-    """Where the feet are to touch down, world frame.
+    """Return the planned touchdowns of the feet, world frame.
 
     Args:
         config: the rule.
-        robot: places of the feet along the trunk, and gravity for the lean in a turn.
-        parameters: its numbers.
-        state: base now.
-        reference: where the base should be now, for the commanded velocity and yaw rate.
+        robot: longitudinal offsets of the feet, and gravity for the lean in a turn.
+        parameters: numbers of the rule.
+        state: current base state.
+        reference: desired base state, for the commanded velocity and yaw rate.
         remaining: time until each foot touches down [s].
         stance: duration of a stance [s].
         swing: duration of a swing [s].
@@ -92,8 +93,8 @@ def touchdown_points(
     hips = jnp.stack([jnp.asarray(robot.foot_ahead), outwards, jnp.zeros(len(yaw))], axis=1)
     hips = jnp.einsum("fxy,fy->fx", jax.vmap(rot_z)(yaw), hips)
     lean = jnp.cross(state.velocity, reference.ang_velocity) * state.position[2] / robot.gravity[2]
-    # Far ahead (a foot that still stands) the sway of this moment says nothing: the commanded
-    # velocity carries on from the next step.
+    # For a foot still in stance the current sway is irrelevant at touchdown: from the next step on
+    # the commanded velocity counts.
     travel = jnp.where(
         (remaining > swing)[:, None],
         state.velocity * swing / 2 + reference.velocity * (remaining[:, None] - swing / 2),

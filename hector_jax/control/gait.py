@@ -1,8 +1,8 @@
-"""Who stands when: the contact schedule in integer ticks.
+"""The contact schedule of the feet in integer ticks.
 
 A tick is one plan interval. Before the gait starts all feet stand; from `first_tick` on a foot
-stands in the first `stance` ticks of its own cycle, which is ahead of the gait's by the offset that
-the pattern has for it. A switch tick belongs to the new stance. With no `swing` all feet stand.
+stands in the first `stance` ticks of its own cycle, which leads the gait's cycle by the offset of
+this foot in the pattern. A switch tick belongs to the new stance. With zero `swing` all feet stand.
 """
 
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ PATTERNS = {
     "pace": (0.0, 0.5, 0.0, 0.5),
     "crawl": (0.0, 0.5, 0.25, 0.75),
 }
-"""Shares of a cycle by which the feet are ahead, in the order of `trajectory.FEET`."""
+"""Phase lead of each foot as a share of the cycle, in the order of `trajectory.FEET`."""
 
-_DUTY = {"crawl": 0.75}  # share of the cycle in which a foot stands; of the others one half
+_DUTY = {"crawl": 0.75}  # share of the cycle in stance; 0.5 for the other patterns
 STAND = "stand"
 GAITS = (*PATTERNS, STAND)
 
@@ -34,11 +34,11 @@ class GaitConfig:
     """Timing of the gait, in ticks."""
 
     tick: float = 0.01  # [s] plan interval
-    stance: int = 20  # ticks a foot stands
-    swing: int = 20  # ticks a foot swings; 0: all feet stand
-    stand: int = 30  # ticks in which all feet stand before the gait starts (MuJoCo worlds)
+    stance: int = 20  # ticks of a stance
+    swing: int = 20  # ticks of a swing; 0: all feet stand
+    stand: int = 30  # ticks with all feet in stance before the gait starts (MuJoCo worlds)
     cycles: int = 2  # gait cycles in place before t = 0 (MuJoCo worlds)
-    pattern: str | tuple[float, ...] = "walk"  # of PATTERNS; or an offset for each foot
+    pattern: str | tuple[float, ...] = "walk"  # name in PATTERNS, or an offset for each foot
 
     def __post_init__(self) -> None:
         rules = {"tick": POSITIVE, "stance": AT_LEAST_ONE, "swing": NOT_NEGATIVE}
@@ -64,74 +64,73 @@ class GaitConfig:
 
     @property
     def offsets(self) -> tuple[float, ...]:
-        """Share of the cycle by which each foot is ahead."""
+        """Phase lead of each foot as a share of the cycle."""
         return PATTERNS[self.pattern] if isinstance(self.pattern, str) else self.pattern
 
     @property
     def _lead(self) -> Int[np.ndarray, " feet"]:
-        """Ticks by which each foot is ahead."""
+        """Phase lead of each foot in ticks."""
         return np.rint(self.cycle * np.array(self.offsets)).astype(int)
 
     @property
     def _stands(self) -> Bool[np.ndarray, "cycle feet"]:
-        """Which feet stand at each tick of a cycle."""
+        """Stance feet at each tick of a cycle."""
         return (np.arange(self.cycle)[:, None] + self._lead) % self.cycle < self.stance
 
     @property
     def most_contacts(self) -> int:
-        """Most feet that stand at once while it walks."""
+        """Largest number of feet in stance at once during the gait."""
         return int(self._stands.sum(axis=1).max())
 
     @property
     def cycle(self) -> int:
-        """Ticks of a whole cycle."""
+        """Number of ticks of a cycle."""
         return self.stance + self.swing
 
     @property
     def first_tick(self) -> int:
-        """Tick at which the first foot lifts; all feet stand before."""
+        """Tick at which the gait starts; all feet stand before."""
         return -self.cycles * self.cycle
 
 
 def gait_named(config: GaitConfig, name: str) -> GaitConfig:
-    """The gait of a name of GAITS at the pace of another: it swings as long.
+    """Return the gait of a name in GAITS with the swing time of a given gait.
 
     Raises:
-        InputError: there is no such gait, or it is one of a robot with other feet.
+        InputError: the gait is unknown or has another number of feet.
     """
     if name == STAND:
         return replace(config, stance=config.cycle, swing=0)
-    of_feet = [one for one in PATTERNS if len(PATTERNS[one]) == len(config.offsets)]
-    if name not in of_feet:
-        raise InputError(unknown("gait", name, [*of_feet, STAND]))
+    gaits = [gait for gait, leads in PATTERNS.items() if len(leads) == len(config.offsets)]
+    if name not in gaits:
+        raise InputError(unknown("gait", name, [*gaits, STAND]))
     duty = _DUTY.get(name, 0.5)
     return replace(config, pattern=name, stance=round(config.swing * duty / (1.0 - duty)))
 
 
 def _feet_ticks(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*batch feet"]:
-    """Ticks of each foot's own clock, which is a multiple of the cycle at its touchdown."""
-    after = jnp.maximum(tick, config.first_tick)
-    return after[..., None] + jnp.asarray(config._lead)
+    """Return the clock of each foot in ticks, a multiple of the cycle at its touchdown."""
+    return jnp.maximum(tick, config.first_tick)[..., None] + jnp.asarray(config._lead)
 
 
 def contact(config: GaitConfig, tick: Int[Array, "*batch"]) -> Bool[Array, "*batch feet"]:
-    """Which feet stand in the interval that starts at `tick`.
+    """Return the feet that stand in the interval that starts at `tick`.
 
     >>> contact(GaitConfig(), jnp.array([0, 19, 20, 40])).tolist()  # left, right
     [[True, False], [True, False], [False, True], [True, False]]
     """
-    gait = _feet_ticks(config, tick) % config.cycle < config.stance
-    return gait | (tick < config.first_tick)[..., None]
+    stance = _feet_ticks(config, tick) % config.cycle < config.stance
+    return stance | (tick < config.first_tick)[..., None]
 
 
 def swing_ticks(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*batch feet"]:
-    """Ticks since lift-off; zero for a foot that stands."""
+    """Return the ticks since lift-off; zero for a foot in stance."""
     since = _feet_ticks(config, tick) % config.cycle - config.stance
     return jnp.where(contact(config, tick), 0, since)
 
 
 def ticks_to_touchdown(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Array, "*batch feet"]:
-    """Ticks until each foot next touches down.
+    """Return the ticks until the next touchdown of each foot.
 
     >>> ticks_to_touchdown(GaitConfig(), jnp.asarray(5)).tolist()
     [35, 15]
@@ -143,7 +142,7 @@ def ticks_to_touchdown(config: GaitConfig, tick: Int[Array, "*batch"]) -> Int[Ar
 def touchdowns(
     config: GaitConfig, tick: Int[Array, ""], later: Int[Array, " N"]
 ) -> Int[Array, "N feet"]:
-    """How often each foot touches down after `tick` and up to each of the ticks `later`."""
+    """Count the touchdowns of each foot after `tick` and up to each of the ticks `later`."""
     if config.swing == 0:
         return jnp.zeros((len(later), len(config.offsets)), int)
     count = lambda t: _feet_ticks(config, t) // config.cycle  # noqa: E731
@@ -151,8 +150,7 @@ def touchdowns(
 
 
 def since_switch(config: GaitConfig, tick: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Time [s] since the last planned touchdown or lift-off."""
+    """Return the time [s] since the last planned touchdown or lift-off."""
     clock = _feet_ticks(config, tick) % config.cycle
-    return config.tick * jnp.min(
-        jnp.where(clock < config.stance, clock, clock - config.stance), axis=-1
-    )
+    since = jnp.where(clock < config.stance, clock, clock - config.stance)
+    return config.tick * jnp.min(since, axis=-1)

@@ -1,10 +1,9 @@
-"""What the joints do for the plan: stance torques, swing foot, joint PD (Eq. 5).
+"""Joint torques for a plan: stance torques, swing foot path and joint PD (Eq. 5).
 
 A stance leg pushes with tau = -J^T wrench, because the wrench is that of the ground on the robot
-(the paper prints no minus). A swing leg follows a smooth path from where the foot left to where it
-is to land, through inverse kinematics and a joint PD that feeds the path's own joint
-rates and the leg's weight forward. The target lies a little under the ground so that the foot does
-land.
+(the paper prints no minus). A swing leg follows a smooth path from lift-off to touchdown by inverse
+kinematics and a joint PD with feedforward of the path's joint rates and the leg's weight. The
+target lies slightly below the ground so that the foot does land.
 """
 
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from hector_jax.robot.model import Robot
 
 
 class Measurement(NamedTuple):
-    """What the robot knows of itself."""
+    """Measurements that the robot has of itself."""
 
     state: State  # estimate of the base
     joints: Float[Array, "*batch joints"]  # [rad], motor side
@@ -34,23 +33,23 @@ class Measurement(NamedTuple):
 
 
 class LegParameters(NamedTuple):
-    """Numbers of the swing path and of the joints; the model of the tuner has neither."""
+    """Traced numbers of the swing path and the joints, which the tuner's model does not have."""
 
     height: Any  # [m] apex of the swing foot
-    landing: Any  # [m] height aimed at
-    kp: Any  # (j,) [N m/rad] of the joints of a leg
+    landing: Any  # [m] target height at touchdown
+    kp: Any  # (j,) [N m/rad] for the joints of a leg
     kd: Any  # (j,) [N m s/rad]
     gravity_compensation: Any  # share of the leg's own weight in the stance torque
 
 
 @dataclass(frozen=True)
 class LegConfig:
-    """Swing path and joint gains, where no others are given."""
+    """Defaults of the swing path and the joint gains."""
 
     RENAMED: ClassVar = {"stance_weight": ("gravity_compensation", {})}
 
     height: float = 0.08  # [m] apex of the swing foot
-    landing: float = -0.005  # [m] height aimed at
+    landing: float = -0.005  # [m] target height at touchdown
     kp: tuple[float, ...] = (60.0, 60.0, 60.0, 60.0, 20.0)  # [N m/rad] from hip yaw to ankle
     kd: tuple[float, ...] = (1.5, 1.5, 1.5, 1.5, 0.5)  # [N m s/rad]
     gravity_compensation: bool = False  # add the leg's own weight to the stance torque
@@ -73,20 +72,20 @@ class LegConfig:
 
     @property
     def parameters(self) -> LegParameters:
-        """The numbers, to be traced."""
+        """The traced numbers."""
         kp, kd = np.array(self.kp), np.array(self.kd)
         return LegParameters(self.height, self.landing, kp, kd, float(self.gravity_compensation))
 
 
 def trunk_position(robot: Robot, state: State) -> Float[Array, "3"]:
-    """Trunk origin [m] of a base state: p_c less the constant offset of the centre of mass."""
+    """Return the trunk origin [m]: p_c minus the constant offset of the centre of mass."""
     return state.position - rotation_from_euler(state.euler) @ robot.com_offset
 
 
 def stance_torques(
     robot: Robot, state: State, joints: Float[Array, " joints"], wrench: Wrench
 ) -> Float[Array, " joints"]:
-    """Joint torques [N m] by which the feet return `wrench`, world frame. Source: Eq. 5, signed."""
+    """Return joint torques [N m] for the wrench on the feet, world frame. Source: Eq. 5, signed."""
     R_wb = rotation_from_euler(state.euler)
     Jv, Jw = foot_jacobians(robot, joints)
     force, moment = wrench.force @ R_wb, wrench.moment @ R_wb
@@ -99,7 +98,7 @@ def swing_path(
     end: Float[Array, "feet 3"],
     s: Float[Array, " feet"],
 ) -> Float[Array, "feet 3"]:
-    """Foot points [m] at share s of the swing: smooth in the plane, up and down to `landing`."""
+    """Return foot points [m] at share s of the swing: smooth in the plane, down to `landing`."""
     smooth = (s * s * (3.0 - 2.0 * s))[:, None]
     point = start + smooth * (end - start)
     half = jnp.where(s < 0.5, 2.0 * s, 2.0 - 2.0 * s)
@@ -119,10 +118,10 @@ def swing_joints(
     elapsed: Float[Array, " feet"],
     swing: float,
 ) -> tuple[Float[Array, " joints"], Float[Array, " joints"]]:
-    """Joint angles [rad] and rates [rad/s] that carry the feet along their swing paths.
+    """Return joint angles [rad] and rates [rad/s] that move the feet along their swing paths.
 
     `elapsed` is the time since each foot's lift-off [s]. The rates are the derivative of the angles
-    along the path while the trunk moves on with its present velocity.
+    along the path while the trunk continues with its current velocity.
     """
     state = measurement.state
 
@@ -150,14 +149,11 @@ def joint_torques(
     target: Float[Array, " joints"],
     target_rates: Float[Array, " joints"],
 ) -> Float[Array, " joints"]:
-    """Torque commands [N m] within the limits: stance legs push, swing legs follow their target."""
+    """Return torques [N m] within the limits: stance legs push, swing legs follow the target."""
     state, joints, joint_rates = measurement
     weight = leg_gravity(robot, joints, robot.gravity @ rotation_from_euler(state.euler))
-    kp, kd = (
-        jnp.tile(jnp.asarray(gains), len(contact)) for gains in (parameters.kp, parameters.kd)
-    )
+    kp, kd = (jnp.tile(jnp.asarray(k), len(contact)) for k in (parameters.kp, parameters.kd))
     swing = kp * (target - joints) + kd * (target_rates - joint_rates) + weight
-    stance = stance_torques(robot, state, joints, wrench)
-    stance = stance + parameters.gravity_compensation * weight
+    stance = stance_torques(robot, state, joints, wrench) + parameters.gravity_compensation * weight
     torque = jnp.where(jnp.repeat(contact, robot.description.leg_joints), stance, swing)
     return jnp.clip(torque, -robot.torque_limit, robot.torque_limit)

@@ -5,12 +5,12 @@ r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stanc
                 lower <= C u_k <= upper                each stance foot: `contact`
                 F = M = 0                              each foot in the air
 
-States are condensed away, and a foot in the air has no variables, nor have the components of the
-wrench that its contact model lacks. `max_contacts` is the number of feet that may stand at once; a
-contact that no foot takes has zero columns and a unit Hessian, so that shapes stay static.
+States are eliminated. Feet in the air have no variables, nor do wrench components outside the
+contact model. `max_contacts` is the largest number of feet in stance at once; a contact without a
+foot has zero columns and a unit Hessian, so that shapes stay static.
 
-Where this leaves the paper: x_1..x_N are priced instead of x_0..x_{N-1}, because x_0 is given; a
-foot in the air has no M_z; and see `contact`.
+Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, because x_0 is given; a
+foot in the air has no M_z; see also `contact`.
 """
 
 from dataclasses import dataclass
@@ -48,35 +48,35 @@ from hector_jax.robot.model import Robot
 
 
 class MpcParameters(NamedTuple):
-    """Numbers of the MPC."""
+    """Traced numbers of the MPC."""
 
     weights: Weights  # Q and R
     friction: Any  # mu
     max_force: Any  # [N] per foot
-    effort_reference: Any  # share of the robot's weight about which R prices the forces
+    effort_reference: Any  # share of the robot's weight in the force reference of R
     integral: IntegralGains
 
 
 @dataclass(frozen=True)
 class MpcConfig:
-    """What the MPC is compiled for, and its numbers where no others are given."""
+    """Static configuration of the MPC, and the defaults of its numbers."""
 
     RENAMED: ClassVar = {"effort_about": ("effort_reference", {"weight": "gravity"})}
 
     horizon: int = 10  # steps N
     step_ticks: int = 3  # ticks per step: dt = 0.03 s
-    friction: float = 0.6  # mu; at most the floor's own, or the feet slip
+    friction: float = 0.6  # mu; larger than the floor's, the feet slip
     max_force: float = 500.0  # [N] per foot
     sole_width: float = 1.0  # share of a flat sole's half width that the plan uses
-    line_friction: bool = True  # False leaves LINE_FRICTION out of the constraints
-    effort_reference: str = "zero"  # R prices u (the paper); "gravity": u less the weight's share
-    horizontal_gain: float = 0.0  # of `IntegralGains`, as the next three [1/s^3]
+    line_friction: bool = True  # False removes LINE_FRICTION from the constraints
+    effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
+    horizontal_gain: float = 0.0  # [1/s^3] of `IntegralGains`, as the next three
     height_gain: float = 0.0
     tilt_gain: float = 0.0
     yaw_gain: float = 0.0
     qp: QpConfig = QpConfig()
     contact: str = LINE_FOOT  # a ContactModel or its name
-    constraints: tuple[str, ...] | None = None  # of Constraint or their names; else the contact's
+    constraints: tuple[str, ...] | None = None  # Constraints or names; None: the contact model's
 
     def __post_init__(self) -> None:
         rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
@@ -85,8 +85,8 @@ class MpcConfig:
         check(self, **rules, effort_reference=("zero", "gravity"))
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
-            choose_part("MpcConfig.constraints", one, Constraint, CONSTRAINTS)
-            for one in (model.constraints if self.constraints is None else self.constraints)
+            choose_part("MpcConfig.constraints", constraint, Constraint, CONSTRAINTS)
+            for constraint in (model.constraints if self.constraints is None else self.constraints)
         ]
         object.__setattr__(self, "contact", model)
         object.__setattr__(self, "constraints", tuple(chosen))
@@ -95,71 +95,71 @@ class MpcConfig:
             raise InputError(f"{text}, got {tuple(chosen)}")
 
     def parameters(self, weights: Weights) -> MpcParameters:
-        """The numbers, to be traced."""
+        """Return the traced numbers."""
         effort_reference = float(self.effort_reference == "gravity")
         gains = IntegralGains(self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
         return MpcParameters(weights, self.friction, self.max_force, effort_reference, gains)
 
     @property
     def contact_model(self) -> ContactModel:
-        """The value of `contact`."""
+        """Contact model of a stance foot."""
         return cast(ContactModel, self.contact)
 
     def on(self, what: str) -> tuple[Constraint, ...]:
-        """The constraints on "inputs" or on "states"."""
+        """Return the constraints on "inputs" or on "states"."""
         constraints = cast(tuple[Constraint, ...], self.constraints)
-        left_out = () if self.line_friction else (LINE_FRICTION,)
-        return tuple(one for one in constraints if one.on == what and one not in left_out)
+        excluded = () if self.line_friction else (LINE_FRICTION,)
+        return tuple(c for c in constraints if c.on == what and c not in excluded)
 
 
 class Horizon(NamedTuple):
-    """What the MPC plans about: nominal motion, footholds and contact of each step."""
+    """Nominal motion, footholds and contact schedule over the steps of the MPC."""
 
     reference: State  # (N, 3) each, at the end of each step
-    euler: Float[Array, "N 3"]  # to linearise about [rad]
+    euler: Float[Array, "N 3"]  # linearisation point [rad]
     lever: Float[Array, "N feet 3"]  # centre of mass to foot points [m]
     foot_yaw: Float[Array, "N feet"]  # [rad]
     contact: Bool[Array, "N feet"]
 
 
 class MpcProblem(NamedTuple):
-    """What is solved for in a tick."""
+    """Data of the MPC in one tick."""
 
     robot: Robot  # nominal body
     parameters: MpcParameters
-    state: State  # base now, x_0
+    state: State  # current base state x_0
     horizon: Horizon
-    disturbance: Disturbance = NO_DISTURBANCE  # that lasts over the horizon
+    disturbance: Disturbance = NO_DISTURBANCE  # constant over the horizon
 
 
 class Condensed(NamedTuple):
     """The states as functions of the inputs v: x = free + map v."""
 
-    feet: Float[Array, "N contacts feet"]  # which foot takes each contact
+    feet: Float[Array, "N contacts feet"]  # foot of each contact
     inputs: Float[Array, "N u b"]  # G_k with u_k = G_k v_k
-    turn: Float[Array, "N 3 b"]  # angular velocity gained in a step by its inputs
-    push: Float[Array, "N 3 b"]  # velocity gained
-    angles: Float[Array, "N N 3 3"]  # after step k by an angular velocity gained in step j
-    later: Float[Array, "N N"]  # velocity after step k by one gained in step j
-    travel: Float[Array, "N N"]  # and distance
+    turn: Float[Array, "N 3 b"]  # change of angular velocity in a step by its inputs
+    push: Float[Array, "N 3 b"]  # change of velocity in a step by its inputs
+    angles: Float[Array, "N N 3 3"]  # angles after step k per angular velocity gained in step j
+    later: Float[Array, "N N"]  # velocity after step k per velocity gained in step j
+    travel: Float[Array, "N N"]  # distance after step k per velocity gained in step j
     free: State  # (N, 3) each, without inputs
 
 
 def _feet_of_contacts(
     contact: Float[Array, " feet"], max_contacts: int
 ) -> Float[Array, "contacts feet"]:
-    """Which foot takes each contact, as rows of a selection matrix; zero where there is none.
+    """Return the selection matrix from feet to contacts; rows without a foot are zero.
 
-    Contact c is that of the c-th foot that stands; where all may stand, each has its own.
+    Contact c belongs to the c-th foot in stance; if all feet may stand, each has its own contact.
     """
     if max_contacts == len(contact):
         return jnp.diag(contact)
-    before = jnp.cumsum(contact) - contact  # feet that stand, of those with a lower number
-    return contact * (before == jnp.arange(max_contacts)[:, None])
+    rank = jnp.cumsum(contact) - contact  # number of stance feet with a lower index
+    return contact * (rank == jnp.arange(max_contacts)[:, None])
 
 
 def _double_integrator(N: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity and travel after step k by a unit of velocity gained in step j, (N, N) each."""
+    """Return velocity and travel after step k per unit of velocity gained in step j, (N, N)."""
     steps = np.arange(N)[:, None] - np.arange(N)
     return np.where(steps >= 0, 1.0, 0.0), dt * np.maximum(steps, 0)
 
@@ -167,25 +167,25 @@ def _double_integrator(N: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
 def _input_map(
     model: ContactModel, feet: Float[Array, "contacts feet"], foot_yaw: Float[Array, " feet"]
 ) -> Float[Array, "u b"]:
-    """G with u = G v: the inputs of the contacts to the paper's u."""
+    """Return G in u = G v, from the inputs of the contacts to the paper's u."""
     force, moment = jax.vmap(model.wrench)(foot_yaw)  # (feet, 3, inputs)
     parts = [jnp.einsum("sf,fxi->fxsi", feet, part) for part in (force, moment)]
     return jnp.stack(parts).reshape(6 * len(foot_yaw), -1)
 
 
 def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: int) -> Condensed:
-    """Roll the dynamics out. Source: Eq. 4a."""
+    """Condense the dynamics: the states as functions of the inputs. Source: Eq. 4a."""
     N, (robot, parameters, state, horizon, disturbance) = config.horizon, problem
     data = parameters.weights, state, horizon.lever
     dtype = jnp.result_type(*jax.tree.leaves(data), jnp.float32)
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
     feet = jax.vmap(lambda c: _feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
     G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)
-    # inputs turn the body and push it; rates and velocities are kept, angles and places add them up
+    # inputs change rates and velocities, which persist; angles and positions integrate them
     turn, push = B[:, 6:9] @ G, B[:, 9:12] @ G
-    angle_by_rate = jnp.cumsum(A[:, 0:3, 6:9], axis=0)  # kept from the start on
+    angle_by_rate = jnp.cumsum(A[:, 0:3, 6:9], axis=0)  # for a rate that is constant from t_0 on
     later, travel = (jnp.asarray(table, dtype) for table in _double_integrator(N, dt))
-    # angles after step k by a rate that is there from the end of step j on
+    # angles after step k per rate that is constant from the end of step j on
     angles = later[:, :, None, None] * (angle_by_rate[:, None] - angle_by_rate)
     count = jnp.arange(1, N + 1, dtype=dtype)[:, None]
     rate, speed = state.ang_velocity, state.velocity
@@ -203,7 +203,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
 
 
 def input_weights(weights: Weights) -> Float[Array, " u"]:
-    """R of the paper's u; feet that exert no moment have no weights of one."""
+    """Return R for the paper's u, with zeros for the moments of point feet."""
     force, moment = weights.R
     return pack_wrench(Wrench(force, moment if moment.size else jnp.zeros_like(force)))
 
@@ -211,7 +211,7 @@ def input_weights(weights: Weights) -> Float[Array, " u"]:
 def cost(
     config: MpcConfig, problem: MpcProblem, condensed: Condensed
 ) -> tuple[Float[Array, "n n"], Float[Array, "N b"]]:
-    """Half of P and of q. Source: Eq. 3."""
+    """Return half of P and half of q. Source: Eq. 3."""
     robot, parameters, _, horizon, _ = problem
     feet, G, turn, push, angles, later, travel, free = condensed
     N, b, dtype = config.horizon, G.shape[-1], later.dtype
@@ -222,18 +222,18 @@ def cost(
     effort = effort + jax.vmap(jnp.diag)(empty)
 
     wide = jnp.swapaxes(angles, 1, 2).reshape(3 * N, 3 * N)  # rows: step and angle
-    both = later.T @ later  # steps that feel both inputs
+    overlap = later.T @ later  # number of steps that two inputs both affect
     turning = wide.T @ (jnp.tile(Q.euler, N)[:, None] * wide)
-    turning += jnp.kron(both, jnp.diag(Q.ang_velocity))
+    turning += jnp.kron(overlap, jnp.diag(Q.ang_velocity))
     spin = block_diagonal(turn)
-    pushing = both[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
+    pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
     pushed = jnp.einsum("ixa,ixjb->iajb", push, jnp.einsum("ijx,jxb->ixjb", pushing, push))
     P = spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
     torque = jnp.einsum("kjxy,kx->jy", angles, error.euler) + later.T @ error.ang_velocity
     force = travel.T @ error.position + later.T @ error.velocity
     q = jnp.einsum("jxb,jx->jb", turn, torque) + jnp.einsum("jxb,jx->jb", push, force)
     share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
-    up = np.zeros((2, horizon.contact.shape[1], 3))  # of forces and moments
+    up = np.zeros((2, horizon.contact.shape[1], 3))  # forces and moments
     up[0, :, 2] = 1.0
     weight = share[:, None] * jnp.asarray(up.ravel(), dtype)
     q = q - parameters.effort_reference * jnp.einsum("kui,u,ku->ki", G, R, weight)
@@ -241,7 +241,7 @@ def cost(
 
 
 def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
-    """Rows of the constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
+    """Return the rows of constraints on inputs, block-diagonal by step: A is (N, rows, b)."""
     feet, (robot, parameters, _, horizon, _) = condensed.feet, problem
     selection = jnp.asarray(config.contact_model.selection, feet.dtype)
     robot = robot._replace(half_width=config.sole_width * robot.half_width)
@@ -261,18 +261,18 @@ def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 
 
 def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> Rows:
-    """Rows of the constraints on states, dense: A is (rows, n)."""
+    """Return the rows of constraints on states, dense: A is (rows, n)."""
     _, _, turn, push, angles, later, travel, free = condensed
     later, travel = later[:, None, :, None], travel[:, None, :, None]
     turn_, push_ = (jnp.swapaxes(part, 0, 1) for part in (turn, push))  # (3, N, b)
-    by_part = [jnp.einsum("kjxy,jyb->kxjb", angles, turn), travel * push_]
-    states = jnp.concatenate([*by_part, later * turn_, later * push_], axis=1)  # (N, 12, N, b)
-    read = State(*jnp.split(jnp.eye(12, dtype=turn.dtype), 4))
+    poses = [jnp.einsum("kjxy,jyb->kxjb", angles, turn), travel * push_]
+    states = jnp.concatenate([*poses, later * turn_, later * push_], axis=1)  # (N, 12, N, b)
+    selection = State(*jnp.split(jnp.eye(12, dtype=turn.dtype), 4))
 
-    def of_step(step: tuple) -> Rows:
-        reference, contact, lever, states, free = step
-        at = Step(read, reference, contact, lever)
-        parts = [rows(constraint, at, turn) for constraint in config.on("states")]
+    def of_step(data: tuple) -> Rows:
+        reference, contact, lever, states, free = data
+        step = Step(selection, reference, contact, lever)
+        parts = [rows(constraint, step, turn) for constraint in config.on("states")]
         C, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
         constant = C @ jnp.concatenate(free)
         return Rows(C @ states, lower - constant, upper - constant)
@@ -287,17 +287,17 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 def build_qp(
     config: MpcConfig, problem: MpcProblem, *, dt: float, max_contacts: int
 ) -> tuple[QP, Float[Array, "u b"]]:
-    """The MPC as a condensed QP, and the map from the first step's inputs to u_0.
+    """Build the MPC as a condensed QP, and the map from the first step's inputs to u_0.
 
     Args:
         config: shape of the problem.
-        problem: what is solved for.
+        problem: data of the problem.
         dt: MPC step [s].
-        max_contacts: feet that may stand at once (static).
+        max_contacts: largest number of feet in stance at once (static).
 
     Returns:
         QP in the inputs of all steps, n = N b with b inputs of `max_contacts` feet; its rows are
-        block-diagonal by step (N, rows, b), or dense with constraints on states; and G_0 with
+        block-diagonal by step (N, rows, b), or dense with constraints on states. G_0 in
         u_0 = G_0 v_0.
 
     Source: Eq. 3, 4.
@@ -306,16 +306,15 @@ def build_qp(
     P, q = cost(config, problem, condensed)
     A, lower, upper = input_rows(config, problem, condensed)
     if config.on("states"):
-        more = state_rows(config, problem, condensed)
-        A = jnp.concatenate([block_diagonal(A), more.A])
-        lower, upper = (jnp.concatenate(b) for b in ((lower, more.lower), (upper, more.upper)))
+        parts = Rows(block_diagonal(A), lower, upper), state_rows(config, problem, condensed)
+        A, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
     return QP(2.0 * P, 2.0 * q.reshape(-1), A, lower, upper), condensed.inputs[0]
 
 
 def solve_mpc(
     config: MpcConfig, problem: MpcProblem, *, dt: float, max_contacts: int
 ) -> tuple[Wrench, Solution]:
-    """Wrench of the first step [N, N m], world frame, with the solution it was read from."""
+    """Solve the MPC; return the first step's wrench [N, N m], world frame, and the QP solution."""
     qp, first = build_qp(config, problem, dt=dt, max_contacts=max_contacts)
     solution = solve_qp(qp, config.qp)
     return unpack_wrench(first @ solution.x[: first.shape[1]]), solution

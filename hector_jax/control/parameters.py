@@ -1,7 +1,7 @@
-"""The controller's numbers as one tree, and which of them are tuned.
+"""The numbers of the controller as one tree, and those that can be tuned.
 
-What is only a number is traced: a new value compiles nothing and has a derivative. What shapes a
-program stays in `WalkConfig`, whose numbers are the defaults:
+These numbers are traced: a new value needs no compilation and has a derivative. Settings that shape
+a program stay in `WalkConfig`, whose numbers are the defaults:
 
 >>> from hector_jax.control.controller import WalkConfig
 >>> from hector_jax.control.weights import expert
@@ -29,7 +29,7 @@ from hector_jax.robot.model import Robot
 
 
 class Parameters(NamedTuple):
-    """All numbers of the controller."""
+    """All traced numbers of the controller."""
 
     mpc: MpcParameters
     footstep: FootstepParameters
@@ -37,31 +37,31 @@ class Parameters(NamedTuple):
 
 
 class Tunable(NamedTuple):
-    """A part of `Parameters` that is tuned, and its box."""
+    """An entry of `Parameters` that can be tuned, and its bounds."""
 
-    path: str  # "mpc.weights.Q"
+    path: str  # for example "mpc.weights.Q"
     lower: float
     upper: float
-    each_joint: bool = False  # a number for each joint of a leg, else one
+    each_joint: bool = False  # an array with a number for each joint of a leg, else a scalar
 
     def shape(self, robot: Robot | None = None) -> tuple[int, ...]:
-        """Of the part in `Weights.others` of a robot, HECTOR by default."""
+        """Return the shape of the entry in a robot's `Weights.others`, HECTOR by default."""
         description = HECTOR if robot is None else robot.description
         return (description.leg_joints,) if self.each_joint else ()
 
     def read(self, parameters: Parameters) -> Any:
-        """The part: a number or a tree of them."""
+        """Return the entry: a number or a tree of numbers."""
         return attrgetter(self.path)(parameters)
 
     def write(self, parameters: Parameters, value: Any) -> Parameters:
-        """The parameters with another value of the part."""
+        """Return the parameters with another value of the entry."""
 
-        def within(tree: Any, names: Sequence[str]) -> Any:
+        def replace(tree: Any, names: Sequence[str]) -> Any:
             first, *rest = names
-            new = within(getattr(tree, first), rest) if rest else value
+            new = replace(getattr(tree, first), rest) if rest else value
             return tree._replace(**{first: new})
 
-        return within(parameters, self.path.split("."))
+        return replace(parameters, self.path.split("."))
 
 
 Q, R = Tunable("mpc.weights.Q", 1e-2, 1e4), Tunable("mpc.weights.R", 1e-7, 1.0)
@@ -80,7 +80,7 @@ TUNABLES = {
     "kp": Tunable("legs.kp", 1.0, 300.0, each_joint=True),
     "kd": Tunable("legs.kd", 0.05, 10.0, each_joint=True),
 }
-"""What can be tuned beside Q and R, by the names that `Weights.others` has for them."""
+"""Numbers that can be tuned in addition to Q and R, by their names in `Weights.others`."""
 
 _FOOTSTEPS = ("footstep_feedback", "turn_lead")
 _INTEGRAL = ("horizontal_gain", "height_gain", "tilt_gain", "yaw_gain")
@@ -90,23 +90,23 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "integral": _INTEGRAL,
     "all": (*_FOOTSTEPS, "effort_reference", *_INTEGRAL),
 }
-"""Numbers tuned beside Q and R by one name. Friction and the width of the steps are not among them:
-the model of the tuning does not know what the ground holds, nor that legs touch."""
+"""Groups of numbers that are tuned together. Friction and step width are in none of them: the
+tuner's model knows neither the friction of the ground nor collisions of the legs."""
 
 
 def tunables(names: Iterable[str]) -> tuple[str, ...]:
-    """Numbers by their names and those of `GROUPS`, each once.
+    """Return tunable names with the names of `GROUPS` expanded, without duplicates.
 
     >>> tunables(["footsteps", "turn_lead"])
     ('footstep_feedback', 'turn_lead')
     """
-    return tuple(dict.fromkeys(one for name in names for one in GROUPS.get(name, (name,))))
+    return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
 
 
 def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Weights, Weights]:
-    """Box Theta of feasible weights, lower and upper, with that of `others`.
+    """Return the lower and upper bounds Theta of feasible weights and of `others`.
 
-    The weights are shaped as those of `like`, by default HECTOR's.
+    The weights have the shapes of `like`, by default HECTOR's.
 
     >>> lower, upper = bounds(["turn_lead"])
     >>> lower.Q.euler.tolist(), upper.others
@@ -114,11 +114,11 @@ def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Wei
     """
     like, others = like or nominal(), tuple(others)
 
-    def side(name: str) -> Weights:
+    def bound(side: str) -> Weights:
         return Weights(
-            jax.tree.map(lambda w: np.full(np.shape(w), getattr(Q, name)), like.Q),
-            jax.tree.map(lambda w: np.full(np.shape(w), getattr(R, name)), like.R),
-            {one: getattr(TUNABLES[one], name) for one in others},
+            jax.tree.map(lambda w: np.full(np.shape(w), getattr(Q, side)), like.Q),
+            jax.tree.map(lambda w: np.full(np.shape(w), getattr(R, side)), like.R),
+            {name: getattr(TUNABLES[name], side) for name in others},
         )
 
-    return side("lower"), side("upper")
+    return bound("lower"), bound("upper")

@@ -1,7 +1,7 @@
-"""Where the robot should be: a velocity command, integrated open loop from t = 0 (Eq. 14-16).
+"""The reference motion: a velocity command, integrated open loop from t = 0 (Eq. 14-16).
 
-The reference does not follow the robot: what the MPC tracks is what the loss measures. Yaw is
-integrated first and the velocity turned by it; on each piece of constant yaw rate the path is an
+The reference does not depend on the robot's motion: the MPC and the loss use the same one. Yaw is
+integrated first and the velocity rotated by it; on each piece of constant yaw rate the path is an
 exact arc. Height, roll and pitch are constant.
 """
 
@@ -20,15 +20,15 @@ from hector_jax.robot.model import Robot
 
 
 class Command(NamedTuple):
-    """Velocity command, constant on each of S pieces, repeated from the start after the last."""
+    """Periodic velocity command, constant on each of S pieces."""
 
     duration: Float[Any, "*batch S"]  # [s]
-    velocity: Float[Any, "*batch S 2"]  # [m/s] ahead and to the left
+    velocity: Float[Any, "*batch S 2"]  # [m/s] forward and to the left
     yaw_rate: Float[Any, "*batch S"]  # [rad/s]
 
 
 class Anchor(NamedTuple):
-    """Where the reference starts, and when: t = 0 at gait tick `tick`."""
+    """Start pose of the reference, and its start t = 0 at gait tick `tick`."""
 
     position: Float[Any, "*batch 3"]  # of the centre of mass [m]
     yaw: Float[Any, "*batch"]  # [rad]
@@ -36,13 +36,13 @@ class Anchor(NamedTuple):
 
 
 def standing_anchor(robot: Robot, start_tick: int = 0) -> Anchor:
-    """Reference of a robot that stands with its trunk above the origin until `start_tick`."""
+    """Return the anchor of a robot that stands with its trunk above the origin to `start_tick`."""
     position = jnp.append(jnp.asarray(robot.com_offset)[:2], robot.standing_height)
     return Anchor(position, jnp.zeros_like(position[0]), jnp.asarray(start_tick, jnp.int32))
 
 
 def anchor_at(robot: Robot, state: State, start_tick: Int[Array, ""] | int) -> Anchor:
-    """Reference from where the robot is at t = 0, at the height at which it stands."""
+    """Return the anchor at the robot's pose at t = 0, at its standing height."""
     position = jnp.append(state.position[:2], robot.standing_height)
     return Anchor(position, state.euler[2], jnp.asarray(start_tick, jnp.int32))
 
@@ -51,10 +51,10 @@ COMMANDS = ("straight", "c", "s")
 """The paper's trajectories."""
 
 UNSEEN = ("sideways", "turn", "eight", "stop-and-go")
-"""Beyond the paper: for judging what was tuned on others."""
+"""Trajectories beyond the paper, to test weights that were tuned on others."""
 
 _QUARTER, _HALF = 0.25 * np.pi, 0.5 * np.pi  # [rad/s]
-# Seconds of each of two pieces; velocity ahead and to the left [m/s], yaw rate [rad/s] of both.
+# For two pieces: common duration [s]; velocities forward and to the left [m/s]; yaw rates [rad/s].
 _PIECES = {
     "straight": (2.0, ((0.5, 0.0), (0.5, 0.0)), (0.0, 0.0)),
     "c": (2.0, ((0.25, 0.0), (0.25, 0.0)), (_QUARTER, _QUARTER)),
@@ -67,17 +67,17 @@ _PIECES = {
 
 
 def named_command(name: str) -> Command:
-    """A trajectory of COMMANDS or UNSEEN.
+    """Return a trajectory of COMMANDS or UNSEEN.
 
     The paper's straight line, C curve and S curve (period 4 s); 0.2 m/s to the left; half a turn on
-    the spot in 4 s; a figure of eight, two circles of 4 s each; a second at 0.5 m/s and one in
-    place. All have two pieces, so that they may share a batch.
+    the spot in 4 s; a figure of eight, two circles of 4 s each; one second at 0.5 m/s and one in
+    place. All have two pieces, so that they can share a batch.
 
     >>> named_command("stop-and-go").velocity.tolist()
     [[0.5, 0.0], [0.0, 0.0]]
 
     Raises:
-        InputError: the name is none of them.
+        InputError: the name is unknown.
     """
     if name not in _PIECES:
         raise InputError(unknown("trajectory", name, _PIECES))
@@ -86,33 +86,33 @@ def named_command(name: str) -> Command:
 
 
 def _turn(angle: Float[Array, "*batch"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-    across = v @ np.array([[0.0, 1.0], [-1.0, 0.0]], jnp.result_type(v))
-    return jnp.cos(angle)[..., None] * v + jnp.sin(angle)[..., None] * across
+    left = v @ np.array([[0.0, 1.0], [-1.0, 0.0]], jnp.result_type(v))  # v turned by 90 degrees
+    return jnp.cos(angle)[..., None] * v + jnp.sin(angle)[..., None] * left
 
 
 def _displacement(command: Command, time: Float[Array, ""]) -> tuple[Array, Array]:
-    """Planar displacement (2,) and turn () from the start to `time` within the first period."""
+    """Return displacement (2,) and turn () from the start to `time` within the first period."""
     start = jnp.cumsum(command.duration) - command.duration
-    spent = jnp.clip(time - start, 0.0, command.duration)
-    turned = command.yaw_rate * spent
-    heading = jnp.cumsum(turned) - turned
-    # of an arc of unit speed; np.sinc is sin(pi x)/(pi x)
-    chord = jnp.sinc(turned / (2 * jnp.pi)) * spent
-    arcs = _turn(heading + turned / 2, command.velocity * chord[:, None])
-    return arcs.sum(axis=0), turned.sum()
+    elapsed = jnp.clip(time - start, 0.0, command.duration)
+    turn = command.yaw_rate * elapsed
+    heading = jnp.cumsum(turn) - turn
+    # chord of an arc at unit speed; np.sinc is sin(pi x)/(pi x)
+    chord = jnp.sinc(turn / (2 * jnp.pi)) * elapsed
+    arcs = _turn(heading + turn / 2, command.velocity * chord[:, None])
+    return arcs.sum(axis=0), turn.sum()
 
 
-@partial(jax.jit, static_argnums=0)  # traced once for all that ask
+@partial(jax.jit, static_argnums=0)  # traced once for all callers
 def reference_at(
     tick_length: float, command: Command, anchor: Anchor, tick: Real[Array, ""]
 ) -> State:
-    """Reference state at a gait tick; before t = 0 it stands at the anchor.
+    """Return the reference state at a gait tick; before t = 0 it stands at the anchor.
 
     Args:
         tick_length: length of a tick [s].
-        command: what to walk.
-        anchor: where and at which tick it starts.
-        tick: gait tick, fractions allowed.
+        command: velocity command.
+        anchor: start pose and start tick.
+        tick: gait tick, may be fractional.
 
     Source: Eq. 14-16, repeated with the period of the command.
     """
@@ -123,18 +123,18 @@ def reference_at(
     rounds = jnp.floor(jnp.maximum(time, 0.0) / period)
     inside = jnp.maximum(time, 0.0) - rounds * period
     lap, lap_turn = _displacement(command, period)
-    # n laps are a geometric series of turned displacements: sum_i R(i a) = R((n-1) a/2) sin(n
-    # a/2)/sin(a/2).
+    # n laps are a geometric series of rotated displacements:
+    # sum_i R(i a) = R((n-1) a/2) sin(n a/2)/sin(a/2).
     half = lap_turn / 2
     flat = jnp.abs(jnp.sin(half)) < 1e-9
-    # where a lap turns by whole turns, sin(n a/2)/sin(a/2) tends to n cos((n-1) a/2)
-    whole = rounds * jnp.cos((rounds - 1.0) * half)
-    ratio = jnp.where(flat, whole, jnp.sin(rounds * half) / jnp.where(flat, 1.0, jnp.sin(half)))
+    # if a lap turns by a multiple of 2 pi, sin(n a/2)/sin(a/2) tends to n cos((n-1) a/2)
+    limit = rounds * jnp.cos((rounds - 1.0) * half)
+    ratio = jnp.where(flat, limit, jnp.sin(rounds * half) / jnp.where(flat, 1.0, jnp.sin(half)))
     laps = _turn((rounds - 1.0) * half, lap * ratio)
-    step, turned = _displacement(command, inside)
+    step, turn = _displacement(command, inside)
     heading = anchor.yaw + rounds * lap_turn
     plane = _turn(anchor.yaw, laps) + _turn(heading, step)
-    yaw = heading + turned
+    yaw = heading + turn
     piece = jnp.minimum(jnp.sum(inside >= jnp.cumsum(command.duration)), command.duration.size - 1)
     velocity = jnp.where(walking, _turn(yaw, command.velocity[piece]), 0.0)
     yaw_rate = jnp.where(walking, command.yaw_rate[piece], 0.0)

@@ -1,16 +1,16 @@
-"""Trajectories of one's own: a command from a small TOML file, and whether the robot can walk it.
+"""User-defined trajectories: a command from a TOML file, and a check that the robot can walk it.
 
     name = "slalom"        # letters, digits, - and _; names the folder of the results
 
-    [[segment]]            # one after the other, from the start again after the last
+    [[segment]]            # executed in order, then repeated from the first
     seconds = 1.0          # a multiple of 0.05 s
-    v_x = 0.4              # [m/s] ahead
+    v_x = 0.4              # [m/s] forward
     v_y = 0.0              # [m/s] to the left
     yaw_rate = 0.8         # [rad/s] to the left
 
-What is left out of a segment is zero. Walks, tunings and verdicts of such a command last as long as
-its segments together. What is beyond any biped of this size is refused; what is beyond this robot
-is told and walked all the same.
+A missing velocity of a segment is zero. Walks, tunings and verdicts of such a command last for the
+sum of its segments. Speeds beyond any biped of this size are an error; speeds beyond this robot
+cause a warning and are walked nevertheless.
 """
 
 import re
@@ -31,23 +31,23 @@ _MOST_SECONDS = 600.0
 _GRID = 0.05  # [s]
 _MOST_SEGMENTS = 100
 _MOST_BYTES = 100_000
-_SPEED = Range(-10.0, 10.0)  # [m/s], [rad/s]; more is another unit
+_SPEED = Range(-10.0, 10.0)  # [m/s], [rad/s]; larger values are in another unit
 
 
 class NamedCommand(NamedTuple):
-    """What to walk."""
+    """A command with its name."""
 
     name: str
     command: Command
-    seconds: float | None = None  # its length, where a file says so
+    seconds: float | None = None  # its duration, if read from a file
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of constant velocity in the robot's own directions."""
+    """A segment of constant velocity in the robot's frame."""
 
     seconds: Annotated[float, Range(_GRID, _MOST_SECONDS)]
-    v_x: Annotated[float, _SPEED] = 0.0  # [m/s] ahead
+    v_x: Annotated[float, _SPEED] = 0.0  # [m/s] forward
     v_y: Annotated[float, _SPEED] = 0.0  # [m/s] to the left
     yaw_rate: Annotated[float, _SPEED] = 0.0  # [rad/s]
 
@@ -80,7 +80,7 @@ class _File:
 
 
 def load_command(path: Path) -> NamedCommand:
-    """The course of a TOML file, see the module.
+    """Read the command of a TOML file, see the module docstring.
 
     Raises:
         InputError: one line naming the file and the field that is unknown, missing or out of range.
@@ -88,27 +88,27 @@ def load_command(path: Path) -> NamedCommand:
     path = Path(path)
     file = from_table(str(path), _File, read_toml(path, "a trajectory", _MOST_BYTES))
     segments = [
-        from_table(f"{path}: segment {number}", Segment, one)
-        for number, one in enumerate(file.segment, 1)
+        from_table(f"{path}: segment {number}", Segment, table)
+        for number, table in enumerate(file.segment, 1)
     ]
-    seconds = sum(one.seconds for one in segments)
+    seconds = sum(segment.seconds for segment in segments)
     if seconds > _MOST_SECONDS:
         raise InputError(
             f"{path}: the segments must last at most {_MOST_SECONDS:g} s together, got {seconds:g}"
         )
     command = Command(
-        duration=np.array([one.seconds for one in segments]),
-        velocity=np.array([(one.v_x, one.v_y) for one in segments]),
-        yaw_rate=np.array([one.yaw_rate for one in segments]),
+        duration=np.array([segment.seconds for segment in segments]),
+        velocity=np.array([(segment.v_x, segment.v_y) for segment in segments]),
+        yaw_rate=np.array([segment.yaw_rate for segment in segments]),
     )
     return NamedCommand(file.name, command, round(seconds / _GRID) * _GRID)
 
 
 def command_of(text: str) -> NamedCommand:
-    """A trajectory by its name, or from the TOML file of that path.
+    """Return a trajectory by its name, or from the TOML file at that path.
 
     Raises:
-        InputError: `named_command` knows no such name, or see `load_command`.
+        InputError: the name is unknown, or see `load_command`.
     """
     if text.endswith(".toml"):
         return load_command(Path(text))
@@ -119,7 +119,7 @@ def command_of(text: str) -> NamedCommand:
 
 
 class Limits(NamedTuple):
-    """Speeds up to which a robot can be expected to walk."""
+    """Largest speeds at which a robot can be expected to walk."""
 
     ahead: float  # [m/s]
     back: float  # [m/s]
@@ -128,36 +128,36 @@ class Limits(NamedTuple):
 
 
 def limits(robot: Robot, gait: GaitConfig) -> Limits:
-    """What a robot can be expected to walk, from its legs and the time that a foot stands.
+    """Estimate the speeds at which a robot can walk, from its legs and the duration of a stance.
 
-    A rule of thumb: over a stance the body moves on by half of what the leg could reach at standing
-    height; the other half is left for balance. Sideways the hip's roll bounds the reach, backwards
-    the foot's shorter lever behind the ankle, in a turn the hip's yaw. Of HECTOR in MuJoCo (`hfs`,
-    expert weights, 6 s from standing) it says 1.55, 1.04, 1.20 m/s and 3.5 rad/s; it walked 1.6,
-    1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
+    A rule of thumb: during a stance the body moves by half of the leg's reach at standing height;
+    the other half remains for balance. Sideways the hip's roll limits the reach, backwards the
+    foot's shorter lever behind the ankle, in a turn the hip's yaw. For HECTOR in MuJoCo (`hfs`,
+    expert weights, 6 s from standing) the estimate is 1.55, 1.04, 1.20 m/s and 3.5 rad/s; it walked
+    at 1.6, 1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
     """
     hip, knee, ankle = knee_joints(robot)
     axis = robot.joint_axis[0]
-    turns = [np.argmax(np.abs(axis[:, direction])) for direction in (2, 0)]  # yaw, roll
+    hip_yaw, hip_roll = (np.argmax(np.abs(axis[:, direction])) for direction in (2, 0))
 
-    def apart(first: int, last: int) -> float:
-        """Distance [m] of two joints in the plane of the knee, the leg straight at zero."""
-        step = robot.joint_origin[0, first + 1 : last + 1].sum(axis=0)
-        return float(np.linalg.norm(step - (step @ axis[knee]) * axis[knee]))
+    def distance(first: int, last: int) -> float:
+        """Return the distance [m] of two joints in the knee's plane, the leg straight at zero."""
+        offset = robot.joint_origin[0, first + 1 : last + 1].sum(axis=0)
+        return float(np.linalg.norm(offset - (offset @ axis[knee]) * axis[knee]))
 
-    thigh, shin = apart(hip, knee), apart(knee, ankle)
+    thigh, shin = distance(hip, knee), distance(knee, ankle)
 
-    def length(bend: float) -> float:
+    def leg_length(bend: float) -> float:
         return np.sqrt(thigh**2 + shin**2 + 2 * thigh * shin * np.cos(bend))
 
-    def least(joint: Any) -> float:
+    def smallest_limit(joint: Any) -> float:
         low, high = robot.joint_lower[joint], robot.joint_upper[joint]
         return 0.0 if low <= 0.0 <= high and joint == knee else np.min(np.abs([low, high]))
 
-    stands = length(robot.standing_joints[knee])
-    reach = np.sqrt(max(length(least(knee)) ** 2 - stands**2, 0.0))
-    yaw, roll = map(least, turns)
-    height = stands + abs(robot.foot_point[0, 2])
+    standing_length = leg_length(robot.standing_joints[knee])
+    reach = np.sqrt(max(leg_length(smallest_limit(knee)) ** 2 - standing_length**2, 0.0))
+    yaw, roll = smallest_limit(hip_yaw), smallest_limit(hip_roll)
+    height = standing_length + abs(robot.foot_point[0, 2])
     stance = gait.stance * gait.tick
     back = min(robot.heel / robot.toe, 1.0) if robot.toe > 0.0 else 1.0
     return Limits(
@@ -169,9 +169,9 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
 
 
 def beyond(limits: Limits, command: Command) -> str | None:
-    """Where a command asks for more than a robot can be expected to walk, in one line.
+    """Return a one-line warning if a command exceeds the limits of a robot, else None.
 
-    A change from one segment to the next counts like a start from standing.
+    A change of velocity between segments has the limits of a start from standing.
     """
     ahead, aside = np.asarray(command.velocity).T
     limits_by_name = {

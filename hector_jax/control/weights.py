@@ -1,9 +1,8 @@
-"""theta: the diagonal weights of the MPC and what is tuned beside them; the sets with a name.
+"""theta: the diagonal weights of the MPC and other tuned numbers; the named weight sets.
 
 The diagonal of Q has the shape of a state and that of R the shape of a wrench (Eq. 3), without
-moments where the feet exert none; the three gravity weights of the paper's 15-state cost are zero
-and not tuned. HECTOR has 24 weights. Trees of this shape also carry bounds, step sizes and
-gradients.
+moments for point feet; the three gravity weights of the paper's 15-state cost are zero and not
+tuned. HECTOR has 24 weights. Bounds, step sizes and gradients are trees of the same shape.
 """
 
 from collections.abc import Collection, Mapping
@@ -21,18 +20,18 @@ from hector_jax.robot.model import Robot
 
 
 class Weights(NamedTuple):
-    """Diagonals of the stage cost |x - x_ref|^2_Q + |u|^2_R, and numbers tuned beside them."""
+    """Diagonals of the stage cost |x - x_ref|^2_Q + |u|^2_R, and other tuned numbers."""
 
-    Q: State  # of the error of each state
-    R: Wrench  # of the input of each foot; of point feet the moment is (feet, 0)
-    others: Mapping[str, Any] = {}  # by the names of `parameters.TUNABLES`; else the config's
+    Q: State  # weight of each state error
+    R: Wrench  # weight of each input of each foot; the moment of point feet is (feet, 0)
+    others: Mapping[str, Any] = {}  # by names in `parameters.TUNABLES`; the config has the rest
 
 
 _STATES = "roll pitch yaw x y z wx wy wz vx vy vz".split()
 
 
 def weight_names(like: Weights | None = None) -> tuple[str, ...]:
-    """Names of the entries of `weights_to_vector`; of HECTOR's weights by default."""
+    """Return the names of the entries of `weights_to_vector`, by default for HECTOR."""
     force, moment = (nominal() if like is None else like).R
     kinds = "FM" if moment.size else "F"
     feet = FEET[force.shape[-2]]
@@ -41,24 +40,24 @@ def weight_names(like: Weights | None = None) -> tuple[str, ...]:
 
 
 def _direction(name: str) -> str:
-    """Name of a weight without its foot."""
+    """Return the name of a weight without its foot."""
     return name if name.startswith("Q_") else "_".join(name.split("_")[:2])
 
 
 def direction_names(like: Weights | None = None) -> tuple[str, ...]:
-    """Names of the directions in which the weights move when the feet share one R."""
+    """Return the names of the directions in which weights change when all feet share one R."""
     return tuple(dict.fromkeys(map(_direction, weight_names(like))))
 
 
 def _weights(rows: tuple, feet: int = 2, moments: bool = True) -> Weights:
-    """Of the diagonals by three, in the order of State and Wrench, one R for all feet."""
+    """Build weights from six triples in the order of State and Wrench, one R for all feet."""
     Q, (force, moment) = np.array(rows[:4], float), np.array(rows[4:], float)
     moment = moment if moments else moment[:0]
     return Weights(State(*Q), Wrench(np.tile(force, (feet, 1)), np.tile(moment, (feet, 1))))
 
 
 def named_like(names: Collection[str]) -> Weights:
-    """Weights of the shape that has these `weight_names` among other names."""
+    """Return weights of the shape that the `weight_names` among these names describe."""
     feet = sum(name.startswith("R_Fx") for name in names)
     return _weights(_NOMINAL, feet, any(name.startswith("R_M") for name in names))
 
@@ -75,23 +74,23 @@ _EXPERT += ((1e-4, 1e-4, 5e-4), (1e-2,) * 3)
 
 
 def nominal(robot: Robot | None = None) -> Weights:
-    """Flat, untuned weights that still walk: what an engineer writes down before tuning.
+    """Return uniform, untuned weights that still walk, as an engineer chooses before tuning.
 
-    Those of a robot are in its description; without one, HECTOR's.
+    They are read from the robot's description; without a robot they are HECTOR's.
     """
     return _weights_of(robot, robot and robot.description.nominal or _NOMINAL)
 
 
 def expert(robot: Robot | None = None) -> Weights:
-    """The weights that the robot's own laboratory published for its walking controller.
+    """Return the weights that the robot's laboratory published for its walking controller.
 
-    Those of a robot are in its description; without one, HECTOR's.
+    They are read from the robot's description; without a robot they are HECTOR's.
     """
     return _weights_of(robot, robot and robot.description.expert or _EXPERT)
 
 
 def weights_to_vector(weights: Weights) -> Float[Array, "*batch weights"]:
-    """Q and R in the order of `weight_names`; for gradients and other such trees too."""
+    """Return Q and R in the order of `weight_names`; also of gradients and other such trees."""
     flat = [*weights.Q, *(w.reshape(*w.shape[:-2], -1) for w in weights.R if w.size)]
     return jnp.concatenate([jnp.asarray(w) for w in flat], axis=-1)
 
@@ -99,24 +98,23 @@ def weights_to_vector(weights: Weights) -> Float[Array, "*batch weights"]:
 def vector_to_weights(
     vector: Float[Array, "*batch weights"], like: Weights | None = None
 ) -> Weights:
-    """Weights from the numbers of `weights_to_vector`, shaped as others, by default HECTOR's."""
+    """Return weights from a vector of `weights_to_vector`, shaped like `like`, default HECTOR's."""
     R = (nominal() if like is None else like).R
     ends = np.cumsum([3, 3, 3, 3, *(int(np.prod(w.shape[-2:])) for w in R)])[:-1]
     *Q, force, moment = jnp.split(vector, ends, axis=-1)
-    shaped = (
-        x.reshape(*x.shape[:-1], *w.shape[-2:]) for x, w in zip((force, moment), R, strict=True)
-    )
-    return Weights(State(*Q), Wrench(*shaped))
+    pairs = zip((force, moment), R, strict=True)
+    R = Wrench(*(x.reshape(*x.shape[:-1], *w.shape[-2:]) for x, w in pairs))
+    return Weights(State(*Q), R)
 
 
 def directions(like: Weights | None = None) -> Float[np.ndarray, "directions weights"]:
-    """Unit steps in the log-weights of `weights_to_vector`, in the order of `direction_names`."""
-    of_weight = np.array([_direction(name) for name in weight_names(like)])
-    return np.array([of_weight == name for name in direction_names(like)], float)
+    """Return unit steps of the log-weights of `weights_to_vector`, ordered as `direction_names`."""
+    of_weights = np.array([_direction(name) for name in weight_names(like)])
+    return np.array([of_weights == name for name in direction_names(like)], float)
 
 
 def scale_weights(weights: Weights, logs: Float[Array | np.ndarray, " directions"]) -> Weights:
-    """Weights after a step in the `directions`; `others` stay.
+    """Return weights after a log-step in the `directions`; `others` do not change.
 
     >>> steps = np.zeros(18)
     >>> steps[direction_names().index("Q_yaw")] = np.log(2.0)
@@ -127,41 +125,41 @@ def scale_weights(weights: Weights, logs: Float[Array | np.ndarray, " directions
     return vector_to_weights(vector, weights)._replace(others=weights.others)
 
 
-def between(one: Weights, other: Weights, share: float = 0.5) -> Weights:
-    """Weights between two sets: their geometric mean, in which `share` counts the other one.
+def between(first: Weights, second: Weights, share: float = 0.5) -> Weights:
+    """Return the weighted geometric mean of two weight sets; `share` is the weight of the second.
 
-    Numbers beside Q and R, which may be zero, are on the straight line from one to the other.
+    The `others`, which may be zero, are interpolated linearly.
 
     Raises:
-        InputError: they do not have the same numbers beside Q and R.
+        InputError: the sets have different `others`.
 
     >>> between(nominal(), expert()).Q.euler.round(1).tolist()
     [70.7, 70.7, 111.8]
     """
-    if one.others.keys() != other.others.keys():
-        each = (", ".join(x.others) or "none" for x in (one, other))
-        raise InputError(f"weights to mix have unlike numbers beside Q and R: {' and '.join(each)}")
-    Q, R = jax.tree.map(lambda x, y: x ** (1.0 - share) * y**share, one[:2], other[:2])
-    line = jax.tree.map(lambda x, y: (1.0 - share) * x + share * y, one.others, other.others)
-    return jax.tree.map(np.asarray, Weights(Q, R, line))
+    if first.others.keys() != second.others.keys():
+        names = (", ".join(x.others) or "none" for x in (first, second))
+        raise InputError(
+            f"weights to mix have unlike numbers beside Q and R: {' and '.join(names)}"
+        )
+    Q, R = jax.tree.map(lambda x, y: x ** (1.0 - share) * y**share, first[:2], second[:2])
+    others = jax.tree.map(lambda x, y: (1.0 - share) * x + share * y, first.others, second.others)
+    return jax.tree.map(np.asarray, Weights(Q, R, others))
 
 
 def sample_weights(weights: Weights, factor: float, count: int) -> list[Weights]:
-    """Draw weight sets log-uniformly within x/factor of some weights, always the same ones."""
+    """Draw weight sets log-uniformly within a factor of given weights, with a fixed seed."""
     draws = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(direction_names(weights))))
-    scaled = [scale_weights(weights, np.log(factor) * row) for row in draws]
-    return jax.device_get(scaled)
+    return jax.device_get([scale_weights(weights, np.log(factor) * row) for row in draws])
 
 
-def moved_most(start: Weights, weights: Weights) -> str:
-    """The three directions in which weights lie farthest from a start, as text.
+def largest_changes(start: Weights, weights: Weights) -> str:
+    """Return the three directions in which weights differ most from a start, as text.
 
-    >>> moved_most(nominal(), scale_weights(nominal(), 0.5 * np.eye(18)[1]))
+    >>> largest_changes(nominal(), scale_weights(nominal(), 0.5 * np.eye(18)[1]))
     'Q_pitch 1.6 times, Q_roll 1 times, Q_yaw 1 times'
     """
-    sizes = [np.asarray(weights_to_vector(one)) for one in (start, weights)]
-    farthest = directions(start).argmax(axis=1)  # of the first foot
-    logs = np.log(sizes[1] / sizes[0])[farthest]
-    order = sorted(range(len(logs)), key=lambda i: -abs(logs[i]))[:3]
-    names = direction_names(start)
-    return ", ".join(f"{names[i]} {np.exp(logs[i]):.2g} times" for i in order)
+    before, after = (np.asarray(weights_to_vector(w)) for w in (start, weights))
+    first_foot = directions(start).argmax(axis=1)  # index of each direction's first weight
+    logs = np.log(after / before)[first_foot]
+    changes = sorted(zip(direction_names(start), logs, strict=True), key=lambda x: -abs(x[1]))
+    return ", ".join(f"{name} {np.exp(log):.2g} times" for name, log in changes[:3])

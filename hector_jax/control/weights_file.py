@@ -1,4 +1,4 @@
-"""Weights to JSON and back."""
+"""Weights as JSON files."""
 
 import json
 from collections.abc import Mapping
@@ -16,14 +16,14 @@ from hector_jax.core.trajectory import State
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
 
-WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far beyond, no QP is solved
-_MOST_WEIGHTS = 1_000_000  # bytes
+WEIGHTS = Range(1e-12, 1e12)  # of weights in a file; far outside it the QP is not solved
+_MAX_BYTES = 1_000_000
 
 
 def weights_tree(weights: Weights) -> dict[str, Any]:
-    """Weights as JSON values, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`.
+    """Return JSON values, `{"Q": {"euler": [..], ...}, "R": {"force": [[..], [..]], ...}}`.
 
-    `"others": {"footstep_feedback": 0.12, ...}` follows where there are any.
+    `"others": {"footstep_feedback": 0.12, ...}` follows if it is not empty.
     """
     parts = {"Q": weights.Q._asdict(), "R": weights.R._asdict(), "others": weights.others}
     return {
@@ -34,23 +34,23 @@ def weights_tree(weights: Weights) -> dict[str, Any]:
 
 
 def save_weights(path: Path, weights: Weights, schema: str | None = None) -> None:
-    """Write weights as JSON, as `weights_tree`; with the place of a schema it names that first.
+    """Write the `weights_tree` as JSON, after the path or URL of a schema if there is one.
 
     Raises:
-        WriteError: where the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     tree = {} if schema is None else {"$schema": schema}
     write_json(path, tree | weights_tree(weights))
 
 
 def best(robot: Robot | None = None) -> Weights:
-    """The tuned weights that are shipped with a robot: `ROBOT-best.json` beside its ROBOT.toml.
+    """Read the tuned weights shipped with a robot: `ROBOT-best.json` beside its ROBOT.toml.
 
-    Those of HECTOR, which are the default, are the row `best` of `hector tune --traj all`, the
-    friction with which to plan included (docs/results.md).
+    HECTOR's, which are the default, are the row `best` of `hector tune --traj all`, including the
+    planner's friction (docs/results.md).
 
     Raises:
-        InputError: one line, where the robot has no such file or it is none of weights.
+        InputError: one line, if the robot has no such file or the file is invalid.
     """
     toml = (HECTOR if robot is None else robot.description).path
     path = toml.with_name(f"{toml.stem}-best.json")
@@ -64,31 +64,32 @@ def best(robot: Robot | None = None) -> Weights:
 def load_weights(path: Path, robot: Robot | None = None) -> Weights:
     """Read weights that `save_weights` or a person wrote.
 
-    Q and R are in `WEIGHTS`, not held to the box; others are.
+    Q and R have to be in the range `WEIGHTS`, `others` in their bounds in `TUNABLES`.
 
     Args:
         path: JSON file.
-        robot: that they are for, HECTOR by default: R has a row for each of its feet, no moment of
-            point feet (one that is there is not read), and gains have a number for each joint of a
+        robot: the robot of the weights, HECTOR by default: R has a row for each of its feet, no
+            moment of point feet (ignored if present), and gains have a number for each joint of a
             leg.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, unknown, of the wrong
-            shape, or not a number of that range.
+            shape, or not a number in its range.
     """
     path = Path(path)
-    tree = read_json(path, "weights", _MOST_WEIGHTS, object_pairs_hook=_no_twins)
+    tree = read_json(path, "weights", _MAX_BYTES, object_pairs_hook=_unique_keys)
+    others: Any = {}
     if isinstance(tree, dict):
-        tree.pop("$schema", None)  # for editors; what is in a file is checked here
+        tree.pop("$schema", None)  # for editors; the content is checked here
+        others = tree.pop("others", {})
     like = nominal(robot)
     shapes: dict[str, dict[str, tuple[int, ...]]] = {
         part: {name: w.shape for name, w in getattr(like, part)._asdict().items() if w.size}
         for part in ("Q", "R")
     }
-    if "moment" not in shapes["R"] and isinstance(tree, dict) and isinstance(tree.get("R"), dict):
-        tree["R"].pop("moment", None)
-    others = tree.pop("others", {}) if isinstance(tree, dict) else {}
     _check_keys(path, tree, shapes.keys(), "")
+    if "moment" not in shapes["R"] and isinstance(tree["R"], dict):
+        tree["R"].pop("moment", None)
     values = {}
     for part, entries in shapes.items():
         _check_keys(path, tree[part], entries.keys(), f"{part}.")
@@ -107,18 +108,18 @@ def _others(path: Path, others: Any, robot: Robot | None) -> dict[str, np.ndarra
     for name, value in others.items():
         if name not in TUNABLES:
             raise InputError(f"{path}: others: {unknown('tunable', name, TUNABLES)}")
-        one = TUNABLES[name]
-        box = Range(one.lower, one.upper)
-        values[name] = _numbers(path, f"others.{name}", value, one.shape(robot), box)
+        tunable = TUNABLES[name]
+        bounds = Range(tunable.lower, tunable.upper)
+        values[name] = _numbers(path, f"others.{name}", value, tunable.shape(robot), bounds)
     return values
 
 
-def _no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     tree = dict(pairs)
     if len(tree) < len(pairs):
-        names = [name for name, _ in pairs]
-        twin = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f'"{twin}" is given twice')
+        keys = [key for key, _ in pairs]
+        duplicate = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f'"{duplicate}" is given twice')
     return tree
 
 
@@ -137,13 +138,13 @@ def _check_keys(path: Path, tree: Any, names: Any, prefix: str) -> None:
 
 
 def _numbers(path: Path, name: str, entry: Any, shape: tuple[int, ...], range: Range) -> np.ndarray:
-    wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
+    expected = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
     try:
         array = np.array(entry, object)
     except ValueError:  # rows of different lengths
         array = np.array(None)
     if array.shape != shape:
-        raise InputError(f"{path}: {name} must be {wanted}, got {json.dumps(entry)[:60]}")
+        raise InputError(f"{path}: {name} must be {expected}, got {json.dumps(entry)[:60]}")
     for index, value in np.ndenumerate(array):
         if fault := validation_error(value, float, range):
             place = "".join(f"[{i}]" for i in index)

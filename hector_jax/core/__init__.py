@@ -1,1 +1,1 @@
-"""Geometry, types, input checks, processes: what every other package uses."""
+"""Geometry, types, input checks and processes, shared by all other packages."""

@@ -1,4 +1,4 @@
-"""The type of arrays: JAX's, beside which NumPy's are welcome."""
+"""The type of arrays: those of JAX, and NumPy's as well."""
 
 from typing import TYPE_CHECKING
 

@@ -26,19 +26,19 @@ from hector_jax.core.inputs import InputError, printable
 
 console = Console(stderr=True, highlight=False)
 
-Tell = Callable[[int, int, str], None]  # (done, all, remark)
+ReportProgress = Callable[[int, int, str], None]  # (done, total, remark)
 
-_QUIET = 15.0  # [s] between lines where there is no terminal to draw a bar on
+_QUIET = 15.0  # [s] between progress lines without a terminal
 
 
 def say(text: str) -> None:
-    """One line to the person who waits."""
+    """Print one line for the user on stderr."""
     console.print(printable(text), markup=False, soft_wrap=True)
 
 
 @contextmanager
 def say_if_slow(text: str) -> Iterator[None]:
-    """Say what goes on within if it takes longer than a second."""
+    """Print the text if the block takes longer than a second."""
     timer = threading.Timer(1.0, say, [text])
     timer.daemon = True
     timer.start()
@@ -49,11 +49,11 @@ def say_if_slow(text: str) -> Iterator[None]:
 
 
 @contextmanager
-def bar(title: str) -> Iterator[Tell]:
-    """A progress bar for anything longer than two seconds; plain lines where there is no terminal.
+def bar(title: str) -> Iterator[ReportProgress]:
+    """Show a progress bar for work longer than two seconds; plain lines without a terminal.
 
     Yields:
-        Function of how many are done, of how many, and a short remark.
+        Function of the number done, the total and a short remark.
     """
     if console.is_terminal:
         columns = (
@@ -67,18 +67,18 @@ def bar(title: str) -> Iterator[Tell]:
         )
         with Progress(*columns, console=console) as progress:
             task = progress.add_task(title, total=None, remark="")
-            yield lambda done, of, remark="": progress.update(
-                task, completed=done, total=of, remark=remark
+            yield lambda done, total, remark="": progress.update(
+                task, completed=done, total=total, remark=remark
             )
-            # what converged early is done, too
+            # work that converged early counts as done
             total = progress.tasks[0].total or 1
             progress.update(task, completed=total, total=total)
         return
     start = last = time.monotonic()
-    first: tuple[int, float] | None = None  # done, and when; what was before it is compiling
+    first: tuple[int, float] | None = None  # (done, time) of the first report after compiling
     say(f"{title} ...")
 
-    def tell(done: int, of: int, remark: str = "") -> None:
+    def report_progress(done: int, total: int, remark: str = "") -> None:
         nonlocal first, last
         now = time.monotonic()
         if remark == "compiling":
@@ -86,55 +86,55 @@ def bar(title: str) -> Iterator[Tell]:
         elif first is None:
             first = done, now
         if now - last >= _QUIET and remark != "compiling":
-            text, last = f"  {done}/{of} after {now - start:.0f} s", now
+            text, last = f"  {done}/{total} after {now - start:.0f} s", now
             if first and done > first[0]:
-                left = (now - first[1]) / (done - first[0]) * (of - done)
+                left = (now - first[1]) / (done - first[0]) * (total - done)
                 text += f", about {left:.0f} s left"
             say(f"{text}  {remark}".rstrip())
 
-    yield tell
+    yield report_progress
     say(f"{title}: done in {time.monotonic() - start:.0f} s")
 
 
-class Broken(RuntimeError):  # noqa: N818, it is no fault of the program
-    """The result is bad news, such as a machine that fails the doctor's tests."""
+class Broken(RuntimeError):  # noqa: N818, not an error of the program
+    """The program works but its result is a failure, such as a machine that fails `doctor`."""
 
 
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-_PATIENCE = 5.0  # [s] for compiled code, in which Python hears no signal, to come to an end
+_PATIENCE = 5.0  # [s] for compiled code to return; Python handles no signal meanwhile
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class Stopped(KeyboardInterrupt):
-    """The first of `_SIGNALS`; its argument is the number."""
+    """The first signal of `_SIGNALS` has arrived; the argument is its number."""
 
 
 @contextmanager
 def _stoppable(name: str) -> Iterator[None]:
-    """Raise `Stopped` at the first signal; end the process on the spot at the second.
+    """Raise `Stopped` at the first signal; end the process immediately at the second.
 
-    On the spot, too, if the first is not heard within `_PATIENCE`. Nothing is lost by that: files
-    appear whole, and workers leave with their parent.
+    The process also ends immediately if the first signal is not handled within `_PATIENCE`. No data
+    is lost: files are written atomically, and workers end with their parent.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may have handlers
         return
-    heard = threading.Event()
+    handled = threading.Event()
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
 
     def stop(number: int, frame: Any) -> None:
-        if not heard.is_set():
-            heard.set()
+        if not handled.is_set():
+            handled.set()
             raise Stopped(number)
 
     def watch() -> None:
-        number = os.read(reading, 1)  # comes at once, whatever the main thread does
-        if number and not select.select([reading], [], [], _PATIENCE)[0] and heard.is_set():
+        number = os.read(reading, 1)  # returns at once, even if the main thread is busy
+        if number and not select.select([reading], [], [], _PATIENCE)[0] and handled.is_set():
             number = os.read(reading, 1)
         if number:
             if console.is_terminal:
-                os.write(2, b"\x1b[?25h")  # the cursor, which a bar hides
+                os.write(2, b"\x1b[?25h")  # show the cursor, which a progress bar hides
             os.write(2, f"{name}: {_SIGNALS[signal.Signals(number[0])]}, at once\n".encode())
             os._exit(128 + number[0])
         os.close(reading)
@@ -145,7 +145,7 @@ def _stoppable(name: str) -> Iterator[None]:
     try:
         yield
     finally:
-        if not heard.is_set():  # else a second one may come while the program ends
+        if not handled.is_set():  # else a second signal may arrive while the program ends
             signal.set_wakeup_fd(wakeup)
             os.close(writing)
             for number, handler in handlers.items():
@@ -153,7 +153,7 @@ def _stoppable(name: str) -> Iterator[None]:
 
 
 def _open_streams() -> None:
-    """Give closed standard streams /dev/null; else the next file would take their number."""
+    """Open /dev/null for closed standard streams; else the next file would take their number."""
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(number, True)
     os.close(number)
@@ -163,27 +163,26 @@ def _open_streams() -> None:
 
 
 def _drop(stream: TextIO) -> None:
-    """Let what a stream could not write go, or Python would try again as it ends."""
+    """Discard unwritten output of a stream; Python would try to write it again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def exit_code(name: str, work: Callable[[], None]) -> int:
-    """Do the work of a program; its exit code, with one line on stderr where that is not 0.
+    """Run a program and return its exit code, with one line on stderr if that is not 0.
 
     Args:
-        name: of the program, before the line.
-        work: `InputError` is bad input (2); `Broken`, a full disk and a killed worker process end
-            in a line of their own (1), SIGINT (130) and SIGTERM (143) too; a second signal does not
-            wait. Where nobody reads standard output any more, it ends without a word (141). Any
-            other exception is a fault of the program: it goes on to the caller with its traceback,
-            which for a script means exit code 1.
+        name: of the program, printed before the line.
+        work: the program. `InputError` gives code 2; `Broken`, a full disk and a killed worker
+            process give 1, SIGINT 130 and SIGTERM 143, each with its own line; a second signal ends
+            the process immediately. A closed standard output gives 141 without a line. Any other
+            exception is a bug: it propagates with its traceback, so a script exits with code 1.
     """
     _open_streams()
     try:
         with _stoppable(name):
             try:
                 work()
-            except SystemExit:  # of a parser that has printed its help
+            except SystemExit:  # from a parser that has printed its help
                 sys.stdout.flush()
                 raise
             sys.stdout.flush()

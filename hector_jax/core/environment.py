@@ -1,10 +1,11 @@
-"""What a result was made with: versions, machine, commit, and a hash of the code itself."""
+"""Provenance of a result: versions, machine, commit and a hash of the code."""
 
 import ast
 import hashlib
 import os
 import platform
 import subprocess
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -12,45 +13,28 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-NUMERIC = ("jax", "jaxlib", "mujoco", "numpy")  # packages that decide the numbers of a result
-# modules that decide none
+NUMERIC = ("jax", "jaxlib", "mujoco", "numpy")  # packages that determine numerical results
+# modules that do not affect numerical results
 _NO_NUMBERS = (
-    "control.weights_file",
-    "core.console",
-    "core.environment",
-    "core.files",
-    "core.inputs",
-    "core.runtime",
-    "core.tree_file",
-)
-_PACKAGES = (
-    "hector-jax",
-    "jax",
-    "jaxlib",
-    "flax",
-    "numpy",
-    "mujoco",
-    "mujoco-mjx",
-    "cmaes",
-    "scikit-learn",
-)
+    "control.weights_file core.console core.environment core.files core.inputs core.runtime"
+    " core.tree_file"
+).split()
+_PACKAGES = "hector-jax jax jaxlib flax numpy mujoco mujoco-mjx cmaes scikit-learn".split()
 _ROOT = Path(__file__).parents[1]
 
 
-@cache  # every file's card asks for them
+@cache  # called for the card of every file
 def versions() -> dict[str, str]:
-    """Versions of Python and of those packages that shape our numbers and are installed."""
+    """Return the versions of Python and of the installed packages that affect results."""
     installed = {"python": platform.python_version()}
     for package in _PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             installed[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return installed
 
 
 def environment() -> dict[str, str]:
-    """What the numbers were made with: versions, platform, device and, if known, the commit."""
+    """Return versions, platform, device, precision and, if available, the commit."""
     details = versions() | {
         "platform": f"{platform.system()} {platform.machine()}",
         "cores": str(os.cpu_count()),
@@ -62,8 +46,8 @@ def environment() -> dict[str, str]:
 
 
 def _commit(folder: Path) -> str:
-    """Commit of the checkout in `folder`, marked where files differ from it; empty elsewhere."""
-    if not (folder / ".git").exists():  # an installed package may lie inside some other checkout
+    """Return the commit of the checkout in `folder`, marked if files changed; "" if it is none."""
+    if not (folder / ".git").exists():  # an installed package may lie inside another checkout
         return ""
 
     def git(*arguments: str) -> str:
@@ -81,23 +65,23 @@ def _commit(folder: Path) -> str:
 
 @cache
 def code_hash(*modules: str) -> str:
-    """Hash (12 hexadecimal digits) of the code and the packages that decide a result's numbers.
+    """Return a hash (12 hexadecimal digits) of the code and packages that determine a result.
 
-    Hashed are the syntax trees of the modules and of all of this package that they import, without
-    docstrings, and the versions of JAX, MuJoCo and NumPy. Comments, layout and what only reads,
-    writes and prints void nothing.
+    It covers the syntax trees, without docstrings, of the modules and of every module of this
+    package that they import, and the versions of JAX, MuJoCo and NumPy. Comments, layout and
+    modules that only read, write and print do not change it.
 
     Args:
         modules: names such as `sim.walk`, relative to this package.
     """
     trees: dict[str, str] = {}
-    waiting = list(modules)
-    while waiting:
-        name = waiting.pop()
+    pending = list(modules)
+    while pending:
+        name = pending.pop()
         if name in trees or name in _NO_NUMBERS:
             continue
         tree = ast.parse(_source(name).read_bytes())
-        waiting += _imported(tree)
+        pending += _imported(tree)
         for node in ast.walk(tree):
             body = getattr(node, "body", None)
             if isinstance(body, list) and body and _is_text(body[0]):
@@ -113,15 +97,13 @@ def _source(module: str) -> Path:
 
 
 def _imported(tree: ast.Module) -> list[str]:
-    """Modules of this package that a module imports, relative to it."""
+    """Return the modules of this package that a module imports, named relative to the package."""
     package, modules = f"{_ROOT.name}.", []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(package):
             module = f"{node.module}."[len(package) :]
-            names = [f"{module}{alias.name}" for alias in node.names]
-            modules += [name for name in names if _source(name).exists()] + [module[:-1]] * bool(
-                module
-            )
+            names = [module[:-1], *(f"{module}{alias.name}" for alias in node.names)]
+            modules += [name for name in names if name and _source(name).exists()]
     return modules
 
 

@@ -1,6 +1,6 @@
-"""Files that appear whole, folders with one writer, and JSON.
+"""Atomic file writes, folder locks and JSON.
 
-A file appears by rename, so that a reader finds the old one or the new one and never a part.
+A file is written under another name and renamed, so readers see the old or the new one in full.
 """
 
 import json
@@ -18,27 +18,27 @@ from filelock import FileLock, Timeout
 from hector_jax.core.console import Broken, say
 from hector_jax.core.inputs import InputError
 
-_PART = ".hector_jax-part"  # ends the name of a file that is being written, and of no other
+_PART = ".hector_jax-part"  # suffix of a file that is being written, and of no other
 
 
 class WriteError(Broken):
-    """A file cannot be written, such as on a full disk; the one line names it."""
+    """A file cannot be written, for example on a full disk; the message names it."""
 
 
 def _cannot_write(path: Path, error: OSError) -> WriteError:
-    # files appear whole, and a run goes on from them
+    # files are complete, and a run continues from them
     return WriteError(f"cannot write {path}: {error.strerror}; what was written before it is kept")
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Put `data` under `path`, whole or not at all; missing folders are made.
+    """Write a file atomically; missing folders are created.
 
     Args:
-        path: the file, replaced if it is there.
-        data: all of it.
+        path: the file, replaced if it exists.
+        data: its whole content.
 
     Raises:
-        WriteError: one line with the path, where the folder or the disk refuses.
+        WriteError: one line with the path, if the folder or the disk cannot be written.
     """
     path = Path(path)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
@@ -51,7 +51,7 @@ def write_file(path: Path, data: bytes) -> None:
         os.replace(part, path)
         folder = os.open(path.parent, os.O_RDONLY)
         try:
-            os.fsync(folder)  # of the name too; without it a rename may outlive its data
+            os.fsync(folder)  # make the rename durable as well
         finally:
             os.close(folder)
     except BaseException as error:
@@ -63,10 +63,10 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def append_file(path: Path, data: bytes) -> None:
-    """Add `data` to a file; a stop in the midst may leave part of it.
+    """Append `data` to a file; an interruption may leave part of it.
 
     Raises:
-        WriteError: one line with the path, where the folder or the disk refuses.
+        WriteError: one line with the path, if the folder or the disk cannot be written.
     """
     try:
         with Path(path).open("ab") as file:
@@ -78,10 +78,10 @@ def append_file(path: Path, data: bytes) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and find out that it can be written before anything is computed for it.
+    """Create a folder and check that it is writable, before anything is computed for it.
 
     Raises:
-        InputError: one line with the folder, where it cannot be made or written.
+        InputError: one line with the folder that cannot be created or written.
     """
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -93,13 +93,13 @@ def make_folder(folder: Path) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Be the only process that writes to `folder`, which is made, as long as the block lasts.
+    """Create `folder` and lock it against other writers for the duration of the block.
 
-    Waits, with a line on stderr, for another process that has the lock. A process that is killed
-    lets go of it; what `write_file` left half-written there is removed here.
+    Waits, with a line on stderr, for another process that holds the lock. A killed process releases
+    it; files that its `write_file` left incomplete are removed here.
 
     Raises:
-        InputError: one line with the folder, where it cannot be made or written.
+        InputError: one line with the folder that cannot be created or written.
     """
     make_folder(folder)
     lock = FileLock(Path(folder) / ".lock")
@@ -117,7 +117,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def as_json(value: Any, indent: int | None = None) -> str:
-    """JSON of nested values; numbers that are not finite, which JSON does not have, are null.
+    """Return nested values as JSON; non-finite numbers, which JSON lacks, become null.
 
     >>> as_json({"L": [1.0, float("nan")]})
     '{"L": [1.0, null]}'
@@ -126,17 +126,17 @@ def as_json(value: Any, indent: int | None = None) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write nested values as JSON, `as_json` with line breaks.
+    """Write nested values as indented JSON, see `as_json`.
 
     Raises:
-        WriteError: where the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     write_file(path, (as_json(value, indent=2) + "\n").encode())
 
 
 def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

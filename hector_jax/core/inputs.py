@@ -1,4 +1,4 @@
-"""Wrong input: the exception, the words of its message, and files read as text."""
+"""Input errors, the wording of their messages, and files read as text."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,21 +7,21 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """Input is wrong; the one line says what came and what was expected.
+    """Invalid input; the one-line message says what was received and what was expected.
 
-    The programs end with exit code 2 and that line. Every other exception is a fault of the program
-    and keeps its traceback.
+    The programs end with exit code 2 and that line. Every other exception is a bug and keeps its
+    traceback.
     """
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """`; did you mean 'NAME'?` with the nearest of some names; nothing where none is near."""
+    """Return `; did you mean 'NAME'?` with the closest of the names; "" if none is close."""
     near = difflib.get_close_matches(str(name)[:100], [n for n in names if n], n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def unknown(what: str, name: Any, names: Iterable[str]) -> str:
-    """Message for a name that is not one of the names.
+    """Return the message for a name that is not among the names.
 
     >>> unknown("set", "wiht", ["with", "without"])
     "unknown set 'wiht'; did you mean 'with'?; known: with, without"
@@ -32,7 +32,7 @@ def unknown(what: str, name: Any, names: Iterable[str]) -> str:
 
 
 def short_repr(value: Any) -> str:
-    """A value as it came, on one line and not longer than a line."""
+    """Return the `repr` of a value on one line of at most 60 characters."""
     try:
         text = " ".join(repr(value).split())
     except ValueError:  # Python prints no integer of many thousand digits
@@ -41,37 +41,38 @@ def short_repr(value: Any) -> str:
 
 
 def one_line(error: BaseException | str) -> str:
-    """Text of an error, on one line of at most 300 characters."""
+    """Return the text of an error on one line of at most 300 characters."""
     return printable(" ".join(str(error).split()))[:300]
 
 
 def printable(text: str) -> str:
-    """A text on one line; what would control a terminal, as in a file's name, becomes `?`."""
+    """Return a text on one line; control characters, as in a file's name, become `?`."""
     return "".join(x if x.isprintable() else " " if x.isspace() else "?" for x in text)
 
 
 def plural(number: int, noun: str) -> str:
-    """A number of things.
+    """Return a number with its noun in the singular or plural.
 
-    >>> plural(1, "plant"), plural(32, "stand-in plant")
-    ('1 plant', '32 stand-in plants')
+    >>> plural(1, "plant"), plural(32, "stand-in plant"), plural(3, "trajectory")
+    ('1 plant', '32 stand-in plants', '3 trajectories')
     """
-    return f"{number} {noun}" + ("" if number == 1 else "s")
+    many = f"{noun[:-1]}ies" if noun.endswith("ry") else f"{noun}s"
+    return f"{number} {noun if number == 1 else many}"
 
 
 def check_file(path: Path, what: str) -> int:
-    """Size of a plain file in bytes.
+    """Return the size of a regular file in bytes.
 
     Args:
         path: the file.
-        what: it should be, in words.
+        what: its expected content, for the message.
 
     Raises:
-        InputError: one line naming the file that is missing or is not a plain one.
+        InputError: one line naming the file that is missing or not a regular file.
     """
     try:
         size = path.stat().st_size
-    except (OSError, ValueError) as error:  # such as a null byte in the name
+    except (OSError, ValueError) as error:  # ValueError: for example a null byte in the name
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot read {what}: {reason}") from None
     if not path.is_file():  # a pipe or a device might never end
@@ -80,20 +81,20 @@ def check_file(path: Path, what: str) -> int:
 
 
 def read_text(path: Path, what: str, max_bytes: int) -> str:
-    """Text of a file in UTF-8, with or without a byte order mark.
+    """Read a text file in UTF-8, with or without a byte order mark.
 
     Args:
         path: the file.
-        what: it should be, in words.
-        max_bytes: size it may have.
+        what: its expected content, for the message.
+        max_bytes: largest size allowed.
 
     Raises:
-        InputError: one line naming the file: missing, too large, no text.
+        InputError: one line naming the file that is missing, too large or not text.
     """
     if (size := check_file(path, what)) > max_bytes:
         raise InputError(f"{path}: {size / 1e6:.1f} MB, expected at most {max_bytes / 1e6:g} MB")
     try:
-        return path.read_text(encoding="utf-8-sig")  # Windows writes a mark before the text
+        return path.read_text(encoding="utf-8-sig")  # Windows writes a byte order mark
     except OSError as error:
         raise InputError(f"{path}: cannot read {what}: {error.strerror}") from None
     except UnicodeDecodeError:

@@ -1,15 +1,15 @@
-"""Parts of a config that are functions: a file holds the name, a program calls the functions.
+"""Config entries that are functions: a file stores the name, the program calls the functions.
 
-A kind of part is a subclass that annotates its functions, a part one value of it:
+A kind of part is a subclass that annotates its functions; a part is an instance of it:
 
     class Solver(Part):
         approach: Callable[[Normal], Approach]
 
     JAXOPT = Solver("jaxopt", approach=box_osqp)
 
-A part is a `str`, so that TOML, JSON and messages have its name. Two parts are equal where name and
-functions are: a jitted function that has one in its static config is compiled anew for another of
-the same name. Its `repr`, by which stored results are known, names the functions.
+A part is a `str`, so that TOML, JSON and messages show its name. Two parts are equal if their names
+and functions are: a jitted function with a part in its static config is recompiled for another part
+of the same name. Its `repr`, which identifies stored results, names the functions.
 """
 
 from collections.abc import Iterable
@@ -23,14 +23,14 @@ class Part(str):
     """A named value of one or two pure functions."""
 
     def __new__(cls, name: str, **functions: Any):
-        """The part of this name."""
+        """Create a part with this name and these functions."""
         part = super().__new__(cls, name)
         part.__dict__.update(functions)
         return part
 
     def __eq__(self, other: object) -> bool:
-        same = str.__eq__(self, other)
-        return same and (not isinstance(other, Part) or self.__dict__ == other.__dict__)
+        same_name = str.__eq__(self, other)
+        return same_name and (not isinstance(other, Part) or self.__dict__ == other.__dict__)
 
     def __ne__(self, other: object) -> bool:
         return not self == other
@@ -51,7 +51,7 @@ P = TypeVar("P", bound=Part)
 
 
 def choose_part(what: str, chosen: str, kind: type[P], parts: Iterable[P]) -> P:
-    """The part itself, or the known one of that name.
+    """Return `chosen` if it is a part of this kind, else the part in `parts` with that name.
 
     Raises:
         InputError: `WHAT must be ..., got ...`.

@@ -1,4 +1,4 @@
-"""How a process of this project is set up: 64 bits and the persistent compilation cache.
+"""Set-up of a process: 64 bits, the persistent compilation cache and worker processes.
 
 The library itself leaves `jax.config` alone; programs (cli, experiments, benchmarks, tests, worker
 processes) call `setup_jax` once, before the first array.
@@ -25,37 +25,35 @@ from typing import Any, NamedTuple, cast
 
 from hector_jax.core.inputs import InputError, one_line
 
-_LEAST_MEMORY = 3e9  # [B] of addresses: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
+_LEAST_MEMORY = 3e9  # [B] of address space: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
 
 
 def home_cache() -> Path:
-    """Folder of the compilation cache in the user's home."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    folder = Path(base) if base else Path(os.path.expanduser("~")) / ".cache"
-    return folder / "hector_jax" / "jax"
+    """Return the folder of the compilation cache in the user's home."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base) / "hector_jax" / "jax"
 
 
 def cache_folder() -> Path:
-    """Folder of the user's compilation cache; a temporary one where the home cannot be written.
+    """Return the folder of the compilation cache; a temporary one if the home is not writable.
 
     Raises:
-        InputError: there is none that this user alone can write.
+        InputError: no folder exists that only this user can write.
     """
     folder = home_cache()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = tempfile.TemporaryFile(dir=folder)
-        probe.close()
-    except OSError as refused:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
         own = Path(tempfile.gettempdir()) / f"hector_jax-{os.getuid()}"
         try:
             own.mkdir(mode=0o700, exist_ok=True)
         except OSError:
             raise InputError(
-                f"no folder for compiled programs: {folder}: {refused.strerror}, and {own} cannot "
+                f"no folder for compiled programs: {folder}: {error.strerror}, and {own} cannot "
                 "be made; set XDG_CACHE_HOME to a folder that can be written"
             ) from None
-        # compiled programs are run: nobody else may have put them there
+        # compiled programs are executed: no other user may have written them
         if own.is_symlink() or own.stat().st_uid != os.getuid() or own.stat().st_mode & 0o077:
             raise InputError(
                 f"{own} is open to others or of another user, so no programs are loaded from it; "
@@ -67,21 +65,21 @@ def cache_folder() -> Path:
 
 
 def check_jax(on_cpu: bool = False) -> None:
-    """Find out whether JAX can compute with what the environment asks of it.
+    """Check that JAX starts under the limits and variables of the environment.
 
     Args:
-        on_cpu: compute on the CPU, whatever accelerators there are.
+        on_cpu: compute on the CPU even if there are accelerators.
 
     Raises:
-        InputError: one line with the limit or variable that it cannot work with.
+        InputError: one line with the limit or variable that prevents it.
     """
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:  # it would hang or abort
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:  # JAX would hang or abort
         raise InputError(
             f"the limit on virtual memory (ulimit -v) is {limit / 1e9:.1f} GB, expected at least "
             f"{_LEAST_MEMORY / 1e9:g} GB"
         )
-    if "XLA_FLAGS" in os.environ:  # one that XLA does not know ends the process
+    if "XLA_FLAGS" in os.environ:  # an unknown flag ends the process
         done = subprocess.run(
             [sys.executable, "-c", "from jaxlib.xla_client import make_cpu_client as c; c()"],
             capture_output=True,
@@ -98,7 +96,7 @@ def check_jax(on_cpu: bool = False) -> None:
         if on_cpu:
             jax.config.update("jax_platforms", "cpu")
         jax.devices()
-    except Exception as error:  # of several kinds, some without a word
+    except Exception as error:  # of several types, some without a message
         what = f"JAX does not start{' with ' if variables else ''}{', '.join(variables)}"
         raise InputError(f"{what}: {one_line(error) or 'no such device here'}") from None
 
@@ -106,29 +104,29 @@ def check_jax(on_cpu: bool = False) -> None:
 def setup_jax() -> None:
     """Turn on 64 bits, full precision and the compilation cache; call before the first array.
 
-    Programs on the CPU run at once, and Python's garbage collector runs less often.
+    CPU programs are dispatched synchronously, and Python's garbage collector runs less often.
     """
     import jax
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_default_matmul_precision", "highest")
-    # A program on the CPU runs in the thread that calls it: to wake another one takes as long as
-    # the small programs of a walk.
+    # Run a CPU program in the calling thread: waking another thread takes as long as the small
+    # programs of a walk.
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    # Tracing makes millions of small objects that live on: looking them over takes a fifth of it.
+    # Tracing creates millions of long-lived objects: collecting garbage takes a fifth of its time.
     gc.freeze()
     gc.set_threshold(100_000, 20, 100)
 
 
 def all_devices() -> None:
-    """Make every CPU core a device of its own, and join the hosts of a cluster.
+    """Make every CPU core a JAX device, and join the hosts of a cluster.
 
-    Call after `setup_jax` and before the first array. Hosts are joined where the environment names
-    a coordinator (`JAX_COORDINATOR_ADDRESS`, with `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` where no
-    cluster that JAX knows tells them) or a step of Slurm or Open MPI runs.
+    Call after `setup_jax` and before the first array. Hosts are joined if the environment names a
+    coordinator (`JAX_COORDINATOR_ADDRESS`, with `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID` unless JAX
+    detects the cluster) or inside a job step of Slurm or Open MPI.
     """
     import jax
 
@@ -137,22 +135,20 @@ def all_devices() -> None:
         jax.config.update("jax_num_cpu_devices", len(cores))
     clusters = ("JAX_COORDINATOR_ADDRESS", "SLURM_STEP_NODELIST", "OMPI_MCA_orte_hnp_uri")
     if any(name in os.environ for name in clusters):
-        count, own = (os.environ.get(f"JAX_{name}") for name in ("NUM_PROCESSES", "PROCESS_ID"))
-        jax.distributed.initialize(
-            num_processes=None if count is None else int(count),
-            process_id=None if own is None else int(own),
-        )
+        variables = ("JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+        count, rank = (int(os.environ[v]) if v in os.environ else None for v in variables)
+        jax.distributed.initialize(num_processes=count, process_id=rank)
 
 
 class _Process(SpawnProcess):
-    """A process that interrupts of the terminal, which reach all of a program, do not reach."""
+    """A process that ignores SIGINT, which a terminal sends to all processes of a program."""
 
     def start(self) -> None:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child keeps it
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits it
         try:
             super().start()
         finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 class _Spawn(SpawnContext):
@@ -160,9 +156,9 @@ class _Spawn(SpawnContext):
 
 
 def _leave_with_parent() -> None:
-    """End this process when its parent ends, by whatever end.
+    """End this process when its parent ends for any reason.
 
-    Without it workers outlive a parent that was killed: each holds the queue open that it waits on.
+    Without this, workers outlive a killed parent: each keeps the queue open on which it waits.
     """
 
     def watch() -> None:
@@ -173,7 +169,7 @@ def _leave_with_parent() -> None:
 
 
 class _Messages(NamedTuple):
-    """A queue whose own process sees bytes only: it would load JAX to know what they are."""
+    """A queue of pickled messages, because its manager process would load JAX to unpickle them."""
 
     queue: Any
 
@@ -189,7 +185,7 @@ class _Messages(NamedTuple):
 
 @contextmanager
 def message_queue() -> Iterator[Any]:
-    """A queue that can be an argument of jobs in worker processes."""
+    """Create a queue that can be passed to jobs in worker processes."""
     manager = SyncManager(ctx=_Spawn())
     manager.start(_leave_with_parent)
     with manager:
@@ -197,10 +193,10 @@ def message_queue() -> Iterator[Any]:
 
 
 def start_worker(cores: Any) -> None:
-    """Set up a worker process as its parent is, with interrupts and accelerators left to it.
+    """Set up a worker process like its parent, which alone handles interrupts and accelerators.
 
-    Several workers stay on a core each, the next of the queue `cores`: XLA's threads of one would
-    otherwise wait for those of the others, which costs several times the work.
+    Several workers are pinned to one core each, the next of the queue `cores`: otherwise their XLA
+    threads would wait for each other, which takes several times as long.
     """
     _leave_with_parent()
     core = cores.get()
@@ -213,23 +209,23 @@ def start_worker(cores: Any) -> None:
 
 
 def _cores(processes: int) -> list[int | None]:
-    """A core for each of several processes; None where a process is alone or cannot be held."""
+    """Return a core for each of several processes; None for a single process or without pinning."""
     if processes < 2 or not hasattr(os, "sched_getaffinity"):
         return [None] * processes
-    mine = sorted(os.sched_getaffinity(0))
-    first = os.getpid()  # two programs at once begin at different cores
-    return [mine[(first + i) % len(mine)] for i in range(processes)]
+    cores = sorted(os.sched_getaffinity(0))
+    first = os.getpid()  # programs that run side by side start at different cores
+    return [cores[(first + i) % len(cores)] for i in range(processes)]
 
 
 @contextmanager
 def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Worker processes, each set up by `start_worker`; on an error they end in the midst of a job.
+    """Start worker processes, each set up by `start_worker`; on an error they are killed.
 
-    The caller's own script has to be importable (`if __name__ == "__main__"`), because the
-    processes are spawned.
+    The caller's script has to be importable (`if __name__ == "__main__"`), because the processes
+    are spawned.
 
     Raises:
-        ValueError: fewer than one.
+        ValueError: `processes` is less than one.
     """
     if processes < 1:
         raise ValueError(f"the number of processes must be at least 1, got {processes}")

@@ -1,9 +1,9 @@
-"""Settings from JSON and TOML and back; a fault is an InputError of one line.
+"""Settings from JSON and TOML and back; an error is an InputError of one line.
 
-Settings are frozen dataclasses that call `check` when they are made. msgspec converts values to the
-types of the fields; the ranges and the words of the messages are here: the field, what was
-expected, what came, and the nearest name. A range stands beside the field as
-`Annotated[float, POSITIVE]`, or is an argument of `check`.
+Settings are frozen dataclasses that call `check` in `__post_init__`. msgspec converts values to the
+types of the fields; this module adds ranges and messages: the field, the expected and the received
+value, and the closest name. A range is declared with the field as `Annotated[float, POSITIVE]`, or
+passed to `check`.
 """
 
 import json
@@ -33,15 +33,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers from `low` to `high`, both allowed."""
+    """Finite numbers from `low` to `high`, both included."""
 
     low: int | float = -math.inf
     high: int | float = math.inf
-    above: bool = False  # low itself is not allowed
+    above: bool = False  # `low` is excluded
 
     def __contains__(self, number: Any) -> bool:
-        over = number > self.low if self.above else number >= self.low
-        return bool(over and number <= self.high and abs(number) <= sys.float_info.max)
+        above_low = number > self.low if self.above else number >= self.low
+        return bool(above_low and number <= self.high and abs(number) <= sys.float_info.max)
 
     def __str__(self) -> str:
         write = lambda x: str(x) if isinstance(x, int) else f"{x:g}"  # noqa: E731
@@ -60,16 +60,16 @@ AT_LEAST_ONE = Range(1)
 SEED = Range(0, 2**32 - 1)
 
 Rule = Range | tuple[str, ...]
-"""Allowed numbers, or the words to choose from."""
+"""Allowed range of numbers, or allowed words."""
 
 
 def convert(value: Any, kind: Any, rule: Rule | None = None) -> Any:
-    """A value as its type says: a tuple for a list, 1.0 for 1, a `Path` for text.
+    """Convert a value to a type: a list to a tuple, 1 to 1.0, text to a `Path`.
 
     Args:
         value: from a file or a program.
-        kind: the annotation, with its range where it is `Annotated`.
-        rule: allowed numbers or words; without one, numbers have to be finite.
+        kind: the type annotation; a range in `Annotated` takes precedence over `rule`.
+        rule: allowed numbers or words; without a rule, numbers have to be finite.
 
     Raises:
         InputError: `must be ..., got ...`.
@@ -80,21 +80,21 @@ def convert(value: Any, kind: Any, rule: Rule | None = None) -> Any:
     if isinstance(rule, tuple):
         kind, rule = Literal[rule], None
     try:
-        made = msgspec.convert(_builtin(value), kind, dec_hook=_instance)
+        converted = msgspec.convert(_builtin(value), kind, dec_hook=_instance)
         allowed = rule or Range()
-        numbers = made if isinstance(made, tuple) else (made,)
-        fine = all(x in allowed for x in numbers if type(x) in (int, float))
+        numbers = converted if isinstance(converted, tuple) else (converted,)
+        valid = all(x in allowed for x in numbers if type(x) in (int, float))
     except msgspec.ValidationError:
-        fine, made = False, None
-    if not fine:
+        valid, converted = False, None
+    if not valid:
         words = get_args(kind) if get_origin(kind) is Literal else ()
         hint = did_you_mean(value, words) if isinstance(value, str) else ""
         raise InputError(f"must be {_expected(kind, rule)}, got {short_repr(value)}{hint}")
-    return made
+    return converted
 
 
 def _builtin(value: Any) -> Any:
-    """A number of NumPy, or a `Part`, as Python's own type."""
+    """Convert a number of NumPy or a `Part` to Python's own type."""
     if isinstance(value, str):
         return str(value)
     if isinstance(value, Real) and not isinstance(value, bool):
@@ -111,7 +111,7 @@ def _instance(kind: type, value: Any) -> Any:
 
 
 def _expected(kind: Any, rule: Rule | None = None) -> str:
-    """What a type allows, in words."""
+    """Describe the values that a type and a rule allow, in words."""
     inner = get_args(kind)
     if get_origin(kind) is Annotated:
         return _expected(inner[0], next((x for x in inner if isinstance(x, Range)), rule))
@@ -119,7 +119,7 @@ def _expected(kind: Any, rule: Rule | None = None) -> str:
         *others, last = map(repr, inner)
         return f"{', '.join(others)} or {last}" if others else last
     if isinstance(kind, UnionType):
-        return " or ".join(_expected(one, rule) for one in inner if one is not NoneType)
+        return " or ".join(_expected(member, rule) for member in inner if member is not NoneType)
     if get_origin(kind) is tuple:
         number = "" if inner[-1] is Ellipsis else f" of {len(inner)}"
         return f"a list{number}, each {_expected(inner[0], rule)}"
@@ -130,7 +130,7 @@ def _expected(kind: Any, rule: Rule | None = None) -> str:
 
 
 def validation_error(value: Any, kind: Any, rule: Rule | None = None) -> str | None:
-    """What is wrong with a value, `must be ..., got ...`; None where nothing is."""
+    """Return the error message of a value, `must be ..., got ...`; None if it is valid."""
     try:
         convert(value, kind, rule)
     except InputError as error:
@@ -154,7 +154,7 @@ def check(settings: Any, /, **rules: Rule) -> None:
 
 
 def choose(name: str, word: str, choices: Iterable[str]) -> str:
-    """The word, one of those there are.
+    """Return the word if it is among the choices.
 
     Raises:
         InputError: `NAME must be ..., got ...`.
@@ -165,19 +165,19 @@ def choose(name: str, word: str, choices: Iterable[str]) -> str:
 
 
 def read_json(path: Path, what: str, max_bytes: int = 10_000_000, **options: Any) -> Any:
-    """Content of a JSON file; see `inputs.read_text`, with `options` of `json.loads`.
+    """Read a JSON file with `inputs.read_text`; `options` are those of `json.loads`.
 
     Raises:
-        InputError: one line naming the file: as `inputs.read_text`, or not valid JSON.
+        InputError: one line naming the file: from `inputs.read_text`, or it is not valid JSON.
     """
     return _decoded(path, "JSON", lambda: json.loads(read_text(path, what, max_bytes), **options))
 
 
 def read_toml(path: Path, what: str, max_bytes: int) -> dict[str, Any]:
-    """Content of a TOML file; see `inputs.read_text`.
+    """Read a TOML file with `inputs.read_text`.
 
     Raises:
-        InputError: one line naming the file: as `inputs.read_text`, or not valid TOML.
+        InputError: one line naming the file: from `inputs.read_text`, or it is not valid TOML.
     """
     return _decoded(path, "TOML", lambda: tomllib.loads(read_text(path, what, max_bytes)))
 
@@ -191,22 +191,22 @@ def _decoded(path: Path, language: str, decode: Callable[[], Any]) -> Any:
         reason = "nested too deeply"
     except ValueError as error:
         reason = one_line(error)
-        if "set_int_max_str_digits" in reason:  # Python's advice to a programmer
+        if "set_int_max_str_digits" in reason:  # advice for programmers, not for users
             reason = "a number has too many digits"
     raise InputError(f"{path}: not valid {language}: {reason}")
 
 
 def from_table(where: str, kind: type[T], table: Any) -> T:
-    """A dataclass from a table of a file; dataclasses inside it from tables inside that.
+    """Build a dataclass from a table of a file, and nested dataclasses from nested tables.
 
     Args:
         where: the file and the place in it, for the message.
-        kind: the dataclass, which checks itself; fields without a default have to be there. Its
-            `RENAMED`, where it has any, maps former names to names and words of today.
+        kind: the dataclass, which checks itself; fields without a default are required. Its
+            optional `RENAMED` maps former field names to the current name and words.
         table: read from the file.
 
     Raises:
-        InputError: one line naming `where` and the field that is unknown, missing or wrong.
+        InputError: one line naming `where` and the field that is unknown, missing or invalid.
     """
     by_name = {field.name: field for field in fields(kind)}  # pyright: ignore[reportArgumentType]
     if not isinstance(table, Mapping):
@@ -243,5 +243,5 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
 
 
 def to_table(settings: Any) -> Any:
-    """Settings as values of JSON, which `from_table` reads; a path becomes text."""
+    """Convert settings to JSON values that `from_table` reads; a path becomes text."""
     return msgspec.to_builtins(settings, enc_hook=str)

@@ -1,9 +1,9 @@
-"""What is walked: state, wrench and trajectory, and the one place that packs them into x and u.
+"""State, wrench and trajectory, and the only functions that pack a wrench into u.
 
-Frames: everything is in the world frame. A wrench is that of the ground on the robot, at the foot
-point (on the sole, under the ankle axis), in the order of `FEET`. The paper's state is x = [e; p;
-omega; v; g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3); f feet have
-6 f. Arrays are of the host (numpy) or of a device.
+Everything is in the world frame. A wrench is that of the ground on the robot, at the foot point (on
+the sole, under the ankle axis), in the order of `FEET`. The paper's state is x = [e; p; omega; v;
+g] with 15 entries and its input u = [F_0; F_1; M_0; M_1] with 12 (Eq. 2, 3); f feet have 6 f.
+Arrays are on the host (numpy) or on a device.
 """
 
 from typing import Any, NamedTuple
@@ -16,15 +16,12 @@ from jaxtyping import Bool, Float
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
 
-FEET = {
-    2: ("left", "right"),
-    4: ("front_left", "front_right", "hind_left", "hind_right"),
-}
-"""Feet of a robot by their number: pairs, the left one first."""
+FEET = {2: ("left", "right"), 4: ("front_left", "front_right", "hind_left", "hind_right")}
+"""Names of the feet by their number: pairs, left before right."""
 
 MIN_HEIGHT = 0.25  # [m] of the centre of mass; below it HECTOR has fallen
-SOLVED = 1e-6  # worst relative KKT residual of a plan that counts: is learned from, is a result
-MAX_TILT = 0.8  # [rad] of roll or pitch; beyond it too
+MAX_TILT = 0.8  # [rad] of roll or pitch; above it a robot has fallen
+SOLVED = 1e-6  # largest relative KKT residual of a plan that is used for learning and results
 
 
 class State(NamedTuple):
@@ -51,29 +48,29 @@ class Load(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """One walk, sampled evenly; every world returns this and nothing else.
+    """One walk, sampled at a constant rate, as every world returns it.
 
     Sample j covers the interval from j*period to (j+1)*period: `command` is held over it, `effect`
     is the mean wrench of the ground over it, `state`, `joints` and `feet` are true values at its
-    end, `reference` is what the state should be there.
+    end, `reference` is the desired state there.
     """
 
     period: Float[Any, "*batch"]  # [s] between samples: 0.01 in srbm, 0.001 in the MuJoCo worlds
     initial: State  # true state at t = 0, batch axes only
     state: State  # (T, 3) each
     reference: State  # (T, 3) each
-    command: Wrench  # (T, feet, 3) each, what the MPC asked for
-    effect: Wrench  # (T, feet, 3) each, what the ground returned
+    command: Wrench  # (T, feet, 3) each, commanded by the MPC
+    effect: Wrench  # (T, feet, 3) each, exerted by the ground
     contact: Bool[Any, "*batch T feet"]  # planned stance
     feet: Float[Any, "*batch T feet 3"]  # foot points [m]
     joints: Float[Any, "*batch T joints"]  # [rad] leg by leg, from the trunk down
     fallen: Bool[Any, "*batch T"]  # true from the sample of the fall on
-    legs_touch: Bool[Any, "*batch T"]  # one leg touched the other, which is no fall
-    residual: Float[Any, "*batch T"]  # worst relative KKT residual of the plan in force
+    legs_touch: Bool[Any, "*batch T"]  # the legs touched each other, which is not a fall
+    residual: Float[Any, "*batch T"]  # largest relative KKT residual of the current plan
 
 
 def no_samples(joints: int, feet: int, *batch: int) -> Trajectory:
-    """Walks of no samples (numpy), with leading axes `batch`: the layout of walks in a file."""
+    """Return walks without samples (numpy), leading axes `batch`: the layout of walks in a file."""
     zeros = lambda *shape: np.zeros((*batch, *shape))  # noqa: E731
     state = State(*[zeros(0, 3)] * 4)
     wrench = Wrench(zeros(0, feet, 3), zeros(0, feet, 3))
@@ -94,27 +91,27 @@ def no_samples(joints: int, feet: int, *batch: int) -> Trajectory:
 
 
 def from_start(walk: Trajectory) -> Trajectory:
-    """The same walk in the frame of its start: at the origin, facing along x (numpy, no batch).
+    """Transform a walk into the frame of its start: at the origin, facing x (numpy, no batch).
 
-    A reference begins where its robot stood at t = 0, and each set of weights leaves the robot
-    elsewhere by then. In this frame all walks of a command have one reference.
+    A reference starts at the robot's pose at t = 0, which differs between sets of weights. In this
+    frame all walks of a command have the same reference.
     """
     walk = jax.tree.map(np.asarray, walk)
     yaw, origin = np.zeros(3), np.zeros(3)
     yaw[2], origin[:2] = walk.initial.euler[2], walk.initial.position[:2]
-    R = np.asarray(rot_z(jnp.asarray(yaw[2])))  # v @ R turns v back by the yaw
+    R = np.asarray(rot_z(jnp.asarray(yaw[2])))  # v @ R rotates v by -yaw
 
-    def turned(state: State) -> State:
+    def transform(state: State) -> State:
         position = (state.position - origin) @ R
         rates = state.ang_velocity @ R, state.velocity @ R
         return State(state.euler - yaw, position, *rates)
 
     return walk._replace(
-        initial=turned(walk.initial),
-        state=turned(walk.state),
-        reference=turned(walk.reference),
-        command=Wrench(*(part @ R for part in walk.command)),
-        effect=Wrench(*(part @ R for part in walk.effect)),
+        initial=transform(walk.initial),
+        state=transform(walk.state),
+        reference=transform(walk.reference),
+        command=Wrench(*(vectors @ R for vectors in walk.command)),
+        effect=Wrench(*(vectors @ R for vectors in walk.effect)),
         feet=(walk.feet - origin) @ R,
     )
 
@@ -122,7 +119,7 @@ def from_start(walk: Trajectory) -> Trajectory:
 def has_fallen(
     state: State, min_height: float = MIN_HEIGHT, max_tilt: float = MAX_TILT
 ) -> Bool[Array, "*batch"]:
-    """Whether a base state is that of a fallen robot: too low, too tilted, or not finite."""
+    """Return whether a base state is that of a fallen robot: too low, too tilted or not finite."""
     low = state.position[..., 2] < min_height
     tilted = jnp.any(jnp.abs(state.euler[..., :2]) > max_tilt, axis=-1)
     finite = jnp.all(jnp.stack([jnp.isfinite(x).all(axis=-1) for x in state]), axis=0)
@@ -130,7 +127,7 @@ def has_fallen(
 
 
 def pack_wrench(wrench: Wrench) -> Float[Array, " inputs"]:
-    """The paper's u = [F_0; F_1; M_0; M_1] (Eq. 3), likewise of more feet.
+    """Return the paper's u = [F_0; F_1; M_0; M_1] (Eq. 3), or its extension to more feet.
 
     >>> left = Wrench(jnp.array([[1.0, 2, 3], [0, 0, 0]]), jnp.array([[4.0, 5, 6], [0, 0, 0]]))
     >>> pack_wrench(left).tolist()
@@ -140,10 +137,10 @@ def pack_wrench(wrench: Wrench) -> Float[Array, " inputs"]:
 
 
 def unpack_wrench(u: Float[Array, " inputs"]) -> Wrench:
-    """Wrench of u = [F_0; F_1; M_0; M_1], likewise of more feet."""
+    """Return the wrench from u = [F_0; F_1; M_0; M_1], or from its extension to more feet."""
     return Wrench(*u.reshape(2, -1, 3))
 
 
 def zero_wrench(feet: int = 2) -> Wrench:
-    """No wrench on any foot."""
+    """Return a zero wrench on each foot."""
     return Wrench(jnp.zeros((feet, 3)), jnp.zeros((feet, 3)))

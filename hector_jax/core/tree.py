@@ -1,4 +1,4 @@
-"""Trees of arrays as a whole."""
+"""Operations on whole trees of arrays: stack, select, pack."""
 
 from collections.abc import Sequence
 from typing import Any, TypeVar
@@ -15,28 +15,28 @@ Layout = tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]  # structure and leaves of
 
 
 def stack(trees: Sequence[Tree]) -> Tree:
-    """Trees of one structure, their leaves stacked along a new first axis (numpy)."""
+    """Stack the leaves of trees of one structure along a new first axis (numpy)."""
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *trees)
 
 
 def where(condition: Bool[Array, ""], yes: Tree, no: Tree) -> Tree:
-    """One tree or the other, of one structure, shapes and dtypes."""
+    """Select one of two trees of the same structure, shapes and dtypes."""
     return jax.tree.map(lambda y, n: jnp.where(condition, y, n), yes, no)
 
 
 def layout(tree: Any) -> Layout:
-    """What `unpack` has to know of a tree."""
+    """Return the structure, shapes and dtypes of a tree, for `unpack`."""
     leaves, structure = jax.tree.flatten(tree)
     return structure, tuple(jax.ShapeDtypeStruct(np.shape(x), jnp.result_type(x)) for x in leaves)
 
 
 def pack(tree: Any) -> Float[Array, " n"]:
-    """All numbers of a tree in one array; whole numbers and truth values become floats."""
+    """Concatenate the leaves of a tree in one array; integers and booleans become floats."""
     return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
 def unpack(layout: Layout, packed: Float[Array, " n"]) -> Any:
-    """The tree of this layout whose numbers were packed."""
+    """Rebuild the tree of this layout from the array that `pack` returned."""
     structure, leaves = layout
     parts = jnp.split(packed, np.cumsum([leaf.size for leaf in leaves])[:-1])
     pairs = zip(parts, leaves, strict=True)

@@ -1,10 +1,10 @@
 """Trees of arrays in files, and their hash.
 
-Nothing is pickled, nothing is believed unseen. A file is a plain `.npz` (`numpy.load` opens it)
-whose entry `card` is JSON: format, kind, robot, what each array is, versions, and `about`, which
-belongs to whoever wrote it. The archive's comment is the sha256 of all bytes before it, so a file
-that was cut or changed anywhere is refused as a whole. The robot is known by the hash of its
-numbers: what was learned on one body is not loaded for another.
+Nothing is pickled, and everything is checked when it is read. A file is a plain `.npz`
+(`numpy.load` opens it) whose entry `card` is JSON: format, kind, robot, shape and dtype of each
+array, versions, and `about` with entries of the writer. The archive's comment is the sha256 of all
+bytes before it, so a truncated or modified file is rejected. The robot is identified by the hash of
+its numbers: a file made for one robot is not loaded for another.
 """
 
 import hashlib
@@ -24,14 +24,14 @@ from hector_jax.core.inputs import InputError, one_line, short_repr
 from hector_jax.core.settings import validation_error
 
 FORMAT = 1
-ROBOT_DIGITS = 9  # of a robot's numbers: two machines' last bits make the same robot
+ROBOT_DIGITS = 9  # of a robot's numbers; rounding on another machine gives the same hash
 _SHA256 = 64  # hexadecimal digits
 
 Tree = TypeVar("Tree")
 
 
 def tree_hash(tree: Any, digits: int | None = None) -> str:
-    """Hash (16 hexadecimal digits) of a tree's arrays: exact, or of so many significant digits."""
+    """Return a hash (16 hexadecimal digits) of a tree's arrays, exact or of `digits` digits."""
     content = hashlib.sha256()
     for name, leaf in _named_leaves(tree).items():
         array = np.asarray(leaf)
@@ -50,14 +50,14 @@ def save_tree(
     """Write a tree of arrays.
 
     Args:
-        path: file, replaced if it is there.
+        path: file, replaced if it exists.
         tree: NamedTuples and dictionaries of arrays.
-        kind: what it is, in a word; `load_tree` asks for the same.
+        kind: its kind in one word; `load_tree` expects the same.
         robot: the `Robot` that the numbers belong to, or None.
         about: JSON values for the card: units, frames, seeds, settings.
 
     Raises:
-        WriteError: where the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
     card = {
@@ -73,7 +73,7 @@ def save_tree(
         for name, array in {"card": np.array(json.dumps(card)), **arrays}.items():
             with archive.open(f"{name}.npy", "w") as entry:
                 np.lib.format.write_array(entry, array, allow_pickle=False)
-        archive.comment = b"0" * _SHA256  # makes room; a zip file ends with its comment
+        archive.comment = b"0" * _SHA256  # placeholder; a zip file ends with its comment
     content = buffer.getvalue()[:-_SHA256]
     write_file(path, content + hashlib.sha256(content).hexdigest().encode())
 
@@ -81,20 +81,20 @@ def save_tree(
 def load_tree(
     path: Path, like: Tree, *, kind: str, robot: Any = None
 ) -> tuple[Tree, dict[str, Any]]:
-    """Read what `save_tree` wrote.
+    """Read a file that `save_tree` wrote.
 
     Args:
         path: the file.
-        like: a tree of the expected structure. Shapes must agree with its leaves, where an axis of
-            length 0 stands for any length; dtypes are those of the file.
-        kind: as given to `save_tree`.
-        robot: the `Robot` in use, or None to take any.
+        like: a tree of the expected structure. Shapes must match its leaves, in which an axis of
+            length 0 matches any length; dtypes are those of the file.
+        kind: the kind passed to `save_tree`.
+        robot: the `Robot` in use, or None to accept any.
 
     Returns:
         The tree, with numpy arrays, and its card.
 
     Raises:
-        InputError: one line naming the file, for one that is missing, cut, changed, of another
+        InputError: one line naming the file that is missing, truncated, modified, or of another
             kind, format, layout or robot.
     """
     arrays, card = _read(path, kind)
@@ -102,12 +102,11 @@ def load_tree(
         raise InputError(
             f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
         )
-    wanted = _named_leaves(like)
-    if arrays.keys() != wanted.keys():
-        odd = sorted(arrays.keys() ^ wanted.keys())
-        differences = one_line(", ".join(odd))
+    leaves = _named_leaves(like)
+    if arrays.keys() != leaves.keys():
+        differences = one_line(", ".join(sorted(arrays.keys() ^ leaves.keys())))
         raise InputError(f"{path}: another layout of {kind}; fields that differ: {differences}")
-    for name, leaf in wanted.items():
+    for name, leaf in leaves.items():
         is_text = np.asarray(leaf).dtype.kind == "U"
         if (dtype := arrays[name].dtype).kind not in ("U" if is_text else "biuf"):
             what = "text" if is_text else "numbers"
@@ -116,15 +115,14 @@ def load_tree(
         if len(shape) != len(got) or any(s not in (0, g) for s, g in zip(shape, got, strict=True)):
             text = ", ".join("any" if s == 0 else str(s) for s in shape)
             raise InputError(f"{path}: {name} has shape {got}, expected ({text})")
-    leaves = [arrays[name] for name in wanted]
-    return jax.tree.unflatten(jax.tree.structure(like), leaves), card
+    return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in leaves]), card
 
 
 def read_card(path: Path, kind: str | None = None) -> dict[str, Any]:
-    """The card of a file that `save_tree` wrote, of a kind, once the whole file is found sound.
+    """Read the card of a file that `save_tree` wrote, after checking the whole file and its kind.
 
     Raises:
-        InputError: one line naming the file, as `load_tree`.
+        InputError: one line naming the file, see `load_tree`.
     """
     return _read(path, kind)[1]
 
@@ -141,7 +139,7 @@ def _read(path: Path, kind: str | None) -> tuple[dict[str, np.ndarray], dict[str
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         card = json.loads(str(arrays.pop("card")))
-    except Exception as error:  # whoever made the archive chose what goes wrong
+    except Exception as error:  # a malformed archive can raise anything
         raise InputError(f"{path}: no card or no plain arrays inside: {one_line(error)}") from error
     _check_card(path, card)
     if kind is not None and card["kind"] != kind:
@@ -179,7 +177,7 @@ def _named_leaves(tree: Any) -> dict[str, Any]:
 
 
 def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Hold the settings that a file was made with against those that it would be made with now.
+    """Check that the settings recorded in a file equal those of the current command.
 
     Raises:
         InputError: one line naming the file and the first setting that differs.

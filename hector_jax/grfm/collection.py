@@ -1,8 +1,8 @@
 """Walks for learning phi, on disk: whole walks at the plan interval, in the world frame.
 
-A folder holds a file for each walk, with the job that asked for it, and `card.json`, which is
-written when all are there. Windows, frames and labels are made from the walks anew each time, so
-another history or another label needs no new data.
+A folder holds a file for each walk, with its job, and `card.json`, which is written when all walks
+are complete. Windows, frames and labels are made from the walks anew each time, so another history
+or another label needs no new data.
 """
 
 import hashlib
@@ -37,7 +37,7 @@ _UNITS = {
 
 
 class Walks(NamedTuple):
-    """Walks with what was asked for, stacked; trajectories are sampled at the plan interval."""
+    """Walks and their jobs, stacked; trajectories are sampled at the plan interval."""
 
     job: Job  # arrays with a leading axis; commands of PIECES pieces
     trajectory: Trajectory
@@ -53,19 +53,19 @@ def collect(
     about: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Walk all jobs and keep each walk in a file, taking up what an earlier call left.
+    """Walk all jobs and save each walk to a file, resuming what an earlier call left.
 
-    A sound file of the same job is kept, a missing or damaged one is made.
+    A sound file of the same job is kept, a missing or damaged one is written anew.
 
     Args:
-        folder: where; made if missing.
-        jobs: what to walk.
-        walk_jobs: called once, with the jobs whose walks are missing; gives the walks in their
-            order, from any world. An iterator that walks while it is asked loses least to a stop.
-        robot: the body; walks of another one are refused.
-        settings: JSON values of all that the walks follow from; walks of others are refused.
-        about: JSON values for the card, such as the engine that walked.
-        progress: called with walks done and walks in all.
+        folder: folder of the walks; made if missing.
+        jobs: walks to simulate.
+        walk_jobs: called once, with the jobs whose walks are missing; returns the walks in their
+            order, from any world. A lazy iterator loses least when it is interrupted.
+        robot: the robot; walks of another one are refused.
+        settings: JSON values of all that determines the walks; walks of others are refused.
+        about: JSON values for the card, such as the engine.
+        progress: called with the number of walks done and of all walks.
 
     Raises:
         InputError: a walk in the folder is of another job, robot or of other settings; or the
@@ -73,37 +73,35 @@ def collect(
         ValueError: walks are missing or too short.
     """
     interval = walk_config(robot).gait.tick
-    # as it is read back
-    made_with = json.loads(json.dumps({"interval": interval, **(settings or {})}))
+    # a JSON round trip, to compare equal with settings that are read from a file
+    all_settings = json.loads(json.dumps({"interval": interval, **(settings or {})}))
     facts = {
         "units": _UNITS,
         "frames": "world; wrench of the ground on each foot at its foot point, left feet first",
-        "settings": made_with,
+        "settings": all_settings,
         **(about or {}),
     }
     paths = [Path(folder) / f"walk-{i:05d}.npz" for i in range(len(jobs))]
-    each = zip(paths, jobs, strict=True)
-    walks = [_load_sound(path, stack([job]), robot, made_with) for path, job in each]
+    files = zip(paths, jobs, strict=True)
+    walks = [_load_if_sound(path, stack([job]), robot, all_settings) for path, job in files]
     missing = [i for i, walk in enumerate(walks) if walk is None]
     done = len(jobs) - len(missing)
     progress(done, len(jobs))
-    for i, walk in zip(
-        missing, walk_jobs([jobs[i] for i in missing]) if missing else (), strict=False
-    ):
+    new_walks = walk_jobs([jobs[i] for i in missing]) if missing else ()
+    for i, walk in zip(missing, new_walks, strict=False):
         walks[i] = Walks(stack([jobs[i]]), stack([at_interval(walk, interval)]))
         save_tree(paths[i], walks[i], kind="walks", robot=robot, about=facts)
         done += 1
         progress(done, len(jobs))
-    complete = [walk for walk in walks if walk is not None]
-    if len(complete) < len(jobs):
-        raise ValueError(f"{folder}: {len(jobs)} walks asked for, {len(complete)} came")
-    falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in complete)
+    if done < len(jobs):
+        raise ValueError(f"{folder}: {len(jobs)} walks asked for, {done} came")
+    falls = sum(bool(np.any(walk.trajectory.fallen)) for walk in walks if walk is not None)
     card = {"walks": len(jobs), "falls": falls, "shards": [path.name for path in paths], **facts}
     write_json(Path(folder) / "card.json", card)
 
 
 def load_walks(folder: Path, robot: Robot) -> Walks:
-    """All walks that `collect` left in a folder.
+    """Read all walks that `collect` wrote to a folder.
 
     Raises:
         InputError: one line naming folder or file: nothing collected, not finished, damaged, or of
@@ -111,14 +109,14 @@ def load_walks(folder: Path, robot: Robot) -> Walks:
     """
     names = _read_collection(folder)["shards"]
     parts = [_load_file(Path(folder) / name, robot) for name in names]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 def fingerprint(folder: Path) -> dict[str, Any]:
-    """What tells one collection from another: a hash of its walks, and its settings.
+    """Return the identity of a collection: a hash of its walks, and its settings.
 
     Raises:
-        InputError: nothing collected, not finished, or a card that is none.
+        InputError: nothing collected, not finished, or no valid card.
     """
     card = _read_collection(folder)
     digest = hashlib.sha256()
@@ -150,13 +148,13 @@ def _load_file(path: Path, robot: Robot) -> Walks:
     for name, tree in (("job", walks.job), ("trajectory", walks.trajectory)):
         if any(len(leaf) != count for leaf in jax.tree.leaves(tree)):
             raise InputError(f"{path}: {name} is not of {count} walks, as trajectory.fallen is")
-    run = walks.trajectory._replace(initial=walks.trajectory.fallen, period=walks.trajectory.fallen)
-    if not count or any(leaf.shape[1] != ticks for leaf in jax.tree.leaves(run)):
+    by_tick = walks.trajectory._replace(initial=None, period=None)
+    if not count or any(leaf.shape[1] != ticks for leaf in jax.tree.leaves(by_tick)):
         raise InputError(f"{path}: its walks are not of one length, that of trajectory.fallen")
     return walks
 
 
-def _load_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) -> Walks | None:
+def _load_if_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) -> Walks | None:
     if not path.exists():
         return None
     try:
@@ -172,7 +170,7 @@ def _load_sound(path: Path, job: Job, robot: Robot, settings: dict[str, Any]) ->
 
 
 def walks_like(robot: Robot) -> Walks:
-    """Shapes in a file of a robot; axes of length 0 are walks and ticks."""
+    """Return zeros in the shapes of a robot's files; axes of length 0 are walks and ticks."""
     (job,) = draw_jobs(0, 1, robot=robot)
     samples = no_samples(len(robot.joint_lower), len(robot.foot_point), 0)
     return Walks(jax.tree.map(lambda x: np.zeros((0, *np.shape(x))), job), samples)

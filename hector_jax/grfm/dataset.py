@@ -1,9 +1,9 @@
-"""How walks become samples of phi.
+"""Samples of phi, made from walks.
 
-A sample belongs to one tick: the commands of the tick and of those before, the mean wrench that the
-ground returned over the tick, the load on the trunk that a rigid body would have needed beside it
-to move as the trunk moved (that of the legs), and, in the last tick of a swing, how far from its
-planned touchdown the foot landed, all in the robot's yaw frame at the start of the tick. Training
+A sample belongs to one tick: the commands of this and earlier ticks, the mean wrench that the
+ground returned over the tick, the additional load under which a rigid body would have moved as the
+trunk did (the load of the legs), and, in the last tick of a swing, the offset of the foot's
+landing from its planned touchdown, all in the robot's yaw frame at the start of the tick. Training
 and validation are split by walk: samples of one walk are too alike.
 """
 
@@ -27,32 +27,31 @@ from hector_jax.robot import srbm
 from hector_jax.robot.model import Robot
 from hector_jax.sim.world import NO_PUSH, Push
 
-ALONG = np.array([1.0, -1.0, 1.0])  # mirror, left for right: of positions, velocities, forces
-ACROSS = -ALONG  # and of angles, angular velocities, moments
+ALONG = np.array([1.0, -1.0, 1.0])  # signs of mirrored positions, velocities, forces
+ACROSS = -ALONG  # signs of mirrored angles, angular velocities, moments
 
 
 def partners(feet: int) -> Int[np.ndarray, " feet"]:
-    """The other foot of each foot's pair, which is its mirror image."""
+    """Return the other foot of each foot's pair, its mirror image."""
     return np.arange(feet) ^ 1
 
 
 class Dataset(NamedTuple):
     """Samples of phi, n of them; those of one walk follow one another in time."""
 
-    window: Window  # what phi may look at, yaw frame
+    window: Window  # input of phi, yaw frame
     label: Wrench  # (n, feet, 3) each, mean effect over the tick, yaw frame
-    legs: Load  # (n, 3) each, what moved the rigid body beside the effect, yaw frame
-    touchdown_error: Float[
-        Array, "n feet 3"
-    ]  # [m] from planned touchdown to where it is, yaw frame
-    lands: Bool[Array, "n feet"]  # whether the foot touches down at the end of the tick
+    legs: Load  # (n, 3) each, load on the rigid body in addition to the effect, yaw frame
+    # [m] from the planned touchdown to the foot, yaw frame
+    touchdown_error: Float[Array, "n feet 3"]
+    lands: Bool[Array, "n feet"]  # the foot touches down at the end of the tick
     state: State  # (n, 3) each, true state at the start of the tick, world frame
-    walk: Int[Array, " n"]  # which walk
-    tick: Int[Array, " n"]  # which tick of it
+    walk: Int[Array, " n"]  # index of the walk
+    tick: Int[Array, " n"]  # tick within the walk
 
 
 def at_interval(walk: Trajectory, interval: float) -> Trajectory:
-    """The same walk sampled every `interval` [s]: mean wrenches, states at the end.
+    """Return the walk sampled every `interval` [s]: mean wrenches, states at the end.
 
     Args:
         walk: one walk, whose samples fill a whole number of intervals.
@@ -62,57 +61,48 @@ def at_interval(walk: Trajectory, interval: float) -> Trajectory:
         ValueError: the samples do not fill whole intervals.
     """
     period, samples = float(walk.period), len(walk.fallen)
-    each = round(interval / period)
-    if each < 1 or not math.isclose(each * period, interval, rel_tol=1e-6) or samples % each:
+    size = round(interval / period)  # samples per interval
+    if size < 1 or not math.isclose(size * period, interval, rel_tol=1e-6) or samples % size:
         raise ValueError(f"{samples} samples of {period} s do not fill intervals of {interval} s")
 
-    def cut(x: Any) -> np.ndarray:
-        return np.asarray(x).reshape(-1, each, *np.shape(x)[1:])
+    def group(x: Any) -> np.ndarray:
+        return np.asarray(x).reshape(-1, size, *np.shape(x)[1:])
 
-    def mean(x: Any) -> np.ndarray:
-        return cut(x).mean(axis=1)
-
-    def last(x: Any) -> np.ndarray:
-        return cut(x)[:, -1]
-
-    ends = walk._replace(period=None, initial=None)
-    return jax.tree.map(last, ends)._replace(
+    groups = jax.tree.map(group, walk._replace(period=None, initial=None))
+    mean = partial(jax.tree.map, lambda x: x.mean(axis=1))
+    return jax.tree.map(lambda x: x[:, -1], groups)._replace(
         period=np.asarray(interval),
         initial=jax.tree.map(np.asarray, walk.initial),
-        command=jax.tree.map(mean, walk.command),
-        effect=jax.tree.map(mean, walk.effect),
-        contact=cut(walk.contact)[:, 0],
-        fallen=cut(walk.fallen).any(axis=1),
-        legs_touch=cut(walk.legs_touch).any(axis=1),
-        residual=cut(walk.residual).max(axis=1),
+        command=mean(groups.command),
+        effect=mean(groups.effect),
+        contact=groups.contact[:, 0],
+        fallen=groups.fallen.any(axis=1),
+        legs_touch=groups.legs_touch.any(axis=1),
+        residual=groups.residual.max(axis=1),
     )
 
 
 def make_dataset(
-    robot: Robot,
-    walks: Trajectory,
-    start_tick: Any = 0,
-    *,
-    push: Push = NO_PUSH,
+    robot: Robot, walks: Trajectory, start_tick: Any = 0, *, push: Push = NO_PUSH
 ) -> tuple[Dataset, int]:
-    """Samples from walks at the plan interval.
+    """Make samples from walks at the plan interval.
 
     Args:
-        robot: the rigid body that is to move as the trunk did.
+        robot: the rigid body that has to move as the trunk did.
         walks: W walks of T ticks, stacked, from t = 0.
         start_tick: gait tick of t = 0, of all walks or of each (W,).
         push: pushes from outside, of all walks or of each (W, ...).
 
     Returns:
-        The dataset, with numpy arrays, and how many samples were dropped because of a fall, an
-        unsolved QP, or a push, which would pass for one by the legs. The first HISTORY - 1 ticks of
-        a walk have no full history and are no samples.
+        The dataset, with numpy arrays, and the number of samples dropped because of a fall, an
+        unsolved QP, or a push, which would be mistaken for a push of the legs. The first
+        HISTORY - 1 ticks of a walk have no full history and are no samples.
     """
     config = walk_config(robot)
     count = len(walks.fallen)
     starts = np.broadcast_to(np.asarray(start_tick, np.int32), (count,))
     pushes = jax.tree.map(
-        lambda given, one: np.broadcast_to(given, (count, *np.shape(given)[-one.ndim :])),
+        lambda x, no_push: np.broadcast_to(x, (count, *np.shape(x)[-no_push.ndim :])),
         push,
         NO_PUSH,
     )
@@ -134,61 +124,54 @@ def _samples(
     push: Push,
     walk: Trajectory,
 ) -> tuple[Dataset, Bool[Array, " n"]]:
-    """Samples of one walk and whether each is of a robot on its feet."""
+    """Return the samples of one walk and whether each is usable."""
     first, ticks = HISTORY - 1, walk.fallen.shape[0]
-    before = jax.tree.map(
-        lambda start, later: jnp.concatenate([start[None], later[:-1]])[first:],
-        walk.initial,
-        walk.state,
-    )
+    current = jax.tree.map(lambda x: x[first:], walk._replace(period=None, initial=None))
+    earlier = (walk.state, walk.reference, walk.feet)  # HISTORY > 1: the initial state is not used
+    previous, reference, previous_feet = jax.tree.map(lambda x: x[first - 1 : -1], earlier)
 
     def newest_first(w: Array) -> Array:
         return jnp.stack([w[first - i : ticks - i] for i in range(HISTORY)], axis=1)
 
-    to_yaw_frame = jax.vmap(lambda vectors, yaw: turn(vectors, -yaw))
-    commands = to_yaw_frame(jax.tree.map(newest_first, walk.command), before.euler[:, 2])
-    label = to_yaw_frame(jax.tree.map(lambda w: w[first:], walk.effect), before.euler[:, 2])
+    def to_yaw_frame(vectors: Any) -> Any:
+        return jax.vmap(lambda v, yaw: turn(v, -yaw))(vectors, previous.euler[:, 2])
+
+    def next_tick(x: Array) -> Array:
+        return jnp.concatenate([x[1:], x[-1:]])
+
+    commands = to_yaw_frame(jax.tree.map(newest_first, walk.command))
+    label = to_yaw_frame(current.effect)
     legs = jax.vmap(partial(srbm.unexplained, robot, dt=config.gait.tick))(
-        before,
-        jax.tree.map(lambda s: s[first:], walk.state),
-        jax.tree.map(lambda w: w[first:], walk.effect),
-        0.5 * (walk.feet[first - 1 : -1] + walk.feet[first:]),
+        previous, current.state, current.effect, 0.5 * (previous_feet + current.feet)
     )
-    legs = to_yaw_frame(legs, before.euler[:, 2])
+    legs = to_yaw_frame(legs)
     tick = jnp.arange(first, ticks)
-    contact, later = walk.contact[first:], lambda x: jnp.concatenate([x[first + 1 :], x[-1:]])
-    planned = _planned_touchdowns(
-        config,
-        robot,
-        before,
-        jax.tree.map(lambda r: r[first - 1 : -1], walk.reference),
-        start_tick + tick,
-    )
-    error = to_yaw_frame(later(walk.feet) - planned, before.euler[:, 2])
-    lands = later(walk.contact) & ~contact & ~later(walk.fallen)[:, None]
+    planned = _planned_touchdowns(config, robot, previous, reference, start_tick + tick)
+    error = to_yaw_frame(next_tick(current.feet) - planned)
+    lands = next_tick(current.contact) & ~current.contact & ~next_tick(current.fallen)[:, None]
     lands &= jnp.isfinite(error).all(axis=-1) & robot.description.tuning.touchdown_error
     window = Window(
         commands=commands,
-        contact=contact,
+        contact=current.contact,
         since_switch=gait.since_switch(config.gait, start_tick + tick),
-        base=jax.vmap(from_yaw_frame)(before),
+        base=jax.vmap(from_yaw_frame)(previous),
     )
     finite = [
         jnp.isfinite(w).reshape(len(tick), -1).all(axis=1)
         for w in jax.tree.leaves((commands, label, legs))
     ]
-    solved = walk.residual[first:] <= SOLVED
+    solved = current.residual <= SOLVED
     begin, end = config.gait.tick * tick[:, None], config.gait.tick * (tick[:, None] + 1)
-    acts = (push.start < end) & (push.start + push.duration > begin) & push.force.any(axis=-1)
-    usable = jnp.stack([~walk.fallen[first:], solved, ~acts.any(axis=1), *finite]).all(axis=0)
+    pushed = (push.start < end) & (push.start + push.duration > begin) & push.force.any(axis=-1)
+    usable = jnp.stack([~current.fallen, solved, ~pushed.any(axis=1), *finite]).all(axis=0)
     walks = jnp.full_like(tick, number)
-    return Dataset(window, label, legs, error, lands, before, walks, tick), usable
+    return Dataset(window, label, legs, error, lands, previous, walks, tick), usable
 
 
 def _planned_touchdowns(
     config: WalkConfig, robot: Robot, state: State, reference: State, tick: Int[Array, " n"]
 ) -> Float[Array, "n feet 3"]:
-    """Where the controller would have had the feet touch down, by the true state at each tick."""
+    """Return the touchdowns that the controller would plan from the true state at each tick."""
     period = config.gait.tick
     times = {"stance": period * config.gait.stance, "swing": period * config.gait.swing}
 
@@ -201,10 +184,10 @@ def _planned_touchdowns(
 
 
 def with_mirror(dataset: Dataset) -> Dataset:
-    """The samples and their mirror images, left for right: a symmetric robot has both.
+    """Return the samples and their mirror images, left for right: a symmetric robot has both.
 
-    The image of a sample belongs to the same walk, so that a split by walk stays one. What a plant
-    has on one side only, such as the gain of a motor, it then has on the other.
+    The image of a sample belongs to the same walk, so that a split by walk remains one. A property
+    of one side of a plant, such as the gain of a motor, moves to the other side in the image.
     """
     other = partners(dataset.lands.shape[1])
 
@@ -233,18 +216,18 @@ def with_mirror(dataset: Dataset) -> Dataset:
         lands=dataset.lands[:, other],
         state=flip_state(dataset.state),
     )
-    return jax.tree.map(lambda *both: np.concatenate(both), dataset, image)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), dataset, image)
 
 
 def split_by_walk(
     dataset: Dataset, held_out: float = 0.2, seed: int = 0
 ) -> tuple[Dataset, Dataset]:
-    """Training and held-out samples; no walk is in both.
+    """Split into training and held-out samples; no walk is in both.
 
     Args:
         dataset: samples of at least two walks.
-        held_out: share of the walks to hold out, at least one and not all.
-        seed: which ones.
+        held_out: share of the walks to hold out, at least one walk and not all.
+        seed: of the choice of walks.
 
     Raises:
         InputError: fewer than two walks.
@@ -254,5 +237,5 @@ def split_by_walk(
         raise InputError(f"a split by walk needs samples of at least 2 walks, got {len(walks)}")
     number = int(np.clip(round(held_out * len(walks)), 1, len(walks) - 1))
     chosen = np.random.default_rng(seed).permutation(walks)[:number]
-    held = np.isin(dataset.walk, chosen)
-    return jax.tree.map(lambda x: x[~held], dataset), jax.tree.map(lambda x: x[held], dataset)
+    test = np.isin(dataset.walk, chosen)
+    return jax.tree.map(lambda x: x[~test], dataset), jax.tree.map(lambda x: x[test], dataset)

@@ -1,8 +1,8 @@
-"""phi: what the ground really returns for what was commanded (Eq. 13).
+"""phi: the wrench that the ground really returns for a command (Eq. 13).
 
 An effect is a function `Window -> Effect`, a pytree that can be called (`jax.tree_util.Partial`),
 so that a rollout takes new parameters without a new compilation. Wrenches enter and leave it in the
-yaw frame of the robot at the tick, which makes what is learned on one heading true on all others.
+yaw frame of the robot at the tick, so that what is learned on one heading holds on all others.
 A `Phi` is a family of such functions, fitted to walks; network.VARIANTS holds them by name.
 """
 
@@ -21,7 +21,7 @@ HISTORY = 3  # commands in a window: the current one and two before it
 
 
 class Window(NamedTuple):
-    """What phi may look at, in the robot's yaw frame at the tick."""
+    """Input of phi, in the robot's yaw frame at the tick."""
 
     commands: Wrench  # (HISTORY, feet, 3) each, newest first
     contact: Bool[Array, "*batch feet"]  # planned stance
@@ -30,18 +30,18 @@ class Window(NamedTuple):
 
 
 class Effect(NamedTuple):
-    """What acts on the body over the tick, in the yaw frame."""
+    """Loads on the body over the tick, and errors of touchdowns, in the yaw frame."""
 
     wrench: Wrench  # of the ground on each foot
-    legs: Load  # of the moving legs on the trunk; zero where phi does not model it
+    legs: Load  # of the moving legs on the trunk; zero if phi does not model it
     touchdown_error: Float[Array, "*batch feet 3"]  # [m] from planned touchdown to true one
 
 
 class Phi(NamedTuple):
-    """A family of effects: how its parameters are made, fitted to walks and applied.
+    """A family of effects: functions that make its parameters, fit them to walks and apply them.
 
     `init` fixes the shapes of the parameters and depends on no data, so that a file can be checked
-    against it; an axis whose length the data decide has length 0 in it.
+    against it; an axis whose length depends on the data has length 0 in it.
     """
 
     name: str  # in flags; a file of its parameters is of the kind `grfm-<name>`
@@ -50,7 +50,7 @@ class Phi(NamedTuple):
     # (nets.FitConfig, training, validation Dataset, progress) -> (params, nets.History)
     fit: Callable[..., tuple[Any, Any]]
     apply: Callable[[Any, Window], Effect]
-    widths: Callable[[Any], tuple[int, ...]] = lambda params: ()  # `hidden` of given params
+    widths: Callable[[Any], tuple[int, ...]] = lambda params: ()  # `hidden` of the params
 
 
 Vectors = TypeVar("Vectors")  # a tree of arrays whose last axis is x, y, z
@@ -63,7 +63,7 @@ def turn(vectors: Vectors, yaw: Float[Array, ""]) -> Vectors:
 
 
 def from_yaw_frame(state: State) -> State:
-    """The base as seen from its own yaw frame on the floor under it: no yaw, height only."""
+    """Return the base in its own yaw frame on the floor under it: no yaw, height only."""
     R = rot_z(-state.euler[2])
     return State(
         euler=state.euler * jnp.array([1.0, 1.0, 0.0]),
@@ -74,13 +74,13 @@ def from_yaw_frame(state: State) -> State:
 
 
 def ground_effect(wrench: Wrench) -> Effect:
-    """The effect of a ground wrench alone: no load of moving legs, feet land as planned."""
+    """Return the effect of a ground wrench alone: no load of moving legs, feet land as planned."""
     zero = jnp.zeros_like(wrench.force[0])
     return Effect(wrench, Load(zero, zero), jnp.zeros_like(wrench.force))
 
 
 def in_dtype_of(window: Window, tree: Any) -> Any:
-    """A tree on the device, its floating-point leaves in the dtype of a window's commands."""
+    """Return a tree on the device, floating-point leaves in the dtype of a window's commands."""
     dtype = window.commands.force.dtype
     return jax.tree.map(
         lambda x: jnp.asarray(x, dtype if jnp.issubdtype(x.dtype, jnp.floating) else None), tree

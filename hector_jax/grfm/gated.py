@@ -2,20 +2,20 @@
 
 Three maps, each fitted to what the high-fidelity simulator shows:
 
-- **ground**: what the ground returns to a foot is the command itself (nothing, for a foot planned
-  to swing), a bias of the tick since the switch, and terms in the latest changes of the commands.
-- **legs**: the push that the moving legs give the trunk, which a rigid body cannot know: a bias of
+- **ground**: the wrench of the ground on a foot is the command itself (zero for a foot planned to
+  swing), a bias of the tick since the switch, and terms in the latest changes of the commands.
+- **legs**: the push of the moving legs on the trunk, which a rigid body does not have: a bias of
   the tick, and terms in the motion of the base and in the latest changes of the commands.
-- **touchdown**: how far from its planned touchdown a foot lands: a bias, and terms in the motion of
+- **touchdown**: the offset of a foot's landing from plan: a bias, and terms in the motion of
   the base and in the horizontal force commanded on the other feet, which accelerates the base and
-  so moves the planned point. A swinging leg sags and lags, so the lever of its force is not the
-  planned one. The fit is robust, because a robot that is about to fall lands anywhere.
+  so moves the planned point. A swinging leg sags and lags, so the lever of its force differs from
+  the plan. The fit is robust, because a robot that is about to fall lands anywhere.
 
-A command that stays is returned as it is, by construction. It has to be: the walks were recorded in
-closed loop, where the controller asks for whatever the ground withheld, so that over a step the
-wrench is that which walking needs, whatever was commanded. A regression on the command itself reads
-this as a ground that hardly answers, and the body of the rollout cannot hold itself on such ground.
-Changes of the command within 20 ms are too quick for that loop.
+By construction a constant command is returned unchanged. This is necessary: the walks were recorded
+in closed loop, where the controller makes up for any force that the ground did not give, so that
+over a step the wrench is what walking needs, whatever was commanded. A regression on the command
+itself would read this as a ground that hardly responds, and the rollout's body could not stand on
+such ground. Changes of the command within 20 ms are too quick for that loop.
 
 Each foot sees the walk as if it were a left one, so a mirrored window has the mirrored effect. Each
 pair of feet has maps of its own.
@@ -32,54 +32,54 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Load, Wrench
 from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset, partners
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, in_dtype_of
-from hector_jax.grfm.nets import NO_EPOCHS
+from hector_jax.grfm.nets import closed_form
 
-MOTION = 3  # of the base: yaw rate, forward and sideways velocity
-TOUCHDOWN = 1 + MOTION + 2  # and one; and the force on the other feet, forward and sideways
-GATES = (0.0, 0.01, 0.03, 0.08, 0.19)  # [s] after a switch, where the terms of the legs may differ
+MOTION = 3  # terms of the base's motion: yaw rate, forward and sideways velocity
+TOUCHDOWN = 1 + MOTION + 2  # constant, motion, force on the other feet (forward and sideways)
+GATES = (0.0, 0.01, 0.03, 0.08, 0.19)  # [s] after a switch, knots of the terms of the legs
 RIDGE, RIDGE_MOTION = 0.03, 1e-3  # penalty on standardised terms, relative to the number of samples
-HUBER, HUBER_ROUNDS = 2.0, 20  # where errors count linearly, in medians of the error
+HUBER, HUBER_ROUNDS = 2.0, 20  # threshold of the linear loss, in medians of the error
 _FLOOR = 0.05  # least scale of a change, relative to the largest of its kind
 
 
-def changes_seen(feet: int) -> int:
-    """Changes from tick to tick of the commands of all feet."""
+def num_changes(feet: int) -> int:
+    """Return the number of tick-to-tick changes in a window's commands, over all feet."""
     return 6 * feet * (HISTORY - 1)
 
 
 def signs(feet: int) -> Float[np.ndarray, "feet 6"]:
-    """Of force and moment as each foot sees them: those of right feet are mirrored."""
+    """Return the signs of force and moment in each foot's view: right feet are mirrored."""
     return np.tile(np.stack([np.ones(6), np.concatenate([ALONG, ACROSS])]), (feet // 2, 1))
 
 
 class View(NamedTuple):
-    """What a foot sees of a window; a right one sees the mirror image."""
+    """A window as one foot sees it; a right foot sees the mirror image."""
 
-    command: Float[Array, "*batch 6"]  # force and moment on it, newest
-    others: Float[Array, "*batch 2"]  # force on the other feet together, forward and sideways
-    changes: Float[Array, "*batch changes"]  # of commands, newest first: its own, its partner's, ..
+    command: Float[Array, "*batch 6"]  # newest force and moment on the foot
+    others: Float[Array, "*batch 2"]  # total force on the other feet, forward and sideways
+    changes: Float[Array, "*batch changes"]  # of commands, newest first: own foot, partner, others
     motion: Float[Array, "*batch 3"]  # of the base
-    stands: Bool[Array, "*batch"]  # planned
-    alone: Bool[Array, "*batch"]  # it stands and its partner swings
-    kind: Int[Array, "*batch"]  # swing and stance of the first pair, then of the next
+    stands: Bool[Array, "*batch"]  # planned stance
+    alone: Bool[Array, "*batch"]  # the foot stands and its partner swings
+    kind: Int[Array, "*batch"]  # 2 * pair + stance: swing and stance of the first pair, then next
 
 
 class GatedMap(NamedTuple):
-    """The three maps; a kind is that of a `View`, 6 are force and moment (torque)."""
+    """The three maps; kinds are those of a `View`, an axis of 6 is force and moment (torque)."""
 
-    ticks: Float[Array, " ticks"]  # [s] after a switch, where a bias is given
-    gates: Float[Array, " gates"]  # [s] after a switch, where terms of the legs are given
+    ticks: Float[Array, " ticks"]  # [s] after a switch, knots of the biases
+    gates: Float[Array, " gates"]  # [s] after a switch, knots of the terms of the legs
     bias: Float[Array, "kinds ticks 6"]
     changes: Float[Array, "kinds changes 6"]
-    legs_bias: Float[Array, "ticks pushes"]  # 6 of each pair
-    legs: Float[Array, "gates terms pushes"]  # of motion, then changes; likewise
-    touchdown: Float[Array, "terms shifts"]  # 3 of each pair [m]; of 1, motion, force on others
+    legs_bias: Float[Array, "ticks pushes"]  # 6 pushes per pair
+    legs: Float[Array, "gates terms pushes"]  # terms: motion, then changes; 6 pushes per pair
+    touchdown: Float[Array, "terms shifts"]  # terms: 1, motion, force on others; 3 [m] per pair
 
 
 def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()) -> GatedMap:
-    """A map to nothing; the axis of ticks has length 0."""
+    """Return maps of zeros; the axis of ticks has length 0."""
     del key, hidden
-    pairs, changes = feet // 2, changes_seen(feet)
+    pairs, changes = feet // 2, num_changes(feet)
     return GatedMap(
         ticks=jnp.zeros(0),
         gates=jnp.zeros(len(GATES)),
@@ -92,33 +92,33 @@ def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()) -> Ga
 
 
 def views(window: Window) -> View:
-    """What each foot sees of one window; the feet are the leading axis."""
+    """Return each foot's view of one window; the feet are the leading axis."""
     dtype, feet = window.commands.force.dtype, len(window.contact)
-    both = jnp.concatenate(window.commands, axis=-1)  # (HISTORY, feet, 6)
+    commands = jnp.concatenate(window.commands, axis=-1)  # (HISTORY, feet, 6)
 
-    def own(foot: int) -> View:
+    def view_of(foot: int) -> View:
         sign = jnp.asarray(signs(feet)[foot], dtype)
-        # its own pair first, and of each pair first the foot on its own side
+        # the foot's own pair first, and in each pair first the foot on its own side
         order = (np.arange(feet) ^ foot % 2).reshape(-1, 2)
         order = np.roll(order, -(foot // 2), axis=0).ravel()
-        seen, base = both[:, order] * sign, window.base
+        wrenches, base = commands[:, order] * sign, window.base
         motion = (base.ang_velocity * sign[3:])[2:], (base.velocity * sign[:3])[:2]
         stands = window.contact[foot]
         return View(
-            command=seen[0, 0],
-            others=seen[0, 1:, :2].sum(axis=0),
-            changes=jnp.swapaxes(seen[:-1] - seen[1:], 0, 1).ravel(),
+            command=wrenches[0, 0],
+            others=wrenches[0, 1:, :2].sum(axis=0),
+            changes=jnp.swapaxes(wrenches[:-1] - wrenches[1:], 0, 1).ravel(),
             motion=jnp.concatenate(motion),
             stands=stands,
             alone=stands & ~window.contact[partners(feet)[foot]],
             kind=foot // 2 * 2 + stands.astype(int),
         )
 
-    return jax.tree.map(lambda *of_feet: jnp.stack(of_feet), *map(own, range(feet)))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(view_of, range(feet)))
 
 
 def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[Array, "... knots"]:
-    """Piecewise linear functions of the time [s], one at each knot; the ends reach on."""
+    """Return piecewise linear hat functions of the time [s], 1 at their knot, constant beyond."""
     before = jnp.concatenate([knots[:1] - 1.0, knots[:-1]])
     after = jnp.concatenate([knots[1:], knots[-1:] + 1.0])
     time = jnp.clip(time, knots[0], knots[-1])[..., None]
@@ -127,58 +127,60 @@ def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[A
 
 
 def from_views(values: Float[Array, "feet 6"]) -> Wrench:
-    """Forces and moments as each foot sees them, back in the yaw frame."""
-    back = values * jnp.asarray(signs(len(values)), values.dtype)
-    return Wrench(back[:, :3], back[:, 3:])
+    """Return forces and moments of the feet's views in the yaw frame."""
+    wrench = values * jnp.asarray(signs(len(values)), values.dtype)
+    return Wrench(wrench[:, :3], wrench[:, 3:])
 
 
 def apply_gated(
     gated: GatedMap, window: Window, view: View
 ) -> tuple[Float[Array, "feet 6"], Load, Float[Array, "feet 3"]]:
-    """Ground wrench as each foot sees it; load of the legs, error of the touchdown [m], yaw frame.
+    """Return the ground wrench in each foot's view, and legs' load and touchdown error [m].
+
+    Load and touchdown error are in the yaw frame.
 
     Args:
         gated: fitted maps.
         window: one window.
-        view: what the feet see of it, `views(window)`.
+        view: views of that window, `views(window)`.
     """
     feet = len(view.stands)
+    pairs = feet // 2
     tick, gate = hats(window.since_switch, gated.ticks), hats(window.since_switch, gated.gates)
     ground = (
         view.stands[:, None] * view.command
         + jnp.einsum("k,fko->fo", tick, gated.bias[view.kind])
         + jnp.einsum("fi,fio->fo", view.changes, gated.changes[view.kind])
     )
-    terms = jnp.concatenate([view.motion, view.changes], axis=-1)
-    pairs = feet // 2
     legs_bias, legs, touchdown = (
         table.reshape(*table.shape[:-1], pairs, -1)
         for table in (gated.legs_bias, gated.legs, gated.touchdown)
     )
-    terms, aims = (x.reshape(pairs, 2, -1) for x in (terms, _touchdown_terms(view)))
+    terms = jnp.concatenate([view.motion, view.changes], axis=-1)
+    terms, touchdown_terms = (x.reshape(pairs, 2, -1) for x in (terms, _touchdown_terms(view)))
     push = jnp.einsum("k,kpo->po", tick, legs_bias)[:, None]
     push = push + jnp.einsum("g,psi,gipo->pso", gate, terms, legs)
-    back = from_views(push.reshape(feet, -1) * view.alone[:, None])
-    shift = touchdown[0][:, None] + jnp.einsum("psi,ipo->pso", aims, touchdown[1:])
+    pushes = from_views(push.reshape(feet, -1) * view.alone[:, None])
+    shift = touchdown[0][:, None] + jnp.einsum("psi,ipo->pso", touchdown_terms, touchdown[1:])
     shift = shift.reshape(feet, -1) * jnp.asarray(signs(feet)[:, :3], shift.dtype)
-    return ground, Load(back.force.sum(axis=0), back.moment.sum(axis=0)), shift
+    return ground, Load(pushes.force.sum(axis=0), pushes.moment.sum(axis=0)), shift
 
 
 def apply(gated: GatedMap, window: Window) -> Effect:
-    """Effect of the linear part alone for one window."""
+    """Return the effect of the linear part alone for one window."""
     gated, window = in_dtype_of(window, gated), in_dtype_of(window, window)
     ground, legs, shift = apply_gated(gated, window, views(window))
     return Effect(from_views(ground), legs, shift)
 
 
 def labels_in_view(dataset: Dataset) -> Float[np.ndarray, "n feet 6"]:
-    """Wrench of the ground as each foot sees it."""
+    """Return the labels, wrenches of the ground, in each foot's view."""
     ground = np.concatenate([dataset.label.force, dataset.label.moment], axis=-1)
     return ground * signs(ground.shape[1])
 
 
 def fit_gated(dataset: Dataset) -> GatedMap:
-    """Ridge regression of the maps; every sample is seen by all feet."""
+    """Fit the maps by ridge regression; every sample counts once in the view of each foot."""
     window = jax.tree.map(jnp.asarray, dataset.window)
     view = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
@@ -187,19 +189,18 @@ def fit_gated(dataset: Dataset) -> GatedMap:
     residual = labels_in_view(dataset) - view.stands[..., None] * view.command
     scale = _scale(view.changes)
     changes = view.changes / scale
-    by_foot = np.repeat(tick[:, None], feet, axis=1)
-    bias, slope = zip(
-        *(
-            _ridge(RIDGE, by_foot[rows], changes[rows], residual[rows])
-            for rows in (view.kind == kind for kind in range(feet))
-        ),
-        strict=True,
-    )
+    tick_by_foot = np.repeat(tick[:, None], feet, axis=1)
+
+    def fit_kind(kind: int) -> tuple[np.ndarray, np.ndarray]:
+        rows = view.kind == kind
+        return _ridge(RIDGE, tick_by_foot[rows], changes[rows], residual[rows])
+
+    bias, slope = map(np.stack, zip(*map(fit_kind, range(feet)), strict=True))
     maps = GatedMap(
         ticks=ticks,
         gates=gates,
-        bias=np.stack(bias),
-        changes=np.stack(slope) / scale[:, None],
+        bias=bias,
+        changes=slope / scale[:, None],
         **_fit_legs(view, dataset, tick, gate, scale),
         touchdown=_fit_touchdown(view, dataset),
     )
@@ -209,29 +210,30 @@ def fit_gated(dataset: Dataset) -> GatedMap:
 def _fit_legs(
     view: View, dataset: Dataset, tick: np.ndarray, gate: np.ndarray, scale: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Maps of the legs' push, by their names: a sum over the feet whose partner swings.
+    """Fit the maps of the legs' push, a sum over the feet whose partner swings; by field name.
 
-    Of what right feet see, three of the six axes are mirrored, so these are fitted apart.
+    In the view of right feet three of the six axes are mirrored: they are fitted apart.
     """
     rows, feet = view.alone.any(axis=1), view.alone.shape[1]
+    pairs = feet // 2
     load = np.concatenate([dataset.legs.force, dataset.legs.torque], axis=-1)[rows]
     term_scale = np.concatenate([_spread(np.asarray(view.motion)[view.alone]), scale])
     terms = np.concatenate([view.motion, view.changes], axis=-1)[rows] / term_scale
     gated = gate[rows][:, None, :, None] * terms[:, :, None]  # (n, feet, gates, terms)
-    one = np.repeat(tick[rows][:, None], feet, axis=1)
-    pairs = feet // 2
+    tick_by_foot = np.repeat(tick[rows][:, None], feet, axis=1)
     legs_bias = np.zeros((tick.shape[1], pairs, 6))
     legs = np.zeros((gate.shape[1], terms.shape[-1], pairs, 6))
     for axes in (signs(2)[1] > 0.0, signs(2)[1] < 0.0):
-        share = np.asarray(view.alone)[rows] * signs(feet)[:, axes][:, 0]
-        share = share.reshape(-1, pairs, 2)
+        sign = np.asarray(view.alone)[rows] * signs(feet)[:, axes][:, 0]  # 0 for feet not alone
+        sign = sign.reshape(-1, pairs, 2)
 
-        def by_pair(x: np.ndarray, share: np.ndarray = share) -> np.ndarray:
-            both = x.reshape(*share.shape, -1)
-            return np.einsum("nps,npsi->nip", share, both).reshape(len(x), -1)
+        def sum_pairs(x: np.ndarray, sign: np.ndarray = sign) -> np.ndarray:
+            by_pair = x.reshape(*sign.shape, -1)
+            return np.einsum("nps,npsi->nip", sign, by_pair).reshape(len(x), -1)
 
-        free, slope = _ridge(RIDGE_MOTION, by_pair(one), by_pair(gated), load[:, axes])
-        legs_bias[..., axes] = free.reshape(*legs_bias.shape[:2], -1)
+        columns = sum_pairs(tick_by_foot), sum_pairs(gated)
+        bias, slope = _ridge(RIDGE_MOTION, *columns, load[:, axes])
+        legs_bias[..., axes] = bias.reshape(*legs_bias.shape[:2], -1)
         legs[..., axes] = slope.reshape(*legs.shape[:3], -1)
     legs /= term_scale[:, None, None]
     flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
@@ -239,12 +241,12 @@ def _fit_legs(
 
 
 def _touchdown_terms(view: View) -> Float[Array, "*batch terms"]:
-    """Motion of the base and horizontal force on the other feet, as a foot sees them."""
+    """Return motion of the base and horizontal force on the other feet, as a foot sees them."""
     return jnp.concatenate([view.motion, view.others], axis=-1)
 
 
 def _fit_touchdown(view: View, dataset: Dataset) -> Float[np.ndarray, "terms shifts"]:
-    """The map of the errors of touchdowns, of the samples in which a foot lands."""
+    """Fit the map of touchdown errors on the samples in which a foot lands."""
     feet = dataset.lands.shape[1]
     all_terms, error = np.asarray(_touchdown_terms(view)), dataset.touchdown_error
     maps = []
@@ -262,22 +264,22 @@ def _fit_touchdown(view: View, dataset: Dataset) -> Float[np.ndarray, "terms shi
 
 
 def _huber_ridge(terms: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Coefficients (1 + terms, outputs) of one and the terms by the Huber loss, penalised.
+    """Return coefficients (1 + terms, outputs) of a constant and the terms by Huber loss and ridge.
 
     Each round weighs the samples by their errors in the round before.
     """
-    one = np.ones((len(y), 1))
+    constant = np.ones((len(y), 1))
 
     def fit(y: np.ndarray, weight: np.ndarray) -> np.ndarray:
         return np.concatenate(_ridge(RIDGE_MOTION, weight, weight * terms, weight * y))
 
     def robust(y: np.ndarray) -> np.ndarray:
-        found = fit(y, one)
+        coefficients = fit(y, constant)
         for _ in range(HUBER_ROUNDS):
-            error = np.abs(y - found[0] - terms @ found[1:])
+            error = np.abs(y - coefficients[0] - terms @ coefficients[1:])
             limit = HUBER * np.median(error)
-            found = fit(y, np.sqrt(np.minimum(1.0, limit / np.maximum(error, 1e-9))))
-        return found
+            coefficients = fit(y, np.sqrt(np.minimum(1.0, limit / np.maximum(error, 1e-9))))
+        return coefficients
 
     return np.concatenate([robust(column[:, None]) for column in y.T], axis=1)
 
@@ -288,7 +290,7 @@ def _spread(x: np.ndarray) -> np.ndarray:
 
 
 def _scale(changes: np.ndarray) -> np.ndarray:
-    """Spread of each change; one that hardly moves is no signal to be blown up."""
+    """Return the spread of each change, at least `_FLOOR` of the largest of its kind."""
     spread = changes.reshape(-1, changes.shape[-1] // 6, 2, 3).std(axis=0)
     largest = spread.max(axis=(0, 2), keepdims=True)
     largest = np.where(largest > 0.0, largest, 1.0)
@@ -298,7 +300,7 @@ def _scale(changes: np.ndarray) -> np.ndarray:
 def _ridge(
     penalty: float, free: np.ndarray, terms: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients of the free columns and of the penalised ones, in the mean square."""
+    """Solve least squares (mean square) for the coefficients of free and of penalised columns."""
     if len(y) == 0:
         return np.zeros((free.shape[1], y.shape[1])), np.zeros((terms.shape[1], y.shape[1]))
     columns = np.concatenate([free, terms], axis=1)
@@ -308,10 +310,4 @@ def _ridge(
     return coefficients[: free.shape[1]], coefficients[free.shape[1] :]
 
 
-GATED = Phi(
-    "gated",
-    GatedMap,
-    init,
-    lambda config, training, validation, progress: (fit_gated(training), NO_EPOCHS),
-    apply,
-)
+GATED = Phi("gated", GatedMap, init, closed_form(fit_gated), apply)

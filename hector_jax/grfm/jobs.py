@@ -1,4 +1,4 @@
-"""What to walk so that phi knows the ground that tuning will tread."""
+"""Draws the walks from which phi is learned, around the weights and commands of tuning."""
 
 from collections.abc import Sequence
 
@@ -12,11 +12,11 @@ from hector_jax.robot.model import Robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import Push, hfs_drawn
 
-KINDS = (*COMMANDS, "random")  # of walks; job i is of kind i modulo their number
+KINDS = (*COMMANDS, "random")  # of commands; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
-NEAR = 1.5  # and within x/NEAR of what a tuning went through
+NEAR = 1.5  # and within x/NEAR of the weights of a tuning path
 PIECES = 4  # of every command, so that jobs can be stacked
-PUSHES = 2  # of every walk, likewise; most are of no force
+PUSHES = 2  # of every walk, so that jobs can be stacked; most have zero force
 PUSH_TIME = 0.1  # [s]
 
 
@@ -31,17 +31,17 @@ def draw_jobs(
     """Draw walks around the nominal and expert weights, and along tuning paths.
 
     Trajectories take turns: straight, c, s, random velocities. Weights take turns too: each of the
-    24 log-uniform around nominal, around expert and, where tuning paths are given, a point of one.
-    Each walk has a plant of its own, drawn around the hfs. A third of the walks, drawn too, is
-    pushed once or twice: 10 to 30 N (times the robot's size) for 0.1 s, from any side. Job i
-    depends on the seed and on i alone, so a longer list begins with the shorter one.
+    24 log-uniform around nominal, around expert and, if tuning paths are given, a point of a path.
+    Each walk has a plant of its own, drawn around the hfs. A random third of the walks is pushed
+    once or twice: 10 to 30 N (times the robot's size) for 0.1 s, from any side. Job i depends on
+    the seed and on i alone, so a longer list begins with the shorter one.
 
     Args:
-        seed: of everything drawn.
+        seed: of all random draws.
         count: number of walks.
-        paths: weights that tunings went through, stacked along a first axis each.
+        paths: weights along tunings, each path stacked along a first axis.
         seconds: length of each walk.
-        robot: whose weights and plants they are; HECTOR by default.
+        robot: robot of the weights and plants; HECTOR by default.
 
     Raises:
         ValueError: fewer than one walk.
@@ -60,7 +60,7 @@ def draw_jobs(
             weights = _point(path, int(rng.integers(len(path.Q.euler))))
         else:
             weights = _draw_weights(rng, centres[centre], SPREAD)
-        return _draw_plant(rng, i, command, weights, seconds=seconds, robot=robot)
+        return _draw_job(rng, i, command, weights, seconds=seconds, robot=robot)
 
     return [draw(i) for i in range(count)]
 
@@ -74,27 +74,27 @@ def draw_jobs_near(
     seconds: float = 4.0,
     robot: Robot | None = None,
 ) -> list[Job]:
-    """Draw walks around where one tuning went.
+    """Draw walks around the path of one tuning.
 
-    Commands take turns: the given one, random velocities. Weights take turns too: each of the 24
-    log-uniform within x/NEAR of a point of the path, drawn, and of its last point. Plants and
+    Commands take turns: the given command, random velocities. Weights take turns too: each of the
+    24 log-uniform within x/NEAR of a random point of the path, and of its last point. Plants and
     pushes are drawn as in `draw_jobs`, and job i depends on the seed and on i alone.
 
     Args:
-        seed: of everything drawn.
+        seed: of all random draws.
         count: number of walks.
-        command: what was tuned for.
-        path: weights that the tuning went through, stacked along a first axis.
+        command: the tuning's command.
+        path: weights along the tuning, stacked along a first axis.
         seconds: length of each walk.
-        robot: whose plants they are; HECTOR by default.
+        robot: robot of the plants; HECTOR by default.
     """
 
     def draw(i: int) -> Job:
         rng = np.random.default_rng([seed, i])
-        mine = _random_command(rng) if i % 2 else _split_last(command)
+        job_command = _random_command(rng) if i % 2 else _split_last(command)
         point = -1 if i // 2 % 2 else int(rng.integers(len(path.Q.euler)))
         weights = _draw_weights(rng, _point(path, point), NEAR)
-        return _draw_plant(rng, i, mine, weights, seconds=seconds, robot=robot)
+        return _draw_job(rng, i, job_command, weights, seconds=seconds, robot=robot)
 
     return [draw(i) for i in range(count)]
 
@@ -103,7 +103,7 @@ def _point(path: Weights, index: int) -> Weights:
     return jax.tree.map(lambda w: np.asarray(w)[index], path)
 
 
-def _draw_plant(
+def _draw_job(
     rng: np.random.Generator,
     i: int,
     command: Command,
@@ -123,10 +123,10 @@ def _draw_weights(rng: np.random.Generator, centre: Weights, spread: float) -> W
 
 
 def _draw_push(rng: np.random.Generator, seconds: float, scale: float) -> Push:
-    number = rng.integers(1, PUSHES + 1) if rng.random() < 1.0 / 3.0 else 0
-    size = scale * rng.uniform(10.0, 30.0, PUSHES) * (np.arange(PUSHES) < number)
-    side = rng.uniform(-np.pi, np.pi, PUSHES)
-    force = size[:, None] * np.stack([np.cos(side), np.sin(side), np.zeros(PUSHES)], axis=1)
+    count = rng.integers(1, PUSHES + 1) if rng.random() < 1.0 / 3.0 else 0
+    size = scale * rng.uniform(10.0, 30.0, PUSHES) * (np.arange(PUSHES) < count)
+    angle = rng.uniform(-np.pi, np.pi, PUSHES)
+    force = size[:, None] * np.stack([np.cos(angle), np.sin(angle), np.zeros(PUSHES)], axis=1)
     start = rng.uniform(0.0, max(seconds - PUSH_TIME, 0.0), PUSHES)
     return Push(force, start, np.full(PUSHES, PUSH_TIME))
 
@@ -140,7 +140,7 @@ def _random_command(rng: np.random.Generator) -> Command:
 
 
 def _split_last(command: Command) -> Command:
-    """The same command in PIECES pieces: the last one is walked in parts."""
+    """Return the same command in PIECES pieces, its last piece split into equal parts."""
     parts = np.ones(len(command.duration), int)
     parts[-1] += PIECES - len(parts)
     whole = jax.tree.map(lambda x: np.repeat(x, parts, axis=0), command)

@@ -1,9 +1,9 @@
 """The networks of GRFM-Net and their training.
 
-Minimised is, for forces and moments apart, the mean square of the standardised error plus
-l2/2 |kernels|^2, by Adam (the paper's: 1e-3, 1e-3, 200 epochs). Each axis counts alike, as each is
-divided by its own spread. Several nets of one kind are trained side by side; of each the epoch with
-the least mean square error (N^2, (N m)^2) on validation walks is kept.
+The loss, for forces and moments apart, is the mean square of the standardised error plus
+l2/2 |kernels|^2, minimised by Adam (in the paper: 1e-3, 1e-3, 200 epochs). All axes count equally,
+as each is divided by its own spread. Several nets of one kind are trained side by side, and each
+keeps the epoch with its least mean square error (N^2, (N m)^2) on validation walks.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED,
 
 @dataclass(frozen=True, kw_only=True)
 class FitConfig:
-    """How the parameters of a phi are fitted."""
+    """Settings of the fit of a phi's parameters."""
 
     epochs: int = 200
     batch: int = 512  # samples per step
@@ -55,19 +55,24 @@ NO_EPOCHS = History(*np.zeros((4, 0)))
 Progress = Callable[[int, History], None]  # called after each epoch, from 1, with the errors so far
 
 
+def closed_form(fit: Callable[[Any], Any]) -> Callable[..., tuple[Any, History]]:
+    """Return the `Phi.fit` of a fit that needs the training samples alone and has no epochs."""
+    return lambda config, training, validation, progress: (fit(training), NO_EPOCHS)
+
+
 class Pair(NamedTuple):
-    """Something of the force nets and of the moment nets: parameters, samples, errors."""
+    """A value of the force nets and one of the moment nets: parameters, samples or errors."""
 
     force: Any
     moment: Any
 
 
 class Samples(NamedTuple):
-    """What the nets are trained on, n samples."""
+    """Training samples of the nets, n of them."""
 
     x: Pair  # inputs (n, ..., inputs)
     y: Pair  # standardised labels (n, ..., outputs)
-    trust: Any  # (n, ..., 1) factor of what the nets add
+    trust: Any  # (n, ..., 1) factor on the nets' outputs
 
 
 class Net(nn.Module):
@@ -78,7 +83,7 @@ class Net(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
-        """Outputs for inputs, both standardised."""
+        """Return outputs for inputs, both standardised."""
         for width in self.hidden:
             # the two-pass variance: the fast one loses half the digits that gradient checks need
             x = nn.soft_sign(nn.LayerNorm(use_fast_variance=False)(nn.Dense(width)(x)))
@@ -88,19 +93,19 @@ class Net(nn.Module):
 def init_nets(
     key: Key[Array, ""], hidden: tuple[int, ...], inputs: int, *, outputs: int, members: int
 ) -> Pair:
-    """Fresh parameters of force nets and moment nets, `members` of each stacked."""
+    """Draw parameters of force nets and moment nets, `members` of each stacked."""
     net, x = Net(hidden, outputs), jnp.zeros(inputs)
     draw = jax.jit(jax.vmap(lambda k: net.init(k, x)["params"]))
     return Pair(*(draw(jax.random.split(k, members)) for k in jax.random.split(key)))
 
 
 def widths(net: dict[str, Any]) -> tuple[int, ...]:
-    """Widths of the hidden layers of a net, read off its parameters."""
+    """Return the widths of the hidden layers of a net, read off its parameters."""
     return tuple(net[f"Dense_{i}"]["kernel"].shape[-1] for i in range(len(net) // 2))
 
 
 def apply_net(params: dict[str, Any], x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
-    """Standardised outputs of one net."""
+    """Return the standardised outputs of one net."""
     hidden = widths(params)
     outputs = params[f"Dense_{len(hidden)}"]["kernel"].shape[-1]
     y: Any = Net(hidden, outputs).apply({"params": params}, x)
@@ -108,7 +113,7 @@ def apply_net(params: dict[str, Any], x: Float[Array, "*batch n"]) -> Float[Arra
 
 
 class _Rates(NamedTuple):
-    """The numbers of a training, traced: another rate needs no new compilation."""
+    """Numbers of the optimiser, traced: another rate needs no new compilation."""
 
     learning: float
     l2: float
@@ -116,9 +121,9 @@ class _Rates(NamedTuple):
 
 class _Carry(NamedTuple):
     nets: Pair  # parameters of force and moment nets, members stacked
-    optimiser: Any
-    best: Pair  # of each member those of the epoch with the least validation error
-    least: Pair  # that error, by member
+    optimiser: Any  # its state
+    best: Pair  # parameters of each member's epoch with the least validation error
+    best_error: Pair  # that error, by member
 
 
 def fit_nets(
@@ -135,13 +140,13 @@ def fit_nets(
     """Train force nets and moment nets in 32 bits.
 
     Args:
-        config: settings; the same ones and the same data give the same bytes on a CPU.
-        key: of the order of the samples.
+        config: settings; the same settings and data give the same bytes on a CPU.
+        key: for the order of the samples.
         nets: parameters to start from, members stacked along the first axis.
         training: samples to learn from.
         validation: samples of other walks, which choose the epoch.
         scale: physical unit of each standardised output, in N and N m.
-        output: `(output of a net, trust) -> standardised prediction`, a module's function.
+        output: `(output of a net, trust) -> standardised prediction`, a module-level function.
         progress: see `Progress`.
 
     Returns:
@@ -160,7 +165,7 @@ def fit_nets(
         )
         rows.append(jax.device_get(row))
         progress(epoch, History(*np.array(rows).T))
-    if not all(np.isfinite(leaf).all() for leaf in carry.least):
+    if not all(np.isfinite(error).all() for error in carry.best_error):
         raise InputError("training diverged: no epoch has a finite validation error")
     return carry.best, History(*np.array(rows).T)
 
@@ -175,7 +180,7 @@ def _optimiser(rates: _Rates) -> optax.GradientTransformation:
 
 
 def _squares(output: Callable[[Array, Array], Array], nets: Pair, samples: Samples) -> Pair:
-    """Mean square of the standardised error per member and output."""
+    """Return the mean square of the standardised error per member and output."""
 
     def square(net: Any, x: Array, y: Array) -> Array:
         error = output(apply_net(net, x), samples.trust) - y
@@ -201,28 +206,26 @@ def _train_epoch(
     order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
     optimiser = _optimiser(rates)
 
-    def loss(nets: Pair, chosen: Samples) -> tuple[Float[Array, ""], Pair]:
-        squares = _squares(output, nets, chosen)
+    def loss(nets: Pair, samples: Samples) -> tuple[Float[Array, ""], Pair]:
+        squares = _squares(output, nets, samples)
         return squares.force.mean(axis=1).sum() + squares.moment.mean(axis=1).sum(), squares
 
     def step(state: tuple[Any, Any], rows: Int[Array, " batch"]) -> tuple[tuple[Any, Any], Pair]:
-        nets, memory = state
-        chosen = jax.tree.map(lambda a: a[rows], training)
-        gradient, squares = jax.grad(loss, has_aux=True)(nets, chosen)
-        update, memory = optimiser.update(gradient, memory, nets)
-        return (optax.apply_updates(nets, update), memory), squares
+        nets, opt_state = state
+        samples = jax.tree.map(lambda a: a[rows], training)
+        gradient, squares = jax.grad(loss, has_aux=True)(nets, samples)
+        update, opt_state = optimiser.update(gradient, opt_state, nets)
+        return (optax.apply_updates(nets, update), opt_state), squares
 
-    (nets, memory), squares = jax.lax.scan(step, (carry.nets, carry.optimiser), order)
+    def keep_best(error: Array, best_error: Array, new: Any, old: Any) -> Any:
+        return jax.tree.map(partial(jax.vmap(jnp.where), error < best_error), new, old)
+
+    (nets, opt_state), squares = jax.lax.scan(step, (carry.nets, carry.optimiser), order)
     variance = jax.tree.map(jnp.square, scale)
     physical = partial(jax.tree.map, lambda square, v: jnp.mean(square * v, axis=-1))
     error = physical(_squares(output, nets, validation), variance)
-    best = Pair(
-        *(
-            jax.tree.map(partial(jax.vmap(jnp.where), now < least), new, old)
-            for now, least, new, old in zip(error, carry.least, nets, carry.best, strict=True)
-        )
-    )
-    least = jax.tree.map(jnp.fmin, error, carry.least)
-    learned = physical(jax.tree.map(lambda s: s.mean(axis=0), squares), variance)
-    row = jnp.stack([x.mean() for x in (*learned, *error)])
-    return _Carry(nets, memory, best, least), row
+    best = Pair(*map(keep_best, error, carry.best_error, nets, carry.best))
+    best_error = jax.tree.map(jnp.fmin, error, carry.best_error)
+    train_error = physical(jax.tree.map(lambda s: s.mean(axis=0), squares), variance)
+    row = jnp.stack([x.mean() for x in (*train_error, *error)])
+    return _Carry(nets, opt_state, best, best_error), row

@@ -1,7 +1,7 @@
 """GRFM-Net: phi with parameters that are learned from walks. The variants, and their files.
 
-`as_effect` makes parameters a phi. It computes in the dtype of the window, so that a net trained in
-32 bits has exact derivatives in a rollout of 64, and new parameters need no new compilation.
+`as_effect` makes a phi of parameters. It computes in the dtype of the window, so that a net trained
+in 32 bits has exact derivatives in a rollout of 64, and new parameters need no new compilation.
 """
 
 from functools import lru_cache, partial
@@ -26,22 +26,22 @@ VARIANTS = {phi.name: phi for phi in (RESIDUAL, PAPER, GATED, LINEAR)}
 """Every variant by its name; whoever adds one adds it here."""
 
 Params = Any  # of a variant: `Phi.params`
-_DEEPEST, _WIDEST = 8, 4096  # hidden layers and their units in a file
+_MAX_LAYERS, _MAX_WIDTH = 8, 4096  # hidden layers and their units in a file
 _IN_OLD_FILES = {"stats": "usual", "residual_rms": "left"}
 
 
 def variant_of(params: Params) -> Phi:
-    """The variant that parameters belong to."""
+    """Return the variant that parameters belong to."""
     return next(phi for phi in VARIANTS.values() if phi.params is type(params))
 
 
 def as_effect(params: Params) -> jax.tree_util.Partial:
-    """Phi of fitted parameters: `Window -> Effect`."""
+    """Return the phi of fitted parameters: `Window -> Effect`."""
     return jax.tree_util.Partial(variant_of(params).apply, params)
 
 
 def effect_of(params: Params | None, gait: GaitConfig) -> jax.tree_util.Partial:
-    """Phi of a net, or of the plain rigid body (None), which needs no program of its own."""
+    """Return the phi of a net, or of the plain rigid body (None), in one and the same program."""
     return as_effect(plain_net(gait) if params is None else params)
 
 
@@ -49,7 +49,7 @@ def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any])
     """Write a GRFM-Net for one robot; `about` goes on its card.
 
     Raises:
-        WriteError: where the file cannot be written.
+        WriteError: the file cannot be written.
     """
     phi = variant_of(params)
     facts = {
@@ -61,7 +61,7 @@ def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any])
 
 
 def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str, Any]]:
-    """Variant and card of the GRFM-Net in a file; see `load_net`.
+    """Read variant and card of the GRFM-Net in a file; see `load_net`.
 
     Raises:
         InputError: one line naming the file: damaged, no net, or a net of another variant.
@@ -69,14 +69,14 @@ def read_net_card(path: Path, variant: str | None = None) -> tuple[str, dict[str
     card = read_card(path)
     kinds = {f"grfm-{name}": name for name in ([variant] if variant else VARIANTS)}
     if card["kind"] not in kinds:
-        held = short_repr(card["kind"])[1:-1]
-        raise InputError(f"{path}: holds {held}, expected {' or '.join(kinds)}")
+        kind = short_repr(card["kind"])[1:-1]
+        raise InputError(f"{path}: holds {kind}, expected {' or '.join(kinds)}")
     hidden = card["about"].get("hidden")
-    sizes = hidden if isinstance(hidden, list) and len(hidden) <= _DEEPEST else [None]
-    if any(validation_error(size, int, Range(1, _WIDEST)) for size in sizes):
+    sizes = hidden if isinstance(hidden, list) and len(hidden) <= _MAX_LAYERS else [None]
+    if any(validation_error(size, int, Range(1, _MAX_WIDTH)) for size in sizes):
         raise InputError(
-            f"{path}: about.hidden must be at most {_DEEPEST} whole numbers from 1 to {_WIDEST}, "
-            f"got {short_repr(hidden)}"
+            f"{path}: about.hidden must be at most {_MAX_LAYERS} whole numbers from 1 to "
+            f"{_MAX_WIDTH}, got {short_repr(hidden)}"
         )
     return kinds[card["kind"]], card
 
@@ -88,8 +88,8 @@ def load_net(
 
     Args:
         path: the file.
-        robot: the body in use.
-        variant: the one that is expected; None takes any.
+        robot: the robot in use.
+        variant: name of the expected variant; None takes any.
 
     Raises:
         InputError: one line naming the file: damaged, of another robot, kind, layout or variant, or
@@ -114,19 +114,19 @@ def load_net(
 
 
 def _is_in_file(path: Any, arrays: Any) -> bool:
-    """Whether a file has a parameter; older files have no `touchdown`."""
+    """Return whether a file has a parameter; older files have no `touchdown`."""
     name = jax.tree_util.keystr(path, simple=True, separator=".")
     return not name.endswith("touchdown") or name in arrays
 
 
 def layout(variant: str, hidden: tuple[int, ...], feet: int = 2) -> Params:
-    """Zeros of the shapes of the parameters, as `load_tree` wants them; an axis 0 is of ticks."""
+    """Return zeros in the parameters' shapes, as `load_tree` takes them; an axis of 0 is ticks."""
     shapes = _shapes(VARIANTS[variant], hidden, feet, jnp.result_type(float))
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 @lru_cache(maxsize=64)
-def _shapes(variant: Phi, hidden: tuple[int, ...], feet: int, number: Any) -> Any:
-    """Shapes of the parameters where `number` is JAX's; it takes longer than to read a file."""
-    del number  # what it is decides what is found
+def _shapes(variant: Phi, hidden: tuple[int, ...], feet: int, dtype: Any) -> Any:
+    """Return the parameters' shapes under JAX's default `dtype`; cached, as it is slow."""
+    del dtype  # a part of the cache's key only
     return jax.eval_shape(partial(variant.init, feet=feet, hidden=hidden), jax.random.key(0))

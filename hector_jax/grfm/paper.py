@@ -1,10 +1,10 @@
-"""The paper's GRFM-Net, and the linear map beside it.
+"""The paper's GRFM-Net, and a linear map for comparison.
 
 Each of two nets, one for forces and one for moments, reads the current and the two past commands of
-all feet (18 numbers of two), passes them through three layers (linear, layer normalisation,
-softsign; 64 wide) and returns what the ground returns at all feet (6). Inputs and outputs are
-standardised by statistics of the training samples. The best affine map of the same inputs is what a
-net has to beat.
+all feet (18 numbers for two feet), passes them through three layers (linear, layer normalisation,
+softsign; 64 wide) and returns the ground's forces or moments at all feet (6). Inputs and outputs
+are standardised by statistics of the training samples. A net has to beat the best affine map of the
+same inputs.
 
 Mirror images of the samples are our addition: with 51 training walks they lowered the held-out
 force error by 5 to 10 % and the moment error by 4 to 6 %.
@@ -22,7 +22,7 @@ from hector_jax.core.trajectory import Wrench, zero_wrench
 from hector_jax.grfm import nets
 from hector_jax.grfm.dataset import Dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, ground_effect, in_dtype_of
-from hector_jax.grfm.nets import NO_EPOCHS, FitConfig, History, Pair, Progress, Samples
+from hector_jax.grfm.nets import FitConfig, History, Pair, Progress, Samples
 
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
 
@@ -35,7 +35,7 @@ class Scaling(NamedTuple):
 
 
 class PaperParams(NamedTuple):
-    """All of a GRFM-Net of the paper's variant."""
+    """Parameters of a GRFM-Net of the paper's variant."""
 
     force: dict[str, Any]  # of a `Net`
     moment: dict[str, Any]
@@ -53,21 +53,19 @@ class LinearMap(NamedTuple):
 
 
 def fit_scaling(wrench: Wrench) -> Scaling:
-    """Mean and standard deviation over all leading axes.
+    """Return mean and standard deviation over all leading axes.
 
     An axis that hardly moves, such as the commanded M_x, is scaled by a hundredth of the largest
     spread of its kind, so that rounding errors are not taken for a signal.
     """
 
     def scale(w: np.ndarray) -> np.ndarray:
-        spread = w.reshape(-1, *w.shape[-2:]).std(axis=0)
+        spread = w.std(axis=0)
         largest = spread.max()
         return np.maximum(spread, _FLOOR * largest) if largest > 0.0 else np.ones_like(spread)
 
-    return Scaling(
-        mean=Wrench(*(np.mean(w.reshape(-1, *w.shape[-2:]), axis=0) for w in wrench)),
-        scale=Wrench(*(scale(w) for w in wrench)),
-    )
+    rows = [w.reshape(-1, *w.shape[-2:]) for w in wrench]
+    return Scaling(Wrench(*(w.mean(axis=0) for w in rows)), Wrench(*map(scale, rows)))
 
 
 def _standardised(scaling: Scaling, wrench: Wrench) -> Wrench:
@@ -75,7 +73,7 @@ def _standardised(scaling: Scaling, wrench: Wrench) -> Wrench:
 
 
 def _features(scaling: Scaling, commands: Wrench) -> Wrench:
-    """Inputs of force net and moment net, (*batch, inputs) each, from the commands of windows."""
+    """Return inputs of force net and moment net, (*batch, inputs) each, from windows' commands."""
     flat = lambda w: w.reshape(*w.shape[:-3], -1)  # noqa: E731
     return jax.tree.map(flat, _standardised(scaling, commands))
 
@@ -86,16 +84,16 @@ def _effect(scaling: Scaling, flat: Wrench) -> Effect:
 
 
 def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = (64, 64, 64)) -> PaperParams:
-    """Fresh networks without statistics, in 32 bits."""
-    fresh = nets.init_nets(key, hidden, 3 * feet * HISTORY, outputs=3 * feet, members=1)
+    """Draw the parameters of networks without statistics, in 32 bits."""
+    drawn = nets.init_nets(key, hidden, 3 * feet * HISTORY, outputs=3 * feet, members=1)
     scaling = Scaling(zero_wrench(feet), zero_wrench(feet))
-    force, moment = jax.tree.map(lambda p: p[0], fresh)
+    force, moment = jax.tree.map(lambda p: p[0], drawn)
     params = PaperParams(force, moment, scaling, scaling)
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 
 def with_statistics(params: PaperParams, dataset: Dataset) -> PaperParams:
-    """The same networks, standardised by the statistics of a training set."""
+    """Return the same networks, standardised by the statistics of a training set."""
     scalings = fit_scaling(dataset.window.commands), fit_scaling(dataset.label)
     inputs, outputs = jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), scalings)
     return params._replace(inputs=inputs, outputs=outputs)
@@ -138,7 +136,7 @@ def fit(
 
 
 def apply(params: PaperParams, window: Window) -> Effect:
-    """Effect of a trained net for one window."""
+    """Return the effect of a trained net for one window."""
     params = in_dtype_of(window, params)
     x = _features(params.inputs, window.commands)
     flat = Wrench(nets.apply_net(params.force, x.force), nets.apply_net(params.moment, x.moment))
@@ -149,7 +147,7 @@ PAPER = Phi("paper", PaperParams, init, fit, apply, lambda p: nets.widths(p.forc
 
 
 def init_linear(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()) -> LinearMap:
-    """A map to zero."""
+    """Return a map to zero."""
     del key, hidden
     zeros = jnp.zeros((3 * feet * HISTORY + 1, 3 * feet))
     scaling = Scaling(zero_wrench(feet), zero_wrench(feet))
@@ -157,7 +155,7 @@ def init_linear(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()
 
 
 def fit_linear(dataset: Dataset) -> LinearMap:
-    """Least squares from the nets' inputs to the label."""
+    """Fit the map by least squares from the nets' inputs to the label."""
     inputs, outputs = fit_scaling(dataset.window.commands), fit_scaling(dataset.label)
     x = _features(inputs, dataset.window.commands)
     y = _standardised(outputs, dataset.label)
@@ -170,7 +168,7 @@ def fit_linear(dataset: Dataset) -> LinearMap:
 
 
 def apply_linear(linear: LinearMap, window: Window) -> Effect:
-    """Effect of a linear map for one window."""
+    """Return the effect of a linear map for one window."""
     linear = in_dtype_of(window, linear)
     x = _features(linear.inputs, window.commands)
     affine = lambda x, A: x @ A[:-1] + A[-1]  # noqa: E731
@@ -178,10 +176,4 @@ def apply_linear(linear: LinearMap, window: Window) -> Effect:
     return _effect(linear.outputs, flat)
 
 
-LINEAR = Phi(
-    "linear",
-    LinearMap,
-    init_linear,
-    lambda config, training, validation, progress: (fit_linear(training), NO_EPOCHS),
-    apply_linear,
-)
+LINEAR = Phi("linear", LinearMap, init_linear, nets.closed_form(fit_linear), apply_linear)

@@ -1,10 +1,10 @@
-"""The default GRFM-Net: the gated linear part, and nets that learn what it leaves.
+"""The default GRFM-Net: the gated linear part, and nets that learn its residual.
 
 Nets of two layers, 32 wide, add to the ground wrench of each foot the residual of the linear part.
-They read what it reads, as each foot sees it; what they add is bounded, and fades where the inputs
-are unlike those of the training samples: far from the data this phi is linear. Four of each kind
-are trained side by side and their mean is added. The statistics of the training samples are part of
-the parameters: a net cannot be used with another's.
+They have the inputs of the linear part, in each foot's view; their output is bounded, and fades
+where the inputs are unlike those of the training samples: far from the data this phi is linear.
+Four of each kind are trained side by side and their mean is added. The statistics of the training
+samples are part of the parameters: a net cannot be used with another net's.
 """
 
 from functools import partial
@@ -20,17 +20,17 @@ from hector_jax.core.arrays import Array
 from hector_jax.grfm import gated, nets
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import Effect, Phi, Window, in_dtype_of
-from hector_jax.grfm.gated import GATES, MOTION, GatedMap, View, changes_seen, hats, views
+from hector_jax.grfm.gated import GATES, MOTION, GatedMap, View, hats, num_changes, views
 from hector_jax.grfm.nets import FitConfig, History, Pair, Progress, Samples
 
 HIDDEN = (32, 32)
 MEMBERS = 4  # nets of each kind
 BOUND = 0.5  # most that a net adds, in units of the residual's RMS
-FAMILIAR = 0.99  # share of the training samples that are nearer than where trust is halved
+FAMILIAR = 0.99  # share of the training samples whose trust is above one half
 
 
 class FeatureStats(NamedTuple):
-    """Statistics of what a net reads, by the tick since the switch; a kind is that of a `View`."""
+    """Statistics of a net's features, by the tick since the switch; kinds are those of a `View`."""
 
     mean: Float[Array, "kinds ticks terms"]
     scale: Float[Array, "kinds ticks terms"]
@@ -38,18 +38,18 @@ class FeatureStats(NamedTuple):
 
 
 class ResidualParams(NamedTuple):
-    """All of a GRFM-Net of the residual variant."""
+    """Parameters of a GRFM-Net of the residual variant."""
 
     linear: GatedMap
     force: dict[str, Any]  # of MEMBERS `Net`s, stacked, for one foot
     moment: dict[str, Any]
     stats: FeatureStats
-    residual_rms: Float[Array, "6"]  # [N], [N m] of what the linear part leaves
+    residual_rms: Float[Array, "6"]  # [N], [N m] of the linear part's residual
 
 
 def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = HIDDEN) -> ResidualParams:
-    """Fresh networks without statistics, in 32 bits; the axis of ticks has length 0."""
-    terms = changes_seen(feet) + MOTION
+    """Draw networks without statistics, in 32 bits; the axis of ticks has length 0."""
+    terms = num_changes(feet) + MOTION
     inputs = terms + len(GATES) + feet - 1
     force, moment = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS)
     table = jnp.zeros((feet, 0, terms))
@@ -59,7 +59,7 @@ def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = HIDDEN) -
 
 
 def with_statistics(params: ResidualParams, dataset: Dataset) -> ResidualParams:
-    """The same networks with the linear part and the statistics of a training set."""
+    """Return the same networks with the linear part and the statistics of a training set."""
     linear = gated.fit_gated(dataset)
     fitted = linear, *_fit_stats(linear, dataset)
     linear, stats, rms = jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), fitted)
@@ -67,24 +67,24 @@ def with_statistics(params: ResidualParams, dataset: Dataset) -> ResidualParams:
 
 
 def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.ndarray]:
-    """Statistics of the features, and the RMS of what the linear part leaves."""
+    """Return statistics of the features, and the RMS of the linear part's residual."""
 
-    def one(window: Window) -> tuple[View, Array, Array]:
+    def evaluate(window: Window) -> tuple[View, Array, Array]:
         view = views(window)
         ground, *_ = gated.apply_gated(linear, window, view)
         return view, hats(window.since_switch, linear.ticks), ground
 
     window = jax.tree.map(jnp.asarray, dataset.window)
-    view, tick, ground = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(window))
+    view, tick, ground = jax.tree.map(np.asarray, jax.jit(jax.vmap(evaluate))(window))
     feet = view.stands.shape[1]
     terms, tick = _terms(view), np.repeat(tick[:, None], feet, axis=1)
     mean, scale = (np.zeros((feet, len(linear.ticks), terms.shape[-1])) for _ in range(2))
-    for kind in range(feet):  # as many as feet: two of each pair
+    for kind in range(feet):  # there are as many kinds as feet: two of each pair
         rows = view.kind == kind
         weight = tick[rows] / np.maximum(tick[rows].sum(axis=0), 1e-9)
         mean[kind] = weight.T @ terms[rows]
         scale[kind] = np.sqrt(np.maximum(weight.T @ terms[rows] ** 2 - mean[kind] ** 2, 0.0))
-    # a term that rests at some ticks only, such as the change of a swinging foot's command
+    # some terms are constant at some ticks only, such as the change of a swinging foot's command
     scale = np.maximum(scale, 0.05 * np.maximum(scale.max(axis=(0, 1)), 1e-6))
     stats = FeatureStats(mean, scale, np.asarray(1.0))
     z = np.asarray(_standard_terms(stats, terms, view.kind, tick))
@@ -98,12 +98,12 @@ def _terms(view: View) -> Float[Array, "*batch terms"]:
 
 
 def _standard_terms(stats: FeatureStats, terms: Any, kind: Any, tick: Any) -> Array:
-    at = lambda table: jnp.einsum("...k,...ki->...i", tick, table[kind])  # noqa: E731
-    return (terms - at(stats.mean)) / at(stats.scale)
+    lookup = lambda table: jnp.einsum("...k,...ki->...i", tick, table[kind])  # noqa: E731
+    return (terms - lookup(stats.mean)) / lookup(stats.scale)
 
 
 def _inputs(params: ResidualParams, window: Window, view: View) -> tuple[Array, Array]:
-    """What the nets read of one window (feet, n), and how far they are trusted (feet,)."""
+    """Return the nets' inputs for one window (feet, n), and the trust in their outputs (feet,)."""
     stats, feet = params.stats, len(view.stands)
     tick, gate = (hats(window.since_switch, k) for k in (params.linear.ticks, params.linear.gates))
     z = _standard_terms(stats, _terms(view), view.kind, jnp.stack([tick] * feet))
@@ -113,7 +113,7 @@ def _inputs(params: ResidualParams, window: Window, view: View) -> tuple[Array, 
 
 
 def _bounded(raw: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """What a net adds for its raw output, both standardised."""
+    """Return a net's raw output limited smoothly to +-BOUND, both standardised."""
     return BOUND * jnp.tanh(raw / BOUND)
 
 
@@ -122,13 +122,13 @@ def _output(raw: Array, trust: Array) -> Array:
 
 
 def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
-    def one(window: Window) -> tuple[Array, Array, Array]:
+    def evaluate(window: Window) -> tuple[Array, Array, Array]:
         view = views(window)
         ground, *_ = gated.apply_gated(params.linear, window, view)
         return ground, *_inputs(params, window, view)
 
     window = jax.tree.map(jnp.asarray, dataset.window)
-    ground, z, trust = jax.jit(jax.vmap(one))(window)
+    ground, z, trust = jax.jit(jax.vmap(evaluate))(window)
     residual = (gated.labels_in_view(dataset) - ground) / params.residual_rms
     y = Pair(residual[..., :3], residual[..., 3:])
     samples = Samples(Pair(z, z), y, trust[..., None])
@@ -138,7 +138,7 @@ def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
 def fit(
     config: FitConfig, training: Dataset, validation: Dataset, progress: Progress
 ) -> tuple[ResidualParams, History]:
-    """Fit the linear part, then train the nets on what it leaves; see `nets.fit_nets`."""
+    """Fit the linear part, then train the nets on its residual; see `nets.fit_nets`."""
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
     params = with_statistics(init(key_init, training.lands.shape[1]), training)
     best, history = nets.fit_nets(
@@ -155,7 +155,7 @@ def fit(
 
 
 def apply(params: ResidualParams, window: Window) -> Effect:
-    """Effect of a trained net for one window."""
+    """Return the effect of a trained net for one window."""
     params, window = in_dtype_of(window, params), in_dtype_of(window, window)
     view = views(window)
     ground, legs, shift = gated.apply_gated(params.linear, window, view)
@@ -170,7 +170,7 @@ RESIDUAL = Phi("residual", ResidualParams, init, fit, apply, lambda p: nets.widt
 
 
 def plain_net(gait: GaitConfig) -> ResidualParams:
-    """A net that returns every command as it is: the plain rigid body, in the program of the net.
+    """Return a net that returns every command unchanged: the rigid body, in the net's program.
 
     Its parameters have the shapes of a net that was trained on walks of `gait`.
     """
@@ -181,14 +181,13 @@ def plain_net(gait: GaitConfig) -> ResidualParams:
         return np.zeros([len(ticks) if n == 0 else n for n in x.shape], np.float32)
 
     net = jax.tree.map(zeros, jax.eval_shape(partial(init, feet=feet), jax.random.key(0)))
-    knots = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
-    one = np.ones((), np.float32)
-    return net._replace(linear=knots, stats=FeatureStats(net.stats.mean, net.stats.scale + 1, one))
+    linear = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
+    stats = net.stats._replace(scale=net.stats.scale + 1, reach=np.ones((), np.float32))
+    return net._replace(linear=linear, stats=stats)
 
 
 def member_params(params: ResidualParams) -> ResidualParams:
-    """The members of the ensemble alone, each an ensemble of one, stacked on a first axis."""
-    alone = lambda p: jnp.asarray(p)[:, None]  # noqa: E731
-    shared = lambda p: jnp.broadcast_to(jnp.asarray(p), (MEMBERS, *jnp.shape(p)))  # noqa: E731
-    own = {name: jax.tree.map(alone, getattr(params, name)) for name in ("force", "moment")}
-    return jax.tree.map(shared, params)._replace(**own)
+    """Return each member of the ensemble as an ensemble of one, stacked on a new first axis."""
+    shared = jax.tree.map(lambda p: jnp.broadcast_to(p, (MEMBERS, *jnp.shape(p))), params)
+    nets_of_member = jax.tree.map(lambda p: jnp.asarray(p)[:, None], (params.force, params.moment))
+    return shared._replace(force=nets_of_member[0], moment=nets_of_member[1])

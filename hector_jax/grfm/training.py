@@ -1,4 +1,4 @@
-"""Training a phi, and how well it does beside the raw command and other variants."""
+"""Training of a phi, and its errors in comparison with the raw command and other variants."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from hector_jax.grfm.network import VARIANTS, Params
 
 @dataclass(frozen=True)
 class TrainConfig(FitConfig):
-    """What is trained, and how."""
+    """Variant of phi to train, and settings of its fit."""
 
     variant: str = "residual"  # of network.VARIANTS
 
@@ -35,7 +35,7 @@ class Errors(NamedTuple):
     moment: float
     stance: Float[np.ndarray, "6"]  # per axis, of feet planned to stand
     swing: Float[np.ndarray, "6"]  # of feet planned to swing
-    # forward and sideways [cm^2], of feet that land; zero where no touchdowns are learned
+    # forward and sideways [cm^2], of feet that land; zero if no touchdowns are learned
     touchdown: Float[np.ndarray, "2"]
 
 
@@ -48,7 +48,7 @@ def train(
     """Fit the parameters of a variant of phi.
 
     Args:
-        config: which and how; the same settings and data give the same bytes on a CPU.
+        config: variant and settings; the same settings and data give the same bytes on a CPU.
         training: samples to learn from; their statistics become part of the parameters.
         validation: samples of other walks, which choose the epoch of a net.
         progress: called after each epoch with its number, from 1, and the errors so far.
@@ -57,7 +57,7 @@ def train(
         Parameters, and the errors by epoch.
 
     Raises:
-        InputError: no samples, or the training came to nothing finite.
+        InputError: no samples, or the training diverged.
     """
     for name, dataset in (("training", training), ("validation", validation)):
         if len(dataset.walk) == 0:
@@ -68,31 +68,29 @@ def train(
 
 @jax.jit
 def predict(effect: jax.tree_util.Partial, window: Window) -> Effect:
-    """What a phi returns for a batch of windows."""
+    """Return the effects of a phi for a batch of windows."""
     return jax.vmap(effect)(window)
 
 
 def errors(effect: jax.tree_util.Partial, dataset: Dataset) -> Errors:
-    """Mean square errors of a phi on a dataset."""
-    predicted = predict(effect, jax.tree.map(jnp.asarray, dataset.window))
-    squares = jax.tree.map(
-        lambda g, label: np.asarray((g - label) ** 2), predicted.wrench, dataset.label
-    )
-    axes = np.concatenate(squares, axis=-1)  # (n, 2, 6)
-    away = (predicted.touchdown_error - dataset.touchdown_error)[dataset.lands]
+    """Return the mean square errors of a phi on a dataset."""
+    effects = predict(effect, jax.tree.map(jnp.asarray, dataset.window))
+    squares = jax.tree.map(lambda p, y: np.asarray((p - y) ** 2), effects.wrench, dataset.label)
+    axes = np.concatenate(squares, axis=-1)  # (n, feet, 6)
+    touchdown = (effects.touchdown_error - dataset.touchdown_error)[dataset.lands]
     return Errors(
         force=float(squares.force.mean()),
         moment=float(squares.moment.mean()),
         stance=axes[dataset.window.contact].mean(axis=0),
         swing=axes[~dataset.window.contact].mean(axis=0),
-        touchdown=1e4 * np.square(away[:, :2]).sum(axis=0) / max(len(away), 1),
+        touchdown=1e4 * np.square(touchdown[:, :2]).sum(axis=0) / max(len(touchdown), 1),
     )
 
 
 def report(
     effects: Mapping[str, jax.tree_util.Partial], dataset: Dataset
 ) -> dict[str, dict[str, Any]]:
-    """Errors of several phi on one dataset, as JSON values, by their names."""
+    """Return the errors of several phi on one dataset, as JSON values, by their names."""
     return {
         name: jax.tree.map(lambda x: np.asarray(x).tolist(), errors(effect, dataset)._asdict())
         for name, effect in effects.items()

@@ -1,9 +1,8 @@
 """Minimise 1/2 x'Px + q'x subject to l <= A x <= u, and differentiate the minimiser.
 
-`problem` has the data and the one form that all of it is brought to, `active_set`,
-`interior_point` and `jaxopt_solver` the ways to a solution (`gpu_kernel` guesses on a GPU),
-`certificates` what is proved on the way, `method` the loop over both and the verdict, `derivative`
-the rule of both modes and `solver` the door.
+`problem` has the data and its normalised form, `active_set`, `interior_point` and `jaxopt_solver`
+the methods (`gpu_kernel` guesses an active set on a GPU), `certificates` the proofs, `method` the
+loop over the methods and the status, `derivative` the JVP rule and `solver` the public functions.
 """
 
 from hector_jax.qp.derivative import SAVED

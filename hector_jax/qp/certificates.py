@@ -1,4 +1,4 @@
-"""What a QP's data and a step prove: curvature, a held minimiser, no solution, no lower bound."""
+"""Proofs from a QP's data and a step: curvature, unique minimiser, infeasible, unbounded."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,97 +14,98 @@ from hector_jax.qp.problem import SIGN, Normal, Point, Tolerances
 
 
 def _shifted(matrix: Array, shift: float) -> tuple[Array, Array]:
-    """Cholesky factor of a matrix plus a multiple of the unit matrix, and whether there is one.
+    """Factorise a matrix plus `shift` times the identity; return the factor and whether it exists.
 
-    So a smallest eigenvalue is compared exactly. Pivots would not tell: that of a singular matrix
-    grows with the number of variables that share the flat direction.
+    Its existence compares the smallest eigenvalue exactly. Pivots do not: those of a singular
+    matrix grow with the number of variables that share the flat direction.
     """
     factor = cholesky(matrix + shift * jnp.eye(len(matrix), dtype=matrix.dtype))
     return factor, jnp.isfinite(factor[-1, -1])
 
 
-def without_rows(tolerances: Tolerances, qp: Normal) -> tuple[Array, Array, Array]:
-    """Minimiser without rows; whether P curves in every direction; whether it is semidefinite.
+def unconstrained_minimiser(tolerances: Tolerances, qp: Normal) -> tuple[Array, Array, Array]:
+    """Return the minimiser without rows, whether P is definite and whether it is semidefinite.
 
-    One factorisation where P curves.
+    A definite P takes one factorisation.
     """
 
     def minimiser(shift: float, qp: Normal) -> tuple[Array, Array]:
         factor, exists = _shifted(qp.P, shift)
         return -cho_solve((factor, True), qp.q), exists
 
-    x, curved = minimiser(-tolerances.curvature, qp)
-    softened = partial(minimiser, tolerances.proximal)
-    x, convex = only_if(~curved, softened, (x, curved), qp)
-    return x, curved, convex
+    x, definite = minimiser(-tolerances.curvature, qp)
+    proximal = partial(minimiser, tolerances.proximal)
+    x, convex = only_if(~definite, proximal, (x, definite), qp)
+    return x, definite, convex
 
 
 def only_if(enabled: Array, function: Callable, otherwise: Any, operands: Any) -> Any:
-    """`function(operands)` where `enabled`, else `otherwise`; costs nothing where none is enabled.
+    """Return `function(operands)` if `enabled`, else `otherwise`, at no cost if none is enabled.
 
-    A loop of one round, because vmap makes a cond compute for every problem of a batch.
+    This is a loop of one iteration, because under vmap a cond computes both branches.
     """
 
     def once(state: tuple) -> tuple:
-        # that reads the state, or the compiler would compute it once, before the loop
+        # depend on the state, otherwise the compiler moves the computation out of the loop
         _, hidden = lax.optimization_barrier((state[0], operands))
         return jnp.zeros((), bool), function(hidden)
 
     return lax.while_loop(lambda state: state[0], once, (enabled, otherwise))[1]
 
 
-def is_held(tolerances: Tolerances, qp: Normal, point: Point) -> Array:
-    """Whether P and the rows hold a minimiser in every direction.
+def is_unique(tolerances: Tolerances, qp: Normal, point: Point) -> Array:
+    """Return whether P and the rows make a minimiser unique in every direction.
 
-    A row holds where it is an equality or presses with more than the tolerance. One that is active
-    without force does not: the minimiser can leave it.
+    A row counts if it is an equality or its force is above the tolerance. A row that is active
+    without force does not count: the minimiser can leave it.
     """
     force = point.z / qp.slope_size(point)
     slack = jnp.abs(qp.violation(point.x)) / qp.row_sizes(point.x)
     pressing = qp.side & (force > tolerances.residual) & (force > slack)
-    holding = qp.equality | jnp.any(pressing, axis=0)
-    # the cap's rounding could hide a flat direction; this one's is a hundredth of the curvature
-    weight = jnp.where(holding, 0.01 * tolerances.curvature / jnp.finfo(force.dtype).eps, 0.0)
+    binding = qp.equality | jnp.any(pressing, axis=0)
+    # rounding with the cap could hide a flat direction; with this weight it is 1 % of the curvature
+    weight = jnp.where(binding, 0.01 * tolerances.curvature / jnp.finfo(force.dtype).eps, 0.0)
     return _shifted(plus_gram(qp.P, qp.A, weight), -tolerances.curvature)[1]
 
 
 def rays(tolerances: Tolerances, qp: Normal, before: Point, point: Point) -> tuple[Array, Array]:
-    """What a step leaves of a proof that no x of moderate size meets the rows, of an endless fall.
+    """Test whether a step is a ray: of infeasible rows for any moderate x, or of unbounded descent.
 
-    Without a solution the multipliers grow for ever along a combination of rows that cancels, or x
-    along a fall. A step shows that purely; in the point itself is a part that does not cancel.
+    Without a solution the multipliers diverge along a combination of rows that cancels, or x along
+    a descent direction. The step shows it alone; the point also contains a part that does not
+    cancel.
 
     Returns:
-        What should be zero (2,), and a share of what it is to be small beside: below it, the step
-        shows a ray.
+        A residual that is zero for a ray (2,), and a threshold (2,): the step is a ray if the
+        residual is below it.
     """
     dx, rise = point.x - before.x, point.z - before.z
     sign = jnp.asarray(SIGN, dx.dtype)
-    grown = jnp.where(qp.equality, rise, jnp.maximum(rise, 0.0))  # what falls counts against it
-    gap = -jnp.sum(sign * qp.bound * grown + (grown - rise) / tolerances.certificate)
-    # differences of products that an iteration needs at both points anyway
+    growth = jnp.where(qp.equality, rise, jnp.maximum(rise, 0.0))  # a decrease is a penalty in gap
+    gap = -jnp.sum(sign * qp.bound * growth + (growth - rise) / tolerances.certificate)
+    # differences of products that an iteration computes at both points anyway
     pull = rmatvec(qp.A, multiplier(point.z)) - rmatvec(qp.A, multiplier(before.z))
     outside = sign * (matvec(qp.A, point.x) - matvec(qp.A, before.x))
     outward = jnp.where(qp.equality, jnp.abs(outside), jnp.where(qp.side, outside, 0.0))
-    needed = jnp.maximum(largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
-    # where P curves in every direction no fall is endless
-    left = jnp.stack([largest(pull), jnp.where(qp.flat, needed, jnp.inf)])
-    return left, tolerances.certificate * jnp.stack([gap, -jnp.dot(qp.q, dx)])
+    change = jnp.maximum(largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
+    # if P is definite the objective is bounded
+    residual = jnp.stack([largest(pull), jnp.where(qp.flat, change, jnp.inf)])
+    return residual, tolerances.certificate * jnp.stack([gap, -jnp.dot(qp.q, dx)])
 
 
 def certificates(tolerances: Tolerances, qp: Normal, before: Point, point: Point) -> Array:
-    """Whether the step proves that the problem is infeasible, and unbounded (2,).
+    """Return whether the step proves that the problem is infeasible, and unbounded (2,).
 
-    By more than the tolerance, within which it can be solved, and by more than rounding.
+    The proof has to exceed rounding and the tolerance, within which the problem can be solved.
     """
     dx, rise = point.x - before.x, point.z - before.z
     rows = jnp.sum(jnp.abs(rise) * qp.row_sizes(point.x))
     sizes = jnp.stack([rows, jnp.sum(jnp.abs(dx)) * qp.slope_size(point)])
-    left, share = rays(tolerances, qp, before, point)
+    residual, threshold = rays(tolerances, qp, before, point)
     A, x = jnp.abs(qp.A), jnp.abs(point.x)
     terms = largest(rmatvec(A, jnp.sum(jnp.abs(point.z), axis=0)))
     rounding = jnp.finfo(x.dtype).eps * jnp.stack(
         [terms, jnp.maximum(largest(jnp.abs(qp.P) @ x), largest(matvec(A, x)))]
     )
-    certain = left + rounding < share
-    return certain & (share > tolerances.certificate * tolerances.residual * sizes)
+    certain = residual + rounding < threshold
+    return certain & (threshold > tolerances.certificate * tolerances.residual * sizes)

@@ -5,11 +5,11 @@ Differentiating stationarity and the active rows gives, for tangents of the data
     P dx + A'dy = -(dP x + dq + dA'y),    A dx - dy / W = du (dl) - dA x,
 
 W_side = ((z + e) / (s + e))^2 from multiplier z and slack s of a side: infinite on active rows,
-zero on the others. The square is that of the central path: a row barely active (z = s = 0), where
-the true derivative has one value on either side, gets one between. W is capped in the matrix that
-is factorised, and a second pass takes the cap's bias off; degenerate vertices stay regular.
-The derivative is zero without status SOLVED. (In 32 bits the matrix of a minimiser that is barely
-held may have no Cholesky factor; the derivative is then NaN.)
+zero on the others. The square is that of the central path: a weakly active row (z = s = 0), where
+the one-sided derivatives differ, gets a value between them. W is capped in the factorised matrix,
+and a second pass removes the cap's bias; degenerate vertices stay regular. The derivative is zero
+without status SOLVED. (In 32 bits the matrix of a minimiser that is almost not unique may have no
+Cholesky factor; the derivative is then NaN.)
 """
 
 from functools import partial
@@ -27,16 +27,16 @@ from hector_jax.qp.method import QpConfig, solve_normal
 from hector_jax.qp.problem import QP, Solution, Status
 
 SAVED = "qp"
-"""Name of what `jax.checkpoint` is to keep of a solve, so that none is solved again backwards."""
+"""Checkpoint name of solver results: a `jax.checkpoint` policy saves them for the reverse pass."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def differentiable_solve(config: QpConfig, qp: QP) -> Solution:
-    """`solve_normal` with the derivative of this module; P has to be symmetric."""
+    """Solve a QP with symmetric P by `solve_normal`, with the derivative of this module."""
     return solve_normal(config, qp)[0]
 
 
-def _moves(tangent: Any) -> bool:
+def _nonzero(tangent: Any) -> bool:
     return not isinstance(tangent, SymbolicZero)
 
 
@@ -48,29 +48,29 @@ def _jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple[Sol
     dtype = qp.q.dtype
     tolerances = config.tolerances(dtype)
     column, row = normal.column, normal.row
-    both = ratio[0] + ratio[1]
-    firm = both >= tolerances.cap
+    weight = ratio[0] + ratio[1]
+    capped = weight >= tolerances.cap
     eye = jnp.eye(len(qp.q), dtype=dtype)
-    factor = cholesky(plus_gram(normal.P + tolerances.proximal * eye, normal.A, both))
-    sound = solution.status == Status.SOLVED
-    factor = jnp.where(sound, factor, eye)
+    factor = cholesky(plus_gram(normal.P + tolerances.proximal * eye, normal.A, weight))
+    solved = solution.status == Status.SOLVED
+    factor = jnp.where(solved, factor, eye)
     pull, shift = jnp.zeros_like(solution.x), jnp.zeros_like(solution.y)
-    if _moves(d.P):
+    if _nonzero(d.P):
         pull += d.P @ solution.x
-    if _moves(d.q):
+    if _nonzero(d.q):
         pull += d.q
-    if _moves(d.A):
-        pull, shift = pull + rmatvec(d.A, solution.y), shift + both * matvec(d.A, solution.x)
-    if _moves(d.u):
+    if _nonzero(d.A):
+        pull, shift = pull + rmatvec(d.A, solution.y), shift + weight * matvec(d.A, solution.x)
+    if _nonzero(d.u):
         shift -= ratio[0] * d.u
-    if _moves(d.l):
+    if _nonzero(d.l):
         shift -= ratio[1] * d.l
-    pull, shift = jnp.where(sound, column * pull, 0.0), jnp.where(sound, row * shift, 0.0)
+    pull, shift = jnp.where(solved, column * pull, 0.0), jnp.where(solved, row * shift, 0.0)
     dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
-    for _ in range(2):  # as in `active_set`: later passes take off what cap and rho did
-        force = jnp.where(firm, dz, 0.0) + both * matvec(normal.A, dv) + shift
+    for _ in range(2):  # as in `active_set`, the second pass removes the bias of cap and rho
+        force = jnp.where(capped, dz, 0.0) + weight * matvec(normal.A, dv) + shift
         step = -cho_solve((factor, True), normal.P @ dv + pull + rmatvec(normal.A, force))
-        dv, dz = dv + step, force + both * matvec(normal.A, step)
+        dv, dz = dv + step, force + weight * matvec(normal.A, step)
     zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)
     return solution, Solution(column * dv, row * dz, zero, zero, zero, none, none)

@@ -1,13 +1,13 @@
-"""A guess at the active set of a small QP, in one GPU kernel; `active_set` proves or mends it.
+"""A guess of the active set of a small QP in one GPU kernel; `active_set` confirms or corrects it.
 
-A batched factorisation per try keeps a GPU waiting: the slowest problem of the batch decides how
-often all are factorised. Here a problem is one program with registers of its own and stops alone.
-It inverts P once (by sweeps) and then changes a row at a time, each a rank-one change of the
-inverse of P + c A'A over the active rows: the worst row in and the worst out, and, should that
-cycle, the first wrong row alone (Murty's least-index rule, which ends because soft rows make the
-complementarity problem one of a positive definite matrix).
+A batched factorisation per iteration keeps a GPU waiting: the slowest problem of the batch
+determines how often all are factorised. Here each problem is one program with its own registers and
+stops independently. It inverts P once (by sweeps) and then applies rank-one updates to the inverse
+of P + c A'A over the active rows: the worst row enters and the worst leaves, and in case of a cycle
+only the first wrong row changes (Murty's least-index rule, which terminates because soft rows make
+the matrix of the complementarity problem positive definite).
 
-Rows are soft here (c = `stiffness`) and the inverse drifts, so nothing of this is believed.
+Rows are soft here (c = `stiffness`) and the inverse drifts, so the result is only a guess.
 """
 
 from collections.abc import Callable
@@ -23,36 +23,36 @@ from jaxtyping import Float, Int
 
 from hector_jax.core.arrays import Array
 
-VARIABLES, ROWS = 64, 128  # of the kernel's tiles: what the registers of a program hold
-_LIMIT = 120  # row changes; the least-index rule from half of it on
+VARIABLES, ROWS = 64, 128  # size of the kernel's tiles, limited by the registers of a program
+_LIMIT = 120  # row changes; the second half uses the least-index rule
 
 
 class Guess(NamedTuple):
-    """Where the pivoting ended."""
+    """Result of the pivoting."""
 
     x: Float[Array, " n"]
     y: Float[Array, " m"]  # positive where the upper bound presses
     side: Int[Array, " m"]  # 1 active at the upper bound, -1 at the lower, 0 inactive
-    settled: Int[Array, ""]  # 1 where no row is wrong any more
+    settled: Int[Array, ""]  # 1 if no row is wrong
 
 
 class _Softness(NamedTuple):
-    """What the dtype allows, for unit diagonal of P and rows of length one."""
+    """Parameters for a dtype, for unit diagonal of P and rows of length one."""
 
     stiffness: float  # c of an active row
     proximal: float  # added to the diagonal of P
-    tolerance: float  # a violation or a multiplier this small is none
+    tolerance: float  # smaller violations and multipliers count as zero
     passes: int  # of the method of multipliers after a change
 
 
 def _softness(dtype: jnp.dtype) -> _Softness:
     if jnp.finfo(dtype).bits == 64:
         return _Softness(1e4, 1e-8, 1e-10, 1)
-    return _Softness(30.0, 1e-3, 3e-6, 3)  # a row let go divides by 1 / c: 32 bits bear little
+    return _Softness(30.0, 1e-3, 3e-6, 3)  # a leaving row divides by 1 / c: 32 bits need a small c
 
 
 def fits(variables: int, rows: int) -> bool:
-    """Whether a QP of this size can be guessed here."""
+    """Return whether the kernel accepts a QP of this size."""
     return variables <= VARIABLES and rows <= ROWS
 
 
@@ -67,18 +67,18 @@ def guess(
     """Guess the active set of a normalised QP, for which `fits` holds; `vmap` is the GPU's grid.
 
     Args:
-        P, q, A, lower, upper: the QP, P with unit diagonal, rows of A of length one; a bound that
-            is not there is infinite.
-        interpret: run the kernel's operations one by one, anywhere; for tests.
+        P, q, A, lower, upper: the QP, P with unit diagonal, rows of A of length one; a missing
+            bound is infinite.
+        interpret: interpret the kernel's operations on any device; for tests.
     """
     n, m, dtype = len(q), len(lower), q.dtype
-    more, spare = VARIABLES - n, ROWS - m
+    columns, rows = (0, VARIABLES - n), (0, ROWS - m)  # padding
     tiles = (
-        jnp.pad(P, ((0, more), (0, more))),
-        jnp.pad(q, (0, more)),
-        jnp.pad(A, ((0, spare), (0, more))),
-        jnp.pad(lower, (0, spare), constant_values=-jnp.inf),
-        jnp.pad(upper, (0, spare), constant_values=jnp.inf),
+        jnp.pad(P, (columns, columns)),
+        jnp.pad(q, columns),
+        jnp.pad(A, (rows, columns)),
+        jnp.pad(lower, rows, constant_values=-jnp.inf),
+        jnp.pad(upper, rows, constant_values=jnp.inf),
     )
     shapes = {"x": (VARIABLES,), "y": (ROWS,), "side": (ROWS,), "settled": ()}
     kinds = {"x": dtype, "y": dtype, "side": jnp.int32, "settled": jnp.int32}
@@ -98,14 +98,14 @@ def guess(
 
 
 class _Problem(NamedTuple):
-    """The QP in a program's registers, and what its dtype allows."""
+    """The QP in a program's registers, and parameters of its dtype."""
 
     P: Array
     q: Array
     A: Array
     lower: Array
     upper: Array
-    number: Array  # of each row
+    number: Array  # index of each row
     c: np.ndarray
     tolerance: np.ndarray
     one: np.ndarray
@@ -118,7 +118,7 @@ def _times(M: Array, v: Array) -> Array:
 
 
 def _inverse(n: int, P: Array, proximal: np.ndarray, one: np.ndarray, zero: np.ndarray) -> Array:
-    """Inverse of P with `proximal` on its diagonal, by sweeps."""
+    """Invert P with `proximal` added to its diagonal, by sweeps."""
     index = lax.broadcasted_iota(jnp.int32, (VARIABLES,), 0)
     across = lax.broadcasted_iota(jnp.int32, P.shape, 0)
     down = lax.broadcasted_iota(jnp.int32, P.shape, 1)
@@ -127,7 +127,7 @@ def _inverse(n: int, P: Array, proximal: np.ndarray, one: np.ndarray, zero: np.n
     def sweep(k: Array, M: Array) -> Array:
         column = jnp.sum(jnp.where(down == k, M, zero), axis=1)
         pivot = jnp.sum(jnp.where(index == k, column, zero))
-        # with this entry one rank-one change sweeps row and column too, and leaves 2 too many at k
+        # with this entry one rank-one update also sweeps row and column k, and adds 2 at (k, k)
         column = jnp.where(index == k, pivot - one, column)
         return M - (column * (one / pivot))[:, None] * column[None, :]
 
@@ -136,11 +136,11 @@ def _inverse(n: int, P: Array, proximal: np.ndarray, one: np.ndarray, zero: np.n
 
 
 def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tuple:
-    """Solve with the active rows, then take up the worst row and let the worst go."""
+    """Solve with the active rows, then let the worst row enter and the worst row leave."""
     c, one, zero, number = qp.c, qp.one, qp.zero, qp.number
 
-    def change(M: Array, row: Array, weight: Array) -> Array:
-        """The inverse with a weight on one more row."""
+    def update(M: Array, row: Array, weight: Array) -> Array:
+        """Update the inverse for a weight on one more row."""
         a = read_row(row)
         v = _times(M, a)
         return M - (weight / (one + weight * jnp.sum(a * v))) * v[:, None] * v[None, :]
@@ -151,19 +151,19 @@ def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tu
     for _ in range(qp.passes):
         y = jnp.where(active, y + c * (rows - bound), zero)
         dx = -_times(M, _times(qp.P, x) + qp.q + jnp.sum(qp.A * y[:, None], axis=0))
-        moved = _times(qp.A, dx)
-        x, rows, y = x + dx, rows + moved, jnp.where(active, y + c * moved, zero)
+        d_rows = _times(qp.A, dx)
+        x, rows, y = x + dx, rows + d_rows, jnp.where(active, y + c * d_rows, zero)
     over, under = rows - qp.upper, qp.lower - rows
-    leaves = jnp.where(active, -one, jnp.maximum(over, under))
-    pulls = jnp.where(active, jnp.where(side > 0, -y, y), -one)
-    wrong = jnp.maximum(leaves, pulls) > qp.tolerance
+    outside = jnp.where(active, -one, jnp.maximum(over, under))
+    negative = jnp.where(active, jnp.where(side > 0, -y, y), -one)
+    wrong = jnp.maximum(outside, negative) > qp.tolerance
     first = jnp.min(jnp.where(wrong, number, ROWS))
-    chosen = wrong & ((count < _LIMIT // 2) | (number == first))
-    leaves, pulls = jnp.where(chosen, leaves, -one), jnp.where(chosen, pulls, -one)
-    enter, leave = jnp.max(leaves) > qp.tolerance, jnp.max(pulls) > qp.tolerance
-    entering, leaving = lax.argmax(leaves, 0, jnp.int32), lax.argmax(pulls, 0, jnp.int32)
-    M = change(M, entering, jnp.where(enter, c, zero))
-    M = change(M, leaving, jnp.where(leave, -c, zero))
+    allowed = wrong & ((count < _LIMIT // 2) | (number == first))
+    outside, negative = jnp.where(allowed, outside, -one), jnp.where(allowed, negative, -one)
+    enter, leave = jnp.max(outside) > qp.tolerance, jnp.max(negative) > qp.tolerance
+    entering, leaving = lax.argmax(outside, 0, jnp.int32), lax.argmax(negative, 0, jnp.int32)
+    M = update(M, entering, jnp.where(enter, c, zero))
+    M = update(M, leaving, jnp.where(leave, -c, zero))
     side = jnp.where(enter & (number == entering), jnp.where(over > under, 1, -1), side)
     side = jnp.where(leave & (number == leaving), 0, side)
     return x, rows, y, side, M, count + 1, enter | leave
@@ -178,13 +178,12 @@ def _kernel(n: int, soft: _Softness, P_ref, q_ref, A_ref, lower_ref, upper_ref, 
     number = lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
     qp = _Problem(P, q, A, lower, upper, number, c, tolerance, one, zero, soft.passes)
     x = -_times(inverse, q)
-    none = jnp.zeros((ROWS,), P.dtype)
-    nowhere = jnp.zeros((ROWS,), jnp.int32)
-    state = (x, _times(A, x), none, nowhere, inverse, jnp.int32(0), jnp.asarray(True))
-    x, _, y, side, _, _, going = lax.while_loop(
+    y, side = jnp.zeros((ROWS,), P.dtype), jnp.zeros((ROWS,), jnp.int32)
+    state = (x, _times(A, x), y, side, inverse, jnp.int32(0), jnp.asarray(True))
+    x, _, y, side, _, _, running = lax.while_loop(
         lambda state: state[-1] & (state[-2] < _LIMIT),
         partial(_pivot, qp, lambda row: A_ref[row, :]),
         state,
     )
     out.x[...], out.y[...], out.side[...] = x, y, side.astype(jnp.int32)
-    out.settled[...] = jnp.where(going, 0, 1).astype(jnp.int32)
+    out.settled[...] = jnp.where(running, 0, 1).astype(jnp.int32)

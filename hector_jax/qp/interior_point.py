@@ -1,9 +1,9 @@
 """Mehrotra's predictor and corrector, proximal in x and in the multipliers.
 
-It always gets near a solution where there is one, and names the active set for a last correction;
-where there is none, its steps prove it. The matrix is P + rho I + A'WA, W = 1 / (slack / multiplier
-+ delta), so that equality rows (slack zero), redundant rows and singular P need no case of their
-own.
+It always approaches an existing solution and yields the active set for a last correction; without
+a solution its steps prove that there is none. The matrix is P + rho I + A'WA, W = 1 / (slack /
+multiplier + delta), so that equality rows (slack zero), redundant rows and singular P need no
+special cases.
 """
 
 from functools import partial
@@ -21,25 +21,25 @@ from hector_jax.qp.problem import SIGN, Approach, Normal, Point, Tolerances
 
 
 class _Fixed(NamedTuple):
-    """What all iterations share."""
+    """Data of all iterations."""
 
     tolerances: Tolerances
     qp: Normal
-    least: Array  # (2,) proximal parameters
+    least: Array  # (2,) smallest proximal parameters
     sign: Array  # (2, 1)
     free: Array  # (2, m) bool: sides whose multiplier has no sign
-    held: Array  # (2, m) bool: sides that are there
-    sides: Array  # how many have a sign
+    present: Array  # (2, m) bool: sides with a finite bound
+    sides: Array  # number of sides whose multiplier has a sign, at least 1
     eye: Array
 
 
 class _Loop(NamedTuple):
     point: Point
     before: Point
-    slack: Array  # (2, m), positive; 1 on sides that are not there
+    slack: Array  # (2, m), positive; 1 on missing sides
     proximal: Array  # (2,) rho and delta
     iterations: Array
-    going: Array
+    running: Array
 
 
 class _Newton(NamedTuple):
@@ -54,47 +54,47 @@ class _Newton(NamedTuple):
 
 
 def _direction(fixed: _Fixed, newton: _Newton, z: Array, product: Array) -> tuple:
-    """Newton step (dx, dz, dslack) that takes slack * z to slack * z + product."""
+    """Return the Newton step (dx, dz, dslack) from slack * z to slack * z + product."""
     qp, sign, weight = fixed.qp, fixed.sign, newton.weight
 
-    def closer(_: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+    def refine(_: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         dx, dz = step
-        pull = newton.dual + qp.P @ dx + rmatvec(qp.A, multiplier(dz))
-        more = -cho_solve((newton.cholesky, True), pull)
-        return dx + more, dz + weight * sign * matvec(qp.A, more)
+        residual = newton.dual + qp.P @ dx + rmatvec(qp.A, multiplier(dz))
+        correction = -cho_solve((newton.cholesky, True), residual)
+        return dx + correction, dz + weight * sign * matvec(qp.A, correction)
 
-    # later passes take off what rounding and rho did
+    # later passes remove the error of rounding and rho
     begin = jnp.zeros_like(qp.q), newton.inverse * product - weight * newton.primal
-    dx, dz = lax.fori_loop(0, 3, closer, begin)
+    dx, dz = lax.fori_loop(0, 3, refine, begin)
     along = sign * matvec(qp.A, dx)
     return dx, dz, jnp.where(qp.side, newton.primal - along + newton.delta * dz, 0.0)
 
 
 def _longest(qp: Normal, z: Array, slack: Array, dz: Array, dslack: Array) -> Array:
-    """Step at which the first slack or multiplier reaches zero."""
+    """Return the step length at which the first slack or multiplier reaches zero."""
     rates = jnp.maximum(-dslack / slack, -dz / jnp.where(qp.side, z, 1.0))
     fastest = jnp.max(jnp.where(qp.side, rates, 0.0), initial=0.0)
     return 1.0 / jnp.maximum(fastest, jnp.finfo(z.dtype).tiny)
 
 
 def _newton(fixed: _Fixed, state: _Loop) -> tuple[_Newton, Array]:
-    """The factorised system at a point, and the mean product of slack and multiplier."""
-    tolerances, qp, _, sign, free, held, count, eye = fixed
+    """Return the factorised system at a point, and the mean product of slack and multiplier."""
+    tolerances, qp, _, sign, free, present, count, eye = fixed
     (x, z), slack = state.point, state.slack
     dual = qp.P @ x + qp.q + rmatvec(qp.A, multiplier(z))
     room = sign * (qp.bound - matvec(qp.A, x))
-    primal = jnp.where(held, room - jnp.where(free, 0.0, slack), 0.0)
+    primal = jnp.where(present, room - jnp.where(free, 0.0, slack), 0.0)
     mu = jnp.sum(jnp.where(qp.side, slack * z, 0.0)) / count
     rho, delta = state.proximal
     softness = jnp.where(free, 0.1 / tolerances.cap, slack + delta * z)
-    inverse = jnp.where(held, 1.0 / softness, 0.0)
+    inverse = jnp.where(present, 1.0 / softness, 0.0)
     weight = inverse * jnp.where(free, 1.0, z)
     factor = cholesky(plus_gram(qp.P + rho * eye, qp.A, weight[0] + weight[1]))
     return _Newton(delta, dual, primal, inverse, weight, factor), mu
 
 
 def _advance(fixed: _Fixed, limit: int, state: _Loop) -> _Loop:
-    """One iteration: predict, centre, correct."""
+    """Run one iteration: predictor, centring, corrector."""
     tolerances, qp, least, *_ = fixed
     (x, z), slack, dtype = state.point, state.slack, qp.q.dtype
     newton, mu = _newton(fixed, state)
@@ -110,40 +110,40 @@ def _advance(fixed: _Fixed, limit: int, state: _Loop) -> _Loop:
     dx, dz, dslack = direction(jnp.where(qp.side, product + centre - dslack * dz, 0.0))
     step = jnp.minimum(0.995 * longest(dz, dslack), 1.0)
     new = (Point(x + step * dx, z + step * dz), slack + step * dslack)
-    # a factorisation that fails is tried again further from singular
-    fine = jnp.isfinite(jnp.sum(new[0].x) + jnp.sum(new[0].z) + jnp.sum(new[1]))
-    point, slack = where(fine, new, (state.point, state.slack))
-    factors = jnp.where(fine, 0.1, jnp.array([10.0, 100.0], dtype))
+    # a failed factorisation is repeated with larger proximal parameters
+    finite = jnp.isfinite(jnp.sum(new[0].x) + jnp.sum(new[0].z) + jnp.sum(new[1]))
+    point, slack = where(finite, new, (state.point, state.slack))
+    factors = jnp.where(finite, 0.1, jnp.array([10.0, 100.0], dtype))
     proximal = jnp.maximum(factors * state.proximal, least)
-    done = jnp.max(qp.residuals(point)) <= tolerances.target
+    converged = jnp.max(qp.residuals(point)) <= tolerances.target
     iterations = state.iterations + 1
-    left, share = rays(tolerances, qp, state.point, point)
-    going = ~done & ~jnp.any(left < share) & (proximal[0] < 1.0)
-    going &= iterations < limit
-    return _Loop(point, state.point, slack, proximal, iterations, going)
+    residual, threshold = rays(tolerances, qp, state.point, point)
+    running = ~converged & ~jnp.any(residual < threshold) & (proximal[0] < 1.0)
+    running &= iterations < limit
+    return _Loop(point, state.point, slack, proximal, iterations, running)
 
 
 def interior_point(
     tolerances: Tolerances, qp: Normal, enabled: Array, *, max_iterations: int
 ) -> tuple[Point, Array, Array, Array]:
-    """Solve from a cold start; last finite point, slacks, certificates, iterations.
+    """Solve from a cold start. Returns the last finite point, slacks, certificates and iterations.
 
-    Nothing is computed where `enabled` is false.
+    If `enabled` is false nothing is computed.
     """
     dtype = qp.q.dtype
     least = jnp.array([10.0 * tolerances.proximal, 50.0 * jnp.finfo(dtype).eps], dtype)
     sign = jnp.asarray(SIGN, dtype)
     free = jnp.zeros_like(qp.side).at[0].set(qp.equality)
-    held = qp.side | free
+    present = qp.side | free
     count = jnp.maximum(jnp.sum(qp.side), 1)
     eye = jnp.eye(len(qp.q), dtype=dtype)
-    fixed = _Fixed(tolerances, qp, least, sign, free, held, count, eye)
-    # every product of slack and multiplier the same, however far the bound
+    fixed = _Fixed(tolerances, qp, least, sign, free, present, count, eye)
+    # all products of slack and multiplier are equal, however far the bound
     room = jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0)
     begin = Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0))
     start = _Loop(begin, begin, room, least, jnp.zeros((), jnp.int32), enabled)
     advance = partial(_advance, fixed, max_iterations)
-    end = lax.while_loop(lambda state: state.going, advance, start)
+    end = lax.while_loop(lambda state: state.running, advance, start)
     proofs = certificates(tolerances, qp, end.before, end.point)
     return end.point, end.slack, proofs, end.iterations
 
@@ -151,19 +151,20 @@ def interior_point(
 def approach(
     tolerances: Tolerances, qp: Normal, enabled: Array, *, max_iterations: int
 ) -> Approach:
-    """The interior point, again in the sizes of what it found where it did not get near.
+    """Run the interior point method, and once more in the scales of its result if it stays far.
 
-    One size was taken for x and slope from q and the bounds. Where rows hold x far from where q
-    would have it they differ, and what regularises one is too coarse for the other.
+    `normalise` scales x and slope by one size from q and the bounds. If rows hold x far from the
+    unconstrained minimiser the sizes differ, and the regularisation of one is too coarse for the
+    other.
     """
 
     def attempt(state: tuple) -> tuple:
         best, (size, slope), _ = state
-        sized = qp._replace(
+        scaled = qp._replace(
             P=size / slope * qp.P, q=qp.q / slope, bound=qp.bound / size, reach=qp.reach / size
         )
-        point, slack, certified, more = interior_point(
-            tolerances, sized, enabled, max_iterations=max_iterations
+        point, slack, certified, iterations = interior_point(
+            tolerances, scaled, enabled, max_iterations=max_iterations
         )
         point = Point(size * point.x, slope * point.z)
         residuals = qp.residuals(point)
@@ -174,15 +175,15 @@ def approach(
         sizes = jnp.stack([largest(point.x), jnp.maximum(largest(qp.P @ point.x), largest(qp.q))])
         far = first & (jnp.max(residuals) > tolerances.target)
         again = far & ~jnp.any(certified) & jnp.all(sizes > 0.0)
-        best = Approach(point, slack, residuals, certified, best.iterations + more)
+        best = Approach(point, slack, residuals, certified, best.iterations + iterations)
         return best, jnp.where(again, sizes, 1.0), again
 
-    nowhere = Approach(
+    initial = Approach(
         Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound)),
         jnp.ones_like(qp.bound),
         jnp.full(3, jnp.inf, qp.q.dtype),
         jnp.zeros(2, bool),
         jnp.zeros((), jnp.int32),
     )
-    start = nowhere, jnp.ones(2, qp.q.dtype), enabled
+    start = initial, jnp.ones(2, qp.q.dtype), enabled
     return lax.while_loop(lambda state: state[-1], attempt, start)[0]

@@ -1,4 +1,4 @@
-"""BoxOSQP of jaxopt, as a second way to get near a solution; its derivative is not used."""
+"""BoxOSQP of jaxopt, as a second method to approach a solution; its derivative is not used."""
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +12,14 @@ from hector_jax.qp.problem import SIGN, Approach, Normal, Point, Tolerances
 def box_osqp(
     tolerances: Tolerances, qp: Normal, enabled: Array, *, max_iterations: int
 ) -> Approach:
-    """Run BoxOSQP, a hundred iterations for each of `max_iterations`, as they are cheaper.
+    """Run BoxOSQP with a hundred times `max_iterations`, because its iterations are cheaper.
 
-    It runs for every problem, whether `enabled` or not.
+    It runs for every problem, even if `enabled` is false.
     """
     from jaxopt import BoxOSQP
 
-    held = qp.side | qp.equality
-    bound = jnp.where(held, qp.bound, jnp.asarray(SIGN, qp.q.dtype) * jnp.inf)
+    present = qp.side | qp.equality
+    bound = jnp.where(present, qp.bound, jnp.asarray(SIGN, qp.q.dtype) * jnp.inf)
     solver = BoxOSQP(
         eq_qp_solve="lu",
         tol=max(1e-5, tolerances.target),
@@ -33,7 +33,7 @@ def box_osqp(
     x = jnp.where(finite, params.primal[0], 0.0)
     y = jnp.where(finite, params.dual_eq, 0.0)
     z = jnp.maximum(jnp.asarray(SIGN, y.dtype) * y, 0.0)
-    z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(held, z, 0.0))
+    z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(present, z, 0.0))
     point = Point(x, z)
     certified = certificates(tolerances, qp, jax.tree.map(jnp.zeros_like, point), point)
     slack = jnp.maximum(-qp.violation(x), 0.0)

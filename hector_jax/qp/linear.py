@@ -1,4 +1,4 @@
-"""Products with rows that may be block-diagonal by step, and what else the methods share."""
+"""Linear algebra of all methods; A is dense (m, n) or block-diagonal by step (N, r, b)."""
 
 import jax.numpy as jnp
 from jax import lax
@@ -8,28 +8,28 @@ from hector_jax.core.arrays import Array
 
 
 def matvec(A: Array, x: Array) -> Array:
-    """A x."""
+    """Return A x."""
     if A.ndim == 2:
         return A @ x
     return jnp.einsum("krb,kb->kr", A, x.reshape(A.shape[0], A.shape[2])).ravel()
 
 
 def rmatvec(A: Array, y: Array) -> Array:
-    """A'y."""
+    """Return A'y."""
     if A.ndim == 2:
         return y @ A
     return jnp.einsum("krb,kr->kb", A, y.reshape(A.shape[:2])).ravel()
 
 
 def block_diagonal(blocks: Float[Array, "N r b"]) -> Float[Array, "m n"]:
-    """Matrix (N r, N b) with these blocks on its diagonal."""
+    """Return the matrix (N r, N b) with these blocks on its diagonal."""
     N, r, b = blocks.shape
     wide = blocks[:, :, None, :] * jnp.eye(N, dtype=blocks.dtype)[:, None, :, None]
     return wide.reshape(N * r, N * b)
 
 
 def plus_gram(P: Array, A: Array, w: Array) -> Array:
-    """P + A' diag(w) A."""
+    """Return P + A' diag(w) A."""
     if A.ndim == 2:
         return P + (w[:, None] * A).T @ A
     weighted = w.reshape(*A.shape[:2], 1) * A
@@ -37,15 +37,15 @@ def plus_gram(P: Array, A: Array, w: Array) -> Array:
 
 
 def cholesky(matrix: Array) -> Array:
-    """Lower factor of a symmetric matrix; NaN where it is not positive definite."""
+    """Return the lower Cholesky factor of a symmetric matrix; NaN if not positive definite."""
     return lax.linalg.cholesky(jnp.asarray(matrix), symmetrize_input=False)
 
 
 def largest(v: Array) -> Array:
-    """Largest magnitude; zero of nothing."""
+    """Return the largest magnitude; zero for an empty array."""
     return jnp.max(jnp.abs(v), initial=0.0)
 
 
 def multiplier(z: Array) -> Array:
-    """Vector y (m,) of the multipliers of the sides (2, m)."""
+    """Return the multipliers y (m,) of the rows from those of the sides (2, m)."""
     return z[0] - z[1]

@@ -1,20 +1,20 @@
-"""How a QP is solved, and what the answer is worth.
+"""The solution of a QP, and its status.
 
-First the active set is guessed and corrected by signs (`active_set`). Where it does not settle,
-another method gets near (`interior_point`), and its active set is corrected in the same way. A
-`Solver` is the pair of both: where to guess, how to get near.
+First the active set is guessed and corrected by signs (`active_set`). If it does not converge,
+another method approaches a solution (`interior_point`), and its active set is corrected in the same
+way. A `Solver` is the pair of both: the guess and the approach.
 
-Verdicts. All are comparisons in the normalised problem; t is the tolerance.
+Status. All conditions are comparisons in the normalised problem; t is the tolerance.
 
-- SOLVED: the three residuals are at most t, and the minimiser is held in every direction: P less
-  1e-8 of the unit matrix is positive definite, or it is with the rows added to P that are
-  equalities or press with a force of more than t. Where it is not held: NOT_UNIQUE.
+- SOLVED: the three residuals are at most t, and the minimiser is unique: P - 1e-8 I is positive
+  definite, alone or after adding to P the rows that are equalities or have a force above t. If the
+  minimiser is not unique: NOT_UNIQUE.
 - INFEASIBLE: a step of the multipliers proves that rows contradict each other, by more than t and
   by more than its own rounding. Or a row of zeros, or a row with l > u, is violated by more than t
-  whatever x is.
-- UNBOUNDED: P is not positive definite, and a step of x proves a fall that neither P nor a row
-  ends, likewise by more than t and rounding.
-- BAD_DATA: a number is not finite, or P plus 1e-9 of the unit matrix is not positive definite.
+  for every x.
+- UNBOUNDED: P is not positive definite, and a step of x proves a descent that neither P nor a row
+  limits, by more than t and by more than its own rounding.
+- BAD_DATA: a number is not finite, or P + 1e-9 I is not positive definite.
 
 (In 32 bits: 1e-5 and 1e-6 for 1e-8 and 1e-9.)
 """
@@ -22,7 +22,7 @@ Verdicts. All are comparisons in the normalised problem; t is the tolerance.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ from hector_jax.core.part import Part, choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.tree import where
 from hector_jax.qp.active_set import active_set, first_guess
-from hector_jax.qp.certificates import is_held, only_if, without_rows
+from hector_jax.qp.certificates import is_unique, only_if, unconstrained_minimiser
 from hector_jax.qp.interior_point import approach
 from hector_jax.qp.jaxopt_solver import box_osqp
 from hector_jax.qp.linear import largest, multiplier
@@ -53,13 +53,13 @@ from hector_jax.qp.problem import (
 
 
 class Solver(Part):
-    """A way to a solution; last correction, verdict and derivative are the same for all.
+    """A method to approach a solution; last correction, status and derivative are common to all.
 
     Attributes:
-        approach: gets near a solution of the normalised problem; called as `approach(tolerances,
-            qp, enabled, max_iterations=...)`, and its result counts where `enabled`.
-        guess: point and active sides from the minimiser without rows, tried before `approach`; None
-            begins with the approach.
+        approach: approaches a solution of the normalised problem; called as `approach(tolerances,
+            qp, enabled, max_iterations=...)`; its result is used only if `enabled`.
+        guess: returns point and active sides from the unconstrained minimiser, which are tried
+            before `approach`; None starts with `approach`.
     """
 
     approach: Callable[..., Approach]
@@ -69,19 +69,19 @@ class Solver(Part):
 INTERIOR_POINT = Solver("interior_point", approach=approach, guess=first_guess)
 JAXOPT = Solver("jaxopt", approach=box_osqp, guess=None)
 SOLVERS = (INTERIOR_POINT, JAXOPT)
-"""Those that a file can name."""
+"""Solvers that a file can name."""
 
 
 @dataclass(frozen=True)
 class QpConfig:
-    """How QPs are solved. Numbers left None follow the dtype.
+    """Configuration of the QP solver. Numbers that are None depend on the dtype.
 
     Attributes:
-        solver: a `Solver`, or the name of one of SOLVERS: "interior_point" (active set first,
-            interior point where it does not settle) or "jaxopt" (BoxOSQP instead of both, with our
-            last correction and our derivative).
+        solver: a `Solver`, or a name in SOLVERS: "interior_point" (active set first, interior point
+            if it does not converge) or "jaxopt" (BoxOSQP instead of both, with our last correction
+            and our derivative).
         tolerance: largest residual of a SOLVED problem; 1e-8 in 64 bits, 1e-4 in 32.
-        active_set_tries: before the solver's approach.
+        active_set_tries: largest number of active set iterations before the solver's approach.
         max_iterations: of the approach; BoxOSQP takes a hundred times as many, cheaper ones.
         ratio_cap: largest multiplier-to-slack ratio in a factorised matrix; 1e7 in 64 bits, 1e4
             in 32.
@@ -96,19 +96,15 @@ class QpConfig:
     def __post_init__(self) -> None:
         rules = {"tolerance": POSITIVE, "ratio_cap": POSITIVE}
         check(self, **rules, active_set_tries=AT_LEAST_ONE, max_iterations=AT_LEAST_ONE)
-        object.__setattr__(self, "solver", _solver(self))
+        solver = choose_part("QpConfig.solver", self.solver, Solver, SOLVERS)
+        object.__setattr__(self, "solver", solver)
 
     def tolerances(self, dtype: jnp.dtype) -> Tolerances:
-        """What this config and the dtype allow."""
-        usual = BITS_64 if jnp.finfo(dtype).bits == 64 else BITS_32
-        tolerance = self.tolerance or usual.residual
-        return usual._replace(
-            residual=tolerance, target=min(usual.target, tolerance), cap=self.ratio_cap or usual.cap
-        )
-
-
-def _solver(config: QpConfig) -> Solver:
-    return choose_part("QpConfig.solver", config.solver, Solver, SOLVERS)
+        """Return the tolerances of this config for a dtype."""
+        default = BITS_64 if jnp.finfo(dtype).bits == 64 else BITS_32
+        residual = self.tolerance or default.residual
+        target, cap = min(default.target, residual), self.ratio_cap or default.cap
+        return default._replace(residual=residual, target=target, cap=cap)
 
 
 class _Best(NamedTuple):
@@ -116,41 +112,40 @@ class _Best(NamedTuple):
     residuals: Array
     certified: Array  # (2,) bool: infeasible, unbounded
     iterations: Array
-    approached: Array  # whether the next round begins with an approach
-    going: Array
+    approached: Array  # the next round starts with an approach
+    running: Array
 
 
 def _solve_rounds(
     config: QpConfig, tolerances: Tolerances, qp: Normal, unconstrained: Point, enabled: Array
 ) -> _Best:
-    """Best point: by the active set from a guess, else from where the approach gets near.
+    """Return the best point: by the active set from a guess, else from the approach.
 
     Both rounds are one loop, so that the active set is compiled once.
     """
-    solver = _solver(config)
+    solver = cast(Solver, config.solver)
     if solver.guess is None:
         start, guess = unconstrained, jnp.zeros_like(qp.side)
     else:
         start, guess = solver.guess(qp, unconstrained)
 
     def attempt(state: _Best) -> _Best:
-        approaches = state.going & state.approached
+        approaches = state.running & state.approached
         near = solver.approach(tolerances, qp, approaches, max_iterations=config.max_iterations)
-        # slacks and multipliers have sizes of their own: far apart where the rows, not P, hold x
-        pushes = near.point.z * qp.reach > near.slack * largest(near.point.z)
-        begin, active = where(state.approached, (near.point, pushes), (start, guess))
+        # compare relative sizes: slacks and multipliers differ widely if the rows, not P, hold x
+        pressing = near.point.z * qp.reach > near.slack * largest(near.point.z)
+        begin, active = where(state.approached, (near.point, pressing), (start, guess))
         limit = jnp.where(state.approached, config.max_iterations, config.active_set_tries)
-        hopeful = state.going & ~jnp.any(near.certified)
-        exact, exact_residuals, tries = active_set(
-            tolerances, qp, begin, active=active, enabled=hopeful, limit=limit
+        solvable = state.running & ~jnp.any(near.certified)
+        exact, exact_residuals, iterations = active_set(
+            tolerances, qp, begin, active=active, enabled=solvable, limit=limit
         )
-        point, residuals = state.point, state.residuals
-        for other, its in ((near.point, near.residuals), (exact, exact_residuals)):
-            better = jnp.max(its) < jnp.max(residuals)
-            point, residuals = where(better, (other, its), (point, residuals))
-        steps = state.iterations + near.iterations + tries
-        going = ~state.approached & (jnp.max(residuals) > tolerances.target)
-        return _Best(point, residuals, near.certified, steps, jnp.ones((), bool), going)
+        best = state.point, state.residuals
+        for candidate in ((near.point, near.residuals), (exact, exact_residuals)):
+            best = where(jnp.max(candidate[1]) < jnp.max(best[1]), candidate, best)
+        iterations = state.iterations + near.iterations + iterations
+        running = ~state.approached & (jnp.max(best[1]) > tolerances.target)
+        return _Best(*best, near.certified, iterations, jnp.ones((), bool), running)
 
     first = _Best(
         unconstrained,
@@ -160,38 +155,34 @@ def _solve_rounds(
         jnp.asarray(solver.guess is None),
         enabled,
     )
-    return lax.while_loop(lambda state: state.going, attempt, first)
-
-
-def _or_trivial(valid: Array, qp: QP) -> QP:
-    """The QP, or a trivial one in its place, so that nothing that follows meets a NaN."""
-    trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
-    return where(valid, qp, trivial)
+    return lax.while_loop(lambda state: state.running, attempt, first)
 
 
 @partial(jax.jit, static_argnums=0)
 def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
-    """Solution, the ratios W (2, m) of its derivative, and the normalised problem."""
+    """Solve a QP. Returns the solution, W (2, m) of its derivative and the normalised problem."""
     tolerances = config.tolerances(qp.q.dtype)
     no_bound = jnp.isnan(qp.l) | jnp.isnan(qp.u) | (qp.l >= INFINITE) | (qp.u <= -INFINITE)
     numbers = jnp.maximum(jnp.maximum(largest(qp.P), largest(qp.q)), largest(qp.A))
     valid = jnp.isfinite(numbers) & ~jnp.any(no_bound)
-    normal = normalise(tolerances, _or_trivial(valid, qp))
-    free, definite, convex = without_rows(tolerances, normal)
+    # a trivial QP replaces an invalid one, so that no NaN reaches the solver
+    trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
+    normal = normalise(tolerances, where(valid, qp, trivial))
+    x, definite, convex = unconstrained_minimiser(tolerances, normal)
     normal = normal._replace(flat=~definite)
     valid &= convex
-    unconstrained = Point(free, jnp.zeros(normal.side.shape, qp.q.dtype))
+    unconstrained = Point(x, jnp.zeros(normal.side.shape, qp.q.dtype))
     best = _solve_rounds(config, tolerances, normal, unconstrained, valid)
-    # far from any solution (infeasible, unbounded) all residuals may be infinite, and so may x
+    # without a solution (infeasible, unbounded) residuals and x may be infinite
     usable = valid & jnp.all(jnp.isfinite(best.residuals))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), best.point)
 
     solved = usable & (jnp.max(best.residuals) <= tolerances.residual)
-    # what no x can meet; an x that solves nothing is no measure of it
+    # the unavoidable violation; an x that is not a solution does not scale it
     sizes = jnp.min(normal.row_sizes(jnp.where(solved, point.x, normal.reach)), axis=0)
     unmet = jnp.max(normal.unmet / sizes, initial=0.0)
-    held = lambda operands: is_held(tolerances, *operands)  # noqa: E731
-    unique = only_if(solved & ~definite, held, definite, (normal, point))
+    test = lambda operands: is_unique(tolerances, *operands)  # noqa: E731
+    unique = only_if(solved & ~definite, test, definite, (normal, point))
     status = jnp.where(best.certified[1], Status.UNBOUNDED, Status.INACCURATE)
     status = jnp.where(best.certified[0], Status.INFEASIBLE, status)
     status = jnp.where(solved, jnp.where(unique, Status.SOLVED, Status.NOT_UNIQUE), status)
@@ -200,15 +191,15 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     primal, dual, gap = jnp.where(valid, best.residuals, jnp.inf)
     x = normal.size * normal.column * point.x
     y = normal.size * normal.row * multiplier(point.z)
-    worst = jnp.maximum(primal, unmet)
-    solution = Solution(x, y, worst, dual, gap, best.iterations, status)
+    primal = jnp.maximum(primal, unmet)
+    solution = Solution(x, y, primal, dual, gap, best.iterations, status)
     return solution, _ratios(tolerances, normal, point), normal
 
 
 def _ratios(tolerances: Tolerances, qp: Normal, point: Point) -> Array:
-    """W (2, m) of the derivative."""
+    """Return W (2, m) of the derivative."""
     slack, kink = jnp.maximum(-qp.violation(point.x), 0.0), tolerances.kink
     ratio = ((point.z + kink) / (slack / qp.row_sizes(point.x) + kink)) ** 2
     ratio = jnp.where(qp.side, jnp.minimum(ratio, tolerances.cap), 0.0)
-    # an equality moves with both of its bounds, half with each
+    # an equality depends on both of its bounds, half on each
     return jnp.where(qp.equality, 0.5 * tolerances.cap, ratio)

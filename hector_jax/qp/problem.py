@@ -1,15 +1,16 @@
-"""The problem that the QP solvers work on: data, one size for all, residuals.
+"""Data, normalisation and residuals of the QPs.
 
-Every QP is first brought to one size (`normalise`): x = kappa D v, D = diag(P)^-1/2, rows of A D of
-length one, kappa the larger of |D q| and the bounds violated at v = 0. Residuals are those of
-(x, y) alone in that form, so that the units of objective, rows and variables do not matter. They do
-where nothing else gives a size: a column without price in P is scaled by its largest entry in A,
-and where q and the violated bounds are zero, kappa is 1.
+Every QP is first normalised (`normalise`): x = kappa D v, D = diag(P)^-1/2, rows of A D of length
+one, kappa the larger of |D q| and the bounds violated at v = 0. Residuals depend only on (x, y) in
+that form, so that the units of objective, rows and variables do not matter. They do matter if
+nothing else gives a scale: a column with zero diagonal in P is scaled by its largest entry in A,
+and if q and the violated bounds are zero, kappa is 1.
 
-A violation is measured by the larger of x and the row's bound. A row of zeros (entries of at most
-1e-15 of the longest row's, 1e-7 in 32 bits) has neither a length nor a bound that counts: it is
-measured by x, its length is the geometric mean of the others, and what is below the rounding of the
-largest bound is none. Within the tolerance crossed bounds are an equality with their middle.
+A violation is relative to the larger of x and the row's bound. A row of zeros (entries of at most
+1e-15 of the longest row's, 1e-7 in 32 bits) has no length and its bound sets no scale: its
+violation is relative to x, its length is the geometric mean of the others, and a violation below
+the rounding of the largest bound is zero. Bounds that cross within the tolerance are an equality
+at their middle.
 """
 
 from enum import IntEnum
@@ -23,22 +24,22 @@ from jaxtyping import Float, Int
 from hector_jax.core.arrays import Array
 from hector_jax.qp.linear import largest, matvec, multiplier, rmatvec
 
-INFINITE = 1e20  # a bound as large as this is none, as most solvers have it
-SIGN = np.array([[1.0], [-1.0]])  # a side holds where sign * (A v - bound) <= 0
-_ROUNDING = 8  # machine epsilons; what is smaller than that beside its like is rounding
-_SMALL = 1e-3  # keeps relative residuals meaningful where the solution is zero
+INFINITE = 1e20  # a bound of at least this size is infinite, as in most solvers
+SIGN = np.array([[1.0], [-1.0]])  # a side is satisfied if sign * (A v - bound) <= 0
+_ROUNDING = 8  # machine epsilons; smaller relative differences are rounding
+_SMALL = 1e-3  # keeps relative residuals meaningful if the solution is zero
 
 
 class Status(IntEnum):
-    """What a solution is worth; `Solution.status` holds these codes.
+    """Status codes of a solution, in `Solution.status`.
 
-    `meaning` says it in words, with a remedy.
+    `meaning` explains the code and gives a remedy.
     """
 
     meaning: str
 
     def __new__(cls, code: int, meaning: str) -> "Status":
-        """A code that carries its meaning."""
+        """Create a code with its meaning."""
         member = int.__new__(cls, code)
         member._value_, member.meaning = code, meaning
         return member
@@ -76,8 +77,8 @@ class QP(NamedTuple):
 
     P is positive semidefinite (its symmetric part counts). A is dense (m, n), or block-diagonal by
     step (N, r, b) with m = N r rows and n = N b: rows r k .. r (k+1) read variables b k .. b (k+1).
-    Infinite bounds (1e20 and more), rows with l = u, redundant rows and rows of zeros are legal,
-    and so are bounds that only rounding has crossed. A batch is vmap.
+    Infinite bounds (1e20 and more), rows with l = u, redundant rows and rows of zeros are valid,
+    and so are bounds that cross by rounding only. Use vmap for a batch.
     """
 
     P: Float[Array, "n n"]
@@ -88,37 +89,37 @@ class QP(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Minimiser and multipliers with their own evidence.
+    """Minimiser and multipliers with residuals and status.
 
     Residuals are those of (x, y) in the normalised problem (module docstring), so they have no unit
-    and compare between problems: `primal_residual` is the largest violation of a row over the
-    larger of x and the row's bound, `dual_residual` the largest entry of P x + q + A'y over the
-    largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (and a
-    little, so that a solution of zeros has residuals too). With BAD_DATA x and y are zero and the
-    residuals infinite.
+    and are comparable between problems: `primal_residual` is the largest violation of a row over
+    the larger of x and the row's bound, `dual_residual` the largest entry of P x + q + A'y over the
+    largest of its terms, `gap` |x'Px + q'x + sum(u y+ - l y-)| over the largest of its terms (plus
+    a small number, so that a zero solution has residuals too). With BAD_DATA x and y are zero and
+    the residuals infinite.
     """
 
     x: Float[Array, " n"]
-    y: Float[Array, " m"]  # positive where the upper bound presses, negative where the lower does
+    y: Float[Array, " m"]  # positive if the upper bound is active, negative if the lower is
     primal_residual: Float[Array, ""]
     dual_residual: Float[Array, ""]
     gap: Float[Array, ""]
     iterations: Int[Any, ""]  # factorisations; with jaxopt its iterations and ours
-    status: Int[Any, ""]  # of Status
+    status: Int[Any, ""]  # a code of Status
 
 
 class Tolerances(NamedTuple):
-    """What the dtype allows, in the normalised problem."""
+    """Tolerances of a dtype, in the normalised problem."""
 
-    residual: float  # of a solved problem, at most
+    residual: float  # largest residual of a solved problem
     target: float  # residuals and complementarity at which the iterations stop
-    proximal: float  # rho of the active set; the interior point starts from ten times it
+    proximal: float  # rho of the active set; the interior point starts from ten times this
     cap: float  # largest W in a factorised matrix
-    rounding: float  # a multiplier or violation this small has no sign
+    rounding: float  # smaller multipliers and violations have no sign
     kink: float  # e of the derivative
     certificate: float  # of infeasible and unbounded problems
-    curvature: float  # a direction with less than this along it is flat
-    zero: float  # a row with no larger entry, beside the longest, is a row of zeros
+    curvature: float  # a direction of less curvature is flat
+    zero: float  # a row whose entries relative to the longest are at most this is a row of zeros
 
 
 BITS_64 = Tolerances(1e-8, 1e-11, 1e-9, 1e7, 1e-12, 1e-11, 1e-7, 1e-8, 1e-15)
@@ -126,83 +127,81 @@ BITS_32 = Tolerances(1e-4, 1e-5, 1e-6, 1e4, 1e-6, 1e-6, 1e-4, 1e-5, 1e-7)
 
 
 class Point(NamedTuple):
-    """Candidate of one problem; side values stand for (u, l) as in `Normal`."""
+    """Candidate solution of a problem; sides are (u, l) as in `Normal`."""
 
     x: Array  # (n,)
-    z: Array  # (2, m) multipliers of the sides; z[0] is the free one of an equality row
+    z: Array  # (2, m) multipliers of the sides; z[0] has no sign for an equality row
 
 
 class Normal(NamedTuple):
-    """A QP in normalised variables, x = size * column * v; side values stand for (u, l)."""
+    """A QP in normalised variables, x = size * column * v; sides are (u, l)."""
 
     P: Array
     q: Array
     A: Array
-    bound: Array  # (2, m), zero where infinite; both sides of an equality the same
+    bound: Array  # (2, m), zero if infinite; both sides of an equality are the same
     side: Array  # (2, m) bool: a finite bound of a row that is neither an equality nor of zeros
     equality: Array  # (m,) bool
-    unmet: Array  # (m,) violation of a row of zeros, or of crossed bounds, whatever x is
+    unmet: Array  # (m,) violation, for every x, of rows of zeros and of crossed bounds
     column: Array  # (n,)
     row: Array  # (m,)
     size: Array
     flat: Array  # () bool: P may have no curvature along some direction
-    reach: Array  # size of A v: largest finite bound, but 1 at most, and where all are zero
+    reach: Array  # size of A v: the largest finite bound, at most 1; 1 if all are zero
 
     def violation(self, x: Array) -> Array:
-        """How far A x lies outside each side (2, m), negative inside; 0 where there is no side."""
+        """Return the violation of each side (2, m) by A x, negative inside; 0 without a side."""
         outside = jnp.asarray(SIGN, x.dtype) * (matvec(self.A, x) - self.bound)
         return jnp.where(self.side | self.equality, outside, 0.0)
 
     def row_sizes(self, x: Array) -> Array:
-        """What a violation of each side is measured by (2, m): x, as rows are unit, and its bound.
+        """Return the scale of a violation of each side (2, m): x, as rows are unit, and its bound.
 
-        Of its own row: one loose bound would otherwise make every violation small.
+        Only the bound of its own row: a loose bound elsewhere would make every violation small.
         """
         return jnp.maximum(jnp.maximum(largest(x), _SMALL * self.reach), jnp.abs(self.bound))
 
     def slope_size(self, point: Point) -> Array:
-        """What a residual of P x + q + A'y is measured by: its largest term, and a little."""
+        """Return the scale of a residual of P x + q + A'y: its largest term plus a small number."""
         pull = rmatvec(self.A, multiplier(point.z))
-        return _SMALL + jnp.maximum(
-            jnp.maximum(largest(self.P @ point.x), largest(pull)), largest(self.q)
-        )
+        terms = jnp.maximum(largest(self.P @ point.x), largest(pull))
+        return _SMALL + jnp.maximum(terms, largest(self.q))
 
     def residuals(self, point: Point) -> Array:
-        """Primal residual, dual residual and gap, as `Solution` defines them; infinite for NaN."""
+        """Return primal residual, dual residual and gap, see `Solution`; infinite for NaN."""
         x, y = point.x, multiplier(point.z)
-        pull, price = rmatvec(self.A, y), self.P @ x
-        prices = jnp.dot(x, price), jnp.dot(self.q, x)
+        pull, slope = rmatvec(self.A, y), self.P @ x
         support = jnp.sum(jnp.where(y > 0, self.bound[0], self.bound[1]) * y)  # u y+ - l y-
-        terms = jnp.stack([*prices, support])
+        terms = jnp.stack([jnp.dot(x, slope), jnp.dot(self.q, x), support])
         primal = jnp.max(self.violation(x) / self.row_sizes(x), initial=0.0)
-        dual = largest(price + self.q + pull) / self.slope_size(point)
+        dual = largest(slope + self.q + pull) / self.slope_size(point)
         gap = jnp.abs(jnp.sum(terms)) / (_SMALL * self.reach + largest(terms))
         residuals = jnp.stack([primal, dual, gap])
         return jnp.where(jnp.isfinite(jnp.sum(residuals)), residuals, jnp.inf)
 
 
 def _scales(tolerances: Tolerances, qp: QP) -> tuple[Array, Array, Array]:
-    """Columns D, rows that make those of A D unit vectors, and which rows are zeros.
+    """Return the column scales D, the scales that make rows of A D unit, and which rows are zeros.
 
-    D = diag(P)^-1/2. A column that P does not price is scaled by its largest entry in A, so that it
-    is as large there as the largest priced one: D keeps one unit when the objective changes its.
+    D = diag(P)^-1/2. A column with zero diagonal in P is scaled by its largest entry in A, to the
+    size of the largest of the other columns: D is then independent of the unit of the objective.
     A row of zeros has no length and gets the geometric mean of the others' largest entries.
     """
     diagonal = jnp.diagonal(qp.P)
     reach = jnp.max(jnp.abs(qp.A), axis=-2, initial=0.0).ravel()  # largest entry of a column
-    priced = diagonal > 1e-3 * jnp.finfo(qp.P.dtype).eps * jnp.max(diagonal)
-    column = lax.rsqrt(jnp.where(priced, diagonal, 1.0))
-    widest = jnp.max(jnp.where(priced, column * reach, 0.0))
-    unpriced = jnp.where(widest > 0, widest, 1.0) / jnp.where(reach > 0, reach, 1.0)
-    column = jnp.where(priced, column, unpriced)
+    curved = diagonal > 1e-3 * jnp.finfo(qp.P.dtype).eps * jnp.max(diagonal)
+    column = lax.rsqrt(jnp.where(curved, diagonal, 1.0))
+    widest = jnp.max(jnp.where(curved, column * reach, 0.0))
+    by_reach = jnp.where(widest > 0, widest, 1.0) / jnp.where(reach > 0, reach, 1.0)
+    column = jnp.where(curved, column, by_reach)
     wide = column if qp.A.ndim == 2 else column.reshape(qp.A.shape[0], 1, qp.A.shape[2])
     rows = qp.A * wide
-    most = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)
-    zeros = most <= tolerances.zero * jnp.max(most, initial=0.0)
-    most = jnp.where(zeros, 1.0, most)  # divided by first, or squares leave the range
-    squares = jnp.sum((rows / most[..., None]) ** 2, axis=-1)
-    mean = jnp.exp(jnp.sum(jnp.log(most)) / jnp.maximum(jnp.sum(~zeros), 1))
-    row = jnp.where(zeros, 1.0 / mean, lax.rsqrt(jnp.where(zeros, 1.0, squares)) / most)
+    peak = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)
+    zeros = peak <= tolerances.zero * jnp.max(peak, initial=0.0)
+    peak = jnp.where(zeros, 1.0, peak)  # divide by it first, otherwise squares overflow
+    squares = jnp.sum((rows / peak[..., None]) ** 2, axis=-1)
+    mean = jnp.exp(jnp.sum(jnp.log(peak)) / jnp.maximum(jnp.sum(~zeros), 1))
+    row = jnp.where(zeros, 1.0 / mean, lax.rsqrt(jnp.where(zeros, 1.0, squares)) / peak)
     return column, row.ravel(), zeros.ravel()
 
 
@@ -214,21 +213,21 @@ def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
 
 
 def normalise(tolerances: Tolerances, qp: QP) -> Normal:
-    """Bring a QP of finite numbers to one size."""
+    """Normalise a QP of finite numbers."""
     column, row, zeros = _scales(tolerances, qp)
     A = _scale_rows_and_columns(qp.A, row, column)
     sign = jnp.asarray(SIGN, A.dtype)
     bound = jnp.stack([qp.u, qp.l])
-    given = jnp.abs(bound) < INFINITE
-    bound = jnp.where(given, row * bound, 0.0)
+    finite = jnp.abs(bound) < INFINITE
+    bound = jnp.where(finite, row * bound, 0.0)
     rounding = _ROUNDING * jnp.finfo(A.dtype).eps
-    # no x mends a row of zeros, nor brings a row nearer to crossed bounds than their middle
-    width = jnp.where(given[0] & given[1], bound[0] - bound[1], jnp.inf)
+    # no x satisfies a violated row of zeros, nor comes nearer to crossed bounds than their middle
+    width = jnp.where(finite[0] & finite[1], bound[0] - bound[1], jnp.inf)
     crossed = width < 0
     unmet = jnp.maximum(-0.5 * width, jnp.where(zeros, jnp.max(-sign * bound, axis=0), 0.0))
-    given &= ~zeros
+    finite &= ~zeros
     bound = jnp.where(crossed, 0.5 * (bound[0] + bound[1]), bound)
-    bound = jnp.where(given, bound, 0.0)
+    bound = jnp.where(finite, bound, 0.0)
     q = column * qp.q
     size = jnp.maximum(largest(q), jnp.max(-sign * bound, initial=0.0))  # violated at v = 0
     size = jnp.where(size > 0, size, 1.0)
@@ -243,7 +242,7 @@ def normalise(tolerances: Tolerances, qp: QP) -> Normal:
         q / size,
         A,
         bound,
-        given & ~equality,
+        finite & ~equality,
         equality,
         jnp.where(unmet / size > rounding * widest, unmet / size, 0.0),
         column,
@@ -255,10 +254,10 @@ def normalise(tolerances: Tolerances, qp: QP) -> Normal:
 
 
 class Approach(NamedTuple):
-    """What a method that gets near a solution hands to the active set."""
+    """Result of a method that approaches a solution, for the active set."""
 
     point: Point
     slack: Array  # (2, m)
-    residuals: Array  # (3,) of the point; infinite where nothing was tried
+    residuals: Array  # (3,) of the point; infinite if no point was computed
     certified: Array  # (2,) bool: infeasible, unbounded
     iterations: Array

@@ -1,4 +1,4 @@
-"""`solve_qp`, the one door to the solvers, and `check_solved`, which looks at their answers."""
+"""The public functions: `solve_qp`, and `check_solved` for its solutions."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +11,13 @@ from hector_jax.qp.problem import QP, Solution, Status
 def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
     """Solve a QP; differentiable in both modes, for jit and vmap, in the dtype of the data.
 
-    Never raises on values and never returns a NaN: `status` says what the answer is worth
-    (`check_solved` looks at it).
+    Never raises on values and never returns a NaN: `status` qualifies the solution (`check_solved`
+    checks it).
 
     Raises:
-        ValueError: shapes that do not fit together.
+        ValueError: the shapes do not match.
 
-    The point of a line, x + y = 1, that is nearest to the origin with x at most 0.2:
+    The point of the line x + y = 1 that is nearest to the origin, with x at most 0.2:
 
     >>> A = jnp.array([[1.0, 1.0], [1.0, 0.0]])
     >>> low, high = jnp.array([1.0, 0.0]), jnp.array([1.0, 0.2])
@@ -28,15 +28,15 @@ def solve_qp(qp: QP, config: QpConfig = QpConfig()) -> Solution:  # noqa: B008
     _check_shapes(qp)
     dtype = jnp.result_type(*qp, jnp.float32)
     P, q, A, lower, upper = (jnp.asarray(v, dtype) for v in qp)
-    # only the symmetric part of P acts; taken here, the derivative is that of the same function
+    # only the symmetric part of P matters; taking it here makes the derivative consistent
     return differentiable_solve(config, QP(0.5 * (P + P.T), q, A, lower, upper))
 
 
 def check_solved(solution: Solution) -> None:
-    """Look at a solution, or a batch of them, outside jit before believing it.
+    """Check a solution, or a batch of solutions, outside jit.
 
     Raises:
-        ValueError: names the first one that is not SOLVED, its status, residuals and remedy.
+        ValueError: names the first solution that is not SOLVED, its status, residuals and remedy.
     """
     status = np.atleast_1d(np.asarray(solution.status))
     bad = np.argwhere(status != Status.SOLVED)
@@ -48,8 +48,8 @@ def check_solved(solution: Solution) -> None:
         for name in ("primal_residual", "dual_residual", "gap")
     )
     count = f"{len(bad)} of {status.size} problems, first at {first}: " if status.size > 1 else ""
-    worth = Status(status[first])
-    raise ValueError(f"QP: {count}{worth.name} ({residuals}). {worth.meaning}")
+    code = Status(status[first])
+    raise ValueError(f"QP: {count}{code.name} ({residuals}). {code.meaning}")
 
 
 def _check_shapes(qp: QP) -> None:

@@ -20,13 +20,13 @@ from hector_jax.runs.metrics import BASELINES, Interval
 def compare_runs(runs: Sequence[Run]) -> dict[str, Any]:
     """Compare several runs, as JSON values.
 
-    `runs` is a list of `run`, `seconds` (null where the run has none), `sets.<name>` (as the
-    verdict on the stand-in in result.json, with the number of seeds), `versions` and
-    `tuning.<name>.{iterations, refused}`; `differ.settings` and `differ.versions` hold what is not
-    the same in all, a value for each run, null where a run has none.
+    `runs` is a list of `run`, `seconds` (null if unknown), `sets.<name>` (the verdict on the
+    stand-in from result.json, with the number of seeds), `versions` and
+    `tuning.<name>.{iterations, refused}`; `differ.settings` and `differ.versions` hold the entries
+    that differ between the runs, one value per run, null if a run has none.
 
     Raises:
-        InputError: no run, or one without a verdict on the stand-in.
+        InputError: there is no run, or one has no verdict on the stand-in.
     """
     if not runs:
         raise InputError("expected at least one run folder, got none")
@@ -50,7 +50,7 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
     try:
         verdict = run.result["sets"][name]["standin"]
         verdict = verdict | {"seeds": len(verdict["seeds"]), "falls": int(verdict["falls"])}
-        _cells(name, verdict)  # a file without what is printed is refused here
+        _cells(name, verdict)  # raises if the file lacks a printed value
         return verdict
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(
@@ -61,23 +61,23 @@ def _verdict(run: Run, name: str) -> dict[str, Any]:
 def _iterations(metrics: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
     counts: dict[str, dict[str, int]] = {}
     for line in metrics:
-        one = counts.setdefault(line["set"], {"iterations": -1, "refused": 0})
-        one["iterations"] += 1  # the start is none
-        one["refused"] += not line["accepted"]
+        count = counts.setdefault(line["set"], {"iterations": -1, "refused": 0})
+        count["iterations"] += 1  # the start is not an iteration
+        count["refused"] += not line["accepted"]
     return counts
 
 
-def _differing(each: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    columns = {name: [one.get(name) for one in each] for some in each for name in some}
-    return {name: values for name, values in columns.items() if any(v != values[0] for v in values)}
+def _differing(tables: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    rows = {name: [table.get(name) for table in tables] for names in tables for name in names}
+    return {name: values for name, values in rows.items() if any(v != values[0] for v in values)}
 
 
 def print_comparison(comparison: Mapping[str, Any], console: Console | None = None) -> None:
-    """Print what `compare_runs` returned as a table with a column for each run.
+    """Print the result of `compare_runs` as a table with a column for each run.
 
     Args:
-        comparison: of `compare_runs`.
-        console: where to print; None takes stdout.
+        comparison: result of `compare_runs`.
+        console: output; None means stdout.
     """
     runs, differ = comparison["runs"], comparison["differ"]
     console = plain_console(console, width=60 + 60 * len(runs))
@@ -96,7 +96,7 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
         table.add_section()
     for name in dict.fromkeys(name for run in runs for name in run["tuning"]):
         counts = [run["tuning"].get(name) for run in runs]
-        texts = (one and f"{one['iterations']} ({one['refused']})" for one in counts)
+        texts = (count and f"{count['iterations']} ({count['refused']})" for count in counts)
         add(f"{name}: iterations (refused)", texts)
     seconds = [run["seconds"] for run in runs]
     add("time [s]", (None if s is None else f"{s:.0f}" for s in seconds))
@@ -117,11 +117,11 @@ def print_comparison(comparison: Mapping[str, Any], console: Console | None = No
 
 
 def _cells(name: str, verdict: Mapping[str, Any]) -> dict[str, str]:
-    """One weight set of one run, by the title of the row."""
+    """Return the cells of one weight set of one run by the title of the row."""
     cells = {f"{name}: L [1e6]": f"{verdict['L']['mean'] / 1e6:.3f}"}
     for baseline in BASELINES:
         if change := verdict["change"].get(baseline):
-            # null where there is no interval
+            # null if there is no interval
             ends = (math.nan if change[key] is None else change[key] for key in ("low", "high"))
             text = Interval(change["median"], *ends).text()
             cells[f"  against {baseline} [%]"] = text + VOID * (not change["counts"])

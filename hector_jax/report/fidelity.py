@@ -1,9 +1,9 @@
-"""How well a phi predicts what the ground returns, and where the body goes.
+"""Prediction errors of phi: of the ground wrench, and of the body's motion.
 
 Errors of the wrench by axis and by the phase of the step; and open-loop prediction: from recorded
-states, the rigid body is moved for up to 0.4 s under the recorded commands through phi, and
-compared with where the robot was. The row `measured` moves it by the measured wrench: the error
-that is left there is not due to the ground, but to a rigid body standing for a robot with legs.
+states, the rigid body is simulated for up to 0.4 s under the recorded commands through phi, and
+compared with the recorded motion. The row `measured` applies the measured wrench: its remaining
+error is not due to the ground, but to modelling a robot with legs as a rigid body.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,14 +36,14 @@ PHASES = {  # time [s] since the switch of stance
     "last 50 ms": (0.15, np.inf),
 }
 HORIZONS = (0.2, 0.4)  # [s]
-FIRST, APART = 5, 35  # ticks: of the first prediction in a walk, and from one to the next
+FIRST, SPACING = 5, 35  # ticks: start of the first prediction in a walk; between starts
 
 _UNITS = {"force": "N^2", "moment": "(N m)^2"}
 _AXES = {f"{kind[0].upper()}_{axis}": kind for kind in _UNITS for axis in "xyz"}
 
 
 class Drift(NamedTuple):
-    """RMS error of open-loop predictions by time ahead; NaN where no walk stayed up so long."""
+    """RMS error of open-loop predictions by time ahead; NaN if no walk stays upright so long."""
 
     time: Float[np.ndarray, " ticks"]  # [s]
     position: Float[np.ndarray, " ticks"]  # [m], distance of the centres of mass
@@ -51,33 +51,35 @@ class Drift(NamedTuple):
 
 
 def _mean(rows: np.ndarray) -> np.ndarray:
-    """Mean over the rows; NaN, without a warning, where there are none."""
+    """Return the mean over the rows; NaN, without a warning, if there are none."""
     return rows.mean(axis=0) if len(rows) else np.full(rows.shape[1:], np.nan)
 
 
 def by_phase(
     effects: Mapping[str, jax.tree_util.Partial], dataset: Dataset
 ) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Mean square errors by phi, phase of the step and planned contact, per axis.
+    """Compute mean square errors by phi, phase of the step and planned contact, per axis.
 
     Returns:
-        `[phi][phase]["stance" | "swing"]`: F_x F_y F_z [N^2], M_x M_y M_z [(N m)^2]; NaN where no
+        `[phi][phase]["stance" | "swing"]`: F_x F_y F_z [N^2], M_x M_y M_z [(N m)^2]; NaN if no
         sample is in the phase.
     """
-    since, stands = dataset.window.since_switch[:, None], np.asarray(dataset.window.contact)
+    since, stance = dataset.window.since_switch[:, None], np.asarray(dataset.window.contact)
+    window = jax.tree.map(jnp.asarray, dataset.window)
     errors: dict[str, dict[str, dict[str, list[float]]]] = {name: {} for name in effects}
     for name, effect in effects.items():
-        guess = predict(effect, jax.tree.map(jnp.asarray, dataset.window)).wrench
-        pairs = zip(guess, dataset.label, strict=True)
-        square = np.concatenate([np.square(np.asarray(g) - y) for g, y in pairs], axis=-1)
+        pairs = zip(predict(effect, window).wrench, dataset.label, strict=True)
+        square = np.concatenate([np.square(np.asarray(x) - label) for x, label in pairs], axis=-1)
         for phase, (low, high) in PHASES.items():
             inside = (since > low - 1e-6) & (since < high - 1e-6)
-            places = {"stance": inside & stands, "swing": inside & ~stands}
-            errors[name][phase] = {c: _mean(square[rows]).tolist() for c, rows in places.items()}
+            errors[name][phase] = {
+                "stance": _mean(square[inside & stance]).tolist(),
+                "swing": _mean(square[inside & ~stance]).tolist(),
+            }
     return errors
 
 
-def _ahead(
+def _predict_states(
     config: gait.GaitConfig,
     robot: Robot,
     ticks: int,
@@ -86,7 +88,7 @@ def _ahead(
     start_tick: Int[Array, ""],
     first: Int[Array, ""],
 ) -> State:
-    """States of the rigid body at the ends of `ticks` ticks from `first` on."""
+    """Simulate the rigid body; return its states at the ends of `ticks` ticks from `first` on."""
 
     def step(state: State, j: Int[Array, ""]) -> tuple[State, State]:
         yaw = state.euler[2]
@@ -103,11 +105,11 @@ def _ahead(
             effects = effect(window)
             ground, push = turn(effects.wrench, yaw), turn(effects.legs, yaw)
         feet = 0.5 * (walk.feet[j - 1] + walk.feet[j])
-        later = srbm.step(robot, state, ground, feet, config.tick, push)
-        return later, later
+        state = srbm.step(robot, state, ground, feet, config.tick, push)
+        return state, state
 
-    begin = jax.tree.map(lambda s: s[first - 1], walk.state)
-    return jax.lax.scan(step, begin, first + jnp.arange(ticks))[1]
+    initial = jax.tree.map(lambda s: s[first - 1], walk.state)
+    return jax.lax.scan(step, initial, first + jnp.arange(ticks))[1]
 
 
 def drift(
@@ -116,35 +118,35 @@ def drift(
     walks: Trajectory,
     start_tick: Int[np.ndarray, " W"],
 ) -> Drift:
-    """Open-loop prediction errors of a phi over walks at the plan interval.
+    """Compute open-loop prediction errors of a phi over walks at the plan interval.
 
     Args:
         robot: the rigid body.
-        effect: phi; None moves the body by the measured wrench.
-        walks: W walks of T ticks; what follows a fall is left out.
+        effect: phi; None applies the measured wrench.
+        walks: W walks of T ticks; ticks after a fall are excluded.
         start_tick: gait tick of their t = 0.
 
     Raises:
-        InputError: no walk is long enough to predict in.
+        InputError: the walks are too short.
     """
     config = walk_config(robot).gait
     ticks = round(HORIZONS[-1] / config.tick)
     fallen = np.asarray(walks.fallen)
-    starts = np.arange(FIRST, fallen.shape[1] - ticks + 1, APART)
+    starts = np.arange(FIRST, fallen.shape[1] - ticks + 1, SPACING)
     if not len(starts):
         raise InputError(f"walks of {fallen.shape[1]} ticks are too short to predict {ticks} ticks")
 
-    ahead = partial(_ahead, config, robot, ticks)
-    over_starts = jax.vmap(ahead, in_axes=(None, None, None, 0))
-    guess = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
+    predict_walk = partial(_predict_states, config, robot, ticks)
+    over_starts = jax.vmap(predict_walk, in_axes=(None, None, None, 0))
+    predicted = jax.jit(jax.vmap(over_starts, in_axes=(None, 0, 0, None)))(
         effect, jax.tree.map(jnp.asarray, walks), jnp.asarray(start_tick), jnp.asarray(starts)
     )
     spans = starts[:, None] + np.arange(ticks)
-    whole = ~fallen[:, spans].any(axis=-1)
+    upright = ~fallen[:, spans].any(axis=-1)
 
     def rms(name: str) -> Float[np.ndarray, " ticks"]:
-        error = np.asarray(getattr(guess, name)) - getattr(walks.state, name)[:, spans]
-        return np.sqrt(_mean(np.sum(error**2, axis=-1)[whole]))
+        error = np.asarray(getattr(predicted, name)) - getattr(walks.state, name)[:, spans]
+        return np.sqrt(_mean(np.sum(error**2, axis=-1)[upright]))
 
     return Drift(config.tick * np.arange(1, ticks + 1), rms("position"), rms("euler"))
 
@@ -155,54 +157,54 @@ def drifts(
     walks: Trajectory,
     start_tick: Int[np.ndarray, " W"],
 ) -> dict[str, Drift]:
-    """`drift` of several phi, and of the measured wrench."""
+    """Compute `drift` for several phi and for the measured wrench."""
     phis = {**effects, "measured": None}
     return {name: drift(robot, effect, walks, start_tick) for name, effect in phis.items()}
 
 
 def as_result(
-    whole: Mapping[str, Mapping[str, Any]], phases: Mapping[str, Any], drifts: Mapping[str, Drift]
+    errors: Mapping[str, Mapping[str, Any]], phases: Mapping[str, Any], drifts: Mapping[str, Drift]
 ) -> dict[str, Any]:
-    """All errors of one world as JSON values; `whole` is `training.report`."""
+    """Return all errors of one world as JSON values; `errors` is from `training.report`."""
 
-    def at(horizon: float, one: Drift) -> dict[str, float]:
-        parts = {"position": one.position, "euler": one.euler}
-        return {name: float(np.interp(horizon, one.time, x)) for name, x in parts.items()}
+    def at(horizon: float, drift: Drift) -> dict[str, float]:
+        parts = {"position": drift.position, "euler": drift.euler}
+        return {name: float(np.interp(horizon, drift.time, x)) for name, x in parts.items()}
 
-    ahead = {
-        name: {f"{horizon:g} s": at(horizon, one) for horizon in HORIZONS}
-        for name, one in drifts.items()
+    open_loop = {
+        name: {f"{horizon:g} s": at(horizon, drift) for horizon in HORIZONS}
+        for name, drift in drifts.items()
     }
-    return {"errors": dict(whole), "phases": dict(phases), "open_loop": ahead}
+    return {"errors": dict(errors), "phases": dict(phases), "open_loop": open_loop}
 
 
 def curves(
     robot: Robot, walks: Trajectory, effects: Mapping[str, jax.tree_util.Partial]
 ) -> dict[str, Wrench]:
-    """Command, predictions and measurement of the first of some walks, for a picture.
+    """Return commanded, predicted and measured wrenches of the first walk, for a picture.
 
     Args:
         robot: the body that walked.
-        walks: as `make_dataset` takes them.
-        effects: phis by name; drawn are `linear`, `paper` and `residual`, the last as `predicted`.
+        walks: as for `make_dataset`.
+        effects: phis by name; `linear`, `paper` and `residual` are used, the last as `predicted`.
 
     Returns:
-        Wrenches (ticks, feet, 3) in the yaw frame, from t = 0; NaN at ticks that are no samples.
+        Wrenches (ticks, feet, 3) in the yaw frame, from t = 0; NaN at ticks without a sample.
     """
-    one = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
-    samples, _ = make_dataset(robot, one)
+    first = jax.tree.map(lambda x: np.asarray(x)[:1], walks)
+    samples, _ = make_dataset(robot, first)
     window = jax.tree.map(jnp.asarray, samples.window)
     wrenches = {
         "commanded": jax.tree.map(lambda w: w[:, 0], samples.window.commands),
         "measured": samples.label,
     }
-    for name, drawn in (("linear", "linear"), ("paper", "paper"), ("residual", "predicted")):
+    for name, label in (("linear", "linear"), ("paper", "paper"), ("residual", "predicted")):
         if name in effects:
-            wrenches[drawn] = predict(effects[name], window).wrench
+            wrenches[label] = predict(effects[name], window).wrench
 
     def by_tick(values: Any) -> np.ndarray:
-        """NaN at ticks that are no samples: the first, unsolved ones, those after a fall."""
-        rows = np.full((one.fallen.shape[1], *values.shape[1:]), np.nan)
+        """Place values by tick; NaN at the first ticks, unsolved ones and those after a fall."""
+        rows = np.full((first.fallen.shape[1], *values.shape[1:]), np.nan)
         rows[samples.tick] = values
         return rows
 
@@ -212,12 +214,12 @@ def curves(
 def write_report(
     folder: Path, worlds: Mapping[str, Mapping[str, Any]], pictures: Sequence[Picture]
 ) -> Path:
-    """Write report.md on the nets' fidelity, and the same numbers as result.json.
+    """Write report.md on the nets' prediction errors, and the same numbers as result.json.
 
     Args:
-        folder: where the pictures are.
-        worlds: by their names, the values of `as_result`.
-        pictures: to show.
+        folder: folder of the pictures.
+        worlds: results of `as_result` by world.
+        pictures: pictures to show.
 
     Returns:
         report.md.
@@ -230,10 +232,10 @@ def write_report(
 
 
 def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
-    """Mean square errors, labelled: of force and moment, by contact and axis, of touchdowns.
+    """Return labelled mean square errors: of force and moment, by contact and axis, of touchdowns.
 
     Args:
-        errors: of several phis, as `training.report` has them.
+        errors: results of `training.report`, one per phi.
     """
     errors = list(errors)
     rows = [(f"{kind}, all [{unit}]", [x[kind] for x in errors]) for kind, unit in _UNITS.items()]

@@ -1,4 +1,4 @@
-"""The motion of a robot over a walk: what both the film and the page draw, made once."""
+"""The motion of a robot over a walk, drawn by both the film and the page."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,24 +11,26 @@ from scipy.spatial.transform import Rotation
 from hector_jax.core.trajectory import State, Trajectory, Wrench, from_start
 from hector_jax.robot.model import Robot
 
-COLOURS = ((184, 33, 51), (0, 122, 94))  # of before and after
+COLOURS = ((184, 33, 51), (0, 122, 94))  # before and after
 INK = (20, 20, 25)
-LEAST = 0.015  # [m] to either side of the foot point that a footprint is drawn, of point feet too
+MIN_SOLE = 0.015  # [m] of a footprint ahead of and behind the foot point, also for point feet
 
 
 class Motion(NamedTuple):
-    """A walk in the frame of its start; after a fall the robot stays where it was last seen."""
+    """A walk in the frame of its start; after a fall the robot keeps its last upright pose."""
 
-    period: float  # [s] between samples, which stand at the ends of their intervals
+    period: float  # [s] between samples, which are at the ends of their intervals
+    weight: float  # of the robot [N]
+    height: float  # of the centre of mass when the robot stands [m]
     qpos: Float[np.ndarray, "T nq"]  # of MuJoCo
     path: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
     reference: Float[np.ndarray, "T 3"]  # of the centre of mass [m]
     contact: Bool[np.ndarray, "T feet"]  # planned stance
     feet: Float[np.ndarray, "T feet 3"]  # foot points [m]
-    R_yaw: Float[np.ndarray, "T 3 3"]  # heading of the trunk as each interval starts
+    R_yaw: Float[np.ndarray, "T 3 3"]  # heading of the trunk at the start of each interval
     wrenches: dict[str, Wrench]  # of the ground on the feet by source, (T, feet, 3) each
-    soles: Float[np.ndarray, "n 2 3"]  # heel and toe of each foot as it was set down; see LEAST
-    upright: int  # samples before the fall; all of them where there is none
+    soles: Float[np.ndarray, "n 2 3"]  # heel and toe of each foot at touchdown; see MIN_SOLE
+    upright: int  # number of samples before the fall; all of them if there is none
 
     @property
     def times(self) -> Float[np.ndarray, " T"]:
@@ -37,7 +39,7 @@ class Motion(NamedTuple):
 
     @property
     def fall_time(self) -> float:
-        """Time of the fall [s]; infinite where there is none."""
+        """Time of the fall [s]; infinite if there is none."""
         return self.period * self.upright if self.upright < len(self.qpos) else np.inf
 
     @property
@@ -46,7 +48,7 @@ class Motion(NamedTuple):
         return np.linalg.norm((self.path - self.reference)[:, :2], axis=1)
 
     def sample_at(self, times: Float[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
-        """Indices of the samples at some times [s]."""
+        """Return the indices of the samples at some times [s]."""
         return np.clip(np.round(times / self.period).astype(int) - 1, 0, len(self.qpos) - 1)
 
 
@@ -61,17 +63,19 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
     walk = from_start(walk)
     count, fallen = len(walk.fallen), walk.fallen
     upright = int(np.argmax(fallen)) if fallen.any() else count
-    last_seen = np.minimum(np.arange(count), max(upright - 1, 0))
-    seen = walk.state, walk.feet, walk.joints
-    state, feet, joints = jax.tree.map(lambda x: np.asarray(x)[last_seen], seen)
+    shown = np.minimum(np.arange(count), max(upright - 1, 0))  # index of the pose at each sample
+    moving = walk.state, walk.feet, walk.joints
+    state, feet, joints = jax.tree.map(lambda x: np.asarray(x)[shown], moving)
     heading = np.append(walk.initial.euler[2], state.euler[:-1, 2])
     R_yaw = Rotation.from_euler("z", heading[:, None]).as_matrix()
     ahead = R_yaw[:, None, :, 0]
-    heel, toe = max(LEAST, float(robot.heel)), max(LEAST, float(robot.toe))
+    heel, toe = max(MIN_SOLE, float(robot.heel)), max(MIN_SOLE, float(robot.toe))
     soles = np.stack([feet - heel * ahead, feet + toe * ahead], axis=2)
-    set_down = np.diff(walk.contact[:upright].astype(int), axis=0, prepend=0) > 0
+    touchdowns = np.diff(walk.contact[:upright].astype(int), axis=0, prepend=0) > 0
     return Motion(
         period=float(walk.period),
+        weight=float(robot.mass * robot.gravity[2]),
+        height=float(robot.standing_height),
         qpos=poses(robot, state, joints),
         path=state.position,
         reference=np.asarray(walk.reference.position),
@@ -79,26 +83,26 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
         feet=feet,
         R_yaw=R_yaw,
         wrenches={
-            source: Wrench(*(np.asarray(part)[last_seen] @ R_yaw.mT for part in wrench))
+            source: Wrench(*(np.asarray(part)[shown] @ R_yaw.mT for part in wrench))
             for source, wrench in (ground or {}).items()
         },
-        soles=soles[:upright][set_down],
+        soles=soles[:upright][touchdowns],
         upright=upright,
     )
 
 
 def motions(robot: Robot, walks: Mapping[str, Trajectory]) -> dict[str, Motion]:
-    """Compute the motions of walks by name, without the ground."""
+    """Compute the motions of walks by name, without wrenches of the ground."""
     return {name: motion(robot, walk) for name, walk in walks.items()}
 
 
 def poses(
     robot: Robot, state: State, joints: Float[np.ndarray, "T joints"]
 ) -> Float[np.ndarray, "T nq"]:
-    """MuJoCo's qpos of a walk: trunk position, trunk quaternion, joints.
+    """Return MuJoCo's qpos of a walk: trunk position, trunk quaternion, joints.
 
     Args:
-        robot: whose CoM offset leads from the centre of mass to the trunk.
+        robot: the body; its CoM offset gives the trunk from the centre of mass.
         state: (T, 3) each, world frame.
         joints: [rad].
     """

@@ -1,4 +1,4 @@
-"""The pictures and the film that each command leaves, drawn by plots and video.py."""
+"""The pictures and the film of each command, drawn by plots and video.py."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -33,28 +33,28 @@ def of_run(
     """Draw the pictures of a tuning into `pictures/` of its folder.
 
     Args:
-        folder: of the run.
-        config: of the tunings.
+        folder: folder of the run.
+        config: config of the tunings.
         sets: weights by name.
-        tunings: the tunings by set.
-        walks: one of each set, at the plan interval.
-        ground: by `fidelity.curves`.
-        training: of the net.
+        tunings: tunings by set.
+        walks: one walk by set, at the plan interval.
+        ground: result of `fidelity.curves`.
+        training: errors of the net by epoch.
 
     Returns:
         The pictures, in the order of the report.
     """
-    four = {name: walks[name] for name in ("nominal", "expert", "with", "best")}
+    walks = {name: walks[name] for name in ("nominal", "expert", "with", "best")}
     compared = ("nominal", "expert", "without", "with")
-    flat = {name: np.asarray(weights_to_vector(sets[name])) for name in compared}
+    vectors = {name: np.asarray(weights_to_vector(sets[name])) for name in compared}
     histories = {name: tunings[name].history for name in ("without", "with")}
     path, tick = folder / "pictures", config.rollout.walk.gait.tick
     path.mkdir(exist_ok=True)
     captions = {
-        "tracking": plots.tracking(path / "tracking.png", four),
-        "path": plots.path_from_above(path / "path.png", four),
+        "tracking": plots.tracking(path / "tracking.png", walks),
+        "path": plots.path_from_above(path / "path.png", walks),
         "losses": plots.losses(path / "losses.png", config.loss, histories),
-        "weights": plots.weights(path / "weights.png", weight_names(sets["nominal"]), flat),
+        "weights": plots.weights(path / "weights.png", weight_names(sets["nominal"]), vectors),
         "wrenches": plots.wrenches(path / "wrenches.png", tick, ground),
         "training": plots.training(path / "training.png", training),
     }
@@ -71,11 +71,11 @@ def of_nets(
     """Draw the predictions and the training of nets.
 
     Args:
-        folder: where to.
-        tick: from one plan to the next [s].
-        ground: by `fidelity.curves`, of the first held-out walk.
-        drifts: by `fidelity.drifts`, by world.
-        trainings: by the name of the picture.
+        folder: output folder.
+        tick: interval between plans [s].
+        ground: result of `fidelity.curves` for the first held-out walk.
+        drifts: results of `fidelity.drifts` by world.
+        trainings: errors by epoch, by the name of the picture.
 
     Returns:
         The pictures, in the order of the report.
@@ -85,7 +85,7 @@ def of_nets(
     captions = {
         "wrenches": f"{wrenches} The first held-out walk, in the robot's yaw frame.",
         "open_loop": plots.open_loop(folder / "open_loop.png", worlds),
-        **{name: plots.training(folder / f"{name}.png", one) for name, one in trainings.items()},
+        **{name: plots.training(folder / f"{name}.png", x) for name, x in trainings.items()},
     }
     return [Picture(f"{name}.png", caption) for name, caption in captions.items()]
 
@@ -93,27 +93,27 @@ def of_nets(
 def of_view(
     folder: Path, robot: Robot, histories: Histories, loss: Loss, views: Mapping[str, ViewedWalk]
 ) -> None:
-    """Draw what the page of `view` shows, as a film and pictures.
+    """Draw the content of the page of `view` as a film and pictures.
 
     Args:
-        folder: where to.
+        folder: output folder.
         robot: the body that walked.
-        histories: of the run.
-        loss: that its L is of.
+        histories: tuning histories of the run.
+        loss: loss of the tunings.
         views: walks by the name of their set, before and after.
 
     Raises:
-        VideoUnavailable: no film can be made here.
+        VideoUnavailable: this machine cannot make a film.
     """
-    walks = {name: one.walk for name, one in views.items()}
+    walks = {name: viewed.walk for name, viewed in views.items()}
     plots.tracking(folder / "tracking.png", walks)
     plots.path_from_above(folder / "path.png", walks)
     after, ground = list(views.values())[-1]
     period = float(after.period)
     first = min(0.4, period * len(after.fallen))  # [s], two steps
     plots.wrenches(folder / "wrenches.png", period, ground, seconds=first)
-    if courses := {name: histories[name] for name in ("without", "with") if histories.get(name)}:
-        plots.losses(folder / "losses.png", loss, courses)
+    if shown := {name: histories[name] for name in ("without", "with") if histories.get(name)}:
+        plots.losses(folder / "losses.png", loss, shown)
     say("making the film")
     pair = motions(robot, plots.style.titled(walks))
     write_film(folder / "film.mp4", robot, pair)
@@ -123,16 +123,16 @@ def of_view(
 def film(
     path: Path, robot: Robot, walks: Mapping[str, Trajectory], strip: Path | None = None
 ) -> str:
-    """Film two walks, and draw a strip of snapshots where it has a path.
+    """Film two walks, and draw a strip of snapshots if `strip` is its path.
 
-    A missing back end costs one line, not the run; returns why there is no film.
+    Returns the reason if no film can be made, which does not stop the run, else "".
     """
     say("making the film")
-    both = motions(robot, walks)
+    pair = motions(robot, walks)
     try:
-        write_film(path, robot, both)
+        write_film(path, robot, pair)
         if strip is not None:
-            write_strip(strip, robot, both)
+            write_strip(strip, robot, pair)
     except VideoUnavailable as error:
         say(str(error))
         return str(error)

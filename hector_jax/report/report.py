@@ -1,8 +1,8 @@
-"""Verdicts for people: the table on the terminal, and the Markdown that all reports share.
+"""Verdicts as text: the table on the terminal, and the Markdown parts of all reports.
 
 Prose is in the templates; the functions here make the tables of numbers that they include. The
-stand-in for the robot is called "hardware stand-in" wherever it is named, and a comparison that
-falls make void is shown with a mark, never left out.
+stand-in for the robot is always called "hardware stand-in", and a comparison that falls make void
+is shown with a mark, never left out.
 """
 
 import json
@@ -22,7 +22,7 @@ from rich.text import Text
 from hector_jax.core.inputs import plural
 from hector_jax.runs.metrics import BASELINES, FEWEST, Comparison, Summary, Verdict, rms, summarize
 
-# what worlds are called where it is not their name
+# titles of worlds that differ from their names
 WORLDS = {"standin": "hardware stand-in", "standin-even": "hardware stand-in, family even"}
 VOID = "*"
 
@@ -35,7 +35,7 @@ class Picture(NamedTuple):
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:
-    """A table in Markdown; the first `words` columns are words, aligned left.
+    """Format a table in Markdown; the first `words` columns are words, aligned left.
 
     >>> print(markdown_table(("set", "L"), [("nominal", "3.9"), ("expert", "2.8")]))
     | set | L |
@@ -48,46 +48,46 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: in
 
 
 def seeds_text(seeds: Sequence[int] | np.ndarray) -> str:
-    """Seeds as a range where they are one."""
+    """Format seeds, as a range if they are consecutive."""
     if len(seeds) > 1 and np.array_equal(seeds, np.arange(seeds[0], seeds[0] + len(seeds))):
         return f"{seeds[0]}-{seeds[-1]}"
     return ", ".join(map(str, seeds))
 
 
 def power_text(x: float) -> str:
-    """A loss weight, such as `1e5`."""
+    """Format a loss weight, such as `1e5`."""
     return f"{x:.0e}".replace("e+0", "e") if x >= 1e3 else f"{x:g}"
 
 
 def number(x: float, form: str = ".3g") -> str:
-    """A number of a table; a dash where nothing was there to measure."""
+    """Format a number of a table; a dash if it is not finite."""
     return format(x, form) if math.isfinite(x) else "-"
 
 
 class Column(NamedTuple):
-    """How the numbers of a part of the loss are written."""
+    """Number format of a part of the loss."""
 
     part: str
-    power: int  # of ten, by which they are divided
+    power: int  # numbers are divided by ten to this power
     digits: int
 
     @property
     def unit(self) -> str:
-        """What the column's head says of its power."""
+        """Power of ten in the column's head."""
         return f"x1e{self.power}" if self.power else ""
 
     @property
     def head(self) -> str:
-        """The column's head."""
+        """Head of the column."""
         return f"{self.part} {self.unit}".strip()
 
     def text(self, x: float) -> str:
-        """A number of the column."""
+        """Format a number of the column."""
         return f"{x / 10.0**self.power:.{self.digits}f}"
 
 
 def column(part: str, largest: float) -> Column:
-    """Three significant digits of the largest number, divided by a power of a thousand."""
+    """Choose three significant digits of the largest number, divided by a power of a thousand."""
     if not largest > 0.0:
         return Column(part, 0, 2)
     power = 0 if 0.1 <= largest < 1e3 else 3 * math.floor(math.log10(largest) / 3)
@@ -95,41 +95,41 @@ def column(part: str, largest: float) -> Column:
 
 
 def columns(verdict: Verdict) -> dict[str, Column]:
-    """How the numbers of each part are written in the tables of a verdict."""
-    each = [one.means for one in summaries(verdict).values()]
-    return {part: column(part, max(one[part].value for one in each)) for part in verdict.parts}
+    """Choose the number format of each part for the tables of a verdict."""
+    means = [summary.means for summary in summaries(verdict).values()]
+    return {part: column(part, max(mean[part].value for mean in means)) for part in verdict.parts}
 
 
 def summaries(verdict: Verdict) -> dict[str, Summary]:
-    """All sets of a verdict, each against the baselines."""
+    """Summarize all sets of a verdict, each against the baselines."""
     return {name: summarize(verdict, name) for name in verdict.scores}
 
 
 def baselines(verdict: Verdict) -> list[str]:
-    """Those baselines that another set can be compared with."""
+    """Return the baselines that another set can be compared with."""
     return [name for name in BASELINES if name in verdict.scores and len(verdict.scores) > 1]
 
 
 def change_text(comparison: Comparison, part: str = "L", void: str = f" \\{VOID}") -> str:
-    """A change in % with its interval, marked where falls make it void."""
+    """Format a change in % with its interval and, if falls make it void, a mark."""
     return comparison.change[part].text() + ("" if comparison.counts else void)
 
 
 def legend(verdict: Verdict) -> list[str]:
-    """What the columns of a verdict mean, line by line."""
-    comparisons = [one for s in summaries(verdict).values() for one in s.against.values()]
+    """Explain the columns of a verdict, line by line."""
+    comparisons = [c for summary in summaries(verdict).values() for c in summary.against.values()]
     text = render(
         "legend.txt.j2",
         verdict=verdict,
         seeds=seeds_text(verdict.seeds),
         has_intervals=len(verdict.seeds) >= FEWEST,
-        mark=None if all(one.counts for one in comparisons) else VOID,
+        mark=None if all(comparison.counts for comparison in comparisons) else VOID,
     )
     return text.splitlines()
 
 
 def plain_console(console: Console | None, width: int) -> Console:
-    """The console, or one of a width where a file would cut or wrap cells; None takes stdout."""
+    """Return the console, or a plain one of this width for a file; None means stdout."""
     console = console or Console(highlight=False)
     if console.is_terminal:
         return console
@@ -139,17 +139,17 @@ def plain_console(console: Console | None, width: int) -> Console:
 def print_table(
     verdict: Verdict, title: str = "", world: str = "standin", console: Console | None = None
 ) -> None:
-    """Print the verdict as one table on the terminal, plain where there is none.
+    """Print the verdict as one table, without colours outside a terminal.
 
     Args:
-        verdict: to print.
-        title: what was walked.
-        world: where.
-        console: where to print; None takes stdout.
+        verdict: verdict to print.
+        title: title of the walks.
+        world: world of the walks.
+        console: output; None means stdout.
     """
     console = plain_console(console, width=160)
-    where = WORLDS.get(world, world)
-    console.print(Text(f"{title} on the {where}" if title else f"On the {where}", style="bold"))
+    world = WORLDS.get(world, world)
+    console.print(Text(f"{title} on the {world}" if title else f"On the {world}", style="bold"))
     console.print(_terminal_table(verdict, padding=1 if console.width >= 90 else 0))
     for line in legend(verdict):
         console.print(Text(line, style="dim"))
@@ -158,14 +158,15 @@ def print_table(
 def _terminal_table(verdict: Verdict, padding: int) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, padding, 0, 0), pad_edge=False, show_edge=False)
     table.add_column("set\n", no_wrap=True)
-    formats, others = columns(verdict), baselines(verdict)
-    heads = [f"{part}\n{one.unit}" for part, one in formats.items()]
+    formats, others = columns(verdict).values(), baselines(verdict)
+    heads = [f"{form.part}\n{form.unit}" for form in formats]
     for head in (*heads, "falls\n", *(f"against {baseline}\n[%]" for baseline in others)):
         table.add_column(head, justify="right", no_wrap=True)
     for name, summary in summaries(verdict).items():
-        means = [one.text(summary.means[part].value) for part, one in formats.items()]
+        means = [form.text(summary.means[form.part].value) for form in formats]
         falls = Text(str(summary.falls), style="red" if summary.falls else "")
-        table.add_row(name, *means, falls, *(_change(summary.against.get(one)) for one in others))
+        changes = [_change(summary.against.get(baseline)) for baseline in others]
+        table.add_row(name, *means, falls, *changes)
     return table
 
 
@@ -178,7 +179,7 @@ def _change(comparison: Comparison | None) -> Text:
 
 
 def wins_text(comparison: Comparison, seeds: int) -> str:
-    """Number of seeds on which the set is better."""
+    """Format the number of seeds on which the set is better."""
     return f"{round(comparison.wins * seeds)} / {seeds}"
 
 
@@ -190,7 +191,7 @@ TEMPLATES = Environment(
     keep_trailing_newline=True,
 )
 _FUNCTIONS = (baselines, change_text, columns, legend, markdown_table, plural, rms, summaries)
-TEMPLATES.globals |= {one.__name__: one for one in (*_FUNCTIONS, wins_text)}
+TEMPLATES.globals |= {function.__name__: function for function in (*_FUNCTIONS, wins_text)}
 TEMPLATES.globals["BASELINES"] = BASELINES
 TEMPLATES.filters |= {
     "degrees": math.degrees,
@@ -206,5 +207,5 @@ def render(template: str, **values: Any) -> str:
 
 
 def caption(picture: str, **values: Any) -> str:
-    """Caption of a picture of `plots`, by the name of its function."""
+    """Return the caption of a picture of `plots` by the name of its function."""
     return getattr(TEMPLATES.get_template("captions.j2").module, picture)(**values)

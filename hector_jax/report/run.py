@@ -22,17 +22,17 @@ def write_report(folder: Path, **contents: Any) -> Path:
     Args:
         folder: where the pictures are.
         contents: all of these:
-            trajectory, verdict: what was walked, and the walks of all sets on the stand-in.
+            trajectory, verdict: names of the trajectories; verdict of all sets on the stand-in.
             tunings: by set, `without`, `with` and, refreshed, `with_refreshed`.
-            norms: of the terms' gradients in log-weights at nominal, by model.
-            curvature: of the loss in the starting weights.
-            errors: held-out, of `raw`, `linear`, `net`, as `training.report` has them.
-            shifts: of each refresh, by `nets.refresh`.
-            walked, cases: `Change`s of the tuning on walks; walks of each weight set.
-            chosen: by set, iteration that was taken, where not the last.
-            pictures, film: `Picture`s; of the film, or why there is none.
-            config, environment: resolved settings, as JSON values, and what it was made with.
-            command: that makes this run again.
+            norms: gradient norms of the terms in log-weights at nominal, by model.
+            curvature: of the loss at the starting weights.
+            errors: held-out errors of `raw`, `linear`, `net`, from `training.report`.
+            shifts: result of `nets.refresh` for each refresh.
+            walked, cases: `Change`s of the tuning on walks; number of walks per weight set.
+            chosen: chosen iteration by set, if it is not the last.
+            pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
+            config, environment: resolved settings, as JSON values; versions and machine.
+            command: command line that repeats this run.
 
     Returns:
         The file.
@@ -43,7 +43,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
 
 
 def tuning_section(name: str, tuning: Tuning, chosen: Mapping[str, int] | None = None) -> str:
-    """What a tuning did, under a heading of its name; one along walks begins after the paper's."""
+    """Return the section of a tuning; a tuning on walks starts after the paper's iterations."""
     return render(
         "tuning.md.j2",
         name=name,
@@ -56,23 +56,21 @@ def tuning_section(name: str, tuning: Tuning, chosen: Mapping[str, int] | None =
 
 
 def _refusals(refused: Sequence[Iteration]) -> list[str]:
-    """Why steps were refused, and which."""
+    """List the reasons for refused steps, each with its iterations."""
     iterations: dict[str, list[str]] = {}
-    for i in refused:
+    for step in refused:
         # without the numbers, which differ from step to step
-        reason = re.sub(r" (\d|inf|nan).*", "", i.reason)
-        iterations.setdefault(reason, []).append(str(i.iteration))
-    return [f"{reason} (iteration {', '.join(which)})" for reason, which in iterations.items()]
+        reason = re.sub(r" (\d|inf|nan).*", "", step.reason)
+        iterations.setdefault(reason, []).append(str(step.iteration))
+    return [f"{reason} (iteration {', '.join(steps)})" for reason, steps in iterations.items()]
 
 
 def _at_bounds(weights: Weights) -> str:
     others = [name for name, value in weights.others.items() if np.ndim(value) == 0]
-    values, *box = (
+    values, *limits = (
         np.append(weights_to_vector(tree), [tree.others[name] for name in others])
         for tree in (weights, *bounds(others, weights))
     )
-    close = np.any([np.isclose(values, bound, rtol=1e-9) for bound in box], axis=0)
-    return (
-        ", ".join(f"`{name}`" for name in np.array([*weight_names(weights), *others])[close])
-        or "none"
-    )
+    close = np.any(np.isclose(values, limits, rtol=1e-9), axis=0)
+    names = np.array([*weight_names(weights), *others])[close]
+    return ", ".join(f"`{name}`" for name in names) or "none"

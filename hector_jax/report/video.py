@@ -1,10 +1,10 @@
 """Two walks of one command side by side: a film, and a strip of snapshots.
 
-Both halves have the same camera and, as each walk is seen from where it started, the same
-reference. MuJoCo chooses its OpenGL back end when it is imported, and a broken back end may end its
-process. So a child process draws (render.py), one for each back end until one succeeds: EGL,
-OSMesa, GLFW, or only that of MUJOCO_GL where it is set. Where none can draw, `VideoUnavailable`
-says why in one line, and the run goes on without a film.
+Both halves have the same camera and, as each walk is shown in the frame of its start, the same
+reference. MuJoCo chooses its OpenGL back end when it is imported, and a broken back end may kill
+its process. So child processes (render.py) try the back ends in turn: EGL, OSMesa, GLFW, or only
+that of MUJOCO_GL if it is set. If none can draw, `VideoUnavailable` gives the reason in one line,
+and the run goes on without a film.
 """
 
 import os
@@ -38,12 +38,12 @@ _TOP = 1.6  # height of the robot, in heights of its centre of mass
 
 
 class VideoUnavailable(Broken):
-    """No film can be made here; the message says why in one line."""
+    """Error of a machine that cannot make a film; the message gives the reason in one line."""
 
 
 @dataclass(frozen=True)
 class VideoConfig:
-    """How a film looks."""
+    """Size and frame rate of a film."""
 
     width: int = 800  # [pixel], both halves together
     height: int = 540  # a quarter of it is the plot below
@@ -53,27 +53,25 @@ class VideoConfig:
     def __post_init__(self) -> None:
         size = Range(64, 8192)
         check(self, width=size, height=size, rate=AT_LEAST_ONE, tiles=AT_LEAST_ONE)
-        for name in ("width", "height"):
-            if getattr(self, name) % 4:
-                raise InputError(
-                    f"VideoConfig.{name} must be a multiple of 4, got {getattr(self, name)}"
-                )
+        for name, value in (("width", self.width), ("height", self.height)):
+            if value % 4:
+                raise InputError(f"VideoConfig.{name} must be a multiple of 4, got {value}")
 
 
 class Scene(NamedTuple):
-    """What the child process draws, into its working directory."""
+    """Inputs of the child process, which draws into its working directory."""
 
     file: str  # name of the film or strip
     strip: bool
     config: VideoConfig
     model: mujoco.MjModel  # of the robot
     top: float  # of the robot above the floor [m]
-    motions: dict[str, Motion]  # before and after, by the words above them
+    motions: dict[str, Motion]  # before and after, by title
     times: Float[np.ndarray, " K"]  # of the frames [s]
 
 
 def check_film(path: Path) -> None:
-    """Check, before anything is walked for a film, that one can be written to this path.
+    """Check, before the walks of a film, that it can be written to this path.
 
     Raises:
         InputError: the ending is none of `ENDINGS`, or MUJOCO_GL names no back end.
@@ -91,20 +89,20 @@ def _check_ending(path: Path) -> None:
 def write_film(
     path: Path, robot: Robot, motions: Mapping[str, Motion], config: VideoConfig | None = None
 ) -> str:
-    """Draw two walks side by side, and below how far each is from the reference.
+    """Draw two walks side by side, and below them their distance from the reference.
 
     Args:
-        path: film (.mp4), or animated picture that starts again (.webp, .gif, .png).
+        path: film (.mp4), or animated picture that repeats (.webp, .gif, .png).
         robot: the body that walked.
-        motions: two of one command, by the words that stand above them, before and after.
+        motions: two of one command by set or title, before and after.
         config: size and rate.
 
     Returns:
         The back end that drew it.
 
     Raises:
-        VideoUnavailable: no back end works here, or there is no encoder.
-        InputError: the ending is none of these.
+        VideoUnavailable: no back end works on this machine, or there is no encoder.
+        InputError: the path has another ending.
     """
     _check_ending(path)
     if path.suffix.lower() == ".mp4":
@@ -118,7 +116,7 @@ def write_film(
 def write_strip(
     path: Path, robot: Robot, motions: Mapping[str, Motion], config: VideoConfig | None = None
 ) -> str:
-    """Draw snapshots of two walks, a row each, spread over the phases of a gait cycle.
+    """Draw snapshots of two walks in two rows, spread over the phases of a gait cycle.
 
     Args, returns and raises as `write_film`; the path is that of a PNG.
     """
@@ -128,7 +126,7 @@ def write_strip(
 def make_scene(
     path: Path, robot: Robot, motions: Mapping[str, Motion], config: VideoConfig, *, strip: bool
 ) -> Scene:
-    """Collect what a film or a strip shows; arguments as in `write_film`."""
+    """Collect the inputs of a film or a strip; arguments as in `write_film`."""
     if len(motions) != 2:
         raise ValueError(f"a film shows two walks side by side, got {len(motions)}: {[*motions]}")
     seconds = min(float(motion.times[-1]) for motion in motions.values())
@@ -147,16 +145,16 @@ def make_scene(
 
 
 def _snapshot_times(motion: Motion, seconds: float, tiles: int) -> Float[np.ndarray, " tiles"]:
-    """Times [s] of snapshots, each 1/tiles of a gait cycle later in it: no two show one pose."""
-    stands = motion.contact[:, 0]
-    lands = np.flatnonzero(stands[1:] & ~stands[:-1]) * motion.period
-    cycle = min(seconds, np.median(np.diff(lands)) if len(lands) > 1 else seconds)
-    whole = np.floor(np.linspace(0.0, seconds / cycle - 1.0, tiles) + 1e-6)
-    return cycle * (whole + np.arange(tiles) / tiles)
+    """Return times [s] of snapshots, whose phase of the gait cycle increases by 1/tiles each."""
+    stance = motion.contact[:, 0]
+    touchdowns = np.flatnonzero(stance[1:] & ~stance[:-1]) * motion.period
+    cycle = min(seconds, np.median(np.diff(touchdowns)) if len(touchdowns) > 1 else seconds)
+    cycles = np.floor(np.linspace(0.0, seconds / cycle - 1.0, tiles) + 1e-6)
+    return cycle * (cycles + np.arange(tiles) / tiles)
 
 
 def _write(scene: Scene, path: Path) -> str:
-    """Draw a scene with the first back end that works; returns it."""
+    """Draw a scene with the first back end that works; return its name."""
     with tempfile.TemporaryDirectory(prefix="hector-film-") as name:
         folder, failures = Path(name), []
         (folder / "scene.pickle").write_bytes(pickle.dumps(scene))
@@ -171,17 +169,17 @@ def _write(scene: Scene, path: Path) -> str:
 
 
 def _draw_in_child(folder: Path, back_end: str) -> str:
-    """Draw scene.pickle of a folder with one back end; returns why it failed, or nothing."""
-    # the child imports the package from where the parent did
-    places = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"MUJOCO_GL": back_end, "PYTHONPATH": os.pathsep.join(places)}
-    environment.pop("PYOPENGL_PLATFORM", None)  # PyOpenGL's own choice follows MuJoCo's
-    # MuJoCo first, with this back end; the package would import it without any
+    """Draw scene.pickle of a folder with one back end; return why it failed, or ""."""
+    # the child imports this copy of the package
+    paths = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"MUJOCO_GL": back_end, "PYTHONPATH": os.pathsep.join(paths)}
+    environment.pop("PYOPENGL_PLATFORM", None)  # PyOpenGL's default follows MuJoCo's choice
+    # import MuJoCo first, with this back end; the package would import it without one
     program = f"import mujoco; from {__package__} import render; render.main()"
     try:
         child = subprocess.run(
             [sys.executable, "-c", program],
-            cwd=folder,  # MuJoCo logs into the working directory
+            cwd=folder,  # where MuJoCo writes its log
             env=environment,
             capture_output=True,
             text=True,
@@ -193,7 +191,7 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
         return f"not done after {_TIMEOUT:.0f} s"
     if child.returncode == 0:
         return ""
-    # the end of the first traceback; those that follow are of what it left open
+    # the error of the first traceback; later ones come from resources that it left open
     first = child.stderr.split("Traceback (most recent call last):")[:2][-1]
-    faults = [line for line in first.splitlines() if line.strip() and line[0] != " "]
-    return one_line(faults[0])[:100] if faults else f"ended with code {child.returncode}"
+    errors = [line for line in first.splitlines() if line.strip() and line[0] != " "]
+    return one_line(errors[0])[:100] if errors else f"ended with code {child.returncode}"

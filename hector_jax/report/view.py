@@ -1,8 +1,8 @@
-"""A run on a local web page: two walks side by side, what the ground does, the tuning as it goes.
+"""A run on a local web page: two walks side by side, ground forces, and the tuning in progress.
 
-A displayed tick is one batch of updates. The walks stand beside one another, shifted across their
-way. To follow them the world moves under the camera, so that turning the camera by hand keeps
-working. The page is drawn by viser, of the extra `view`, and asks no other machine for anything.
+Each displayed tick is one batch of updates. The walks are side by side, shifted across their
+heading. To follow them the world moves under the camera, so that the user can still turn the
+camera. The page is drawn by viser, of the extra `view`, and loads nothing from other machines.
 """
 
 import errno
@@ -29,12 +29,14 @@ from hector_jax.runs.folder import METRICS, RESULT, loss_curves, progress_senten
 
 _RATE = 30.0  # displayed ticks per second, at most
 _PAUSE = 1.0  # [s] between readings of the metrics
-_APART = 0.8  # [m] between the two walks
-# [m/N], [m/(N m)] of the arrows: that of the robot's weight has 35 cm
-_SCALES = {"force": 0.35 / 120.0, "moment": 0.35 / 12.0}
-_MIN_ARROW = 0.03  # [m]; shorter ones are not drawn
-_RADII = {"force": 0.008, "moment": 0.014}  # [m] of their shafts
-# colours and dashes of lines in plots, for before, after and what else there is
+# Lengths in the scene, as shares of the robot's standing height.
+_DISTANCE = 1.9  # between the two walks
+_WEIGHT = 5 / 6  # length of an arrow for the robot's weight
+_MIN_ARROW = 0.07  # shorter ones are not drawn
+_HEAD = 0.083  # of an arrow
+_RADII = {"force": 0.019, "moment": 0.033}  # of the shafts of arrows
+_LEVER = 0.1  # [m]; the moment that is drawn as long as the weight is the weight at this lever
+# colours and dashes of lines in plots: before, after, further sets
 _STROKES = (
     *zip(COLOURS, ([6, 4], []), strict=True),
     ((0, 114, 178), [2, 3]),
@@ -44,17 +46,17 @@ _NO_CURVES = {"no iteration yet": np.full(1, np.nan)}  # viser refuses a plot wi
 
 
 class _Source(NamedTuple):
-    """How the wrenches of one source are shown."""
+    """Appearance of the wrenches of one source."""
 
     words: str
     colour: tuple[int, int, int]
-    aside: float  # [m] outwards from the foot point: legs and arrows do not hide each other
+    offset: float  # outwards from the foot point, so that legs and arrows stay visible; see above
 
 
 _SOURCES = {
-    "commanded": _Source("commanded", (25, 25, 30), 0.06),
-    "measured": _Source("measured", (240, 120, 20), 0.09),
-    "predicted": _Source("predicted by the net", (80, 170, 255), 0.12),
+    "commanded": _Source("commanded", (25, 25, 30), 0.14),
+    "measured": _Source("measured", (240, 120, 20), 0.21),
+    "predicted": _Source("predicted by the net", (80, 170, 255), 0.29),
 }
 
 
@@ -62,26 +64,28 @@ class ViewedWalk(NamedTuple):
     """One walk, at the plan interval."""
 
     walk: Trajectory
-    ground: dict[str, Wrench]  # commanded, measured, predicted, or some; (T, 2, 3), yaw frame
+    ground: dict[str, Wrench]  # some of commanded, measured, predicted; (T, feet, 3), yaw frame
 
 
 def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T feet 2 3"]:
-    """Start and end of the arrow at each foot.
+    """Return start and end of the arrow at each foot.
 
     Args:
-        motion: with wrenches of this source.
+        motion: motion with wrenches of this source.
         kind: force or moment.
         source: commanded, measured or predicted.
     """
+    scale = _WEIGHT * motion.height / motion.weight
+    scale /= {"force": 1.0, "moment": _LEVER}[kind]
     left = motion.R_yaw[:, :, 1]
     pairs = motion.feet.shape[1] // 2
-    outwards = np.stack([left, -left] * pairs, axis=1)  # left feet come first
-    start = motion.feet + _SOURCES[source].aside * outwards
-    return np.stack([start, start + _SCALES[kind] * getattr(motion.wrenches[source], kind)], axis=2)
+    outwards = np.stack([left, -left] * pairs, axis=1)  # each pair is left, right
+    start = motion.feet + _SOURCES[source].offset * motion.height * outwards
+    return np.stack([start, start + scale * getattr(motion.wrenches[source], kind)], axis=2)
 
 
 def check_viser() -> None:
-    """Check, before anything is walked, that the page can be drawn.
+    """Check, before any walk, that the page can be drawn.
 
     Raises:
         InputError: viser is not installed.
@@ -105,31 +109,31 @@ def serve(
     """Show two walks and the tuning of a run until interrupted.
 
     Args:
-        walk: called once the page can be opened; gives the motions of the walks, before and after,
-            by the words that stand above them, and what is shown, in Markdown.
-        model: of the body that walks.
-        folder: of the run, whose metrics are read again as they grow.
+        walk: called once the page can be opened; returns the motions of the walks by title, before
+            and after, and their description in Markdown.
+        model: model of the robot.
+        folder: folder of the run, whose metrics are read again as they grow.
         on_open: called with the page's address once it can be opened.
         host: address to listen on.
-        port: where it is taken, a free one is used instead.
+        port: port to listen on; if it is in use, a free one.
 
     Raises:
-        InputError: viser is not installed, or the address cannot be listened on.
+        InputError: viser is not installed, or the server cannot listen on the address.
     """
     check_viser()
     import viser
 
-    # a browser that hangs up early would leave a traceback
+    # a browser that disconnects early would print a traceback
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    # viser prints an address of its own
-    with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
+    # viser prints the address itself
+    with Path(os.devnull).open("w") as null, redirect_stdout(null):
         server = viser.ViserServer(host, _free_port(host, port), label="hector", verbose=False)
         try:
             note = server.gui.add_markdown("The robots walk in a moment.")
             on_open(f"http://{host}:{server.get_port()}")
-            motions, story = walk()
+            motions, description = walk()
             note.remove()
-            page = Page(server, motions, model, folder, story)
+            page = Page(server, motions, model, folder, description)
             last = time.monotonic()
             while True:
                 time.sleep(1.0 / _RATE)
@@ -141,19 +145,18 @@ def serve(
 
 
 def _free_port(host: str, port: int) -> int:
-    """The port, or a free one where it is taken."""
+    """Return the port, or a free one if it is in use."""
     try:
         with socket.create_server((host, port)) as listener:
             return listener.getsockname()[1]
     except OSError as error:
         if error.errno == errno.EADDRINUSE and port:
             return _free_port(host, 0)
-        reason = f"cannot listen on {host}, port {port}: {error.strerror}"
-        raise InputError(reason) from None
+        raise InputError(f"cannot listen on {host}, port {port}: {error.strerror}") from None
 
 
 class Page:
-    """What the browser shows, and when."""
+    """The page in the browser, with its playback."""
 
     def __init__(
         self,
@@ -161,22 +164,22 @@ class Page:
         motions: Mapping[str, Motion],
         model: mujoco.MjModel,
         folder: Path,
-        story: str,
+        description: str,
     ) -> None:
-        """Build the page on a `viser.ViserServer`; the rest as in `serve`."""
+        """Build the page on a `viser.ViserServer`; other arguments as in `serve`."""
         self._server, self._folder = server, folder
         self._model, self._data = model, mujoco.MjData(model)
         self._names, self._motions = list(motions), list(motions.values())
-        self._length = min(len(one.times) for one in self._motions)
-        self._playing, self._tick = True, -1  # the tick that is shown; -1: to be drawn anew
-        self._metrics_state = (-1, False)  # their size when they were read, and whether it was done
-        self._since = np.inf  # [s] since then
-        self._build_panel(story)
+        self._length = min(len(motion.times) for motion in self._motions)
+        self._playing, self._tick = True, -1  # displayed tick; -1: draw again
+        self._metrics_state = (-1, False)  # size of the metrics when last read; tuning finished
+        self._since = np.inf  # [s] since that reading
+        self._build_panel(description)
         self._build_world()
         self.advance(0.0)
 
     def advance(self, elapsed: float) -> None:
-        """Let `elapsed` [s] go by: move on if playing, read the metrics from time to time."""
+        """Advance by `elapsed` [s]: move the robots if playing, read the metrics periodically."""
         if self._playing:
             now, end = self._time.value, self._time.max
             self._time.value = min(now + elapsed * self._speed.value, end) if now < end else 0.0
@@ -190,12 +193,12 @@ class Page:
             self._since = 0.0
             self._read_metrics()
 
-    def _build_panel(self, story: str) -> None:
+    def _build_panel(self, description: str) -> None:
         gui, first = self._server.gui, self._motions[0]
         times = first.times[: self._length]
         gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
-        gui.add_markdown(story)
+        gui.add_markdown(description)
         with gui.add_folder("Playback"):
             self._button = gui.add_button("Pause")
             self._time = gui.add_slider("time [s]", 0.0, float(times[-1]), first.period, 0.0)
@@ -203,19 +206,21 @@ class Page:
             self._follow = gui.add_checkbox("follow the robots", True)
         with gui.add_folder("Ground on the feet"):
             sources = {source: _SOURCES[source] for source in first.wrenches}
-            gui.add_html(render("legend.html.j2", sources=sources.values()))
-            words = {source: one.words for source, one in sources.items()}
-            words |= {"force": "forces", "moment": "moments"}
-            self._boxes = {k: gui.add_checkbox(w, k != "moment") for k, w in words.items()}
+            drawn = {"weight": first.weight, "length": 100.0 * _WEIGHT * first.height}
+            drawn |= {"sources": sources.values(), "moment": _LEVER * first.weight}
+            gui.add_html(render("legend.html.j2", **drawn))
+            labels = {name: source.words for name, source in sources.items()}
+            labels |= {"force": "forces", "moment": "moments"}
+            self._boxes = {n: gui.add_checkbox(text, n != "moment") for n, text in labels.items()}
         with gui.add_folder("Tuning"):
             self._losses = _plot(gui, "L on the model [1e6]", "iteration", np.zeros(1), _NO_CURVES)
             self._progress = gui.add_markdown("")
         with gui.add_folder("Distance from the reference"):
-            lines = [100.0 * one.distance[: self._length] for one in self._motions]
+            lines = [100.0 * motion.distance[: self._length] for motion in self._motions]
             errors = dict(zip(self._names, lines, strict=True))
             _plot(gui, "in the plane [cm]", "time [s]", times, errors)
         self._button.on_click(lambda _: self._play(not self._playing))
-        # moved by a person, not by us
+        # pause when the user moves the slider, which `advance` also moves
         self._time.on_update(lambda event: event.client is not None and self._play(False))
         for box in (self._follow, *self._boxes.values()):
             box.on_update(lambda _: setattr(self, "_tick", -1))
@@ -227,32 +232,34 @@ class Page:
     def _build_world(self) -> None:
         scene, camera = self._server.scene, self._server.initial_camera
         scene.set_up_direction("+z")
-        way = self._motions[0].reference[-1] - self._motions[0].reference[0]
-        heading = np.arctan2(way[1], way[0])
+        displacement = self._motions[0].reference[-1] - self._motions[0].reference[0]
+        heading = np.arctan2(displacement[1], displacement[0])
         across = np.array([-np.sin(heading), np.cos(heading), 0.0])
         side = heading - np.deg2rad(50.0)
-        camera.look_at = (0.0, 0.0, 0.32)
-        camera.position = (1.6 * np.cos(side), 1.6 * np.sin(side), 0.75)
+        height = self._motions[0].height
+        camera.look_at = (0.0, 0.0, 0.76 * height)
+        camera.position = tuple(height * np.array([3.8 * np.cos(side), 3.8 * np.sin(side), 1.8]))
         self._world = scene.add_frame("/world", show_axes=False)
         colours = {"cell_color": (224, 228, 233), "section_color": (196, 203, 211)}
         colours |= {"plane_color": (241, 243, 246), "plane_opacity": 1.0}
         scene.add_grid("/world/floor", 30.0, 30.0, **colours)
         self._handles = []
         for i in range(len(self._motions)):
-            scene.add_frame(f"/world/{i}", show_axes=False, position=(0.5 - i) * _APART * across)
+            position = (0.5 - i) * _DISTANCE * height * across
+            scene.add_frame(f"/world/{i}", show_axes=False, position=position)
             self._handles.append(self._add_walk(i))
 
     def _add_walk(self, i: int) -> dict[str, Any]:
-        """Add one walk to the scene; returns the handles of what moves."""
-        scene, one, root, colour = self._server.scene, self._motions[i], f"/world/{i}", COLOURS[i]
-        pale = tuple(int(c + 0.55 * (255 - c)) for c in colour)
-        lines = {  # on the floor, each at a height [m] of its own so that nothing flickers
-            "footholds": (one.soles, 0.003, pale, 0.03),
-            "path": (_pieces(one.path, 2), 0.006, colour, 0.008),
-            "reference": (_pieces(one.reference, 6)[::2], 0.008, INK, 0.01),
+        """Add one walk to the scene; return the handles of its moving parts."""
+        scene, motion, colour = self._server.scene, self._motions[i], COLOURS[i]
+        root, pale = f"/world/{i}", tuple(int(c + 0.55 * (255 - c)) for c in colour)
+        lines = {  # on the floor, at different heights [m] to avoid flicker
+            "footholds": (motion.soles, 0.003, pale, 0.03),
+            "path": (_segments(motion.path, 2), 0.006, colour, 0.008),
+            "reference": (_segments(motion.reference, 6)[::2], 0.008, INK, 0.01),
         }
-        for line, (pieces, height, shade, thickness) in lines.items():
-            points = pieces * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
+        for line, (segments, height, shade, thickness) in lines.items():
+            points = segments * [1.0, 1.0, 0.0] + [0.0, 0.0, height]
             scene.add_line_segments(f"{root}/{line}", points, shade, thickness=thickness)
         label = {"anchor": "bottom-center", "font_screen_scale": 1.4}
         return {
@@ -263,45 +270,47 @@ class Page:
                 for body, mesh in body_meshes(self._model, colour).items()
             },
             "arrows": {
-                (kind, source): (self._add_arrows(root, kind, source), arrows(one, kind, source))
-                for source in one.wrenches
-                for kind in _SCALES
+                (kind, source): (self._add_arrows(root, kind, source), arrows(motion, kind, source))
+                for source in motion.wrenches
+                for kind in _RADII
             },
         }
 
     def _add_arrows(self, root: str, kind: str, source: str) -> Any:
-        size = {"shaft_radius": _RADII[kind], "head_radius": 2.3 * _RADII[kind]}
-        none, colour = np.zeros((1, 2, 3), np.float32), _SOURCES[source].colour
-        place = f"{root}/{kind}/{source}"
-        return self._server.scene.add_arrows(place, none, colour, head_length=0.035, **size)
+        height = self._motions[0].height
+        radius = height * _RADII[kind]
+        size = {"shaft_radius": radius, "head_radius": 2.3 * radius, "head_length": _HEAD * height}
+        points, colour = np.zeros((1, 2, 3), np.float32), _SOURCES[source].colour
+        name = f"{root}/{kind}/{source}"
+        return self._server.scene.add_arrows(name, points, colour, **size)
 
     def _draw(self, tick: int) -> None:
         aim = self._motions[0].reference[tick] * [1.0, 1.0, 0.0]
         self._world.position = -aim * self._follow.value
-        for name, one, handles in zip(self._names, self._motions, self._handles, strict=True):
-            self._data.qpos[:] = one.qpos[tick]
+        for name, motion, handles in zip(self._names, self._motions, self._handles, strict=True):
+            self._data.qpos[:] = motion.qpos[tick]
             mujoco.mj_kinematics(self._model, self._data)
             for body, handle in handles["bodies"].items():
                 handle.position = self._data.xpos[body].copy()
                 handle.wxyz = self._data.xquat[body].copy()
             for (kind, source), (handle, ends) in handles["arrows"].items():
                 length = np.linalg.norm(ends[tick, :, 1] - ends[tick, :, 0], axis=1)
-                visible = length > _MIN_ARROW  # false where it is NaN
+                visible = length > _MIN_ARROW * motion.height  # false for NaN
                 switched_on = self._boxes[kind].value and self._boxes[source].value
                 handle.visible = bool(switched_on and visible.any())
                 if handle.visible:
                     handle.points = ends[tick, visible].astype(np.float32)
-            handles["aim"].position = one.reference[tick]
-            handles["name"].position = one.path[tick] + [0.0, 0.0, 0.36]
-            fell = one.times[tick] > one.fall_time
-            handles["name"].text = f"{name}, fell at {one.fall_time:.2f} s" if fell else name
+            handles["aim"].position = motion.reference[tick]
+            handles["name"].position = motion.path[tick] + [0.0, 0.0, 0.86 * motion.height]
+            fell = motion.times[tick] > motion.fall_time
+            handles["name"].text = f"{name}, fell at {motion.fall_time:.2f} s" if fell else name
 
     def _read_metrics(self) -> None:
         path, done = self._folder / METRICS, (self._folder / RESULT).exists()
-        now = (path.stat().st_size if path.exists() else 0, done)
-        if now == self._metrics_state:
+        state = (path.stat().st_size if path.exists() else 0, done)
+        if state == self._metrics_state:
             return
-        self._metrics_state = now
+        self._metrics_state = state
         histories = read_histories(self._folder)
         lines = loss_curves(histories) or _NO_CURVES
         iterations = np.arange(float(len(next(iter(lines.values())))))
@@ -312,34 +321,34 @@ class Page:
 
 
 def _plot(gui: Any, title: str, x_name: str, x: np.ndarray, lines: Mapping[str, np.ndarray]) -> Any:
-    """A plot in the panel."""
+    """Add a plot to the panel."""
     axes = {"scales": {"x": {"time": False}}, "axes": ({"label": x_name}, {}), "aspect": 2.0}
     return gui.add_uplot((x, *lines.values()), _series(x_name, lines), title=title, **axes)
 
 
 def _series(x_name: str, names: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
-    looks = zip(names, cycle(_STROKES), strict=False)
-    lines = ({"label": n, "stroke": f"rgb{c}", "dash": d, "width": 2} for n, (c, d) in looks)
+    strokes = zip(names, cycle(_STROKES), strict=False)
+    lines = ({"label": n, "stroke": f"rgb{c}", "dash": d, "width": 2} for n, (c, d) in strokes)
     return ({"label": x_name}, *lines)
 
 
-def _pieces(points: Float[np.ndarray, "T 3"], ticks: int) -> Float[np.ndarray, "n 2 3"]:
-    """A path as pieces of some ticks each."""
+def _segments(points: Float[np.ndarray, "T 3"], ticks: int) -> Float[np.ndarray, "n 2 3"]:
+    """Split a path into segments of `ticks` ticks each."""
     return np.stack([points[:-ticks:ticks], points[ticks::ticks]], axis=1)
 
 
 def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int, Any]:
-    """Meshes of what MuJoCo draws of each body (geom groups 0 to 2).
+    """Make a mesh of the visible geoms of each body (geom groups 0 to 2).
 
     Args:
-        model: of the robot.
-        accent: colour for the material of that name.
+        model: model of the robot.
+        accent: colour for the material named "accent".
     """
     import trimesh
     from trimesh.creation import box, capsule, cylinder, icosphere
 
     kinds = mujoco.mjtGeom
-    solids = {  # from MuJoCo's sizes; the edges of the first two are sharp
+    solids = {  # from MuJoCo's sizes
         kinds.mjGEOM_BOX: lambda size: box(extents=2.0 * size),
         kinds.mjGEOM_CYLINDER: lambda size: cylinder(radius=size[0], height=2.0 * size[1]),
         kinds.mjGEOM_CAPSULE: lambda size: capsule(radius=size[0], height=2.0 * size[1]),
@@ -352,8 +361,8 @@ def body_meshes(model: mujoco.MjModel, accent: tuple[int, int, int]) -> dict[int
         if body == 0 or geom.group[0] > 2 or kind not in solids:
             continue
         mesh = solids[kind](geom.size)
-        if kind in list(solids)[:2]:
-            mesh.unmerge_vertices()
+        if kind in (kinds.mjGEOM_BOX, kinds.mjGEOM_CYLINDER):
+            mesh.unmerge_vertices()  # draws sharp edges
         rgba = model.mat_rgba[material] if material >= 0 else geom.rgba
         if material >= 0 and model.material(material).name == "accent":
             rgba = np.array([*accent, 255]) / 255.0

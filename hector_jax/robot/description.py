@@ -1,31 +1,31 @@
-"""The names, limits, gait and weights of a robot beside its model, in a short TOML.
+"""The TOML file with names, limits, gait and weights that accompanies a robot's model.
 
-    name = "strider"                   # its walks and net are kept under this name
+    name = "strider"                   # its walks and net are stored under this name
     model = "strider.xml"              # MJCF or URDF, beside this file
     standing = "home"                  # keyframe of the standing pose, or angles: { knee = 0.5 }
     [joints]                           # of each leg, from the trunk down
     left, right = three to seven names each; of four legs: front_left, front_right, hind_left, ..
-    linkage = [5, 4]                   # the fifth joint's motor turns the fourth too; or none
+    linkage = [5, 4]                   # the fifth joint's motor also turns the fourth; optional
     weld = ["waist"]                   # hinges that are fixed in the standing pose
-    armature = a number each           # [kg m^2] of a leg's motors, which a URDF cannot state
-    [feet]                             # likewise; names in the model, or places in a body's frame
+    armature = one number per joint    # [kg m^2] of a leg's motors, which a URDF cannot state
+    [feet]                             # per leg: names in the model, or points in a body's frame
     left, right = { point = site on the sole, toe = geom, heel = geom }
     left, right = { body, contacts = [[x, y, z], ...], point = [x, y, z] }   # 1, 2 or 4 contacts
     [limits]
-    min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond, it has fallen
+    min_height, max_tilt               # [m] of the centre of mass, [rad]: beyond them it has fallen
     [gait] [mpc] [footstep] [legs]     # fields of GaitConfig, MpcConfig, FootstepConfig, LegConfig
-    [weights]
-    nominal, expert = { euler, position, ang_velocity, velocity, force, moment }   # x, y, z or one
-    [loss]                             # weights of the terms of the loss: L_Eul, L_pos, L_ctrl
+    [weights]                          # each an x, y, z triple or a single number
+    nominal, expert = { euler, position, ang_velocity, velocity, force, moment }
+    [loss]                             # weights of the loss terms: L_Eul, L_pos, L_ctrl
     [tuning]                           # fields of TuningSettings
     [plants]                           # fields of PlantSizes
 
-What is left out is as in assets/hector.toml. Masses, lengths, joint and torque limits are the
-model's; a description rides on its `Robot` and is static under jit.
+Defaults are those of assets/hector.toml. Masses, lengths, joint and torque limits come from the
+model; a description is a static field of its `Robot` under jit.
 """
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -36,7 +36,7 @@ from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, check, from_table, 
 from hector_jax.core.trajectory import FEET, MAX_TILT, MIN_HEIGHT
 
 _PACKAGE = Path(__file__).parents[1]
-_INSTALLED = _PACKAGE / "assets"  # where a wheel puts them
+_INSTALLED = _PACKAGE / "assets"  # the folder in a wheel
 _ASSETS = _INSTALLED if _INSTALLED.exists() else _PACKAGE.parent / "assets"
 MODEL_PATH = _ASSETS / "hector.xml"
 DESCRIPTION_PATH = _ASSETS / "hector.toml"
@@ -50,27 +50,23 @@ _MAX_BYTES = 100_000
 Triple = tuple[float, float, float]
 
 
-def _leg(side: str) -> tuple[str, ...]:
+def _joint_names(side: str) -> tuple[str, ...]:
     return tuple(f"{side}_{joint}" for joint in LEG_JOINTS)
 
 
 class Foot(NamedTuple):
-    """A foot in the model: names in it, or places in the frame of a body."""
+    """A foot in the model's file, by names in it or by points in the frame of a body."""
 
-    point: str | Triple | None  # site; or where wrenches act [m]; else under the last joint
-    contacts: tuple[str | Triple, ...]  # spheres; or where the sole touches [m]
-    body: str | None = None  # of places
+    point: str | Triple | None  # site; or point where wrenches act [m]; None: under the last joint
+    contacts: tuple[str | Triple, ...]  # spheres; or contact points of the sole [m]
+    body: str | None = None  # whose frame the points are in
 
 
 class NamedFoot(NamedTuple):
-    """A foot in the compiled model, where everything has a name."""
+    """A foot in the compiled model, where site and spheres have names."""
 
     point: str  # site
     contacts: tuple[str, ...]  # spheres
-
-
-def _named_foot(side: str) -> Foot:
-    return Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel"))
 
 
 _Factor = Annotated[float, NOT_NEGATIVE]
@@ -78,12 +74,12 @@ _Factor = Annotated[float, NOT_NEGATIVE]
 
 @dataclass(frozen=True)
 class PlantSizes:
-    """How large the imperfections of this robot's plants are, each times that of HECTOR's."""
+    """Sizes of the imperfections of this robot's plants, as multiples of HECTOR's."""
 
     joint_friction: _Factor = 1.0
     joint_damping: _Factor = 1.0
-    push: _Factor = 1.0  # forces from outside
-    trunk_com: _Factor = 1.0  # lengths: shift of the trunk's centre of mass, place of a payload
+    push: _Factor = 1.0  # external forces
+    trunk_com: _Factor = 1.0  # lengths: shift of the trunk's centre of mass, payload position
     payload: _Factor = 1.0  # masses
 
     def __post_init__(self) -> None:
@@ -92,11 +88,11 @@ class PlantSizes:
 
 @dataclass(frozen=True)
 class TuningSettings:
-    """How this robot is tuned, where it is not as HECTOR."""
+    """Tuning settings of this robot; the defaults are HECTOR's."""
 
-    lead: Annotated[int, NOT_NEGATIVE] = 0  # gait ticks of a rollout in place, before the command
-    touchdown_error: bool = False  # whether the net learns how far from the plan the feet land
-    choice_plants: Annotated[int, NOT_NEGATIVE] = 0  # on which an iteration is chosen; 0: the last
+    lead: Annotated[int, NOT_NEGATIVE] = 0  # gait ticks of stepping in place before the command
+    touchdown_error: bool = False  # the net learns the distance from planned to actual touchdown
+    choice_plants: Annotated[int, NOT_NEGATIVE] = 0  # plants to choose the iteration; 0: the last
 
     def __post_init__(self) -> None:
         check(self)
@@ -105,33 +101,35 @@ class TuningSettings:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Description:
-    """A robot's TOML; the defaults are the names and limits of HECTOR."""
+    """The content of a robot's TOML; the defaults are the names and limits of HECTOR."""
 
     model: Path = MODEL_PATH  # MJCF or URDF
-    path: Path = DESCRIPTION_PATH  # where this was read
+    path: Path = DESCRIPTION_PATH  # of the TOML
     name: str = "hector"
     standing: str | tuple[tuple[str, float], ...] = "standing"  # keyframe, or angles [rad] by joint
-    joints: tuple[str, ...] = _leg("left") + _leg("right")
-    linkage: tuple[int, int] | None = (5, 4)  # of a leg, counted from 1: whose motor turns which
+    joints: tuple[str, ...] = _joint_names("left") + _joint_names("right")
+    linkage: tuple[int, int] | None = (5, 4)  # motor, and joint it also turns; counted from 1
     weld: tuple[str, ...] = ()  # joints
-    armature: tuple[float, ...] = ()  # [kg m^2] of the joints of a leg; else the model's
-    feet: tuple[Foot, ...] = (_named_foot("left"), _named_foot("right"))
+    armature: tuple[float, ...] = ()  # [kg m^2] of the joints of a leg; empty: the model's
+    feet: tuple[Foot, ...] = tuple(
+        Foot(f"{side}_foot_point", (f"{side}_toe", f"{side}_heel")) for side in FEET[2]
+    )
     min_height: float = MIN_HEIGHT  # [m] of the centre of mass; below it the robot has fallen
-    max_tilt: float = MAX_TILT  # [rad] of roll or pitch; beyond it too
-    control: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()  # sections as they came
-    nominal: tuple[Triple, ...] | None = None  # in the order of _Diagonals; None: as HECTOR's
-    expert: tuple[Triple, ...] | None = None  # likewise
-    loss: tuple[tuple[str, float], ...] = ()  # alphas by term; of the others those of the paper
+    max_tilt: float = MAX_TILT  # [rad] of roll or pitch; beyond it the robot has fallen
+    control: tuple[tuple[str, tuple[tuple[str, Any], ...]], ...] = ()  # unchecked sections
+    nominal: tuple[Triple, ...] | None = None  # in the order of _Diagonals; None: HECTOR's
+    expert: tuple[Triple, ...] | None = None  # in the order of _Diagonals; None: HECTOR's
+    loss: tuple[tuple[str, float], ...] = ()  # alphas by term; missing ones are the paper's
     plants: PlantSizes = PlantSizes()
-    # no part of its repr, of which hashes of a robot are made: walks do not depend on it
+    # not in the repr, which is hashed to identify a robot: walks do not depend on it
     tuning: TuningSettings = field(default=TuningSettings(), repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "control", _frozen(self.control))
+        object.__setattr__(self, "control", _as_tuples(self.control))
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Least height [m] and largest tilt [rad] of a robot that has not fallen."""
+        """Minimum height [m] and maximum tilt [rad] of a robot that has not fallen."""
         return self.min_height, self.max_tilt
 
     @property
@@ -145,7 +143,7 @@ class Description:
         return FEET[len(self.feet)]
 
     @property
-    def named_feet(self) -> tuple["NamedFoot", ...]:
+    def named_feet(self) -> tuple[NamedFoot, ...]:
         """Site and spheres of each foot in the compiled model."""
         return tuple(
             NamedFoot(f"{leg}_point", tuple(f"{leg}_contact_{i}" for i in range(len(contacts))))
@@ -156,22 +154,22 @@ class Description:
 
     @property
     def leg_joints(self) -> int:
-        """Joints of a leg."""
+        """Number of joints of a leg."""
         return len(self.joints) // len(self.feet)
 
 
-def _legs(of_leg: Any, nothing: Any) -> dict[str, Any]:
-    """What a section has of each leg, by name, in the order of FEET.
+def _by_leg(section: Any, default: Any) -> dict[str, Any]:
+    """Return the values of a section that are not the default, by leg in the order of FEET.
 
     Raises:
-        InputError: legs are missing, or too many.
+        InputError: the section has too few or too many legs.
     """
-    known = [leg for names in FEET.values() for leg in names]
-    given = {leg: value for leg in known if (value := getattr(of_leg, leg)) != nothing}
-    if tuple(given) not in FEET.values():
-        expected = "; or ".join(", ".join(names) for names in FEET.values())
-        raise InputError(f"must have {expected}, got {', '.join(given) or 'none of them'}")
-    return given
+    legs = sum(FEET.values(), ())
+    values = {leg: value for leg in legs if (value := getattr(section, leg)) != default}
+    if tuple(values) not in FEET.values():
+        expected = "; or ".join(map(", ".join, FEET.values()))
+        raise InputError(f"must have {expected}, got {', '.join(values) or 'none of them'}")
+    return values
 
 
 @dataclass(frozen=True)
@@ -189,10 +187,11 @@ class _Joints:
     @property
     def legs(self) -> dict[str, tuple[str, ...]]:
         """Joints by leg."""
-        return _legs(self, ())
+        return _by_leg(self, ())
 
     def __post_init__(self) -> None:
-        names, counts = sum(self.legs.values(), self.weld), [*map(len, self.legs.values())]
+        names = sum(self.legs.values(), self.weld)
+        counts = [len(joints) for joints in self.legs.values()]
         count = counts[0]
         if not FEWEST_JOINTS <= count <= MOST_JOINTS or set(counts) != {count}:
             *first, last = map(str, counts)
@@ -202,8 +201,8 @@ class _Joints:
                 f"and {last}"
             )
         if len(set(names)) < len(names):
-            twin = next(name for name in names if names.count(name) > 1)
-            raise InputError(f"must be different names, got {short_repr(twin)} twice")
+            duplicate = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"must be different names, got {short_repr(duplicate)} twice")
         if len(self.armature) not in (0, count):
             raise InputError(
                 f"armature must be a number for each of the {count} joints of a leg, "
@@ -227,15 +226,15 @@ class _Foot:
     contacts: tuple[Triple, ...] = ()
 
     def __post_init__(self) -> None:
-        named = [self.point, self.toe, self.heel]
+        names = [self.point, self.toe, self.heel]
         if self.body is None:
-            right = not self.contacts and all(isinstance(name, str) for name in named)
+            valid = not self.contacts and all(isinstance(name, str) for name in names)
         else:
-            right = len(self.contacts) in (1, 2, 4) and named[1:] == [None, None]
-            places = [*self.contacts, (0.0, 0.0, 0.0) if self.point is None else self.point]
-            right = right and not any(isinstance(place, str) for place in places)
-            right = right and all(math.isfinite(float(x)) for place in places for x in place)
-        if not right:
+            points = [*self.contacts, (0.0, 0.0, 0.0) if self.point is None else self.point]
+            valid = len(self.contacts) in (1, 2, 4) and names[1:] == [None, None]
+            valid = valid and not any(isinstance(point, str) for point in points)
+            valid = valid and all(math.isfinite(float(x)) for point in points for x in point)
+        if not valid:
             raise InputError(
                 "must be names: point (a site), toe and heel (spheres); or a body with 1, 2 or 4 "
                 "contacts [x, y, z] on its sole and, if wanted, a point [x, y, z]"
@@ -243,9 +242,9 @@ class _Foot:
 
     @property
     def foot(self) -> Foot:
-        """As the description has it."""
-        ends = self.contacts if self.toe is None or self.heel is None else (self.toe, self.heel)
-        return Foot(self.point, ends, self.body)
+        """The foot in the form of the description."""
+        contacts = self.contacts if self.toe is None or self.heel is None else (self.toe, self.heel)
+        return Foot(self.point, contacts, self.body)
 
 
 @dataclass(frozen=True)
@@ -260,12 +259,12 @@ class _Feet:
     @property
     def feet(self) -> dict[str, Foot]:
         """Feet by leg."""
-        return {leg: one.foot for leg, one in _legs(self, None).items()}
+        return {leg: foot.foot for leg, foot in _by_leg(self, None).items()}
 
     def __post_init__(self) -> None:
-        count = [len(foot.contacts) for foot in self.feet.values()]
-        if len(set(count)) > 1:
-            raise InputError(f"{' and '.join(self.feet)} must have as many contacts, got {count}")
+        counts = [len(foot.contacts) for foot in self.feet.values()]
+        if len(set(counts)) > 1:
+            raise InputError(f"{' and '.join(self.feet)} must have as many contacts, got {counts}")
 
 
 @dataclass(frozen=True)
@@ -287,9 +286,8 @@ class _Diagonals:
     moment: _Diagonal
 
     def rows(self) -> tuple[Triple, ...]:
-        """Three numbers each."""
-        values = (getattr(self, one.name) for one in fields(self))
-        return tuple(x if isinstance(x, tuple) else (x, x, x) for x in values)
+        """Return three numbers per field."""
+        return tuple(x if isinstance(x, tuple) else (x, x, x) for x in vars(self).values())
 
 
 @dataclass(frozen=True)
@@ -303,7 +301,7 @@ class _File:
     name: str | None = None
     model: str = MODEL_PATH.name
     standing: str | dict[str, float] = "standing"
-    joints: _Joints = _Joints(left=_leg("left"), right=_leg("right"))
+    joints: _Joints = _Joints(left=_joint_names("left"), right=_joint_names("right"))
     feet: _Feet | None = None
     limits: _Limits = _Limits()
     gait: dict | None = None
@@ -332,20 +330,20 @@ class _File:
 
 
 def read_description(path: Path) -> Description:
-    """The description in a TOML file, see the module.
+    """Read a description from a TOML file in the format of the module's docstring.
 
     The fields of the controller's sections are checked by `controller.walk_config`, the terms of
     the loss by `loss.loss_of_robot`.
 
     Raises:
-        InputError: one line naming file, key, what came and what was expected.
+        InputError: one line naming the file, the key, the value received and the expected one.
     """
     path = Path(path)
     return description_of(path, read_toml(path, "the robot description", _MAX_BYTES))
 
 
 def description_of(path: Path, table: dict[str, Any]) -> Description:
-    """The description that a TOML file at a path would give with this content.
+    """Return the description that a TOML file at a path would give with this content.
 
     Raises:
         InputError: as `read_description`.
@@ -357,9 +355,7 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
             f"{path}: name must be letters, digits, - and _ (it names a folder), "
             f"got {short_repr(name)}"
         )
-    weights, standing, feet = file.weights, file.standing, Description.feet
-    if file.feet is not None:
-        feet = tuple(file.feet.feet.values())
+    weights, standing = file.weights, file.standing
     return Description(
         model=path.parent / file.model,
         path=path,
@@ -369,12 +365,12 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
         linkage=file.joints.linkage,
         weld=file.joints.weld,
         armature=file.joints.armature,
-        feet=feet,
+        feet=tuple(file.feet.feet.values()) if file.feet else Description.feet,
         **vars(file.limits),
         control=tuple(
-            (part, tuple(section.items()))
-            for part in CONTROL
-            if (section := getattr(file, part)) is not None
+            (name, tuple(section.items()))
+            for name in CONTROL
+            if (section := getattr(file, name)) is not None
         ),
         nominal=weights.nominal and weights.nominal.rows(),
         expert=weights.expert and weights.expert.rows(),
@@ -384,12 +380,12 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
     )
 
 
-def _frozen(value: Any) -> Any:
-    """The value as one that can be hashed, as static arguments have to be."""
+def _as_tuples(value: Any) -> Any:
+    """Return the value with tuples for lists and dicts, hashable as static arguments must be."""
     if isinstance(value, dict):
         value = list(value.items())
-    return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
 
 
 HECTOR = Description()
-"""Whose plants are drawn where no description is given."""
+"""The default robot, whose plants are drawn if no description is passed."""

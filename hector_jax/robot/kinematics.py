@@ -1,19 +1,19 @@
-"""Feet from joints and joints from feet, all in the trunk frame.
+"""Forward and inverse kinematics of the legs in the trunk frame.
 
-A leg is a chain of three to seven hinges; `Robot.joint_axis` and `Robot.joint_origin` have them in
-any order, sign and place. The way back is a damped Newton iteration from joints nearby: the rows of
-the foot's twist that the leg can place (`Structure.placed`) are met, what the leg has beyond them
-stays near the standing pose.
+A leg is a chain of three to seven hinges with any axes and origins (`Robot.joint_axis`,
+`Robot.joint_origin`). Its inverse is a damped Newton iteration from nearby joint angles: the foot
+meets the target in the rows of its twist that the leg can control (`Structure.placed`), and
+redundant joints stay near the standing pose.
 
-Legs as HECTOR's have a formula (`Structure.closed_form`): hip yaw (z), hip roll (x), hip pitch,
-knee, ankle (y). Behind yaw psi and roll phi the three pitch joints move in one plane. With the
-running pitches a = q_2, b = q_2 + q_3 and theta = q_2 + q_3 + q_4
+Legs built like HECTOR's (`Structure.closed_form`) have a closed-form inverse: hip yaw (z), hip roll
+(x), hip pitch, knee, ankle (y). After yaw psi and roll phi the three pitch joints move in one
+plane. With the cumulative pitches a = q_2, b = q_2 + q_3 and theta = q_2 + q_3 + q_4
 
     foot point = o_yaw + Rz(psi) (o_roll + Rx(phi) p)
     p = o_pitch + Ry(a) o_knee + Ry(b) o_ankle + Ry(theta) sole
 
-Yaw is given, roll turns the plane onto the target, the rest is a triangle of thigh and shin, which
-the knee's limits say which way to bend.
+Yaw is an input, roll turns the plane onto the target, and the pitch joints solve a triangle of
+thigh and shin, bent in the direction that the knee's limits allow.
 """
 
 from functools import partial
@@ -28,20 +28,20 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_x, rot_y, rot_z, skew
 from hector_jax.robot.model import Robot
 
-NEWTON_STEPS = 4  # from the joints of a moment before; from far away more are needed
-_LARGEST_STEP = 0.4  # [rad] of a joint in a Newton step
+NEWTON_STEPS = 4  # from the joint angles of the previous tick; distant starts need more
+_MAX_STEP = 0.4  # [rad] of a joint in a Newton step
 _DAMPING = 0.1  # times the squared error
 
 
 class FootPoses(NamedTuple):
-    """The feet in the trunk frame."""
+    """Poses of the feet in the trunk frame."""
 
     position: Float[Array, "feet 3"]  # foot points [m]
     rotation: Float[Array, "feet 3 3"]  # takes foot vectors to the trunk frame
 
 
 def foot_poses(robot: Robot, joints: Float[Array, " joints"]) -> FootPoses:
-    """Foot points and foot axes of the joint angles [rad]."""
+    """Return foot points and foot axes for joint angles [rad]."""
     chain = _chain(robot, joints)
     return FootPoses(chain.foot, chain.rotation)
 
@@ -49,9 +49,9 @@ def foot_poses(robot: Robot, joints: Float[Array, " joints"]) -> FootPoses:
 def foot_jacobians(
     robot: Robot, joints: Float[Array, " joints"]
 ) -> tuple[Float[Array, "feet 3 j"], Float[Array, "feet 3 j"]]:
-    """Jacobians of each foot point by its own leg's joints: velocity [m] and angular velocity [-].
+    """Return each foot's Jacobians for velocity [m] and angular velocity [-] by its leg's joints.
 
-    Trunk axes, trunk at rest: for a foot at rest on the ground, add the trunk's own motion.
+    In trunk axes with the trunk at rest: for a foot at rest on the ground, add the trunk's motion.
     """
     chain = _chain(robot, joints)
     J_v = jnp.cross(chain.axis, chain.foot[:, None] - chain.origin)
@@ -66,34 +66,34 @@ def inverse_legs(
     start: Float[Array, " joints"],
     steps: int = NEWTON_STEPS,
 ) -> Float[Array, " joints"]:
-    """Joint angles [rad] that put the feet where they are wanted; the inverse of `foot_poses`.
+    """Return the joint angles [rad] for target foot poses; the inverse of `foot_poses`.
 
-    Where a target is out of reach the leg points at it as far as its limits let it. Finite, with
-    finite derivatives, everywhere. By the formula the knee alone is limited, and of the two
-    solutions it is the one with the foot point below the hip roll axis.
+    If a target is out of reach, the leg points at it as far as its limits allow. The result and its
+    derivatives are always finite. The closed form limits yaw and knee only; it returns the solution
+    with the foot point below the hip roll axis.
 
     Args:
-        robot: its legs.
+        robot: with the legs.
         position: foot points in the trunk frame [m].
         yaw: headings of the feet in the trunk frame [rad].
         up: normals of the soles in the trunk frame.
-        start: joints nearby [rad]; the formula needs none.
-        steps: of Newton (static).
+        start: nearby joint angles [rad]; not used by the closed form.
+        steps: of the Newton iteration (static).
     """
     leg = _leg_constants(robot)
     if robot.structure.closed_form:
         yaw = jnp.clip(yaw, leg.lower[:, 0], leg.upper[:, 0])
-        in_leg = jnp.stack([n @ rot_z(psi) for n, psi in zip(up, yaw, strict=True)])
-        pitch = jnp.arctan2(in_leg[:, 0], in_leg[:, 2])
-        return jax.vmap(_inverse_leg)(leg, position, yaw, pitch).reshape(-1)
-    search = jax.vmap(partial(_searched_leg, robot.structure.placed, steps))
-    return search(leg, start.reshape(leg.lower.shape), position, yaw, up).reshape(-1)
+        up_yawed = jnp.stack([n @ rot_z(psi) for n, psi in zip(up, yaw, strict=True)])
+        pitch = jnp.arctan2(up_yawed[:, 0], up_yawed[:, 2])
+        return jax.vmap(_closed_form_inverse)(leg, position, yaw, pitch).reshape(-1)
+    inverse = jax.vmap(partial(_newton_inverse, robot.structure.placed, steps))
+    return inverse(leg, start.reshape(leg.lower.shape), position, yaw, up).reshape(-1)
 
 
 def leg_gravity(
     robot: Robot, joints: Float[Array, " joints"], up: Float[Any, "3"]
 ) -> Float[Array, " joints"]:
-    """Joint torques [N m] that hold the legs' own weight, with the trunk fixed.
+    """Return the joint torques [N m] that hold the legs' own weight, with the trunk fixed.
 
     Args:
         robot: link masses and CoMs.
@@ -106,25 +106,23 @@ def leg_gravity(
     # a joint carries the links from its own outwards: row of the joint, column of the link
     mass = jnp.triu(jnp.broadcast_to(link_mass[:, None, :], (len(link_mass), count, count)))
     lever = jnp.sum(mass[..., None] * (com[:, None] - chain.origin[:, :, None]), axis=2)
-    moment = jnp.cross(lever, up)
-    return jnp.sum(chain.axis * moment, axis=-1).reshape(-1)
+    return jnp.sum(chain.axis * jnp.cross(lever, up), axis=-1).reshape(-1)
 
 
 def knee_joints(robot: Robot) -> tuple[int, int, int]:
-    """Hip, knee and ankle of a leg, counted from the trunk.
+    """Return the indices of hip, knee and ankle in a leg, counted from the trunk.
 
     The knee is the joint that changes the leg's length most in the standing pose; hip and ankle are
-    the joints nearest to it with parallel axes, or the first and the last one.
+    the joints nearest to it with parallel axes, or the first and the last joint.
     """
-    count = robot.description.leg_joints
-    standing = robot.standing_joints[:count]
+    count, standing = robot.description.leg_joints, robot.standing_joints
 
     def length(joints: np.ndarray) -> float:
-        of_all = jnp.asarray(np.concatenate([joints, robot.standing_joints[count:]]))
-        foot = foot_poses(robot, of_all).position[0]
+        foot = foot_poses(robot, jnp.asarray(joints)).position[0]
         return float(np.linalg.norm(foot - robot.joint_origin[0, 0]))
 
-    slopes = [abs(length(standing + 1e-4 * e) - length(standing - 1e-4 * e)) for e in np.eye(count)]
+    steps = 1e-4 * np.eye(count, len(standing))
+    slopes = [abs(length(standing + step) - length(standing - step)) for step in steps]
     knee = int(np.argmax(slopes[1:])) + 1
     parallel = np.abs(robot.joint_axis[0] @ robot.joint_axis[0, knee]) > 0.9
     above, below = np.flatnonzero(parallel[:knee]), np.flatnonzero(parallel[knee + 1 :])
@@ -145,17 +143,17 @@ class _Leg(NamedTuple):
 
 
 class _Chain(NamedTuple):
-    """All legs unrolled in the trunk frame."""
+    """Feet, joints and links of all legs in the trunk frame."""
 
     foot: Float[Array, "feet 3"]
     rotation: Float[Array, "feet 3 3"]
     origin: Float[Array, "feet j 3"]
     axis: Float[Array, "feet j 3"]
-    frames: Float[Array, "feet j 3 3"]  # links' axes; computed only where they are used
+    frames: Float[Array, "feet j 3 3"]  # axes of the links; XLA drops them if they are not used
 
 
 def _leg_constants(robot: Robot) -> _Leg:
-    """Those of all legs."""
+    """Return the constants of all legs."""
     parts = (robot.joint_origin, robot.joint_axis, robot.foot_point, robot.sole)
     limits = (robot.joint_lower, robot.joint_upper, robot.standing_joints)
     return _Leg(
@@ -165,11 +163,11 @@ def _leg_constants(robot: Robot) -> _Leg:
 
 
 def _chain(robot: Robot, joints: Float[Array, " joints"]) -> _Chain:
-    chain = _leg_chain if robot.structure.closed_form else _any_chain
+    chain = _closed_form_chain if robot.structure.closed_form else _general_chain
     return jax.vmap(chain)(_leg_constants(robot), joints.reshape(len(robot.foot_point), -1))
 
 
-def _leg_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
+def _closed_form_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
     pitches = jnp.cumsum(joints[2:])
     cy, sy = jnp.cos(joints[0]), jnp.sin(joints[0])
     cr, sr = jnp.cos(joints[1]), jnp.sin(joints[1])
@@ -178,7 +176,7 @@ def _leg_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
     R_yaw = jnp.stack([cy, -sy, zero, sy, cy, zero, zero, zero, one]).reshape(3, 3)
     R_roll = jnp.stack([cy, -sy * cr, sy * sr, sy, cy * cr, -cy * sr, zero, sr, cr]).reshape(3, 3)
     ahead, side, up = R_roll[:, 0], R_roll[:, 1], R_roll[:, 2]
-    # columns of R_roll Ry(p), one for each of the three running pitches
+    # columns of R_roll Ry(p) for each of the three cumulative pitches
     R_pitch = jnp.stack(
         [
             cp[:, None] * ahead - sp[:, None] * up,
@@ -189,7 +187,7 @@ def _leg_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
     )
     frames = jnp.concatenate([R_yaw[None], R_roll[None], R_pitch])
     steps = jnp.concatenate([leg.origin[1:], leg.foot_point[None]])
-    # o_yaw, o_roll, ..., o_ankle, foot: each is the one before plus a step in its frame
+    # o_yaw, o_roll, ..., o_ankle, foot: each point is the previous one plus a step in its frame
     points = jnp.cumsum(
         jnp.concatenate([leg.origin[:1], jnp.sum(frames * steps[:, None, :], axis=-1)]), axis=0
     )
@@ -197,7 +195,7 @@ def _leg_chain(leg: _Leg, joints: Float[Array, "5"]) -> _Chain:
     return _Chain(points[5], frames[4], points[:5], axis, frames)
 
 
-def _inverse_leg(
+def _closed_form_inverse(
     leg: _Leg, position: Float[Array, "3"], yaw: Float[Array, ""], pitch: Float[Array, ""]
 ) -> Float[Array, "5"]:
     origin, foot_point = leg.origin, leg.foot_point
@@ -206,7 +204,7 @@ def _inverse_leg(
     x, y, z = position - origin[0]
     x, y, z = cy * x + sy * y - origin[1, 0], cy * y - sy * x - origin[1, 1], z - origin[1, 2]
 
-    # roll turns the leg's plane, `side` beside the roll axis, onto the target
+    # roll turns the leg's plane, offset from the roll axis by `side`, onto the target
     side = origin[2, 1] + origin[3, 1] + origin[4, 1] + foot_point[1]
     on_axis = y**2 + z**2 < 1e-12
     z = jnp.where(on_axis, -1e-6, z)
@@ -223,7 +221,7 @@ def _inverse_leg(
     # triangle of thigh and shin
     thigh, shin = -origin[3, 2], -origin[4, 2]
     cos_knee = (x**2 + z**2 - thigh**2 - shin**2) / (2 * thigh * shin)
-    # the limits keep both ends off +-1, where arccos has no slope
+    # the limits keep both ends away from +-1, where the derivative of arccos is infinite
     ends = jnp.cos(leg.lower[3]), jnp.cos(leg.upper[3])
     bend = jnp.arccos(jnp.clip(cos_knee, jnp.minimum(*ends), jnp.maximum(*ends)))
     knee = jnp.where(leg.lower[3] < 0.0, -bend, bend)
@@ -231,23 +229,23 @@ def _inverse_leg(
     return jnp.stack([yaw, roll, hip, knee, pitch - hip - knee])
 
 
-def _any_chain(leg: _Leg, joints: Float[Array, " j"]) -> _Chain:
+def _general_chain(leg: _Leg, joints: Float[Array, " j"]) -> _Chain:
     R, point = jnp.eye(3, dtype=joints.dtype), jnp.zeros(3, joints.dtype)
     K = jax.vmap(skew)(leg.axis.astype(joints.dtype))
     sin, cos = jnp.sin(joints)[:, None, None], jnp.cos(joints)[:, None, None]
-    turns = jnp.eye(3, dtype=joints.dtype) + sin * K + (1.0 - cos) * (K @ K)  # Rodrigues
+    rotations = jnp.eye(3, dtype=joints.dtype) + sin * K + (1.0 - cos) * (K @ K)  # Rodrigues
     points, axes, frames = [], [], []
-    for origin, axis, turn in zip(leg.origin, leg.axis, turns, strict=True):
+    for origin, axis, rotation in zip(leg.origin, leg.axis, rotations, strict=True):
         point = point + R @ origin
         points.append(point)
         axes.append(R @ axis)
-        R = R @ turn
+        R = R @ rotation
         frames.append(R)
     foot = point + R @ leg.foot_point
-    return _Chain(foot, R @ leg.sole, *(jnp.stack(rows) for rows in (points, axes, frames)))
+    return _Chain(foot, R @ leg.sole, *map(jnp.stack, (points, axes, frames)))
 
 
-def _searched_leg(
+def _newton_inverse(
     placed: tuple[int, ...],
     steps: int,
     leg: _Leg,
@@ -261,38 +259,38 @@ def _searched_leg(
     def error(
         joints: Array, position: Array, yaw: Array, up: Array
     ) -> tuple[Float[Array, " rows"], Float[Array, "rows j"]]:
-        """Of foot point [m] and sole [rad], in the rows that the leg places; and its Jacobian."""
-        chain = _any_chain(leg, joints)
+        """Return the error of foot point [m] and sole [rad] in the rows, and its Jacobian."""
+        chain = _general_chain(leg, joints)
         pitch = jnp.arctan2(-up[0], jnp.hypot(up[1], up[2]))
-        to_wanted = rot_z(yaw).T @ rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))
-        turn = _rotation_vector(to_wanted @ chain.rotation)
-        moves = jnp.cross(chain.axis, chain.foot - chain.origin).T
-        turns = _rotation_vector_rates(turn) @ to_wanted @ chain.axis.T
-        found = jnp.concatenate([chain.foot - position, turn])
-        return found[rows], jnp.concatenate([moves, turns])[rows]
+        to_target = rot_z(yaw).T @ rot_y(pitch) @ rot_x(jnp.arctan2(up[1], up[2]))
+        rotation = _rotation_vector(to_target @ chain.rotation)
+        J_v = jnp.cross(chain.axis, chain.foot - chain.origin).T
+        J_w = _rotation_vector_rates(rotation) @ to_target @ chain.axis.T
+        residual = jnp.concatenate([chain.foot - position, rotation])
+        return residual[rows], jnp.concatenate([J_v, J_w])[rows]
 
     def step(joints: Array, *target: Array) -> Array:
-        still = jax.lax.stop_gradient(joints)
-        now, J = error(still, *target)
+        constant = jax.lax.stop_gradient(joints)
+        residual, J = error(constant, *target)
         J = jax.lax.stop_gradient(J)
-        damping = _DAMPING * jax.lax.stop_gradient(now @ now) + 1e-12
+        damping = _DAMPING * jax.lax.stop_gradient(residual @ residual) + 1e-12
         damped = J @ J.T + damping * jnp.eye(len(rows), dtype=J.dtype)
-        rest = leg.standing - still  # of what the foot leaves free
-        return rest - J.T @ _solve(damped, now + J @ rest)
+        rest = leg.standing - constant  # for redundant joints
+        return rest - J.T @ _solve(damped, residual + J @ rest)
 
-    def improved(joints: Array, _: None) -> tuple[Array, None]:
-        moved = joints + jnp.clip(step(joints, *fixed), -_LARGEST_STEP, _LARGEST_STEP)
-        return jnp.clip(moved, leg.lower, leg.upper), None
+    def iterate(joints: Array, _: None) -> tuple[Array, None]:
+        joints = joints + jnp.clip(step(joints, *constant_target), -_MAX_STEP, _MAX_STEP)
+        return jnp.clip(joints, leg.lower, leg.upper), None
 
     target = (position, yaw, up)
-    fixed = jax.lax.stop_gradient(target)
-    joints, _ = jax.lax.scan(improved, jax.lax.stop_gradient(start), length=steps)
-    # one step more, the only one that is differentiated: its derivative is that of the solution
+    constant_target = jax.lax.stop_gradient(target)
+    joints, _ = jax.lax.scan(iterate, jax.lax.stop_gradient(start), length=steps)
+    # only this last step is differentiated: its derivative is that of the solution
     return joints + step(joints, *target)
 
 
 def _solve(A: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solve A x = b, A positive definite and small: elimination in operations that fuse."""
+    """Solve A x = b for a small positive definite A by elimination in operations that XLA fuses."""
     rows = jnp.concatenate([A, b[:, None]], axis=1)
     for i in range(len(b)):
         pivot = rows[i] / rows[i, i]
@@ -301,7 +299,7 @@ def _solve(A: Float[Array, "n n"], b: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def _rotation_vector(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Axis times angle [rad] of a rotation by less than half a turn."""
+    """Return axis times angle [rad] of a rotation by less than half a turn."""
     vector = 0.5 * jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     square = vector @ vector
     small = square < 1e-16
@@ -311,7 +309,7 @@ def _rotation_vector(R: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def _rotation_vector_rates(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """From angular velocity to the rate of a rotation vector (inverse left Jacobian of SO(3))."""
+    """Return the inverse left Jacobian of SO(3): angular velocity to rate of a rotation vector."""
     square = vector @ vector
     small = square < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1.0, square))

@@ -1,29 +1,30 @@
-"""The check of a robot's file, from anywhere, before MuJoCo opens it.
+"""Check a robot's file of any origin before MuJoCo opens it.
 
-A model is one MJCF or URDF file of at most 1 MB that says everything itself: meshes and pictures
-are named in it but never opened (`elements` drops them). What would reach outside of it (includes),
-make much of little (entities, replicated and composed bodies, huge textures and memories) or let a
-number pass that no robot has (NaN, negative masses, empty ranges) is refused by file, element,
-attribute and value. Which bodies and joints a robot has to have is no matter of this module.
+A model is one self-contained MJCF or URDF file of at most 1 MB: meshes and pictures are named in it
+but never opened (`elements` removes them). Elements that read other files (includes) or expand
+(entities, replicated and composed bodies, huge textures and memories) and numbers that no robot has
+(NaN, negative masses, empty ranges) are refused; the message names file, element, attribute and
+value. Other modules check which bodies and joints a robot has.
 """
 
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean, one_line, read_text, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
 
-TIME_STEP = 0.001  # [s] of plant, joint control and samples, whatever the robot
+TIME_STEP = 0.001  # [s] of plant, joint control and samples of every robot
 _MOST_BYTES = 1_000_000
 _DEEPEST = 100
 _MOST_BODIES = 200
-_URDF_PARTS = ("link", "joint", "material")  # of a robot; the rest is for other programs
+_URDF_PARTS = ("link", "joint", "material")  # of a robot; other elements are for other programs
 _REFUSED = ("include", "attach", "model", "replicate", "composite", "flexcomp", "plugin")
 
-_COUNT = Range(-1, 1_000_000)  # -1: as many as it takes
+_COUNT = Range(-1, 1_000_000)  # -1: as many as needed
 _NOT_NEGATIVE = "mass density armature damping frictionloss friction margin size"
 _PIXELS = "width height offwidth offheight nrow ncol shadowsize"
 _COUNTS = "njmax nconmax nkey nstack nuserdata "
@@ -48,10 +49,10 @@ _MOST_MEMORY = 2**30
 
 
 def read_mjcf(path: Path) -> ElementTree.Element:
-    """The elements of an MJCF or URDF that MuJoCo may open, see the module.
+    """Read the elements of an MJCF or URDF that is safe to open with MuJoCo.
 
     Raises:
-        InputError: one line naming the file and what is wrong in it.
+        InputError: one line naming the file and the first error in it.
     """
     text = read_text(path, "the robot description", _MOST_BYTES)
     if match := re.search(r"<!\s*(DOCTYPE|ENTITY)", text, re.IGNORECASE):
@@ -67,38 +68,44 @@ def read_mjcf(path: Path) -> ElementTree.Element:
     bodies = 0
     for element, label in _labelled(path, root):
         if element.tag in _REFUSED:
-            of = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
+            file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
             raise InputError(
-                f"{path}: <{element.tag}>{of} is not accepted, expected one self-contained file"
+                f"{path}: <{element.tag}>{file} is not accepted, expected one self-contained file"
             )
         bodies += element.tag in ("body", "link")
         for name, value in element.attrib.items():
             if expected := _expected(element.tag, name, value):
-                what = f"{name} is {short_repr(value)}, expected {expected}"
-                raise InputError(f"{path}: {label}: {what}")
+                message = f"{name} is {short_repr(value)}, expected {expected}"
+                raise InputError(f"{path}: {label}: {message}")
     if bodies > _MOST_BODIES:
         raise InputError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
     return root
 
 
-def refusal(path: Path, root: ElementTree.Element, error: Exception) -> InputError:
-    """MuJoCo's error in one line, with the nearest name that it would know.
+@contextmanager
+def mujoco_errors(path: Path, root: ElementTree.Element | None = None) -> Iterator[None]:
+    """Raise MuJoCo's errors as one-line InputErrors.
 
     Args:
-        path: the file.
-        root: its elements.
-        error: MuJoCo's.
+        path: of the file, for the message.
+        root: XML element of the file; if passed, the message suggests the name nearest to an
+            unknown one.
     """
-    message, schema = one_line(error), mujoco.mj_printSchema(False, False)
-    names = {element.get("name", "") for element in root.iter()} | set(re.findall(r"\w+", schema))
-    # MuJoCo quotes what it does not know and what the matter is about: the first unknown one counts
-    unknown = [word for word in re.findall(r"'([^']*)'", message) if word not in names]
-    hint = did_you_mean(unknown[0], names) if unknown else ""
-    return InputError(f"{path}: MuJoCo refuses it: {message}{hint}")
+    try:
+        yield
+    except (ValueError, mujoco.FatalError) as error:
+        message, hint = one_line(error), ""
+        if root is not None:
+            schema = re.findall(r"\w+", mujoco.mj_printSchema(False, False))
+            names = {element.get("name", "") for element in root.iter()} | set(schema)
+            # MuJoCo quotes unknown names and their context: the first word without a match counts
+            unknown = [word for word in re.findall(r"'([^']*)'", message) if word not in names]
+            hint = did_you_mean(unknown[0], names) if unknown else ""
+        raise InputError(f"{path}: MuJoCo refuses it: {message}{hint}") from None
 
 
 def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str]]:
-    """Each element with its name in a message."""
+    """Yield each element with its label for messages."""
     depth = {root: 1}
     yield root, f"<{root.tag}>"
     for parent in root.iter():
@@ -106,37 +113,36 @@ def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTr
             raise InputError(f"{path}: elements are nested deeper than {_DEEPEST}")
         for child in parent:
             depth[child] = depth[parent] + 1
-            name, of = child.get("name"), parent.get("name") or parent.get("class")
             label = f"<{child.tag}>"
-            if name:
+            if name := child.get("name"):
                 label += f" {short_repr(name)}"
-            elif of:
-                label += f" of {short_repr(of)}"
+            elif owner := parent.get("name") or parent.get("class"):
+                label += f" of {short_repr(owner)}"
             yield child, label
 
 
 def _expected(tag: str, name: str, value: str) -> str | None:
-    """What an attribute should be, if it is something else."""
+    """Return what was expected of an attribute with an invalid value, None for a valid one."""
     if name == "name":
         return None
     numbers = _numbers(value)
     if name == "memory":
         size = re.fullmatch(r"(\d{1,12})([KMG]?)", value)
-        fine = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)
-        return None if fine else "at most 1G"
+        valid = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)
+        return None if valid else "at most 1G"
     allowed = _RANGES_OF.get((tag, name)) or _RANGES.get(name)
     if allowed and (numbers is None or not all(number in allowed for number in numbers)):
         return f"numbers {allowed}"
     if numbers and not all(number in Range() for number in numbers):
         return "finite numbers"
-    paired = name in _PAIRS and tag != "light"  # whose range is a length
-    if paired and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
+    pair = name in _PAIRS and tag != "light"  # the range of a light is a length
+    if pair and (numbers is None or len(numbers) != 2 or numbers[0] > numbers[1]):
         return "two numbers, the lower one first"
     return None
 
 
 def _numbers(text: str) -> list[float] | None:
-    """The numbers in a text; None where it is something else."""
+    """Return the numbers in a text, None if it contains anything else."""
     try:
         return [float(word) for word in text.split()]
     except ValueError:

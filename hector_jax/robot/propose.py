@@ -1,27 +1,27 @@
-"""The TOML that a model's file asks for: what `survey` finds, and sizes by rules.
+"""Propose the TOML of a model's file: the names that `survey` finds, and settings by rules.
 
 Rules scale HECTOR (m0 = 12 kg; h0 = 0.423 m, the height of its centre of mass standing) to a robot
 of mass m and height h:
 
-    armature                 of joints without one 2e-4 kg m^2 per N m of their torque limit
+    armature                 2e-4 kg m^2 per N m of torque limit for joints that have no armature
     stance, swing [ticks]    20 sqrt(h / h0): a pendulum's time
-    step_ticks               0.15 swing, rounded up, at least 3: ten steps see past the next step
+    step_ticks               0.15 swing, rounded up, at least 3: ten MPC steps reach past one swing
     max_force                2.5 m g
-    effort_reference         "gravity": else the plan jumps before single stance
-    sole_width               0.6 of a flat foot, or it rolls over its edge
-    pattern                  of four feet "trot"
-    width                    of half the distance of the foot points, standing, 0.85; of four 0.7
+    effort_reference         "gravity": otherwise the plan jumps before single stance
+    sole_width               0.6 of a flat foot's: otherwise it rolls over its edge
+    pattern                  "trot" for four feet
+    width                    0.85 (four feet: 0.7) of half the distance of the foot points, standing
     feedback                 0.12 s sqrt(h / h0)
-    height                   0.06 m h / 0.69 m of a swinging foot; landing -0.005 m
-    kp                       I w^2, w = 30 rad/s and I what hangs at the joint, its motor included;
+    height                   0.06 m h / 0.69 m for the swing foot; landing -0.005 m
+    kp                       I w^2 with w = 30 rad/s and I the inertia at the joint with its motor;
                              at most 2 / rad times the torque limit
     kd                       sqrt(kp I)
     Q                        HECTOR's
-    R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; of nominal 0.3 of that
+    R of forces, moments     times (m0 / m)^2, (m0 h0 / (m h))^2; for nominal times 0.3 as well
     L_ctrl                   times (m0 / m)^2
     lead                     one gait cycle in place before the command of a rollout
     touchdown_error          true: heavy legs miss the planned touchdown by some centimetres
-    choice_plants            4: a tuning can gain on the model and lose on the robot
+    choice_plants            4: tuning can improve the model's walk and worsen the robot's
     joint_friction, _damping times m h / (m0 h0); push, payload: m / m0; trunk_com: h / h0
     min_height               0.55 h
 """
@@ -39,6 +39,7 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET
+from hector_jax.robot.checks import standing_data
 from hector_jax.robot.description import Description, description_of
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot, compile_model, robot_of
@@ -47,44 +48,43 @@ from hector_jax.robot.stand import standing_pose
 from hector_jax.robot.survey import Survey, survey_file
 
 MASS, HEIGHT = 12.0, 0.423  # of HECTOR [kg], [m]
-_W = 30.0  # [rad/s] of the swing leg's joints
+_SWING_FREQUENCY = 30.0  # of the joint control of a swing leg [rad/s]
 _KP_PER_LIMIT = 2.0  # [1/rad]
 _ARMATURE_PER_LIMIT = 2e-4  # [s^2]: HECTOR's has 2.4e-4, Unitree's robots 1e-4 to 4e-4
 _COLUMNS = 100
 
 
 class Proposal(NamedTuple):
-    """A TOML for a file."""
+    """The proposed TOML of a model's file."""
 
     survey: Survey
     soles: tuple[Sole, ...]
     table: dict[str, Any]
-    wrong: tuple[str, ...]  # what is to be mended by hand, a line each
+    wrong: tuple[str, ...]  # one line per problem to correct by hand
 
 
 class Size(NamedTuple):
-    """What the rules read."""
+    """The inputs of the rules."""
 
-    mass: float  # against HECTOR's
-    height: float  # against HECTOR's
+    mass: float  # relative to HECTOR's
+    height: float  # relative to HECTOR's
     robot: Robot
     inertia: Float[np.ndarray, " joints"]  # at each joint, standing [kg m^2]
 
 
 def propose(path: Path) -> Proposal:
-    """The TOML that a file asks for.
+    """Return the proposed TOML of a model's file.
 
     Raises:
-        InputError: one line saying what is missing in the file and how to mend it.
+        InputError: one line with the missing part of the file and the remedy.
     """
     survey = survey_file(path)
     soles = find_soles(survey)
     angles, balanced = standing_pose(survey, soles)
-    if len(soles[0].contacts) == 1:  # round: it touches elsewhere where the leg is bent
+    if len(soles[0].contacts) == 1:  # a round foot, whose contact moves when the leg bends
         soles = find_soles(survey, angles)
         angles, balanced = standing_pose(survey, soles, angles)
-    table = names(survey, soles, angles)
-    wrong = []
+    table, wrong = _names(survey, soles, angles), []
     if soles[0].guessed:
         wrong.append(
             f"no box, sphere, capsule or cylinder of body {soles[0].section['body']!r} collides: "
@@ -104,48 +104,42 @@ def propose(path: Path) -> Proposal:
     if armature := _armature(survey, robot):
         table["joints"]["armature"] = armature
         description = description_of(description.path, table)
-    table |= sections(size_of(description, robot))
+    table |= _settings(size_of(description, robot))
     return Proposal(survey, soles, table, tuple(wrong))
 
 
-def names(survey: Survey, soles: Sequence[Sole], angles: dict[str, float]) -> dict[str, Any]:
-    """What the TOML says by names."""
-    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in survey.path.stem)
-    legs = ([survey.model.joint(j).name for j in leg] for leg in survey.legs)
-    joints: dict[str, Any] = dict(zip(FEET[len(survey.legs)], legs, strict=True))
+def _names(survey: Survey, soles: Sequence[Sole], angles: dict[str, float]) -> dict[str, Any]:
+    """Return the part of the TOML with names and standing angles."""
+    joints: dict[str, Any] = {}
+    feet = {}
+    for name, leg, sole in zip(FEET[len(soles)], survey.legs, soles, strict=True):
+        joints[name] = [survey.model.joint(j).name for j in leg]
+        feet[name] = sole.section
     if survey.weld:
         joints["weld"] = list(survey.weld)
-    feet = {leg: sole.section for leg, sole in zip(FEET[len(soles)], soles, strict=True)}
-    return {
-        "name": stem,
-        "model": survey.path.name,
-        "standing": angles,
-        "joints": joints,
-        "feet": feet,
-    }
+    stem = "".join(x if x.isalnum() or x in "-_" else "-" for x in survey.path.stem)
+    table = {"name": stem, "model": survey.path.name, "standing": angles}
+    return {**table, "joints": joints, "feet": feet}
 
 
 def size_of(description: Description, robot: Robot) -> Size:
-    """What the rules read of a robot."""
+    """Return the inputs of the rules for a robot."""
     model = compile_model(description)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.key(description.standing_key).id)
-    mujoco.mj_forward(model, data)
     M = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, M)
+    mujoco.mj_fullM(model, standing_data(description, model), M)
     address = [int(model.joint(name).dofadr[0]) for name in description.joints]
     mass, height = float(robot.mass), float(robot.standing_height)
     return Size(mass / MASS, height / HEIGHT, robot, M.diagonal()[address])
 
 
-def sections(size: Size) -> dict[str, Any]:
-    """What the TOML says by numbers."""
+def _settings(size: Size) -> dict[str, Any]:
+    """Return the part of the TOML with the settings that follow from the rules."""
     robot, mass, root = size.robot, size.mass, math.sqrt(size.height)
     height, weight = float(robot.standing_height), float(robot.mass * robot.gravity[2])
     ticks, torque = round(20 * root), _short(mass * size.height)
-    across = foot_poses(robot, jnp.asarray(robot.standing_joints)).position[:, 1]
-    four = len(across) == 4
-    flat = {"sole_width": 0.6} if robot.structure.contact == "flat" else {}
+    foot_y = foot_poses(robot, jnp.asarray(robot.standing_joints)).position[:, 1]
+    four = len(foot_y) == 4
+    flat = robot.structure.contact == "flat"
     return {
         "limits": {"min_height": round(0.55 * height, 2)},
         "gait": ({"pattern": "trot"} if four else {}) | {"stance": ticks, "swing": ticks},
@@ -153,10 +147,10 @@ def sections(size: Size) -> dict[str, Any]:
             "step_ticks": max(3, math.ceil(0.15 * ticks)),
             "max_force": float(f"{2.5 * weight:.2g}"),
             "effort_reference": "gravity",
-            **flat,
+            **({"sole_width": 0.6} if flat else {}),
         },
         "footstep": {
-            "width": round((0.7 if four else 0.85) * float(np.abs(across).mean()), 3),
+            "width": round((0.7 if four else 0.85) * float(np.abs(foot_y).mean()), 3),
             "feedback": round(0.12 * root, 3),
         },
         "legs": {
@@ -167,11 +161,7 @@ def sections(size: Size) -> dict[str, Any]:
         },
         "weights": _weights(size),
         "loss": {"L_ctrl": _short(mass**-2)},
-        "tuning": {
-            "lead": 2 * ticks,
-            "touchdown_error": True,
-            "choice_plants": 4,
-        },
+        "tuning": {"lead": 2 * ticks, "touchdown_error": True, "choice_plants": 4},
         "plants": {
             "joint_friction": torque,
             "joint_damping": torque,
@@ -183,38 +173,39 @@ def sections(size: Size) -> dict[str, Any]:
 
 
 def _armature(survey: Survey, robot: Robot) -> list[float] | None:
-    """Inertia of a leg's motors [kg m^2] where the file leaves one out, of the others its own."""
-    legs = list(survey.legs[0])
-    given = survey.model.dof_armature[survey.model.jnt_dofadr[legs]]
-    guess = _ARMATURE_PER_LIMIT * robot.torque_limit[: len(legs)]
-    return None if np.all(given) else [_short(x) for x in np.where(given, given, guess)]
+    """Return the armature of a leg's motors [kg m^2], by the rule if the file has none."""
+    leg = list(survey.legs[0])
+    armature = survey.model.dof_armature[survey.model.jnt_dofadr[leg]]
+    default = _ARMATURE_PER_LIMIT * robot.torque_limit[: len(leg)]
+    complete = np.all(armature)
+    return None if complete else [_short(x) for x in np.where(armature, armature, default)]
 
 
 def _gains(size: Size) -> dict[str, list[float]]:
-    """Gains of the joints of a leg, by the mean of all legs."""
+    """Return the gains of a leg's joints from the mean inertia and least torque of all legs."""
     legs = len(size.robot.foot_point)
     inertia = size.inertia.reshape(legs, -1).mean(axis=0)
     limit = size.robot.torque_limit.reshape(legs, -1).min(axis=0)
-    kp = np.minimum(inertia * _W**2, _KP_PER_LIMIT * limit)
+    kp = np.minimum(inertia * _SWING_FREQUENCY**2, _KP_PER_LIMIT * limit)
     return {"kp": [_short(x) for x in kp], "kd": [_short(x) for x in np.sqrt(kp * inertia)]}
 
 
 def _weights(size: Size) -> dict[str, Any]:
-    """Q as HECTOR's; R by the squares of mass, and of mass and height."""
+    """Return HECTOR's Q, and R scaled by the squares of mass and of mass times height."""
     force, moment = size.mass**-2, (size.mass * size.height) ** -2
-    still = {"ang_velocity": 1, "velocity": 1}
+    rates = {"ang_velocity": 1, "velocity": 1}
     return {
         "nominal": {
             "euler": 50,
             "position": [50, 50, 250],
-            **still,
+            **rates,
             "force": _short(0.3e-4 * force),
             "moment": _short(0.3e-3 * moment),
         },
         "expert": {
             "euler": [100, 100, 250],
             "position": [200, 200, 300],
-            **still,
+            **rates,
             "force": [_short(x * force) for x in (1e-4, 1e-4, 5e-4)],
             "moment": _short(1e-2 * moment),
         },
@@ -222,36 +213,36 @@ def _weights(size: Size) -> dict[str, Any]:
 
 
 def _short(x: float) -> float:
-    """Three digits."""
+    """Return a number rounded to three digits."""
     return float(f"{x:.3g}")
 
 
 def as_toml(table: dict[str, Any], comments: Sequence[str]) -> str:
-    """A proposal as the text of a file."""
+    """Return a table as the text of a TOML file that begins with comments."""
     lines = [f"# {line}" for line in comments]
     lines += [_line(key, value) for key, value in table.items() if not isinstance(value, dict)]
     for name, section in table.items():
         if isinstance(section, dict):
-            deep = all(isinstance(value, dict) for value in section.values()) and section
-            parts = {f"{name}.{key}": value for key, value in section.items()} if deep else {}
+            nested = section and all(isinstance(value, dict) for value in section.values())
+            parts = {f"{name}.{key}": value for key, value in section.items()} if nested else {}
             for title, part in (parts or {name: section}).items():
                 lines += ["", f"[{title}]", *(_line(key, value) for key, value in part.items())]
     return "\n".join(lines) + "\n"
 
 
 def _line(key: str, value: Any) -> str:
-    """A key and its value, a long list of words on several lines."""
+    """Return a key and its value; a long list is wrapped into several lines."""
     bare = key.replace("_", "").replace("-", "")
     name = key if bare.isalnum() and bare.isascii() else json.dumps(key)
     text = f"{name} = {_value(value)}"
     if len(text) <= _COLUMNS or not isinstance(value, list):
         return text
     rows, row = [], ""
-    for word in map(_value, value):
-        if row and len(row) + len(word) + 5 > _COLUMNS:
+    for item in map(_value, value):
+        if row and len(row) + len(item) + 5 > _COLUMNS:
             rows.append(row)
             row = ""
-        row += f"{' ' if row else ''}{word},"
+        row += f"{' ' if row else ''}{item},"
     return "\n".join([f"{name} = [", *(f"  {r}" for r in (*rows, row)), "]"])
 
 

@@ -1,12 +1,13 @@
-"""A robot written anew from its links: the form that all later code reads.
+"""Rebuild a robot from its links in the standard form that all later code reads.
 
-A trunk with a free joint, one body a leg joint, leg by leg; torque motors in that order; a
-floor; small spheres where a sole touches and a site where its wrench acts; a keyframe that stands.
+The standard form has a trunk with a free joint; one body per leg joint, leg by leg; torque motors
+in that order; a floor; small spheres at the contacts of the soles and a site where the wrench on a
+foot acts; and a keyframe of the standing pose.
 
 Contact bits: 1 floor, 2 first leg, 4 second leg, and so on. Soles touch the floor with their
-spheres only; the trunk and the legs touch it too, so that a fall is felt, and the legs each other.
-The floor alone decides friction and stiffness. A sphere, a cylinder or an ellipsoid that collides
-becomes a capsule of its length and radius. A body of which nothing is drawn is drawn as a stick.
+spheres only; trunk and legs collide with the floor, so that falls are detected, and the legs with
+each other. Friction and stiffness are those of the floor. A sphere, a cylinder or an ellipsoid that
+collides becomes a capsule of its length and radius. A body without geoms is drawn as a stick.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
-from hector_jax.robot.checks import ON_FLOOR
+from hector_jax.robot.checks import ON_FLOOR, lowest_point
 from hector_jax.robot.description import Description, Foot, NamedFoot
 from hector_jax.robot.links import Link, Pose, pose_of
 from hector_jax.robot.mjcf import TIME_STEP
@@ -61,9 +62,9 @@ _SHORTEST = 1e-4  # [m] half length of a capsule; Go1's hips are 1.5 mm apart
 
 
 class Pieces(NamedTuple):
-    """What a robot is written from."""
+    """The parts that a robot is rebuilt from."""
 
-    model: mujoco.MjModel  # as the file has it
+    model: mujoco.MjModel  # of the original file
     links: list[Link]  # trunk, then leg by leg
     limits: Sequence[float]  # [N m] of the motors
     angles: Sequence[float]  # [rad] of the legs' joints, standing
@@ -71,7 +72,7 @@ class Pieces(NamedTuple):
 
 
 def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
-    """The spec, with the names of `Description.named_feet` and `Description.standing_key`.
+    """Return the spec, with the names of `Description.named_feet` and `Description.standing_key`.
 
     Raises:
         InputError: one line: the soles are not level in the standing pose.
@@ -98,7 +99,7 @@ def rebuild(description: Description, pieces: Pieces) -> mujoco.MjSpec:
 
 
 def _add_link(parent: mujoco.MjsBody, pieces: Pieces, link: Link) -> mujoco.MjsBody:
-    """The body of a link and its joint."""
+    """Add the body of a link and its joint."""
     model, j, I = pieces.model, link.joint, link.inertia  # noqa: E741
     body = parent.add_body(
         name=link.name,
@@ -132,7 +133,7 @@ def _add_link(parent: mujoco.MjsBody, pieces: Pieces, link: Link) -> mujoco.MjsB
 
 
 def contact_bits(legs: int, leg: int | None, *, on_floor: bool = True) -> tuple[int, int]:
-    """Contype and conaffinity of a leg, or of the trunk (None), of a robot with so many legs."""
+    """Return contype and conaffinity of a leg, or of the trunk (None), by the number of legs."""
     if leg is None:
         return 0, 1
     others = sum(2 << i for i in range(legs) if i != leg)
@@ -142,27 +143,26 @@ def contact_bits(legs: int, leg: int | None, *, on_floor: bool = True) -> tuple[
 def _add_geoms(
     description: Description, pieces: Pieces, index: int, body: mujoco.MjsBody, named: set[str]
 ) -> None:
-    """The primitives of a link: what is looked at as it is, what collides as a box or capsule."""
+    """Add the primitives of a link: visual ones unchanged, colliding ones as box or capsule."""
     model, link = pieces.model, pieces.links[index]
     count = description.leg_joints
     leg = None if index == 0 else (index - 1) // count
     bits = contact_bits(len(description.feet), leg, on_floor=index % count > 0 or index == 0)
-    geoms = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in link.bodies]
-    geoms = [g for g in geoms if model.geom_type[g] in SHAPES]
-    touch = [bool(model.geom_contype[g] | model.geom_conaffinity[g]) for g in geoms]
-    for g, collides in zip(geoms, touch, strict=True):
-        own = pose_of(model.geom_pos[g], model.geom_quat[g])
-        pose = link.bodies[int(model.geom_bodyid[g])] @ own
+    in_link = np.isin(model.geom_bodyid, list(link.bodies)) & np.isin(model.geom_type, SHAPES)
+    geoms, collide = np.flatnonzero(in_link), (model.geom_contype | model.geom_conaffinity) > 0
+    for g in map(int, geoms):
+        local = pose_of(model.geom_pos[g], model.geom_quat[g])
+        pose = link.bodies[int(model.geom_bodyid[g])] @ local
         shape, size = int(model.geom_type[g]), model.geom_size[g]
         name, material = model.geom(g).name, int(model.geom_matid[g])
         rgba = np.array(model.mat_rgba[material] if material >= 0 else model.geom_rgba[g])
         fields: dict = {"group": int(model.geom_group[g]), "rgba": rgba}
         if name in named:
             fields |= {**_ROBOT_GEOM, **_FLOOR_BITS}
-        elif collides:
-            shape, size, pose = _solid(shape, size, pose)
+        elif collide[g]:
+            shape, size, pose = _box_or_capsule(shape, size, pose)
             fields |= {**_ROBOT_GEOM, "contype": bits[0], "conaffinity": bits[1], "condim": 1}
-            if all(touch):  # nothing else is drawn
+            if collide[geoms].all():  # nothing else is drawn
                 fields |= {"group": 2, "rgba": [*rgba[:3], 1.0]}
         else:
             fields |= {"contype": 0, "conaffinity": 0}
@@ -171,28 +171,27 @@ def _add_geoms(
         )
 
 
-def _solid(
+def _box_or_capsule(
     shape: int, size: Float[np.ndarray, "3"], pose: Pose
 ) -> tuple[int, Float[np.ndarray, "3"], Pose]:
-    """A box or a capsule in place of another primitive."""
+    """Return a box or capsule unchanged and the capsule of any other primitive."""
     if shape in (_BOX, _CAPSULE):
         return shape, size, pose
     radius, half = size[0], 0.0
     if shape == _CYLINDER:
         half = size[1] - radius
     elif shape == _ELLIPSOID:
-        long = int(np.argmax(size))
-        radius = np.sort(size)[1]
-        half = size[long] - radius
-        # a turn of the axes that takes z to the longest one
-        pose = pose @ Pose(np.roll(np.eye(3), long + 1, axis=0))
+        longest, radius = int(np.argmax(size)), np.sort(size)[1]
+        half = size[longest] - radius
+        # permute the axes so that z becomes the longest one
+        pose = pose @ Pose(np.roll(np.eye(3), longest + 1, axis=0))
     return _CAPSULE, np.array([radius, max(half, _SHORTEST), 0.0]), pose
 
 
 def _add_sticks(pieces: Pieces, bodies: Sequence) -> None:
     """Draw each body of the file that has no geoms, from its origin to those of its children."""
     model, links = pieces.model, pieces.links
-    shown = [int(b) for b, g in zip(model.geom_bodyid, model.geom_type, strict=True) if g in SHAPES]
+    drawn = model.geom_bodyid[np.isin(model.geom_type, SHAPES)]
     for index, link in enumerate(links):
         ends = [(int(model.body_parentid[b]), pose.p) for b, pose in link.bodies.items()]
         for child in links[1:]:
@@ -200,7 +199,7 @@ def _add_sticks(pieces: Pieces, bodies: Sequence) -> None:
                 parent = int(model.body_parentid[model.jnt_bodyid[child.joint]])
                 ends.append((parent, child.pose.p))
         for parent, end in ends:
-            if parent in link.bodies and parent not in shown:
+            if parent in link.bodies and parent not in drawn:
                 _add_stick(bodies[index], link.bodies[parent].p, end, _STICK)
 
 
@@ -208,12 +207,12 @@ def _add_stick(
     body: mujoco.MjsBody, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
 ) -> None:
     if np.linalg.norm(end - start) > radius:
-        looks = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": 2, "rgba": _GREY}
-        body.add_geom(type=_CAPSULE, size=[radius, 0.0, 0.0], fromto=[*start, *end], **looks)
+        fields = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": 2, "rgba": _GREY}
+        body.add_geom(type=_CAPSULE, size=[radius, 0.0, 0.0], fromto=[*start, *end], **fields)
 
 
 def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The robot in the standing pose, its trunk's origin in that of the world."""
+    """Return the robot in the standing pose, with the trunk's origin at the world's."""
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[:] = [0.0, 0.0, 0.0, *pieces.trunk_quat, *pieces.angles]
@@ -222,77 +221,73 @@ def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> tuple[mujoco.MjModel,
 
 
 def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, leg: int) -> None:
-    """Site and contact spheres of a foot."""
+    """Add the site and the contact spheres of a foot."""
     foot, path, model = description.feet[leg], description.model, pieces.model
     last, names = (leg + 1) * description.leg_joints, description.named_feet[leg]
     link = pieces.links[last]
     if foot.body is not None:
-        named = {model.body(b).name: pose for b, pose in link.bodies.items()}
-        if foot.body not in named:
+        poses = {model.body(b).name: pose for b, pose in link.bodies.items()}
+        if foot.body not in poses:
             raise InputError(
                 f"{path}: feet.{description.legs[leg]}.body is {foot.body!r}, expected one that "
-                f"joint {description.joints[last - 1]!r} moves: {', '.join(named)}"
+                f"joint {description.joints[last - 1]!r} moves: {', '.join(poses)}"
             )
-        _place_foot(spec, foot, names, pieces, link, named[foot.body])
+        _add_foot_by_points(spec, foot, names, pieces, link, poses[foot.body])
         return
     for name in names.contacts:
-        there = spec.geom(name)
-        if there is None or there.parent.name != link.name or there.type != _SPHERE:
+        geom = spec.geom(name)
+        if geom is None or geom.parent.name != link.name or geom.type != _SPHERE:
             raise InputError(f"{path}: no sphere {name!r} on body {link.name!r}")
-    own = [s for s in range(model.nsite) if model.site(s).name == names.point]
-    if not own or int(model.site_bodyid[own[0]]) not in link.bodies:
+    site = next((s for s in range(model.nsite) if model.site(s).name == names.point), None)
+    if site is None or int(model.site_bodyid[site]) not in link.bodies:
         raise InputError(f"{path}: no site {names.point!r} on body {link.name!r}")
-    pose = link.bodies[int(model.site_bodyid[own[0]])]
-    point = pose.p + pose.R @ model.site_pos[own[0]]
+    pose = link.bodies[int(model.site_bodyid[site])]
+    point = pose.p + pose.R @ model.site_pos[site]
     spec.body(link.name).add_site(name=names.point, pos=point, **_SITE)
 
 
-def _place_foot(
+def _add_foot_by_points(
     spec: mujoco.MjSpec, foot: Foot, names: NamedFoot, pieces: Pieces, link: Link, pose: Pose
 ) -> None:
-    """Spheres whose lowest points, standing, are the contacts, and the site."""
-    places = np.array([pose.p + pose.R @ np.array(place) for place in foot.contacts])
+    """Add the site and spheres whose lowest points in the standing pose are the contacts."""
+    contacts = np.array([pose.p + pose.R @ np.array(contact) for contact in foot.contacts])
     _, data = _standing_data(spec, pieces)
     R, body = data.body(link.name).xmat.reshape(3, 3), spec.body(link.name)
     up = CONTACT_RADIUS * R.T[:, 2]
-    for place in places:
-        _add_stick(body, places.mean(axis=0) + up, place + up, CONTACT_RADIUS)
-    for name, place in zip(names.contacts, places, strict=True):
-        if taken := spec.geom(name):
-            taken.name = ""
-        looks = {"mass": 0.0, "group": 2, "rgba": _DARK, **_ROBOT_GEOM, **_FLOOR_BITS}
+    for contact in contacts:
+        _add_stick(body, contacts.mean(axis=0) + up, contact + up, CONTACT_RADIUS)
+    fields = {"mass": 0.0, "group": 2, "rgba": _DARK, **_ROBOT_GEOM, **_FLOOR_BITS}
+    for name, contact in zip(names.contacts, contacts, strict=True):
+        if duplicate := spec.geom(name):
+            duplicate.name = ""
         size = [CONTACT_RADIUS, 0.0, 0.0]
-        body.add_geom(name=name, type=_SPHERE, size=size, pos=place + up, **looks)
+        body.add_geom(name=name, type=_SPHERE, size=size, pos=contact + up, **fields)
     if foot.point is None:
-        level = places @ R.T  # axes of the world, origin in the last joint
+        level = contacts @ R.T  # world axes, origin at the last joint
         middle = 0.5 * (level.min(axis=0) + level.max(axis=0))
-        point = R.T @ np.array([0.0 if len(places) > 1 else middle[0], *middle[1:]])
+        point = R.T @ np.array([0.0 if len(contacts) > 1 else middle[0], *middle[1:]])
     else:
         point = pose.p + pose.R @ np.array(foot.point)
     body.add_site(name=names.point, pos=point, **_SITE)
 
 
 def _add_standing(spec: mujoco.MjSpec, description: Description, pieces: Pieces) -> None:
-    """The keyframe: the lowest contact on the floor, all others with it.
+    """Add the keyframe of the standing pose, with the lowest contact on the floor.
 
     Raises:
         InputError: a contact is more than ON_FLOOR above the lowest one.
     """
     model, data = _standing_data(spec, pieces)
     names = [name for foot in description.named_feet for name in foot.contacts]
-    heights = {name: lowest(model, data, name) for name in names}
-    low = min(heights.values())
-    if max(heights.values()) - low > ON_FLOOR:
-        above = ", ".join(f"{name} {1e3 * (h - low):.1f}" for name, h in heights.items())
+    heights = [lowest_point(model, data, name) for name in names]
+    low = min(heights)
+    if max(heights) - low > ON_FLOOR:
+        offsets = (f"{name} {1e3 * (h - low):.1f}" for name, h in zip(names, heights, strict=True))
         raise InputError(
             f"{description.model}: standing, the soles are not level: contacts above the lowest "
-            f"one [mm]: {above}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
+            f"one [mm]: {', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the "
+            "standing angles"
         )
     qpos = [0.0, 0.0, -low, *pieces.trunk_quat, *pieces.angles]
     spec.body(pieces.links[0].name).pos = qpos[:3]
     spec.add_key(name=description.standing_key, qpos=qpos)
-
-
-def lowest(model: mujoco.MjModel, data: mujoco.MjData, sphere: str) -> float:
-    """Height of the lowest point of a sphere [m]."""
-    return float(data.geom(sphere).xpos[2] - model.geom(sphere).size[0])

@@ -1,13 +1,15 @@
-"""Where the feet of a surveyed robot touch the floor.
+"""Find the contact points of a surveyed robot's feet.
 
-Of the primitive geoms of a foot that collide with the floor, those points count that lie within
-5 mm of the lowest one when all joints are zero. Where the lowest box of a foot is tilted then, its
-lower face is the sole, else what is level. A sole that is wider than 2 cm at its front and at
-its back, under a leg of six joints or more, is flat: four corners. One that is longer than 2 cm is
-a line from heel to toe, any other a point. Both feet of a pair get the same lengths.
+The contact points of a foot are those points of its primitive geoms that collide with the floor and
+lie within 5 mm of the lowest one when all joints are zero. If the lowest box of a foot is tilted in
+this pose, its lower face is the sole; otherwise the sole is level. A sole wider than 2 cm at its
+front and at its back, under a leg of six joints or more, is flat with four corners. Any other sole
+longer than 2 cm is a line from heel to toe, and a shorter one a point. Both feet of a pair get the
+same lengths.
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,57 +18,55 @@ from jaxtyping import Float
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET
-from hector_jax.robot.links import at_zero, subtree
+from hector_jax.robot.links import data_at, subtree
 from hector_jax.robot.rebuild import SHAPES
 from hector_jax.robot.survey import Survey
 
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _SAME_SOLE = 5e-3  # [m] above the lowest point
 _WIDE = 0.02  # [m]
-_ALIKE, _ALIKE_GUESSES = 0.01, 0.03  # [m] between the feet
-_LEVEL, _UPRIGHT = np.cos(np.radians((0.5, 45.0)))  # tilts of a box that count
+_TOLERANCE, _GUESS_TOLERANCE = 0.01, 0.03  # [m] between the feet of a pair
+_LEVEL, _UPRIGHT = np.cos(np.radians((0.5, 45.0)))  # range of tilts of a box that is a sole
 _FLAT_FROM = 6  # joints of a leg that can keep a flat sole level
 _DOWN = np.array([0.0, 0.0, -1.0])
 _RIM = 16  # points on a cylinder's edge
 
 
 class Sole(NamedTuple):
-    """One foot."""
+    """The sole of a foot."""
 
     section: dict[str, Any]  # of the TOML
     contacts: Float[np.ndarray, "c 3"]  # in the axes of the sole, from the last joint [m]
-    point: Float[np.ndarray, "3"]  # where wrenches act, likewise
-    axes: Float[np.ndarray, "3 3"]  # of the sole in the trunk's, all joints at zero
+    point: Float[np.ndarray, "3"]  # where wrenches act, in the same frame [m]
+    axes: Float[np.ndarray, "3 3"]  # of the sole in the trunk frame, in the pose of `find_soles`
     guessed: bool  # from the foot's inertia: the file has no geoms
 
 
 def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tuple[Sole, ...]:
-    """All feet of a robot.
+    """Find the soles of all feet.
 
     Args:
-        survey: the robot.
-        angles: pose [rad] by joint in which they are looked at; the others are zero, as is what a
-            `Sole` says beside its section.
+        survey: of the robot.
+        angles: pose [rad] by joint in which the contacts are determined; other joints are at zero.
+            All of a `Sole` except its section refers to this pose.
 
     Raises:
         InputError: one line: the feet differ.
     """
-    model = survey.model
-    pose = {int(model.joint(name).qposadr[0]): angle for name, angle in (angles or {}).items()}
-    data = at_zero(model, pose)
+    data = data_at(survey.model, angles)
     axes = [_axes(survey, data, leg) for leg in survey.legs]
-    touch = [_floor_points(survey, data, leg, R) for leg, R in zip(survey.legs, axes, strict=True)]
-    guessed = any(len(points) == 0 for points in touch)
+    points = [_floor_points(survey, data, leg, R) for leg, R in zip(survey.legs, axes, strict=True)]
+    guessed = not all(map(len, points))
     if guessed:
-        touch = [_box_of_inertia(survey, data, leg) for leg in survey.legs]
-    elif named := _named(survey, data):
+        points = [_inertia_box(survey, data, leg) for leg in survey.legs]
+    elif named := _named_soles(survey, data):
         return named
-    outlines = [_outline(points, len(survey.legs[0])) for points in touch]
-    near, soles = _ALIKE_GUESSES if guessed else _ALIKE, []
+    outlines = [_outline(of_foot, len(survey.legs[0])) for of_foot in points]
+    tolerance, soles = _GUESS_TOLERANCE if guessed else _TOLERANCE, []
     names = FEET[len(survey.legs)]
     for first in range(0, len(outlines), 2):
         left, right = outlines[first], _mirrored(outlines[first + 1])
-        if len(left) != len(right) or np.abs(left - right).max() > near:
+        if len(left) != len(right) or np.abs(left - right).max() > tolerance:
             raise InputError(
                 f"{survey.path}: the {names[first]} foot touches at {np.round(left, 4).tolist()} "
                 f"from its last joint and the mirrored {names[first + 1]} one at "
@@ -74,18 +74,18 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
             )
         mean = np.round(0.5 * (left + right), 4)
         for leg, contacts in ((first, mean), (first + 1, _mirrored(mean))):
-            soles.append(_placed(survey, data, leg, contacts, axes[leg], guessed))
+            soles.append(_sole(survey, data, leg, contacts, axes[leg], guessed))
     return tuple(soles)
 
 
 def _mirrored(contacts: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 3"]:
-    """The other foot's, in the order of this one's."""
+    """Return the contacts of the mirrored foot in the order of `_outline`."""
     order = [1, 0, 3, 2] if len(contacts) == 4 else list(range(len(contacts)))
     return contacts[order] * [1.0, -1.0, 1.0]
 
 
 def _foot_geoms(survey: Survey, leg: Sequence[int]) -> list[int]:
-    """Primitives of a foot that collide, with the floor where there is one."""
+    """Return the colliding primitives of a foot; with the floor, if the file has one."""
     model = survey.model
     bodies = subtree(model, int(model.jnt_bodyid[leg[-1]]))
     contype, conaffinity = model.geom_contype, model.geom_conaffinity
@@ -93,13 +93,14 @@ def _foot_geoms(survey: Survey, leg: Sequence[int]) -> list[int]:
     chosen = collide & np.isin(model.geom_bodyid, bodies) & np.isin(model.geom_type, SHAPES)
     floor = collide & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     if floor.any():
-        own, theirs = (np.bitwise_or.reduce(bits[floor]) for bits in (contype, conaffinity))
-        chosen &= ((contype & theirs) | (conaffinity & own)) > 0
+        floor_contype = np.bitwise_or.reduce(contype[floor])
+        floor_conaffinity = np.bitwise_or.reduce(conaffinity[floor])
+        chosen &= ((contype & floor_conaffinity) | (conaffinity & floor_contype)) > 0
     return np.flatnonzero(chosen).tolist()
 
 
 def _axes(survey: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
-    """Axes of the sole in those of the trunk, as columns."""
+    """Return the axes of the sole in the trunk frame, as columns."""
     boxes = [g for g in _foot_geoms(survey, leg) if survey.model.geom_type[g] == _BOX]
     if not boxes:
         return np.eye(3)
@@ -116,7 +117,7 @@ def _axes(survey: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.n
 def _floor_points(
     survey: Survey, data: mujoco.MjData, leg: Sequence[int], axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Points of the sole in its axes, from the last joint."""
+    """Return the points of the sole in its axes, from the last joint."""
     geoms = _foot_geoms(survey, leg)
     if not geoms:
         return np.zeros((0, 3))
@@ -129,12 +130,11 @@ def _floor_points(
 def _support(
     model: mujoco.MjModel, data: mujoco.MjData, g: int, down: Float[np.ndarray, "3"] = _DOWN
 ) -> Float[np.ndarray, "n 3"]:
-    """Extreme points of a geom; for what is round the lowest ones."""
+    """Return the corners of a box or the lowest points of a round geom."""
     shape, size = int(model.geom_type[g]), model.geom_size[g]
     center, R = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
     if shape == _BOX:
-        signs = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
-        return center + (signs * size) @ R.T
+        return center + (list(product((-1, 1), repeat=3)) * size) @ R.T
     if shape == _ELLIPSOID:
         local = R.T @ down
         return (center + R @ (size**2 * local / np.linalg.norm(size * local)))[None]
@@ -146,84 +146,78 @@ def _support(
     angles = np.arange(_RIM) * 2.0 * np.pi / _RIM
     rim = size[0] * (np.outer(np.cos(angles), R[:, 0]) + np.outer(np.sin(angles), R[:, 1]))
     across = down - R[:, 2] * (R[:, 2] @ down)
-    steep = np.linalg.norm(across)
-    if steep > 1e-6:
-        rim = np.concatenate([rim, size[0] * across[None] / steep])
+    slope = np.linalg.norm(across)
+    if slope > 1e-6:
+        rim = np.concatenate([rim, size[0] * across[None] / slope])
     return (ends[:, None] + rim).reshape(-1, 3)
 
 
 def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray, "c 3"]:
-    """Corners front left, front right, back left, back right; or toe and heel; or a point."""
+    """Return the corners front left, front right, back left, back right; toe, heel; or a point."""
     low, high = points.min(axis=0), points.max(axis=0)
-    middle = 0.5 * (low + high)
-    z = points[:, 2].min()
-    front, back = (points[side] for side in (points[:, 0] >= middle[0], points[:, 0] <= middle[0]))
-    width = min(np.ptp(front[:, 1]), np.ptp(back[:, 1]))
+    x, y, _ = 0.5 * (low + high)
+    z = low[2]
+    front, back = points[points[:, 0] >= x, 1], points[points[:, 0] <= x, 1]
     if high[0] - low[0] <= _WIDE:
-        return np.array([[middle[0], middle[1], z]])
-    if width <= _WIDE or joints < _FLAT_FROM:
-        return np.array([[high[0], middle[1], z], [low[0], middle[1], z]])
-    ends = (high[0], front[:, 1]), (low[0], back[:, 1])
+        return np.array([[x, y, z]])
+    if min(np.ptp(front), np.ptp(back)) <= _WIDE or joints < _FLAT_FROM:
+        return np.array([[high[0], y, z], [low[0], y, z]])
+    ends = (high[0], front), (low[0], back)
     return np.array([[x, y, z] for x, across in ends for y in (across.max(), across.min())])
 
 
-def _box_of_inertia(
+def _inertia_box(
     survey: Survey, data: mujoco.MjData, leg: Sequence[int]
 ) -> Float[np.ndarray, "4 3"]:
-    """Lower corners of the box that has the mass and inertia of the foot's last body."""
+    """Return the lower corners of the box with the mass and inertia of the foot's last body."""
     model, body = survey.model, int(survey.model.jnt_bodyid[leg[-1]])
-    mass, spread = model.body_mass[body], model.body_inertia[body]
-    square = 1.5 * (spread.sum() - 2.0 * spread) / max(mass, 1e-9)
-    size = np.sqrt(np.maximum(square, 1e-6))
-    R = data.ximat[body].reshape(3, 3)
-    half = np.abs(R) @ size
+    mass, moments = model.body_mass[body], model.body_inertia[body]
+    square = 1.5 * (moments.sum() - 2.0 * moments) / max(mass, 1e-9)
+    half = np.abs(data.ximat[body].reshape(3, 3)) @ np.sqrt(np.maximum(square, 1e-6))
     center = data.xipos[body] - data.xanchor[leg[-1]]
-    signs = np.array([[a, b, -1.0] for a in (-1, 1) for b in (-1, 1)])
-    return center + signs * half
+    return center + list(product((-1, 1), (-1, 1), (-1.0,))) * half
 
 
-def _placed(
+def _sole(
     survey: Survey,
     data: mujoco.MjData,
-    side: int,
+    leg: int,
     contacts: Float[np.ndarray, "c 3"],
     axes: Float[np.ndarray, "3 3"],
     guessed: bool,
 ) -> Sole:
-    """A foot by places in the frame of the body that its last joint moves."""
-    model, last = survey.model, survey.legs[side][-1]
+    """Return a sole by points in the frame of the body that the leg's last joint moves."""
+    model, last = survey.model, survey.legs[leg][-1]
     body = int(model.jnt_bodyid[last])
     R, origin = data.xmat[body].reshape(3, 3), data.xpos[body] - data.xanchor[last]
-    places = (contacts @ axes.T - origin) @ R
-    ahead, middle = contacts[:, 0], 0.5 * (contacts.min(axis=0) + contacts.max(axis=0))
-    section: dict[str, Any] = {"body": model.body(body).name}
+    x, middle = contacts[:, 0], 0.5 * (contacts.min(axis=0) + contacts.max(axis=0))
     aligned = np.allclose(np.abs(axes.T @ R).max(axis=0), 1.0, rtol=0.0, atol=1e-9)
     aligned = aligned and np.abs(origin - np.round(origin, 4)).max() <= 1e-9
-    digits = 4 if aligned or len(contacts) == 1 else 8  # a point has nothing to be level with
-    section["contacts"] = [_numbers(place, digits) for place in places]
+    digits = 4 if aligned or len(contacts) == 1 else 8  # rounding cannot tilt a single point
+
+    def rounded(point: Float[np.ndarray, "3"]) -> list[float]:
+        return [round(float(x), digits) + 0.0 for x in point]  # no -0.0
+
+    section: dict[str, Any] = {"body": model.body(body).name}
+    section["contacts"] = [*map(rounded, (contacts @ axes.T - origin) @ R)]
     point = np.array([0.0, middle[1], middle[2]])
-    if not ahead.min() < -1e-3 < 1e-3 < ahead.max():  # the last joint is not above the sole
+    if not x.min() < -1e-3 < 1e-3 < x.max():  # the last joint is not above the sole
         point = middle
         if len(contacts) > 1:
-            section["point"] = _numbers((axes @ point - origin) @ R, digits)
+            section["point"] = rounded((axes @ point - origin) @ R)
     return Sole(section, contacts, point, axes, guessed)
 
 
-def _numbers(place: Float[np.ndarray, "3"], digits: int) -> list[float]:
-    return [round(float(x), digits) + 0.0 for x in place]
-
-
-def _named(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:
-    """Feet of two named spheres and a named site each, as HECTOR's."""
+def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:
+    """Return the soles if each foot has two named spheres and a named site, as HECTOR's have."""
     model, soles = survey.model, []
     for leg in survey.legs:
         geoms, body = _foot_geoms(survey, leg), int(model.jnt_bodyid[leg[-1]])
-        sites = [s for s in range(model.nsite) if int(model.site_bodyid[s]) == body]
-        right = len(geoms) == 2 and len(sites) == 1 and model.site(sites[0]).name
-        if not right or any(
-            model.geom_type[g] != _SPHERE
-            or not model.geom(g).name
-            or int(model.geom_bodyid[g]) != body
+        sites = np.flatnonzero(model.site_bodyid == body)
+        if len(geoms) != 2 or len(sites) != 1 or not (site := model.site(sites[0])).name:
+            return None
+        if any(
+            model.geom_type[g] != _SPHERE or not model.geom(g).name or model.geom_bodyid[g] != body
             for g in geoms
         ):
             return None
@@ -233,7 +227,6 @@ def _named(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None:
         point = data.site_xpos[sites[0]] - anchor
         if np.abs(contacts[:, 2] - point[2]).max() > 1e-3:
             return None
-        names = {"point": model.site(sites[0]).name}
-        names |= {"toe": model.geom(toe).name, "heel": model.geom(heel).name}
+        names = {"point": site.name, "toe": model.geom(toe).name, "heel": model.geom(heel).name}
         soles.append(Sole(names, contacts, point, np.eye(3), guessed=False))
     return tuple(soles)

@@ -1,9 +1,10 @@
-"""A robot's file as published, brought to the one form that all later code reads.
+"""Convert a published robot file to the standard form that all later code reads.
 
-`build_spec` takes an MJCF or a URDF as it is. A model that has that form already (`rebuild` says
-which) is left as it is, but for meshes and the like. Any other is written anew from what MuJoCo
-compiles: joints of no leg are fixed, bodies without a joint become part of their parent, motors
-become torque motors, and floor, solver and contacts are set. Each such change is a note.
+`build_spec` takes any MJCF or URDF. A model that already has the standard form (defined in
+`rebuild`) only loses its meshes, pictures and other unused parts. Any other model is rebuilt from
+what MuJoCo compiles: joints outside the legs are fixed, bodies without a joint are merged with
+their parents, motors become torque motors, and floor, solver and contacts are set. Each change is
+reported in a note.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -15,89 +16,75 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, did_you_mean, one_line
-from hector_jax.robot.checks import ON_FLOOR, expect, listed, require
+from hector_jax.core.inputs import did_you_mean
+from hector_jax.robot.checks import ON_FLOOR, expect, listed, lowest_point, require
 from hector_jax.robot.description import Description
 from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import MASSLESS, Link, links_of
-from hector_jax.robot.mjcf import read_mjcf, refusal
-from hector_jax.robot.rebuild import SHAPES, SOLVER, Pieces, contact_bits, lowest, rebuild
+from hector_jax.robot.mjcf import mujoco_errors, read_mjcf
+from hector_jax.robot.rebuild import SHAPES, SOLVER, Pieces, contact_bits, rebuild
 
 _JOINT = mujoco.mjtJoint
 _MOTOR = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
-_MOST_FRICTION = 0.2  # of the robot's geoms; of two that touch the larger one counts
+_MAX_FRICTION = 0.2  # of the robot's geoms; MuJoCo takes the larger friction of two geoms
 
 
 class Source(NamedTuple):
-    """A robot in the form that all later code reads; `Description.named_feet` has its names."""
+    """A robot in the standard form, with the names of `Description.named_feet`."""
 
     spec: mujoco.MjSpec
-    notes: tuple[str, ...]  # what was mended, a line each
+    notes: tuple[str, ...]  # one line per change to the file
 
 
 class _File(NamedTuple):
     description: Description
     spec: mujoco.MjSpec
-    model: mujoco.MjModel  # without motors and keyframes, which need not fit
+    model: mujoco.MjModel  # without motors and keyframes, which may not match the model
     trunk: int  # body
     joints: list[int]  # of the legs
     free: int  # joint, or -1
 
 
 def build_spec(description: Description) -> Source:
-    """The robot of a description, see the module.
+    """Read the robot of a description and convert it to the standard form.
 
     Raises:
-        InputError: one line saying what came, what was expected and how to mend it.
+        InputError: one line with the value received, the expected one and the remedy.
     """
     path = description.model
     root = read_mjcf(path)
-    name = description.standing if isinstance(description.standing, str) else None
-    spec, notes = spec_of(path, root, description.joints, name)
+    urdf = root.tag == "robot"
+    keyframe = description.standing if isinstance(description.standing, str) else None
+    spec, notes = spec_of(path, root, description.joints, keyframe)
     file = _read(description, root, spec)
-    angles, trunk_quat = _standing(file, root.tag == "robot")
+    angles, trunk_quat = _standing(file, urdf)
     limits = [_torque_limit(file, joint) for joint in file.joints]
-    changes = ["a URDF, with neither motors nor a floor"] if root.tag == "robot" else []
-    changes += _changes(file, limits)
+    changes = ["a URDF, with neither motors nor a floor"] * urdf + _changes(file, limits)
     fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
     links = links_of(file.model, file.trunk, file.joints, fixed)
     _check_links(description, links)
     notes += _set_options(file)
     if not changes:
-        return Source(file.spec, (*notes, *_lower(file)))
-    legs = [angles[joint] for joint in file.joints]
-    spec = rebuild(description, Pieces(file.model, links, limits, legs, trunk_quat))
+        return Source(file.spec, (*notes, *_lower_keyframe(file)))
+    leg_angles = [angles[joint] for joint in file.joints]
+    spec = rebuild(description, Pieces(file.model, links, limits, leg_angles, trunk_quat))
     return Source(spec, (*notes, *changes))
 
 
-def compile_spec(description: Description, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The compiled model of a spec.
-
-    Raises:
-        InputError: MuJoCo's refusal in one line.
-    """
-    try:
-        return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"{description.model}: MuJoCo refuses it: {one_line(error)}") from None
-
-
 def compile_bare(path: Path, root: ElementTree.Element, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The model of a file without motors and keyframes, which need not fit.
+    """Compile a file without its motors and keyframes, which may not match the model.
 
     Raises:
-        InputError: MuJoCo's refusal in one line.
+        InputError: MuJoCo's error in one line.
     """
     bare = spec.copy()
     for part in (*bare.actuators, *bare.keys):
         bare.delete(part)
-    # what is welded may have no mass; the links are checked when they are one
+    # welded bodies may have no mass; `_check_links` checks the masses of the merged links
     bare.compiler.boundmass = MASSLESS
     bare.compiler.boundinertia = 1e-12
-    try:
+    with mujoco_errors(path, root):
         return bare.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise refusal(path, root, error) from None
 
 
 def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSpec) -> _File:
@@ -119,8 +106,8 @@ def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSp
     fixed = [names[j] for j in free if names[j] in description.weld]
     expect(path, not fixed, f"weld names {listed(fixed)}, the free joint, expected hinges")
     joints = [names.index(joint) for joint in description.joints]
-    first = int(model.jnt_bodyid[joints[0]])
-    trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first])
+    first_body = model.jnt_bodyid[joints[0]]
+    trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[first_body])
     if description.armature:
         model.dof_armature[model.jnt_dofadr[joints]] = len(description.feet) * description.armature
     file = _File(description, spec, model, trunk, joints, free[0] if free else -1)
@@ -130,7 +117,7 @@ def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSp
 
 
 def _check_joints(file: _File) -> None:
-    """Leg joints are hinges with a range, one a body; all others are welded."""
+    """Check that leg joints are hinges with a range, one per body, and all others are welded."""
     path, model, weld = file.description.model, file.model, file.description.weld
     extra = [
         model.joint(j).name or f"of body {model.body(model.jnt_bodyid[j]).name!r}"
@@ -140,49 +127,48 @@ def _check_joints(file: _File) -> None:
     text = f"joints {listed(extra)} are of no leg: add them to weld or remove them"
     expect(path, not extra, text)
     for j in file.joints:
-        body, this = int(model.jnt_bodyid[j]), f"joint {model.joint(j).name!r}"
-        expect(path, model.jnt_type[j] == _JOINT.mjJNT_HINGE, f"{this} is not a hinge")
-        on = model.body(body).name
-        text = f"{this} is not below the trunk, body {model.body(file.trunk).name!r}"
+        body, joint = int(model.jnt_bodyid[j]), f"joint {model.joint(j).name!r}"
+        expect(path, model.jnt_type[j] == _JOINT.mjJNT_HINGE, f"{joint} is not a hinge")
+        text = f"{joint} is not below the trunk, body {model.body(file.trunk).name!r}"
         expect(path, model.body_rootid[body] == file.trunk and body != file.trunk, text)
-        text = f"{this} shares body {on!r} with another joint, expected a body for each"
-        expect(path, model.body_jntnum[body] == 1, text)
-        text = f"{this} has no range, expected its limits (in a URDF: revolute, lower and upper)"
+        text = f"{joint} shares body {model.body(body).name!r} with another joint"
+        expect(path, model.body_jntnum[body] == 1, f"{text}, expected a body for each")
+        text = f"{joint} has no range, expected its limits (in a URDF: revolute, lower and upper)"
         expect(path, model.jnt_limited[j], text)
 
 
 def _check_world(file: _File) -> None:
-    """The floor is level or not there, and gravity points downwards."""
+    """Check that gravity points downwards and that the floor, if any, is level at z = 0."""
     path, model = file.description.model, file.model
     gravity = model.opt.gravity
-    right = np.all(gravity[:2] == 0.0) and gravity[2] < 0.0
-    expect(path, right, f"gravity is {gravity}, expected 0 0 and a negative number")
+    downwards = np.all(gravity[:2] == 0.0) and gravity[2] < 0.0
+    expect(path, downwards, f"gravity is {gravity}, expected 0 0 and a negative number")
     for g in _world_geoms(file):
         plane = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE
-        name, place = model.geom(g).name or repr(g), model.geom_pos[g]
+        name, position = model.geom(g).name or repr(g), model.geom_pos[g]
         expect(path, plane, f"geom {name} of the world is terrain, expected a plane at z = 0")
-        level = abs(place[2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
-        expect(path, level, f"floor {name} is at {place}, expected level at z = 0")
+        level = abs(position[2]) <= 1e-6 and np.allclose(model.geom_quat[g][1:3], 0.0)
+        expect(path, level, f"floor {name} is at {position}, expected level at z = 0")
 
 
 def _world_geoms(file: _File) -> list[int]:
-    """Geoms that collide and are no part of the robot."""
+    """Return the geoms that collide and do not belong to the robot."""
     model = file.model
     collide = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     return [int(g) for g in collide if model.body_rootid[model.geom_bodyid[g]] != file.trunk]
 
 
 def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarray, "4"]]:
-    """Angle [rad] of each hinge and slide when the robot stands, and how its trunk is turned."""
+    """Return each hinge's and slide's standing angle [rad] by joint, and the trunk's quaternion."""
     description, model = file.description, file.model
-    path, pose, upright = description.model, description.standing, np.array([1.0, 0.0, 0.0, 0.0])
-    names = {model.joint(j).name: j for j in range(model.njnt)}
-    hinges = (*description.joints, *description.weld)
+    path, pose, trunk_quat = description.model, description.standing, np.array([1.0, 0.0, 0.0, 0.0])
+    names = (*description.joints, *description.weld)
+    hinges = {name: model.joint(name).id for name in names}
     if not isinstance(pose, str):
         for name, _ in pose:
-            require(path, "joint", name, hinges)
-        angles = dict.fromkeys((names[name] for name in hinges), 0.0)
-        return angles | {names[name]: angle for name, angle in pose}, upright
+            require(path, "joint", name, names)
+        angles = dict.fromkeys(hinges.values(), 0.0)
+        return angles | {hinges[name]: angle for name, angle in pose}, trunk_quat
     keys = [key for key in file.spec.keys if key.name == pose]
     hint = "; a URDF has none" if urdf else ""
     text = f"no keyframe {pose!r}{hint}; expected one, or standing = {{ joint = angle }}"
@@ -190,17 +176,18 @@ def _standing(file: _File, urdf: bool) -> tuple[dict[int, float], Float[np.ndarr
     qpos = np.array(keys[0].qpos)
     text = f"keyframe {pose!r} has {len(qpos)} numbers, expected {model.nq}"
     expect(path, len(qpos) == model.nq, text)
-    angles = {names[name]: float(qpos[model.jnt_qposadr[names[name]]]) for name in hinges}
+    angles = {j: float(qpos[model.jnt_qposadr[j]]) for j in hinges.values()}
     if file.free >= 0:
         start = model.jnt_qposadr[file.free]
-        upright = qpos[start + 3 : start + 7]
-    return angles, upright
+        trunk_quat = qpos[start + 3 : start + 7]
+    return angles, trunk_quat
 
 
 def _torque_limit(file: _File, joint: int) -> float:
-    """The smallest limit of a joint's torque [N m] that the file states.
+    """Return the smallest limit of a joint's torque [N m] that the file states.
 
-    Of its actuators' forces, of the control of a motor, and of the joint itself (effort in a URDF).
+    Limits are stated for the forces of its actuators, for the control of a motor and for the joint
+    itself (effort in a URDF).
     """
     name, model, torques = file.model.joint(joint).name, file.model, []
     for motor in _motors(file.spec):
@@ -219,8 +206,8 @@ def _torque_limit(file: _File, joint: int) -> float:
 
 
 def _motors(spec: mujoco.MjSpec) -> list:
-    joint = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    return [motor for motor in spec.actuators if motor.trntype in joint]
+    joint_types = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    return [motor for motor in spec.actuators if motor.trntype in joint_types]
 
 
 def _limited(flag: mujoco.mjtLimited, span: Float[np.ndarray, "2"]) -> bool:
@@ -229,12 +216,12 @@ def _limited(flag: mujoco.mjtLimited, span: Float[np.ndarray, "2"]) -> bool:
 
 
 def _is_motor(motor: mujoco.MjsActuator) -> bool:
-    """Whether its control is a force."""
+    """Return whether the control of an actuator is a force."""
     return (motor.gaintype, motor.biastype, motor.dyntype) == _MOTOR
 
 
 def _changes(file: _File, limits: Sequence[float]) -> list[str]:
-    """Why a robot has to be written anew, in a line each; nothing where it has the form already."""
+    """Return one line per reason to rebuild a robot; none if it has the standard form."""
     description, model = file.description, file.model
     inside = [b for b in range(1, model.nbody) if model.body_rootid[b] == file.trunk]
     static = [model.body(b).name for b in inside if not model.body_jntnum[b] and b != file.trunk]
@@ -248,18 +235,18 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
         (f"made one with their parents: {listed(static)}", static),
         ("joints put in order, leg by leg", file.free >= 0 and not (order or description.weld)),
         ("frames of the joints put into their anchors", not at_origin and order),
-        (f"torque motors {motors}", not _motors_right(file, limits)),
+        (f"torque motors {motors}", not _motors_match(file, limits)),
         ("floor added" if not floor else "floor replaced", bits != [(1, 0)]),
         ("armature of the joints set", description.armature),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
-        ("contact bits, friction and shapes set", not _contacts_right(file)),
+        ("contact bits, friction and shapes set", not _contacts_match(file)),
         ("standing pose by angles", not isinstance(description.standing, str)),
     )
-    return [line for line, there in lines if there]
+    return [line for line, needed in lines if needed]
 
 
 def _set_options(file: _File) -> list[str]:
-    """Set step and solver, in place."""
+    """Set time step and solver in place. Returns the note of the change, if any."""
     option = file.spec.option
     wrong = [name for name, value in SOLVER.items() if getattr(option, name) != value]
     for name in wrong:
@@ -267,11 +254,10 @@ def _set_options(file: _File) -> list[str]:
     return [f"option {listed(wrong)} set"] if wrong else []
 
 
-def _motors_right(file: _File, limits: Sequence[float]) -> bool:
-    motors, names = list(file.spec.actuators), file.description.joints
-    if [motor.target for motor in motors] != list(names):
-        return False
-    return all(
+def _motors_match(file: _File, limits: Sequence[float]) -> bool:
+    """Return whether the actuators are torque motors in the order of the joints."""
+    motors = list(file.spec.actuators)
+    return [motor.target for motor in motors] == list(file.description.joints) and all(
         _is_motor(motor)
         and motor.gainprm[0] == motor.gear[0] == 1.0
         and _limited(motor.ctrllimited, motor.ctrlrange)
@@ -281,38 +267,42 @@ def _motors_right(file: _File, limits: Sequence[float]) -> bool:
     )
 
 
-def _contacts_right(file: _File) -> bool:
-    """Whether the geoms of the robot touch the floor and the other legs as they should."""
+def _contacts_match(file: _File) -> bool:
+    """Return whether the robot's geoms have the contact settings of the standard form."""
     model, feet = file.model, file.description.feet
-    roots = [int(model.jnt_bodyid[j]) for j in file.joints[:: file.description.leg_joints]]
-    ends = {name for foot in feet for name in foot.contacts}
+    leg_roots = [int(model.jnt_bodyid[j]) for j in file.joints[:: file.description.leg_joints]]
+    contacts = {name for foot in feet for name in foot.contacts}
     for g in map(int, np.flatnonzero(model.geom_contype | model.geom_conaffinity)):
-        body = above = int(model.geom_bodyid[g])
-        if model.body_rootid[body] != file.trunk:
+        root = int(model.geom_bodyid[g])
+        if model.body_rootid[root] != file.trunk:
             continue
-        while above and above not in roots:
-            above = int(model.body_parentid[above])
-        contype, conaffinity = contact_bits(len(feet), roots.index(above) if above else None)
-        more = model.geom_contype[g] & ~contype or model.geom_conaffinity[g] & ~conaffinity
-        more = more or model.geom_solmix[g] or model.geom_priority[g]
-        right = model.geom_condim[g] == (3 if model.geom(g).name in ends else 1)
-        right = right and model.geom_friction[g, 0] <= _MOST_FRICTION
-        if more or not right or model.geom_type[g] not in SHAPES:
+        while root and root not in leg_roots:
+            root = int(model.body_parentid[root])
+        contype, conaffinity = contact_bits(len(feet), leg_roots.index(root) if root else None)
+        if (
+            model.geom_contype[g] & ~contype
+            or model.geom_conaffinity[g] & ~conaffinity
+            or model.geom_solmix[g]
+            or model.geom_priority[g]
+            or model.geom_condim[g] != (3 if model.geom(g).name in contacts else 1)
+            or model.geom_friction[g, 0] > _MAX_FRICTION
+            or model.geom_type[g] not in SHAPES
+        ):
             return False
     return True
 
 
-def _lower(file: _File) -> list[str]:
-    """Put level soles of the file's keyframe on the floor, in place."""
+def _lower_keyframe(file: _File) -> list[str]:
+    """Lower the keyframe in place so that level soles are on the floor. Returns a note if so."""
     model, data = file.model, mujoco.MjData(file.model)
     key = next(key for key in file.spec.keys if key.name == file.description.standing)
     data.qpos[:] = key.qpos
     mujoco.mj_kinematics(model, data)
     names = {model.geom(g).name for g in range(model.ngeom)}
-    ends = [str(name) for foot in file.description.feet for name in foot.contacts]
-    if not names.issuperset(ends):  # as `checks` will say
+    contacts = [str(name) for foot in file.description.feet for name in foot.contacts]
+    if not names.issuperset(contacts):  # `checks.check_model` reports it
         return []
-    heights = [lowest(model, data, name) for name in ends]
+    heights = [lowest_point(model, data, name) for name in contacts]
     low = min(heights)
     if abs(low) <= ON_FLOOR or max(heights) - low > ON_FLOOR:
         return []
@@ -322,13 +312,13 @@ def _lower(file: _File) -> list[str]:
 
 
 def _check_links(description: Description, links: Sequence[Link]) -> None:
-    """Legs hang together from the trunk down, and each link has a mass."""
+    """Check that each leg is a chain from the trunk down and that each link has a mass."""
     path, count = description.model, description.leg_joints
     for index, link in enumerate(links):
         text = f"body {link.name!r} moves and has no mass: give it an <inertial>"
         expect(path, link.mass > 0.0, text)
         if index:
-            above = 0 if index % count == 1 else index - 1
+            parent = 0 if index % count == 1 else index - 1
             text = f"joint {description.joints[index - 1]!r} is on body {links[link.parent].name!r}"
-            text += f", expected {links[above].name!r}: name each leg from the trunk down"
-            expect(path, link.parent == above, text)
+            text += f", expected {links[parent].name!r}: name each leg from the trunk down"
+            expect(path, link.parent == parent, text)

@@ -1,8 +1,8 @@
-"""The single rigid body: what wrenches on the feet do to the base (Eq. 2), exactly and linearised.
+"""Single rigid body dynamics: motion of the base under foot wrenches (Eq. 2), exact and linearised.
 
-The body turns with the constant composite inertia of the standing robot. The linearisation is
-forward Euler and drops the gyroscopic term, as the public controllers of this robot do; the
-simulated body keeps it.
+The body has the constant composite inertia of the standing robot. The linearisation uses forward
+Euler and drops the gyroscopic term, as the public controllers of this robot do; the simulated body
+keeps it.
 """
 
 from functools import partial
@@ -20,7 +20,7 @@ from hector_jax.robot.model import Robot
 def centroidal_rates(
     robot: Robot, wrench: Wrench, lever: Float[Array, "feet 3"]
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Linear acceleration [m/s^2] and rate of angular momentum [N m], world frame.
+    """Return linear acceleration [m/s^2] and rate of angular momentum [N m], world frame.
 
     Args:
         robot: mass [kg] and gravity [m/s^2], the latter pointing up as in the paper.
@@ -41,7 +41,7 @@ def rates(
     feet: Float[Array, "feet 3"],
     load: Load | None = None,
 ) -> State:
-    """Time derivative of the state; `feet` are the foot points in the world [m]. Source: Eq. 2."""
+    """Return the state's time derivative for foot points in the world [m]. Source: Eq. 2."""
     acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
     if load is not None:
         acceleration, torque = acceleration + load.force / robot.mass, torque + load.torque
@@ -65,15 +65,15 @@ def step(
     dt: float,
     load: Load | None = None,
 ) -> State:
-    """State after `dt` [s] of constant wrench and load, world frame (4th-order Runge-Kutta)."""
+    """Return the state after `dt` [s] of constant wrench and load, world frame (Runge-Kutta 4)."""
 
-    def ahead(slope: State, h: float) -> State:
+    def euler_step(slope: State, h: float) -> State:
         return jax.tree.map(lambda x, dx: x + h * dx, state, slope)
 
     k1 = rates(robot, state, wrench, feet, load)
-    k2 = rates(robot, ahead(k1, dt / 2), wrench, feet, load)
-    k3 = rates(robot, ahead(k2, dt / 2), wrench, feet, load)
-    k4 = rates(robot, ahead(k3, dt), wrench, feet, load)
+    k2 = rates(robot, euler_step(k1, dt / 2), wrench, feet, load)
+    k3 = rates(robot, euler_step(k2, dt / 2), wrench, feet, load)
+    k4 = rates(robot, euler_step(k3, dt), wrench, feet, load)
     return jax.tree.map(
         lambda x, a, b, c, d: x + dt / 6 * (a + 2 * b + 2 * c + d), state, k1, k2, k3, k4
     )
@@ -87,17 +87,17 @@ def unexplained(
     feet: Float[Array, "feet 3"],
     dt: float,
 ) -> Load:
-    """The load that the motion from one state to the next owes to something beside the wrench.
+    """Return the load that explains the motion between two states in addition to the wrench.
 
     Args:
         robot: mass, gravity and inertia.
         before: state at the start.
         after: state `dt` [s] later.
-        wrench: mean of the wrench of the ground in between.
+        wrench: mean wrench of the ground between the states.
         feet: foot points halfway [m].
         dt: time between the states [s].
 
-    Source: Eq. 2, solved for the forces; the inverse of `step` but for terms of second order.
+    Source: Eq. 2, solved for the forces; the inverse of `step` up to terms of second order.
     """
 
     def momentum(state: State) -> Float[Array, "3"]:
@@ -112,11 +112,11 @@ def unexplained(
     )
 
 
-@partial(jax.jit, static_argnums=3)  # traced once for all that ask
+@partial(jax.jit, static_argnums=3)  # traced once for all callers
 def linearise(
     robot: Robot, euler: Float[Array, "3"], lever: Float[Array, "feet 3"], dt: float
 ) -> tuple[Float[Array, "15 15"], Float[Array, "15 u"]]:
-    """A and B of x' = A x + B u, with x = [e; p; omega; v; g] and u = [F_0; F_1; M_0; M_1].
+    """Return A and B of x' = A x + B u, x = [e; p; omega; v; g] and u = [F_0; F_1; M_0; M_1].
 
     Args:
         robot: mass and inertia.
@@ -128,26 +128,25 @@ def linearise(
     """
     R_wb = rotation_from_euler(euler)
     inverse_inertia = R_wb @ jnp.linalg.inv(robot.inertia) @ R_wb.T
-    eye, none = jnp.eye(3, dtype=R_wb.dtype), jnp.zeros((3, 3), R_wb.dtype)
+    eye, zero = jnp.eye(3, dtype=R_wb.dtype), jnp.zeros((3, 3), R_wb.dtype)
     A = jnp.block(
         [
-            [eye, none, dt * euler_rates(euler), none, none],
-            [none, eye, none, dt * eye, none],
-            [none, none, eye, none, none],
-            [none, none, none, eye, -dt * eye],
-            [none, none, none, none, eye],
+            [eye, zero, dt * euler_rates(euler), zero, zero],
+            [zero, eye, zero, dt * eye, zero],
+            [zero, zero, eye, zero, zero],
+            [zero, zero, zero, eye, -dt * eye],
+            [zero, zero, zero, zero, eye],
         ]
     )
-    turn = dt * inverse_inertia
-    push = dt / robot.mass * eye
+    moment_gain, force_gain = dt * inverse_inertia, dt / robot.mass * eye
     feet = len(lever)
     B = jnp.block(
         [
-            [none] * (2 * feet),
-            [none] * (2 * feet),
-            [turn @ skew(arm) for arm in lever] + [turn] * feet,
-            [push] * feet + [none] * feet,
-            [none] * (2 * feet),
+            [zero] * (2 * feet),
+            [zero] * (2 * feet),
+            [moment_gain @ skew(arm) for arm in lever] + [moment_gain] * feet,
+            [force_gain] * feet + [zero] * feet,
+            [zero] * (2 * feet),
         ]
     )
     return A, B

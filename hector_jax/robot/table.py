@@ -1,27 +1,27 @@
-"""What is known of a robot, as a short table in plain words."""
+"""Describe a robot in a short table of plain words."""
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from hector_jax.core.trajectory import FEET
 from hector_jax.robot.checks import trunk_body
 from hector_jax.robot.kinematics import knee_joints
-from hector_jax.robot.links import at_zero
+from hector_jax.robot.links import data_at
 from hector_jax.robot.model import Robot, compile_model
 from hector_jax.robot.source import build_spec
 from hector_jax.robot.survey import Survey, axis_words
 
 _HEADER = ("joint", "axis", "range [rad]", "motor [N m]", "link [kg]", "standing [rad]")
-_HEAVY = 0.35  # share of the legs in the mass
+_HEAVY_LEGS = 0.35  # share of the robot's mass
 
 
 def table_of(robot: Robot) -> list[str]:
-    """The lines of a robot that can be loaded."""
+    """Return the table of a robot, line by line."""
     description = robot.description
     count = description.leg_joints
     share = float(robot.link_mass.sum() / robot.mass)
     _, knee, _ = knee_joints(robot)
-    bends = robot.standing_joints.reshape(-1, count)[::2, knee] * robot.joint_axis[::2, knee, 1]
+    bend = robot.standing_joints.reshape(-1, count)[::2, knee] * robot.joint_axis[::2, knee, 1]
     model = compile_model(description)
     trunk = model.body(trunk_body(model)).name
     rows = [
@@ -39,56 +39,52 @@ def table_of(robot: Robot) -> list[str]:
         f"robot    {description.name}: {robot.mass:.4g} kg, trunk {trunk!r}; standing, its centre "
         f"of mass is {robot.standing_height:.3g} m high",
         f"legs     {count} joints each, {100 * share:.0f} % of the mass; "
-        f"{_knees((bends > 0.0).tolist())}",
+        f"{_knees((bend > 0.0).tolist())}",
         *_columns([_HEADER, *rows]),
         f"feet     {robot.structure.contact}: {_sole(robot)}",
-        *_words("fixed", description.weld),
+        *_list("fixed", description.weld),
     ]
 
 
 def table_of_survey(survey: Survey) -> list[str]:
-    """The lines of a robot of which only the legs are known."""
-    model, data = survey.model, at_zero(survey.model)
-    rows = [
-        (
-            f"{model.joint(left).name}, {model.joint(right).name}",
-            axis_words(data.xaxis[left]),
-            "{:+.2f} to {:+.2f}".format(*model.jnt_range[left])
-            if model.jnt_limited[left]
-            else "none",
-        )
-        for left, right in zip(*survey.legs[:2], strict=True)
-    ]
+    """Return the table of a robot that cannot be loaded, line by line."""
+    model, data = survey.model, data_at(survey.model)
+    rows = []
+    for left, right in zip(*survey.legs[:2], strict=True):
+        names = f"{model.joint(left).name}, {model.joint(right).name}"
+        low, high = model.jnt_range[left]
+        limits = f"{low:+.2f} to {high:+.2f}" if model.jnt_limited[left] else "none"
+        rows.append((names, axis_words(data.xaxis[left]), limits))
     mass = float(model.body_subtreemass[survey.trunk])
     return [
         f"robot    {mass:.4g} kg, trunk {model.body(survey.trunk).name!r}",
         f"legs     {len(rows)} joints each; {_knees(survey.forwards)}",
         *_columns([_HEADER[:3], *rows]),
-        *_words("fixed", survey.weld),
+        *_list("fixed", survey.weld),
     ]
 
 
-def mended(robot: Robot) -> list[str]:
-    """What of the model's file is read otherwise than it stands there, a line each."""
+def changes(robot: Robot) -> list[str]:
+    """Return one line per change that was made to the model of the robot's file."""
     notes = build_spec(robot.description).notes
-    return [note for note in notes if not note.startswith("fixed: ")]  # as the table has them
+    return [note for note in notes if not note.startswith("fixed: ")]  # the table lists these
 
 
 def remarks(robot: Robot) -> list[str]:
-    """What can be walked with and is likely to be trouble, and how to mend it."""
+    """Return one line per likely cause of trouble in walking, with its remedy."""
     share, lines = float(robot.link_mass.sum() / robot.mass), []
     control = {name: dict(section) for name, section in robot.description.control}
-    if share > _HEAVY and not control.get("legs", {}).get("gravity_compensation"):
+    if share > _HEAVY_LEGS and not control.get("legs", {}).get("gravity_compensation"):
         lines.append(
             f"the legs are {100 * share:.0f} % of the mass and lift the trunk when they stretch: "
             "set legs.gravity_compensation = true and bend the knees"
         )
     model = compile_model(robot.description)
-    bare = [n for n in robot.description.joints if not model.dof_armature[model.joint(n).dofadr[0]]]
-    if bare:
+    names = robot.description.joints
+    if missing := [n for n in names if not model.dof_armature[model.joint(n).dofadr[0]]]:
         lines.append(
-            f"joint {bare[0]!r} has no armature, without which backlash cannot be simulated: set "
-            "joints.armature"
+            f"joint {missing[0]!r} has no armature, without which backlash cannot be simulated: "
+            "set joints.armature"
         )
     if robot.heel > 1.2 * robot.toe:
         lines.append(
@@ -115,23 +111,23 @@ def _sole(robot: Robot) -> str:
 
 
 def _knees(forwards: Sequence[bool]) -> str:
-    """To which side the knees of each pair of legs bend, and whose numbers follow."""
-    ways = ["forwards" if ahead else "backwards" for ahead in forwards]
-    way = ways[0] if len(set(ways)) == 1 else f"{ways[0]} in front and {ways[1]} behind"
-    leg = FEET[2 * len(ways)][0].replace("_", " ")
-    return f"knees bend {way}; axes and numbers of the {leg} leg:"
+    """Return the direction in which the knees bend, and the leg of the numbers that follow."""
+    words = ["forwards" if ahead else "backwards" for ahead in forwards]
+    direction = words[0] if len(set(words)) == 1 else f"{words[0]} in front and {words[1]} behind"
+    leg = FEET[2 * len(words)][0].replace("_", " ")
+    return f"knees bend {direction}; axes and numbers of the {leg} leg:"
 
 
-def _words(title: str, words: Sequence[str]) -> list[str]:
-    """Names under a title."""
-    lines = textwrap.wrap(", ".join(words) or "no joint", 91, break_on_hyphens=False)
+def _list(title: str, names: Sequence[str]) -> list[str]:
+    """Return the names, wrapped into lines, after a title."""
+    lines = textwrap.wrap(", ".join(names) or "no joint", 91, break_on_hyphens=False)
     return [f"{title if i == 0 else '':8s} {line}" for i, line in enumerate(lines)]
 
 
-def _columns(rows: Sequence[Iterable[str]]) -> list[str]:
-    cells = [tuple(row) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the rows with their cells aligned in columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  " + "  ".join(f"{x:{w}}" for x, w in zip(row, widths, strict=True)).rstrip()
-        for row in cells
+        for row in rows
     ]

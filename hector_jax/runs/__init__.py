@@ -1,1 +1,1 @@
-"""What a run computes, stores and reads again."""
+"""Steps of a run, and the artefacts that they store and read again."""

@@ -1,10 +1,10 @@
-"""Artefacts on disk: what takes longer than a moment to compute is computed once.
+"""Artefacts on disk: results that take more than a moment to compute are computed once.
 
 An artefact is a tree of arrays in one file: a tuning, the score of a walk, the scores of a group of
-walks. Its file's name ends in a `content_key` of all that it follows from: settings, robot,
-command, net, weights, plant, seed, loss, and the code and packages that compute it. Other inputs
-make another file, so that nothing is taken for something else and nothing is overwritten. A process
-that is killed loses the artefacts that were not finished; a damaged file is named and made anew.
+walks. The name of its file ends in a `content_key` of all its inputs: settings, robot, command,
+net, weights, plant, seed, loss, and the code and packages that compute it. Other inputs make
+another file, so that no artefact is mistaken for another or overwritten. A process that is killed
+loses the artefacts that were not finished; a damaged file is named in a message and made again.
 """
 
 import hashlib
@@ -25,18 +25,18 @@ Tree = TypeVar("Tree")
 
 
 def robot_hash(robot: Robot) -> str:
-    """Hash (16 hexadecimal digits) of a robot: its numbers, what its TOML says and its MJCF."""
-    body = robot.description
-    settings = replace(body, path=Path(), model=Path(body.model.name))
-    text = f"{tree_hash(robot, ROBOT_DIGITS)} {settings!r} ".encode() + body.model.read_bytes()
+    """Return a hash (16 hexadecimal digits) of a robot: its numbers, its TOML and its MJCF."""
+    model = robot.description.model
+    settings = replace(robot.description, path=Path(), model=Path(model.name))
+    text = f"{tree_hash(robot, ROBOT_DIGITS)} {settings!r} ".encode() + model.read_bytes()
     return hashlib.sha256(text).hexdigest()[:16]
 
 
 def content_key(*parts: Any, code: Sequence[str]) -> str:
-    """Hash (12 hexadecimal digits) of all that a result follows from, exact in every bit.
+    """Return a hash (12 hexadecimal digits) of all inputs of a result, exact in every bit.
 
     Args:
-        parts: settings (by their repr), robots and trees of numbers.
+        parts: settings (hashed by their repr), robots and trees of numbers.
         code: modules that compute the result, see `code_hash`.
     """
 
@@ -58,15 +58,15 @@ def load_or_make(
     robot: Robot,
     about: Mapping[str, Any] | None = None,
 ) -> dict[Key, Tree]:
-    """Artefacts by key: those on disk are read, the others are made, and saved as they come.
+    """Return artefacts by key: read those on disk, make the others and save them as they come.
 
     Args:
-        paths: file of each artefact, all in one folder, which is locked meanwhile.
-        make: given the missing keys and the artefacts that were read, yields each missing key with
-            its artefact, in any order; not called where nothing is missing.
-        like: a tree of the structure of a key's artefact, see `load_tree`.
-        kind: of the files.
-        robot: the body that the artefacts are of.
+        paths: file of each artefact, all in one folder, which is locked during the call.
+        make: function of the missing keys and the artefacts that were read, which yields each
+            missing key with its artefact, in any order; not called if nothing is missing.
+        like: returns a tree with the structure of the artefact of a key, see `load_tree`.
+        kind: kind of the files.
+        robot: robot of the artefacts.
         about: JSON values for the cards.
 
     Raises:

@@ -1,13 +1,14 @@
-"""What a run takes of its tunings: an iteration of each (`choose`), and its answer, `best`.
+"""Selection of the weights of a run: an iteration of each tuning (`choose`), and the set `best`.
 
-The rigid-body model is wrong in places: from some iteration on a tuning can gain on the model and
-lose on the robot. A few points of the path, its start among them, walk on plants drawn around the
-hfs, of which neither the tuner nor an evaluation sees anything. Their estimate of the state is
-noisy: a rollout knows its state exactly, so nothing keeps a tuning from gains that amplify noise.
+The rigid-body model is inexact: from some iteration on a tuning can gain on the model and lose on
+the robot. A few points of the path, including its start, therefore walk on plants drawn around the
+hfs that are used by no tuning and no evaluation. Their state estimate is noisy: a rollout knows its
+state exactly, so nothing keeps a tuning from gains that amplify noise.
 """
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,12 +24,12 @@ from hector_jax.runs import verdicts
 from hector_jax.sim.world import Imperfections, hfs_drawn, truth
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 
-# of the accepted iterations: where a path is walked
+# fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
-_FRICTION = 11 / 12  # share of the controller's friction with which the answer plans
-_FIRST_SEED = 7000  # of the plants, drawn as `hfs-varied` but none of its seeds
-# White noise: encoders of 14 bits; a gyroscope on a vibrating trunk; velocity and position by both
-# over a leg of about 0.7 m.
+_FRICTION = 11 / 12  # of the controller's friction, with which the chosen weights plan
+_FIRST_SEED = 7000  # of the plants, drawn like `hfs-varied` but with other seeds
+# Standard deviations of white noise: encoders of 14 bits; a gyroscope on a vibrating trunk;
+# velocity and position follow from both over a leg of about 0.7 m.
 _SIGMAS = {
     "position": 0.001,  # [m]
     "velocity": 0.02,  # [m/s]
@@ -39,19 +40,20 @@ _SIGMAS = {
 
 
 class Choice(NamedTuple):
-    """An iteration of a tuning."""
+    """The chosen iteration of a tuning."""
 
     weights: Weights
     iteration: int  # its number
-    of: int  # number of the last
+    of: int  # number of the last iteration
 
 
 def drawn_plants(robot: Robot, count: int) -> list[Imperfections]:
-    """The first plants on which weights of a robot are chosen and tuned."""
+    """Return the first plants on which weights of a robot are chosen and tuned."""
     noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
-    seeds = range(_FIRST_SEED, _FIRST_SEED + count)
-    drawn = [hfs_drawn(seed, 0.4, robot.description) for seed in seeds]
-    return [plant._replace(estimator=noisy) for plant in drawn]
+    return [
+        hfs_drawn(seed, 0.4, robot.description)._replace(estimator=noisy)
+        for seed in range(_FIRST_SEED, _FIRST_SEED + count)
+    ]
 
 
 def _ratios(
@@ -63,17 +65,14 @@ def _ratios(
     title: str,
     **notes: Any,
 ) -> dict[str, float]:
-    """L of each set against the first one, mean over the drawn plants and the commands."""
+    """Return L of each set relative to the first set, mean over the drawn plants and commands."""
     plants = drawn_plants(robot, robot.description.tuning.choice_plants)
     title = f"{title} on {plural(len(plants), 'plant')} drawn around the hfs"
-    seeds = range(len(plants))
-    each = [
-        verdicts.judge(pool, config, robot, sets, one, plants, seeds, title=title, **notes).scores
-        for one in commands
-    ]
-    loss = {name: np.array([[one.L for one in scores[name]] for scores in each]) for name in sets}
-    first = loss[next(iter(sets))]
-    return {name: float(np.mean(one / first)) for name, one in loss.items()}
+    judge = partial(verdicts.judge, pool, config, robot, sets, title=title, **notes)
+    results = [judge(command, plants, range(len(plants))).scores for command in commands]
+    losses = {name: np.array([[s.L for s in scores[name]] for scores in results]) for name in sets}
+    first = losses[next(iter(sets))]
+    return {name: float(np.mean(loss / first)) for name, loss in losses.items()}
 
 
 def choose(
@@ -87,27 +86,24 @@ def choose(
     folder: Path,
     commit: str = "",
 ) -> dict[str, Choice]:
-    """Walk the paths of tunings and take the best point of each; none if no plants are asked for.
+    """Walk the paths of tunings and return the best point of each; empty if no plants are required.
 
     Args:
         pool: worker processes.
         config, robot: controller and loss, nominal body with the number of plants.
-        tunings: by name; from one start.
-        commands, seconds: what to walk, and how long. All commands count alike.
-        folder: of the scores, where walks that are there are not walked again.
-        commit: to note with what is walked now.
+        tunings: tunings by name, all from the same start.
+        commands, seconds: commands to walk, which count alike, and their length.
+        folder: folder of the scores; walks whose scores are in it are not repeated.
+        commit: commit to record with new walks.
     """
     if not robot.description.tuning.choice_plants:
         return {}
-    paths = {name: [i for i in one.history if i.accepted] for name, one in tunings.items()}
-    points = {  # of each path, by their labels
-        name: {
-            f"{name}-{i}" if i else "start": path[i]
-            for i in sorted({round(share * (len(path) - 1)) for share in SHARES})
-        }
-        for name, path in paths.items()
-    }
-    sets = {label: one.weights for each in points.values() for label, one in each.items()}
+    points = {}  # of each path, by their labels
+    for name, tuning in tunings.items():
+        path = [iteration for iteration in tuning.history if iteration.accepted]
+        indices = sorted({round(share * (len(path) - 1)) for share in SHARES})
+        points[name] = {f"{name}-{i}" if i else "start": path[i] for i in indices}
+    sets = {label: i.weights for labels in points.values() for label, i in labels.items()}
     sets = {"start": sets["start"], **sets}
     notes = {"seconds": seconds, "folder": folder, "commit": commit}
     ratio = _ratios(pool, config, robot, sets, commands, "choosing an iteration", **notes)
@@ -135,26 +131,26 @@ def answer(
     commands: Sequence[Command],
     **notes: Any,
 ) -> Weights:
-    """The set that a run takes for its answer.
+    """Return the set `best` of a run.
 
-    What each of two tunings gains by the faults of its own model is half lost between them, what
-    both gain stays. The set between them plans with less friction than the controller assumes.
-    For a robot that asks for drawn plants one of the tuned sets is taken where it walks better
-    there, because models are further from such robots.
+    Between two tunings, gains from the faults of one model are half lost, and gains that both
+    tunings share remain. The set between them plans with less friction than the controller
+    assumes. If the description of the robot requires drawn plants, one of the tuned sets is taken
+    where it walks better on them, because the models are less exact for such robots.
 
     Args:
         pool, config, robot, commands, notes: see `choose`.
-        sets: by name: nominal, and all that were tuned.
+        sets: sets by name: nominal and all tuned sets.
         pair: names of the two tunings.
-        share: of the second one.
+        share: share of the second tuning.
     """
     lower, upper = TUNABLES["friction"].lower, TUNABLES["friction"].upper
     friction = float(np.clip(_FRICTION * config.rollout.walk.mpc.friction, lower, upper))
-    half_way = between(sets[pair[0]], sets[pair[1]], share)
-    half_way = half_way._replace(others={"friction": friction, **half_way.others})
+    mixture = between(sets[pair[0]], sets[pair[1]], share)
+    mixture = mixture._replace(others={"friction": friction, **mixture.others})
     if not robot.description.tuning.choice_plants:
-        return half_way
-    walked = {**sets, "between": half_way}
+        return mixture
+    walked = {**sets, "between": mixture}
     ratio = _ratios(pool, config, robot, walked, commands, "choosing the answer", **notes)
     best = min((name for name in walked if name != "nominal"), key=ratio.__getitem__)
     say(f"best: {best} walks best on plants drawn around the hfs")

@@ -1,7 +1,7 @@
 """Export for the robot: the weights with their schema, and the controller as a compiled function.
 
-A recorded walk lies beside it, with the outputs of the live controller; nothing is written unless
-the file gives the same outputs (`TOLERANCE`).
+A recorded walk with the outputs of the live controller lies beside the file; nothing is written
+unless the exported function returns the same outputs (`TOLERANCE`).
 """
 
 import hashlib
@@ -58,17 +58,17 @@ _INPUTS = ("force, foot 0 (left)", "force, foot 1 (right)", "moment, foot 0", "m
 
 
 def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
-    """A weight set's file, and the controller that it was tuned for.
+    """Find the file of a weight set and the controller that it was tuned for.
 
     Args:
         run: folder of a run, or a weights file.
-        name: of the set in the folder.
+        name: name of the set in the folder.
 
     Returns:
-        The file, and the controller; None where a file does not say it.
+        The file, and the controller; None for a weights file, which does not name its controller.
 
     Raises:
-        InputError: one line with what is missing or odd, and what there is.
+        InputError: one line with what is missing or wrong, and the available sets.
     """
     if not run.is_dir():
         return run, None
@@ -87,7 +87,7 @@ def find_weights(run: Path, name: str) -> tuple[Path, WalkConfig | None]:
 
 
 def _constants(config: WalkConfig, robot: Robot, lead: int) -> dict[str, Any]:
-    """Numbers that the robot's own code needs."""
+    """Return numbers that the code of the robot needs."""
     return {
         "milliseconds_per_plan": substeps(config),
         "millisecond_of_tick_0": lead,
@@ -100,6 +100,7 @@ def _constants(config: WalkConfig, robot: Robot, lead: int) -> dict[str, Any]:
 
 
 def _require_same(result: Check) -> None:
+    """Raise `Broken` if the exported controller differs from the live one or fails to solve."""
     if not max(result[:3]) <= TOLERANCE:
         raise Broken(
             f"the exported controller differs from the live one by {result.force:.1e} N, "
@@ -121,43 +122,44 @@ def export(
     name: str,
     seconds: float = 1.0,
 ) -> dict[str, Any]:
-    """Write everything that goes to the robot; files that are there already are replaced.
+    """Write everything that goes to the robot, replacing existing files.
 
     Args:
-        config, robot, weights: the controller, its body and the weights to export.
-        command, seconds: to walk for the check; from t = 0 on.
-        folder: where to.
-        name: of the weights, for the files.
+        config, robot, weights: the controller, its robot and the weights to export.
+        command, seconds: command and length of the walk of the check, from t = 0 on.
+        folder: folder to write.
+        name: name of the weights, for the files.
 
     Returns:
         The card, also in `controller.json`: sha256 of the files, signature, constants, weights,
         settings and the check.
 
     Raises:
-        InputError: as `record` and `export_controller`; or the folder cannot be written.
-        Broken: it differs from the live controller by more than TOLERANCE; nothing is written.
+        InputError: see `record` and `export_controller`; or the folder cannot be written.
+        Broken: the exported controller differs from the live one by more than TOLERANCE, or a QP
+            of the check was not solved; nothing is written.
     """
     make_folder(folder)
-    blobs = {on: export_controller(config, robot, weights, platform=on) for on in PLATFORMS}
+    blobs = {p: export_controller(config, robot, weights, platform=p) for p in PLATFORMS}
     recorded = record(config, robot, weights, command=command, seconds=seconds)
     _, example = controller(config, robot, weights)
     result = check(config, load_controller(blobs["cpu"]), example, recorded)
     _require_same(result)
-    # the card vouches for the others: it goes first and comes last
+    # the card has the hashes of the other files: it is removed first and written last
     (folder / "controller.json").unlink(missing_ok=True)
     save_weights(folder / "weights.json", weights, SCHEMA)
     write_json(folder / SCHEMA, weights_schema(robot))
-    np.savez(rows := io.BytesIO(), **as_arrays(recorded))
-    contents = {f"controller-{on}.jaxexport": blob for on, blob in blobs.items()}
-    if len(robot.foot_point) == 2:  # that controller is one of bipeds
+    np.savez(archive := io.BytesIO(), **as_arrays(recorded))
+    contents = {f"controller-{platform}.jaxexport": blob for platform, blob in blobs.items()}
+    if len(robot.foot_point) == 2:  # the C++ controller is for bipeds
         contents["weights.cpp"] = weights_cpp(weights, config, robot, name=name).encode()
-    contents["check.npz"] = rows.getvalue()
+    contents["check.npz"] = archive.getvalue()
     for file, content in contents.items():
         write_file(folder / file, content)
     files = (*contents, "weights.json", SCHEMA)
     card = {
         "name": name,
-        "sha256": {one: hashlib.sha256((folder / one).read_bytes()).hexdigest() for one in files},
+        "sha256": {f: hashlib.sha256((folder / f).read_bytes()).hexdigest() for f in files},
         "signature": signature(example),
         "constants": _constants(config, robot, recorded.lead),
         "weights": weights_tree(weights),
@@ -171,11 +173,11 @@ def export(
 
 
 def weights_schema(robot: Robot | None = None) -> dict[str, Any]:
-    """JSON schema (draft 2020-12) of a weights file of a robot, HECTOR by default."""
+    """Return the JSON schema (draft 2020-12) of a weights file of a robot, HECTOR by default."""
     schema = _schema(weights_tree(nominal(robot)))
     others = {
-        name: _schema(np.zeros(one.shape(robot)).tolist(), Range(one.lower, one.upper))
-        for name, one in TUNABLES.items()
+        name: _schema(np.zeros(number.shape(robot)).tolist(), Range(number.lower, number.upper))
+        for name, number in TUNABLES.items()
     }
     schema["properties"] |= {
         "$schema": {"type": "string"},
@@ -189,7 +191,7 @@ def weights_schema(robot: Robot | None = None) -> dict[str, Any]:
 
 
 def _schema(example: Any, range: Range = WEIGHTS) -> dict[str, Any]:
-    """Schema of values in a range that are nested as the example is."""
+    """Return the schema of values in a range with the nesting of an example."""
     if isinstance(example, dict):
         properties = {
             name: {"description": _DESCRIPTIONS[name], **_schema(value)}
@@ -221,13 +223,13 @@ _ATTENTION = """\
 
 
 def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str) -> str:
-    """The weights as the two lines of the open HECTOR C++ controller.
+    """Return the weights as the two arrays of the open HECTOR C++ controller.
 
     Args:
-        weights: to write.
-        config: the controller that they were tuned for.
-        robot: its body.
-        name: of the weights, for the first line.
+        weights: weights to write.
+        config: controller that they were tuned for.
+        robot: robot of the controller.
+        name: name of the weights, for the first line.
 
     Source: DRCL-USC/Hector_Simulation, branch ROS_Simulation, ConvexMPCLocomotion.cpp and
         SolverMPC.cpp at commit 79d545a, read for order and factors.
@@ -244,17 +246,14 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
         heel=float(robot.heel),
         line=LINE_FRICTION in mpc.on("inputs"),
     )
-    Alpha = input_weights(weights)
     others = weights_tree(weights).get("others", {}).items()
     notes = [f"// ATTENTION: tuned with {name} {value}.\n" for name, value in others]
-    blocks = _block("Q", np.concatenate(weights.Q), _STATES), _block("Alpha", Alpha, _INPUTS)
-    return "".join([header, _ATTENTION * bool(numbers.effort_reference), *notes, *blocks])
+    Q = _cpp_array("Q", np.concatenate(weights.Q), _STATES)
+    Alpha = _cpp_array("Alpha", input_weights(weights), _INPUTS)
+    return "".join([header, _ATTENTION * bool(numbers.effort_reference), *notes, Q, Alpha])
 
 
-def _block(kind: str, values: Any, names: tuple[str, ...]) -> str:
-    rows = np.asarray(values, float).reshape(4, 3).tolist()
-    lines = [
-        f"    {', '.join(map(repr, row))},  // {name}\n"
-        for row, name in zip(rows, names, strict=True)
-    ]
-    return "".join([f"double {kind}[12] = {{\n", *lines, "};\n"])
+def _cpp_array(variable: str, values: Any, names: tuple[str, ...]) -> str:
+    rows = zip(np.asarray(values, float).reshape(4, 3).tolist(), names, strict=True)
+    lines = [f"    {', '.join(map(repr, row))},  // {name}\n" for row, name in rows]
+    return "".join([f"double {variable}[12] = {{\n", *lines, "};\n"])

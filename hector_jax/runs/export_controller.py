@@ -1,18 +1,19 @@
 """The controller as one function, called every millisecond, and as one file of `jax.export`.
 
-The file is StableHLO with the robot, the configuration and the weights inside, so that one that was
-checked cannot be run with other weights.
+The file is StableHLO that contains the robot, the configuration and the weights, so that a checked
+file cannot be run with other weights.
 
     carry, out = control(carry, millisecond, measured, command, anchor)
 
-It takes and gives plain tuples and dictionaries of arrays, so that whoever loads it needs JAX and
-nothing of this package. In the first millisecond of a tick it plans, in the others it holds the
-plan; the torques are new every millisecond. The carry is opaque: zeros at millisecond 0, when the
-robot stands, and then what came out. The gait's clock starts there, as walks in MuJoCo do.
+It takes and returns plain tuples and dictionaries of arrays, so that loading it needs JAX but not
+this package. In the first millisecond of a tick it plans, in the others it holds the plan; the
+torques are computed every millisecond. The carry is opaque: zeros at millisecond 0, when the robot
+stands, and then the carry of the last call. The gait clock starts at millisecond 0, as in walks in
+MuJoCo.
 
-What is exported is traced on the CPU: the guess by a GPU kernel (`qp`) has no stable custom call,
-and the plain guess leads to the same minimiser. The check of a file is a recorded walk, gone
-through again and timed.
+The exported function is traced on the CPU: the initial guess by a GPU kernel (`qp`) has no stable
+custom call, and the plain guess leads to the same minimiser. A file is checked by replaying and
+timing a recorded walk.
 """
 
 import time
@@ -56,7 +57,7 @@ _STILL = Command(np.ones(2), np.zeros((2, 2)), np.zeros(2))
 
 
 def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, Plan]:
-    """Memory and plan of zeros, with the shapes and dtypes of the real ones."""
+    """Return memory and plan of zeros with the shapes and dtypes of the real ones."""
     joints, feet = np.zeros_like(robot.standing_joints), len(robot.foot_point)
     shapes = jax.eval_shape(
         partial(step_plan, config),
@@ -74,17 +75,17 @@ def _idle(config: WalkConfig, robot: Robot, weights: Weights) -> tuple[Memory, P
 def controller(
     config: WalkConfig, robot: Robot, weights: Weights
 ) -> tuple[Callable[..., tuple], tuple]:
-    """The controller as one function of plain arrays, and an example of its arguments.
+    """Return the controller as one function of plain arrays, and an example of its arguments.
 
     Args:
-        config, robot, weights: what it is made for.
+        config, robot, weights: constants of the function.
 
     Returns:
-        `control(carry, millisecond, measured, command, anchor) -> (carry, out)`, as the module's
-        docstring says, and arguments of a robot that stands at millisecond 0.
+        `control(carry, millisecond, measured, command, anchor) -> (carry, out)`, see the module,
+        and its arguments for a robot that stands at millisecond 0.
     """
     idle, structure = jax.tree.flatten(_idle(config, robot, weights))
-    count, begin, moves = substeps(config), first_tick(config), config.gait.first_tick
+    count, begin, first_step = substeps(config), first_tick(config), config.gait.first_tick
     parameters = config.parameters(weights)
 
     def control(
@@ -95,12 +96,11 @@ def controller(
         anchor: dict[str, Array],
     ) -> tuple[tuple[Array, ...], dict[str, Array]]:
         tick, substep = begin + millisecond // count, millisecond % count
-        base = dict(measured)
-        joints, rates = base.pop("joints"), base.pop("joint_rates")
-        measurement = Measurement(State(**base), joints, rates)
+        state = State(**{name: measured[name] for name in State._fields})
+        measurement = Measurement(state, measured["joints"], measured["joint_rates"])
         memory, plan = jax.tree.unflatten(structure, carry)
 
-        planned = partial(
+        plan_tick = partial(
             step_plan,
             config,
             robot,
@@ -111,16 +111,16 @@ def controller(
             memory=memory,
             measurement=measurement,
         )
-        branch = jnp.where(substep > 0, 0, jnp.where(tick < moves, 2, 1))
-        choices = [
-            partial(planned, max_contacts=contacts_needed(config, when))
-            for when in (moves, moves - 1)
+        branch = jnp.where(substep > 0, 0, jnp.where(tick < first_step, 2, 1))
+        planners = [
+            partial(plan_tick, max_contacts=contacts_needed(config, example_tick))
+            for example_tick in (first_step, first_step - 1)
         ]
-        memory, plan = lax.switch(branch, [lambda: (memory, plan), *choices])
-        now = {"substep": substep, "measurement": measurement, "plan": plan, "memory": memory}
+        memory, plan = lax.switch(branch, [lambda: (memory, plan), *planners])
+        inputs = {"substep": substep, "measurement": measurement, "plan": plan, "memory": memory}
         out = {
             **plan.wrench._asdict(),
-            "torque": actuate(config, robot, parameters.legs, **now),
+            "torque": actuate(config, robot, parameters.legs, **inputs),
             "contact": plan.contact,
             "status": plan.status,
             "residual": plan.residual,
@@ -131,17 +131,16 @@ def controller(
 
 
 def _measured(measurement: Measurement) -> dict[str, Any]:
-    """A measurement by the names that the file knows."""
+    """Return a measurement with the names of the exported function."""
     state, joints, rates = measurement
     return state._asdict() | {"joints": joints, "joint_rates": rates}
 
 
 def _standing(robot: Robot) -> tuple[dict[str, Any], ...]:
-    """Measurement, command and anchor of a robot that stands."""
-    position = np.append(robot.com_offset[:2], robot.standing_height)
-    still = State(np.zeros(3), position, np.zeros(3), np.zeros(3))
-    joints = robot.standing_joints
-    measured = _measured(Measurement(still, joints, np.zeros_like(joints)))
+    """Return measurement, command and anchor of a robot that stands."""
+    position, joints = np.append(robot.com_offset[:2], robot.standing_height), robot.standing_joints
+    state = State(np.zeros(3), position, np.zeros(3), np.zeros(3))
+    measured = _measured(Measurement(state, joints, np.zeros_like(joints)))
     anchor = jax.tree.map(np.asarray, standing_anchor(robot))
     return measured, _STILL._asdict(), anchor._asdict()
 
@@ -182,11 +181,11 @@ _SIGNATURE = {
 def export_controller(
     config: WalkConfig, robot: Robot, weights: Weights, *, platform: str = "cpu"
 ) -> bytes:
-    """The controller as a file's content for `jax.export.deserialize`, of 64-bit numbers.
+    """Return the controller with 64-bit numbers as file content for `jax.export.deserialize`.
 
     Args:
-        config, robot, weights: baked in.
-        platform: cpu or cuda, which need not be here.
+        config, robot, weights: constants of the exported function.
+        platform: cpu or cuda, which this machine need not have.
 
     Raises:
         InputError: flatbuffers is not installed, or JAX runs with 32 bits or not on the CPU.
@@ -200,14 +199,14 @@ def export_controller(
 
 
 def load_controller(content: bytes) -> Callable[..., tuple]:
-    """The function in a file's content, compiled here and now; a call never compiles again."""
+    """Return the function in the content of a file, already compiled for this machine."""
     exported = jax.export.deserialize(bytearray(content))
     arguments, _ = jax.tree.unflatten(exported.in_tree, exported.in_avals)
     return jax.jit(exported.call).lower(*arguments).compile()
 
 
 def _with_shapes(texts: Any, values: Any) -> Any:
-    """The texts beside the shapes of the values; where there are no values, as for `out`, alone."""
+    """Add the shapes of values to their texts; without values, as for `out`, return the texts."""
     if values is None:
         return texts
     if isinstance(texts, dict):
@@ -217,14 +216,14 @@ def _with_shapes(texts: Any, values: Any) -> Any:
 
 
 def signature(example: tuple) -> dict[str, Any]:
-    """What the controller takes and gives: each part in words, with shape and dtype."""
+    """Describe arguments and results of the controller in words, with shapes and dtypes."""
     return _with_shapes(_SIGNATURE, dict(zip(_SIGNATURE, example, strict=False)))
 
 
 class Record(NamedTuple):
-    """Inputs of the controller along a walk, a row each millisecond, and the live one's outputs.
+    """Inputs and outputs of the live controller along a walk, a row for each millisecond.
 
-    The first `lead` rows are those before t = 0, where the anchor is `standing`; from then on it is
+    The first `lead` rows are before t = 0, where the anchor is `standing`; from then on it is
     `anchor`.
     """
 
@@ -233,7 +232,7 @@ class Record(NamedTuple):
     standing: Anchor
     anchor: Anchor
     lead: int
-    wrench: Wrench  # commanded, rows from t = 0 on
+    wrench: Wrench  # commanded; rows from t = 0 on
     torque: Float[np.ndarray, "T joints"]  # [N m]
 
 
@@ -270,21 +269,20 @@ def record(
 
     @jax.jit
     def measurements(rows: Array) -> Measurement:
-        def one(yaw: Array, row: Array) -> tuple[Array, Measurement]:
+        def measure(yaw: Array, row: Array) -> tuple[Array, Measurement]:
             reading = sensing.unpack_reading(row)
             measurement, yaw = sensing.measure(robot, reading, yaw, sensing.no_error(robot))
             return yaw, measurement
 
-        return lax.scan(one, jnp.zeros(()), rows)[1]
+        return lax.scan(measure, jnp.zeros(()), rows)[1]
 
-    lead = -first_tick(config) * substeps(config)
     host = partial(jax.tree.map, np.asarray)
     return Record(
         measurement=host(measurements(np.stack(rows[:-1]))),
         command=command,
         standing=host(standing_anchor(robot)),
         anchor=host(anchor_at(robot, jax.tree.map(jnp.asarray, trajectory.initial), 0)),
-        lead=lead,
+        lead=-first_tick(config) * substeps(config),
         wrench=host(trajectory.command),
         torque=np.stack(torques),
     )
@@ -298,40 +296,39 @@ class Check(NamedTuple):
     torque: float  # [N m]
     unsolved: int  # plans whose QP was not solved
     plan_ms: dict[str, float]  # [ms] of a call that plans: p50, p99, max; cpu_p50, cpu_p99
-    hold_ms: dict[str, float]  # [ms] of one that holds the plan
+    hold_ms: dict[str, float]  # [ms] of a call that holds the plan
 
 
 def check(
     config: WalkConfig, control: Callable[..., tuple], example: tuple, recorded: Record
 ) -> Check:
-    """Run an exported controller along a recorded walk, and time it, numpy in, numpy out.
+    """Run an exported controller along a recorded walk and time it, with NumPy inputs and outputs.
 
     Args:
-        config: for its times.
-        control: from `load_controller`.
+        config: settings of the controller, with its times.
+        control: exported controller, from `load_controller`.
         example: its arguments, from `controller`.
-        recorded: from `record`.
+        recorded: recorded walk, from `record`.
     """
     measured = _measured(recorded.measurement)
     command, standing, anchor = jax.device_put(
         [part._asdict() for part in (recorded.command, recorded.standing, recorded.anchor)]
     )
     jax.block_until_ready(control(*example))  # the first call is slower
-    carry, answers, spent = example[0], [], []
+    carry, outputs, times = example[0], [], []
     for i in range(len(recorded.torque)):
-        now = {name: rows[i] for name, rows in measured.items()}
+        row = {name: rows[i] for name, rows in measured.items()}
+        start = standing if i < recorded.lead else anchor
         wall, cpu = time.perf_counter(), time.process_time()
-        carry, out = control(
-            carry, np.int32(i), now, command, standing if i < recorded.lead else anchor
-        )
+        carry, out = control(carry, np.int32(i), row, command, start)
         np.asarray(out["torque"])
-        spent.append((time.perf_counter() - wall, time.process_time() - cpu))
-        answers.append(out)
-    out = {name: np.stack([answer[name] for answer in answers]) for name in answers[0]}
+        times.append((time.perf_counter() - wall, time.process_time() - cpu))
+        outputs.append(out)
+    out = {name: np.stack([output[name] for output in outputs]) for name in outputs[0]}
     plans = np.arange(len(recorded.torque)) % substeps(config) == 0
 
-    def spread(times: np.ndarray) -> dict[str, float]:
-        wall, cpu = 1e3 * np.quantile(times, [0.5, 0.99, 1.0], axis=0).T
+    def quantiles(rows: np.ndarray) -> dict[str, float]:
+        wall, cpu = 1e3 * np.quantile(np.array(times)[rows], [0.5, 0.99, 1.0], axis=0).T
         names = ("p50", "p99", "max", "cpu_p50", "cpu_p99")
         return dict(zip(names, [*wall.tolist(), *cpu[:2].tolist()], strict=True))
 
@@ -340,13 +337,13 @@ def check(
         moment=float(np.abs(out["moment"][recorded.lead :] - recorded.wrench.moment).max()),
         torque=float(np.abs(out["torque"] - recorded.torque).max()),
         unsolved=int((~np.isin(out["status"][plans], (Status.SOLVED, Status.NOT_UNIQUE))).sum()),
-        plan_ms=spread(np.array(spent)[plans]),
-        hold_ms=spread(np.array(spent)[~plans]),
+        plan_ms=quantiles(plans),
+        hold_ms=quantiles(~plans),
     )
 
 
 def as_arrays(recorded: Record) -> dict[str, Any]:
-    """A record as named arrays, for whoever checks the controller on the robot's computer."""
+    """Return a record as named arrays, to check the controller on the computer of the robot."""
     groups = {
         "measured": _measured(recorded.measurement),
         "command": recorded.command._asdict(),

@@ -1,7 +1,8 @@
-"""The folder of a `hector tune` run: written while it goes on, read at any time.
+"""The folder of a `hector tune` run, which can be read while the run writes it.
 
-`config.json` holds the flags and what follows from them, `versions.json` what it was made with,
-`metrics.jsonl` a line for each iteration, `weights/` the weight sets, `result.json` the verdict.
+`config.json` holds the flags and the settings that follow from them, `versions.json` the versions
+of code and packages, `metrics.jsonl` a line for each iteration, `weights/` the weight sets,
+`result.json` the verdict.
 """
 
 import json
@@ -37,9 +38,9 @@ from hector_jax.tuning.loss import Loss, with_alphas
 from hector_jax.tuning.status import status_of
 
 CONFIG, METRICS, RESULT, VERSIONS = "config.json", "metrics.jsonl", "result.json", "versions.json"
-_MOST_BYTES = 100_000_000
-# of what a line of metrics.jsonl holds
-_KINDS = {"set": str, "iteration": int, "accepted": bool, "weights": dict, "gradient_log": dict}
+_MAX_BYTES = 100_000_000
+# types of entries of a line of metrics.jsonl
+_TYPES = {"set": str, "iteration": int, "accepted": bool, "weights": dict, "gradient_log": dict}
 
 Histories = dict[str, list[Iteration]]  # by set
 
@@ -47,7 +48,7 @@ Histories = dict[str, list[Iteration]]  # by set
 class Run(NamedTuple):
     """A finished run."""
 
-    name: str  # the folder as it was given
+    name: str  # the folder as the user named it
     result: Mapping[str, Any]  # result.json
     metrics: list[dict[str, Any]]  # metrics.jsonl
     settings: dict[str, Any]  # config.json, nested names joined by dots
@@ -55,22 +56,22 @@ class Run(NamedTuple):
 
 
 class RunRequest(NamedTuple):
-    """What a run was started with."""
+    """Settings with which a run was started."""
 
-    trajectory: str  # the first, where there are several
+    trajectory: str  # the first if there are several
     loss: Loss
     data: Path  # folder of its net
-    net: Path | None  # or the net itself
+    net: Path | None  # file of the net, if it is not in `data`
     variant: str  # of the net
     robot: Path | None  # TOML of the robot; None: HECTOR
-    body: str | None  # its `robot_hash` then; None: not in the file
+    body: str | None  # `robot_hash` of the robot at the start; None: not in the file
 
 
 def load_run(folder: Path) -> Run:
     """Read a finished run.
 
     Raises:
-        InputError: one line naming the file that is missing or is not what a run leaves.
+        InputError: one line naming the file that is missing or is not a file of a run.
     """
     result, config, made_with = (read_object(folder / name) for name in (RESULT, CONFIG, VERSIONS))
     if not isinstance(result.get("sets"), dict):
@@ -79,14 +80,14 @@ def load_run(folder: Path) -> Run:
 
 
 def read_request(folder: Path) -> RunRequest:
-    """Read what the run in a folder was started with.
+    """Read the settings with which the run in a folder was started.
 
     Raises:
-        InputError: the folder is none of a run.
+        InputError: the folder is not the folder of a run.
     """
     config = read_object(folder / CONFIG)
     try:
-        # a run that has only just begun has its flags there and nothing else
+        # a run that has just begun has written only its flags
         flags, loss = config["flags"], config.get("tune", {}).get("loss", {})
         return RunRequest(
             trajectory=str(flags["traj"] if isinstance(flags["traj"], str) else flags["traj"][0]),
@@ -104,7 +105,7 @@ def read_request(folder: Path) -> RunRequest:
 
 
 def as_line(name: str, iteration: Iteration) -> str:
-    """A line of metrics.jsonl; `read_histories` reads it."""
+    """Format an iteration as a line of metrics.jsonl, for `read_histories`."""
     evaluation = iteration.evaluation
     gradient = jax.tree.map(np.multiply, evaluation.gradient, iteration.weights)
 
@@ -124,62 +125,62 @@ def as_line(name: str, iteration: Iteration) -> str:
         "weights": {**named(iteration.weights), **iteration.weights.others},
         "gradient_log": named(gradient),
     }
-    if iteration.weights.others:  # they may be zero and have no logarithm
+    if iteration.weights.others:  # others may be zero and have no logarithm
         row["gradient"] = dict(evaluation.gradient.others)
     plain = msgspec.to_builtins(row, enc_hook=lambda x: np.asarray(x).tolist())
     return as_json(plain) + "\n"
 
 
 class Journal:
-    """metrics.jsonl, a line for each iteration: as they come; in order when tunings are over."""
+    """Writer of metrics.jsonl: a line per iteration, in order of arrival, sorted at the end."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._histories: dict[str, Sequence[Iteration]] = {}
 
     def write(self, histories: Mapping[str, Sequence[Iteration]]) -> None:
-        """Write the file anew, with these tunings after or instead of those written before.
+        """Rewrite the file, adding these tunings to the earlier ones or replacing them by name.
 
         Raises:
-            WriteError: where the file cannot be written; the old one stays.
+            WriteError: the file cannot be written; the old file stays.
         """
         self._histories.update(histories)
         lines = (as_line(name, i) for name, history in self._histories.items() for i in history)
         write_file(self.path, "".join(lines).encode())
 
     def add(self, name: str, iteration: Iteration) -> None:
-        """Write one line more.
+        """Append a line.
 
         Raises:
-            WriteError: where the file cannot be written.
+            WriteError: the file cannot be written.
         """
         append_file(self.path, as_line(name, iteration).encode())
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """Lines of a run's metrics.jsonl, also while it is written: a last, cut line is left out.
+    """Read the lines of metrics.jsonl of a run; an incomplete last line is skipped.
 
     Raises:
-        InputError: one line naming the file and, where it is damaged, its line.
+        InputError: one line naming the file and the damaged line, if any.
     """
     path = folder / METRICS
-    text = read_text(path, "the iterations of a run of `hector tune`", _MOST_BYTES)
+    text = read_text(path, "the iterations of a run of `hector tune`", _MAX_BYTES)
     rows = []
     for number, line in enumerate(text.rpartition("\n")[0].splitlines(), 1):
         with _line(path, number):
             row = json.loads(line)
-            for name, kind in _KINDS.items():
-                if not isinstance(row[name], kind):
+            for name, expected in _TYPES.items():
+                if not isinstance(row[name], expected):
                     raise TypeError(f"{name}: {row[name]!r}")
             rows.append(row)
     return rows
 
 
 def read_histories(folder: Path) -> Histories:
-    """The iterations of a run so far, by set; none where nothing was written yet.
+    """Read the iterations of a run so far, by set; empty if nothing was written yet.
 
     Raises:
-        InputError: one line naming the file and the line that is none of an iteration.
+        InputError: one line naming the file and the line that is not an iteration.
     """
     path = folder / METRICS
     histories: Histories = {}
@@ -191,7 +192,7 @@ def read_histories(folder: Path) -> Histories:
 
 @contextmanager
 def _line(path: Path, number: int) -> Iterator[None]:
-    """Blame the line for errors in the block."""
+    """Report errors in the block as errors of this line."""
     try:
         yield
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -201,20 +202,22 @@ def _line(path: Path, number: int) -> Iterator[None]:
 
 
 def _iteration(row: Mapping[str, Any]) -> Iteration:
-    """Read what `as_line` wrote; null, which stands for what is not finite, becomes NaN."""
+    """Return the iteration of a line of `as_line`; null, written for non-finite values, is NaN."""
     number = partial(np.array, dtype=float)  # NaN of None
 
+    like = named_like(row["weights"])
+    names = weight_names(like)
+    other_names = row["weights"].keys() - set(names)
+
     def vector(table: Mapping[str, Any]) -> np.ndarray:
-        return number([table[name] for name in weight_names(like)])
+        return number([table[name] for name in names])
 
     def tree(values: np.ndarray, table: Mapping[str, Any]) -> Weights:
         weights = vector_to_weights(jnp.asarray(values), like)
-        others = {name: number(table[name]) for name in names}
+        others = {name: number(table[name]) for name in other_names}
         return jax.tree.map(np.asarray, weights._replace(others=others))
 
-    like = named_like(row["weights"])
     weights = vector(row["weights"])
-    names = row["weights"].keys() - set(weight_names(like))
     return Iteration(
         iteration=np.array(row["iteration"]),
         weights=tree(weights, row["weights"]),
@@ -231,18 +234,19 @@ def _iteration(row: Mapping[str, Any]) -> Iteration:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """Read a JSON object of a run's folder.
+    """Read a JSON object from the folder of a run.
 
     Raises:
-        InputError: one line naming the file that is missing or holds something else.
+        InputError: one line naming the file that is missing or is not a JSON object.
     """
-    value = read_json(path, "a file of a run of `hector tune`", _MOST_BYTES)
+    value = read_json(path, "a file of a run of `hector tune`", _MAX_BYTES)
     if not isinstance(value, dict):
         raise InputError(f"{path}: expected a JSON object, got {short_repr(value)}")
     return value
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return a nested dictionary as a flat dictionary whose names are joined by dots."""
     flat = {}
     for key, value in tree.items():
         name = prefix + key
@@ -254,13 +258,13 @@ def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Wei
     """Load a weight set of a run, with its description in words.
 
     Args:
-        folder: of the run.
-        name: of a file of its `weights/`; of a tuning that is still going on, whose newest accepted
-            weights are taken; nominal and expert are always there.
-        robot: whose nominal and expert weights they are; HECTOR by default.
+        folder: folder of the run.
+        name: name of a file in `weights/`; nominal or expert, which are always available; or name
+            of a tuning in progress, whose newest accepted weights are taken.
+        robot: robot of the nominal and expert weights; HECTOR by default.
 
     Raises:
-        InputError: there is no such set; names those that there are.
+        InputError: there is no such set; the message names the available sets.
     """
     path, published = folder / "weights" / f"{name}.json", {"nominal": nominal, "expert": expert}
     if path.exists():
@@ -270,29 +274,29 @@ def weights_of(folder: Path, name: str, robot: Robot | None = None) -> tuple[Wei
     newest = _newest(read_histories(folder))
     if name in newest:
         return newest[name].weights, f"{name} at iteration {newest[name].iteration}, so far"
-    there = sorted({*published, *newest, *(file.stem for file in path.parent.glob("*.json"))})
-    raise InputError(f"{folder} has no weight set {name!r}; it has {', '.join(there)}")
+    names = sorted({*published, *newest, *(file.stem for file in path.parent.glob("*.json"))})
+    raise InputError(f"{folder} has no weight set {name!r}; it has {', '.join(names)}")
 
 
 def _newest(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Iteration]:
-    """The last accepted iteration of each set that has one."""
+    """Return the last accepted iteration of each set that has accepted iterations."""
     accepted = {name: [i for i in history if i.accepted] for name, history in histories.items()}
     return {name: history[-1] for name, history in accepted.items() if history}
 
 
 def loss_curves(histories: Mapping[str, Sequence[Iteration]]) -> dict[str, Float[np.ndarray, " n"]]:
-    """L in 1e6 by iteration, padded to the longest history; NaN where refused or not there."""
+    """Return L in 1e6 by iteration, NaN if rejected and as padding to the longest history."""
     count, curves = max(map(len, histories.values()), default=0), {}
     for name, history in histories.items():
-        losses = [one.evaluation.loss / 1e6 if one.accepted else np.nan for one in history]
+        losses = [i.evaluation.loss / 1e6 if i.accepted else np.nan for i in history]
         curves[name] = np.array(losses + [np.nan] * (count - len(losses)))
     return curves
 
 
 def progress_sentence(histories: Mapping[str, Sequence[Iteration]], done: bool) -> str:
-    """How far the tunings are."""
+    """Describe the progress of the tunings."""
     newest = [
-        f"{name}: iteration {one.iteration}, L {one.evaluation.loss / 1e6:.3f}e6"
-        for name, one in _newest(histories).items()
+        f"{name}: iteration {last.iteration}, L {last.evaluation.loss / 1e6:.3f}e6"
+        for name, last in _newest(histories).items()
     ]
     return "; ".join([*newest, "the run is done" if done else "the run goes on"])

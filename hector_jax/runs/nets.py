@@ -1,4 +1,4 @@
-"""The steps `collect` and `fit`: walks to learn from, and nets trained on them."""
+"""The steps `collect` and `fit`: collection of walks, and training of nets on them."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -34,23 +34,23 @@ from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
 
-# modules that decide the numbers, for `code_hash`
+# modules that determine the numbers, for `code_hash`
 TRAINING_CODE = ("grfm.training",)
 COLLECTION_CODE = (*TUNING_CODE, "grfm.collection", "grfm.jobs", "sim.walk", "sim.parallel")
 
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """Walks on the hfs to learn the ground from."""
+    """Settings of walks on the hfs, from which a net learns the ground."""
 
     walks: int = 64
     seconds: float = 4.0  # of each
     seed: int = 0
-    engine: str = "auto"  # c: MuJoCo on the processes; mjx: all at once; auto: mjx on a GPU
+    engine: str = "auto"  # c: MuJoCo in worker processes; mjx: all at once; auto: mjx on a GPU
 
     def __post_init__(self) -> None:
-        # devices stay unasked: their number may not be set up yet
-        # three walks: to learn from, to choose by, to judge by
+        # no device is looked up: their number may not be set up yet
+        # three walks: for training, validation and testing
         check(self, walks=Range(3), seconds=POSITIVE, seed=SEED, engine=("auto", *ENGINES))
         least = HISTORY * GaitConfig.tick
         if self.seconds < least:
@@ -60,23 +60,23 @@ class CollectConfig:
             )
 
 
-REFRESH = CollectConfig(walks=32)  # walks at the current weights, each time
+REFRESH = CollectConfig(walks=32)  # walks at the current weights, for each refresh
 
 
 class TrainedNet(NamedTuple):
-    """A trained GRFM-Net with what there is to say about it."""
+    """A trained GRFM-Net with its training and its errors."""
 
     params: Params
     linear: LinearMap  # the baseline, fitted to the same samples
-    errors: dict[str, Any]  # of raw command, linear map and net on walks that no training saw
-    course: History
+    errors: dict[str, Any]  # of raw command, linear map and net on held-out walks
+    history: History
     config: TrainConfig
-    folders: tuple[Path, ...]  # of the walks; none for a net that came alone
-    held_out_walks: list[int]  # numbers of the walks that no training saw
+    folders: tuple[Path, ...]  # of the walks; empty for a net without walks
+    held_out_walks: list[int]  # numbers of the walks that were not trained on
 
 
 def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
-    """All that the walks of a collection follow from, as JSON values for their card."""
+    """Return all inputs of the walks of a collection, as JSON values for their card."""
     paths = tune_config(robot)
     return {
         **asdict(config),
@@ -88,11 +88,11 @@ def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
 
 
 def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -> None:
-    """Walk on drawn hfs plants and keep the walks under `folder`; takes up what is there.
+    """Walk on drawn hfs plants and save the walks under `folder`, continuing from those in it.
 
     Raises:
-        InputError: the folder cannot be written, told before anything is walked; or it holds walks
-            of other settings.
+        InputError: the folder cannot be written, which is checked before the walks; or it holds
+            walks of other settings.
     """
     with locked(folder):
         compile_programs(pool, robot)
@@ -111,7 +111,7 @@ def _collect(
 ) -> None:
     engine = choose_engine(config.engine)
     what = f"{plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine.name}"
-    with bar(f"collecting {what}") as tell:
+    with bar(f"collecting {what}") as report_progress:
         collection.collect(
             folder,
             jobs,
@@ -119,24 +119,24 @@ def _collect(
             robot=robot,
             settings=settings,
             about={"engine": engine.name, "physics_bits": engine.bits(False)},
-            progress=lambda done, of: tell(done, of, "" if done else "compiling"),
+            progress=lambda done, total: report_progress(done, total, "" if done else "compiling"),
         )
 
 
 class Samples(NamedTuple):
-    """The samples of a collection; no walk is in two of the parts."""
+    """Samples of a collection; no walk is in two of the parts."""
 
     training: dataset.Dataset
-    validation: dataset.Dataset  # chooses the epoch of a net
-    held_out: dataset.Dataset  # is only looked at
-    dropped: int  # by a fall, an unsolved QP or a push
+    validation: dataset.Dataset  # to choose the epoch of a net
+    held_out: dataset.Dataset  # for errors only
+    dropped: int  # number of samples dropped for a fall, an unsolved QP or a push
 
 
 def samples(robot: Robot, *folders: Path) -> Samples:
-    """Samples of the walks under `folders`: a fifth of the walks held out, of the rest another.
+    """Return samples of the walks under `folders`: 1/5 held out, 1/5 of the rest for validation.
 
-    Each folder is split by itself, so that what was held out stays held out beside other walks;
-    walks are numbered by folder.
+    Each folder is split by itself, so that the same walks are held out whatever other folders are
+    given; walks are numbered by folder.
     """
     parts, total = [], 0
     for folder in folders:
@@ -150,7 +150,7 @@ def samples(robot: Robot, *folders: Path) -> Samples:
 
 
 def held_out_walks(robot: Robot, net: TrainedNet) -> collection.Walks:
-    """The walks that no training of a net saw, of the folder that it was trained on."""
+    """Load the held-out walks from the first folder on which a net was trained."""
     walks = collection.load_walks(net.folders[0], robot)
     return jax.tree.map(lambda x: x[net.held_out_walks], walks)
 
@@ -158,9 +158,9 @@ def held_out_walks(robot: Robot, net: TrainedNet) -> collection.Walks:
 def train(
     config: TrainConfig, robot: Robot, folder: Path, path: Path, more: Sequence[Path] = ()
 ) -> TrainedNet:
-    """Train a GRFM-Net on the walks under `folder`, and under `more`, and keep it at `path`.
+    """Train a GRFM-Net on the walks under `folder` and `more`, and save it at `path`.
 
-    Its card tells the walks and the controller that it belongs to.
+    Its card describes its walks and their controller.
 
     Raises:
         InputError: the folder cannot be written; there are no walks, or damaged ones.
@@ -172,12 +172,12 @@ def train(
 def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> TrainedNet:
     with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
         parts = samples(robot, *folders)
-    made_of = [collection.fingerprint(each) for each in folders]
+    made_of, *others = map(collection.fingerprint, folders)
     count = plural(len(parts.training.walk), "sample")
-    with bar(f"training GRFM-Net ({config.variant}) on {count}") as tell:
-        tell(0, config.epochs, "compiling")
-        on_epoch = lambda epoch, _: tell(epoch, config.epochs, "")  # noqa: E731
-        params, course = training.train(config, parts.training, parts.validation, on_epoch)
+    with bar(f"training GRFM-Net ({config.variant}) on {count}") as report_progress:
+        report_progress(0, config.epochs, "compiling")
+        on_epoch = lambda epoch, _: report_progress(epoch, config.epochs, "")  # noqa: E731
+        params, history = training.train(config, parts.training, parts.validation, on_epoch)
     with say_if_slow("computing the errors on held-out walks"):
         linear = fit_linear(parts.training)
         effects = {"raw": last_command, "linear": as_effect(linear), "net": as_effect(params)}
@@ -190,29 +190,29 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
     held_out = np.unique(parts.held_out.walk).tolist()
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
-        "made_of": made_of[0],
-        **({"and_of": made_of[1:]} if made_of[1:] else {}),
+        "made_of": made_of,
+        **({"and_of": others} if others else {}),
         "settings": training_settings(config, robot),
         "samples": {**sizes, "dropped": parts.dropped},
         "held_out": held_out,
         "errors": errors,
         "linear": [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(linear)],
-        "course": {name: np.asarray(values).tolist() for name, values in course._asdict().items()},
+        "course": {name: np.asarray(rows).tolist() for name, rows in history._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
-    return TrainedNet(params, linear, about["errors"], course, config, folders, held_out)
+    return TrainedNet(params, linear, errors, history, config, folders, held_out)
 
 
 def net_path(data: Path, variant: str) -> Path:
-    """Where the net of a variant is kept: `grfm.npz`, and others than the default by their name."""
+    """Return the file of the net of a variant: `grfm.npz` for the default, else with its name."""
     return data / ("grfm.npz" if variant == TrainConfig.variant else f"grfm-{variant}.npz")
 
 
 def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[str, Any]]:
-    """A net from a file with what its card says of its training.
+    """Load a net from a file, with the description of its training from its card.
 
     Returns:
-        The net, and `settings` and `made_of` of its card: how it was trained, and on which walks.
+        The net, and `settings` and `made_of` of its card: settings and walks of its training.
 
     Raises:
         InputError: one line naming the file that is damaged, of another robot or another variant.
@@ -226,30 +226,30 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
         settings, made_of = dict(about["settings"]), dict(about["made_of"])
         trained = {k: v for k, v in settings.items() if k not in ("code", "touchdown_error")}
         config = from_table(f"{path}: about.settings", TrainConfig, trained)
-        course = History(**{n: np.array(about["course"][n], float) for n in History._fields})
+        history = History(**{n: np.array(about["course"][n], float) for n in History._fields})
         errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: its card does not tell its training: {error!r}") from None
-    followed_from = {"settings": settings, "made_of": made_of}
-    return TrainedNet(params, linear, errors, course, config, (), held_out), followed_from
+    inputs = {"settings": settings, "made_of": made_of}
+    return TrainedNet(params, linear, errors, history, config, (), held_out), inputs
 
 
 def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:
-    """All that a net follows from beside its walks, as JSON values for its card."""
-    learned = {"touchdown_error": robot.description.tuning.touchdown_error}
-    return {**asdict(config), **learned, "code": code_hash(*TRAINING_CODE)}
+    """Return all inputs of a net other than its walks, as JSON values for its card."""
+    touchdown_error = robot.description.tuning.touchdown_error
+    return {**asdict(config), "touchdown_error": touchdown_error, "code": code_hash(*TRAINING_CODE)}
 
 
 def load_or_train(
     pool: Executor, robot: Robot, data: Path, variant: str = TrainConfig.variant
 ) -> TrainedNet:
-    """A GRFM-Net with its walks under `data`: made now, or from disk where it would be made so.
+    """Return a GRFM-Net with its walks under `data`, which are made if they do not exist.
 
     Args:
         pool: worker processes.
-        robot: the body.
+        robot: robot of the walks.
         data: folder of `walks/` and of the net, see `net_path`.
-        variant: of the net.
+        variant: variant of the net.
 
     Raises:
         InputError: walks or net in the folder were made with other settings or by other code, the
@@ -262,13 +262,13 @@ def load_or_train(
         collect(pool, CollectConfig(), robot, walks)
     made_of = collection.fingerprint(walks)
     check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
-    with locked(data):  # a second process that begins now waits, and finds the net
+    with locked(data):  # a second process waits here, and then loads the net
         if not path.exists():
             return _train(config, robot, (walks,), path)
-    trained, about = load_net(path, robot, config.variant)
-    check_settings(path, about["settings"], training_settings(config, robot))
-    check_settings(path, about["made_of"], made_of)
-    return trained._replace(folders=(walks,))
+    net, inputs = load_net(path, robot, config.variant)
+    check_settings(path, inputs["settings"], training_settings(config, robot))
+    check_settings(path, inputs["made_of"], made_of)
+    return net._replace(folders=(walks,))
 
 
 def refresh(
@@ -281,36 +281,35 @@ def refresh(
     net: TrainedNet,
     folder: Path,
 ) -> tuple[TrainedNet, dict[str, Any]]:
-    """Collect again where a tuning went, and train its net anew on the old and the new walks.
+    """Collect walks along the path of a tuning and train its net again on old and new walks.
 
-    The walks are kept in `folder`/walks and the net in `folder`/refreshed.npz.
+    The walks are saved in `folder`/walks and the net in `folder`/refreshed.npz.
 
     Args:
         pool: worker processes.
-        config: how much to walk.
-        robot: the body.
-        command: that was tuned for.
-        tuning: whose weights, from ten iterations to converged, are walked.
-        net: that it went through; the new one is trained as this one was.
-        folder: where.
+        config: settings of the collection.
+        robot: robot of the walks.
+        command: command of the tuning.
+        tuning: tuning whose weights, from ten iterations to converged, are walked.
+        net: net of the tuning; the new net has the same training settings.
+        folder: folder of the new walks and the new net.
 
     Returns:
         The new net, and the shift: errors of the raw command and of the nets `before` and `after`
-        on held-out walks, `old` and `new`, as `training.report` gives them.
+        on held-out walks, `old` and `new`, as `training.report` returns them.
     """
     walks = folder / "walks"
     late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
-    how = {"path": stack([tuning.ten, *late]), "seconds": config.seconds, "robot": robot}
-    jobs = draw_jobs_near(config.seed, config.walks, command, **how)
-    settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}  # the jobs say the rest
+    options = {"path": stack([tuning.ten, *late]), "seconds": config.seconds, "robot": robot}
+    jobs = draw_jobs_near(config.seed, config.walks, command, **options)
+    settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}  # the rest is in the jobs
     with locked(walks):
         _collect(pool, config, robot, jobs, walks, settings)
-    oldest, *newer = (*net.folders, walks)
-    after = train(net.config, robot, oldest, folder / "refreshed.npz", newer)
+    first, *more = (*net.folders, walks)
+    after = train(net.config, robot, first, folder / "refreshed.npz", more)
     nets = {"before": as_effect(net.params), "after": as_effect(after.params)}
     effects = {"raw": last_command, **nets}
-    places = {"old": net.folders, "new": (walks,)}
     return after, {
         name: training.report(effects, samples(robot, *folders).held_out)
-        for name, folders in places.items()
+        for name, folders in {"old": net.folders, "new": (walks,)}.items()
     }

@@ -1,8 +1,8 @@
-"""Evaluations that a tuning refused, kept so that they can be done again.
+"""Dumps of evaluations that a tuning rejected, so that they can be repeated.
 
-A step of a tuning is refused where the walk falls, a QP is not solved or a number is not finite. A
-dump of it holds all that the evaluation followed from (body, weights, command, anchor, net and
-settings) and what it came to; `replay` does it once more and says whether the same comes out.
+A step of a tuning is rejected if the walk falls, a QP is not solved or a number is not finite. Its
+dump holds all inputs of the evaluation (robot, weights, command, anchor, net and settings) and its
+result; `replay` repeats the evaluation and tells whether the result is the same.
 """
 
 from functools import partial
@@ -36,13 +36,13 @@ from hector_jax.tuning.rollout import rollout
 from hector_jax.tuning.status import StepStatus
 
 MOST = 3
-"""Dumps of a tuning for one reason: a bad night must not fill a disk."""
+"""Most dumps of a tuning per reason, so that many rejections do not fill the disk."""
 
 _KIND = "refused evaluation"
 
 
 class Dump(NamedTuple):
-    """What an evaluation follows from, beside its settings, and what it came to."""
+    """Inputs of an evaluation, except its settings, and its result."""
 
     robot: Robot
     weights: Weights
@@ -53,19 +53,19 @@ class Dump(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """A dump, done again."""
+    """Result of repeating the evaluation of a dump."""
 
     name: str  # of the tuning
     iteration: int
     recorded: dict[str, Any]  # reason and numbers
-    again: dict[str, Any]  # likewise
-    first: dict[str, int | None]  # tick, now, that is the first not finite, fallen or unsolved
+    again: dict[str, Any]  # reason and numbers of the repetition
+    first: dict[str, int | None]  # first tick of the repetition not finite, fallen or unsolved
     same: bool  # to the last bit, the gradient included
-    changed: dict[str, list[str | None]]  # versions and machine: then and now, where they differ
+    changed: dict[str, list[str | None]]  # versions and machine that differ: then and now
 
     @property
     def verdict(self) -> str:
-        """Whether it is the same, and which versions or machines are not."""
+        """Sentence: whether the results are the same, and which versions or machines differ."""
         if self.same:
             return "the same to the last bit"
         then, now = self.recorded["reason"], self.again["reason"]
@@ -85,19 +85,19 @@ def keep(
     command: Command,
     net: Params | None,
 ) -> Path | None:
-    """Write a dump of an iteration whose evaluation is not to be believed.
+    """Write a dump of an iteration whose evaluation was rejected.
 
-    The first `MOST` of a tuning are kept for each reason. A folder that cannot be written costs one
-    line on stderr, not the tuning.
+    The first `MOST` of a tuning are written for each reason. If the folder cannot be written, one
+    line on stderr says so and the tuning goes on.
 
     Args:
-        folder: of the dumps.
-        name: of the tuning.
-        iteration: any of it; of those to be believed nothing is kept.
-        config, robot, command, net: what it tunes, from standing.
+        folder: folder of the dumps.
+        name: name of the tuning.
+        iteration: any iteration of the tuning; nothing is written for accepted ones.
+        config, robot, command, net: inputs of the tuning, which starts from standing.
 
     Returns:
-        Where it was written, if it was.
+        The file, or None if nothing was written.
     """
     code = StepStatus(int(step_status(config, iteration.evaluation)))
     kind = code.name.lower().replace("_", "-")
@@ -128,16 +128,16 @@ def keep(
 
 
 def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
-    """A dump with its settings and the notes on its card.
+    """Load a dump with its settings and the notes on its card.
 
     Raises:
-        InputError: one line naming the file that is damaged, no dump or of another version.
+        InputError: one line naming the file that is damaged, not a dump or of another version.
     """
     about = read_card(path, _KIND)["about"]
     net, none, hector = about.get("net"), np.zeros(()), load_robot()
     try:
         description = from_table(f"{path}: description", Description, about.get("description", {}))
-        before = to_table(hector.structure)  # of files that do not say it
+        before = to_table(hector.structure)  # of files without this entry
         structure = from_table(f"{path}: structure", Structure, about.get("structure", before))
         config = TuneConfig.from_table(f"{path}: config", about.get("config"))
         feet = len(config.rollout.walk.gait.offsets)
@@ -149,9 +149,9 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         raise InputError(f"{path}: settings that this version does not know: {error!r}") from error
     terms = {term.name: none for term in config.loss}
     # axes of length 0 stand for any number of feet and joints
-    of_any, weights = jax.tree.map(lambda x: np.zeros((0,) * np.ndim(x)), (hector, weights))
+    robot, weights = jax.tree.map(lambda x: np.zeros((0,) * np.ndim(x)), (hector, weights))
     like = Dump(
-        of_any._replace(description=description, structure=structure),
+        robot._replace(description=description, structure=structure),
         weights,
         Command(np.zeros(0), np.zeros((0, 2)), np.zeros(0)),
         Anchor(np.zeros(3), none, none),
@@ -163,14 +163,14 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
 
 
 def replay(path: Path) -> Replay:
-    """Do the evaluation of a dump again, on the CPU, where tunings run.
+    """Repeat the evaluation of a dump on the CPU, on which tunings run.
 
     Raises:
         InputError: see `load`.
     """
     dump, config, about = load(path)
     inputs = *dump[:4], effect_of(dump.params, config.rollout.walk.gait)
-    # where the CPU is the default, naming it would compile a tuning's program once more
+    # if the CPU is the default, naming it would compile the program of a tuning once more
     is_cpu = jax.default_backend() == "cpu"
     with jax.default_device(None if is_cpu else jax.local_devices(backend="cpu")[0]):
         evaluation = jax.device_get(tune_step(config, *inputs))
@@ -183,13 +183,14 @@ def replay(path: Path) -> Replay:
         iteration=about["iteration"],
         recorded=_summary(about["reason"], dump.seen),
         again=_summary(rejection_reason(config, evaluation), evaluation),
-        first=_first(config, trajectory),
+        first=_first_ticks(config, trajectory),
         same=all(jax.tree.leaves(same)),
         changed={name: [a, b] for name, (a, b) in machines.items() if a != b},
     )
 
 
 def _summary(reason: str, evaluation: Evaluation) -> dict[str, Any]:
+    """Return the reason and the numbers of an evaluation."""
     numbers = {
         "loss": evaluation.loss,
         **evaluation.terms,
@@ -200,19 +201,20 @@ def _summary(reason: str, evaluation: Evaluation) -> dict[str, Any]:
     return {"reason": reason, **{name: float(x) for name, x in numbers.items()}}
 
 
-def _first(config: TuneConfig, trajectory: Trajectory) -> dict[str, int | None]:
+def _first_ticks(config: TuneConfig, trajectory: Trajectory) -> dict[str, int | None]:
+    """Return the first tick of each fault; None if there is none."""
     series = *trajectory.state, *trajectory.command
     rows = [np.reshape(x, (len(trajectory.fallen), -1)) for x in series]
-    wrong = {
+    faults = {
         "not finite": ~np.isfinite(np.hstack(rows)).all(axis=1),
         "fallen": trajectory.fallen,
         "unsolved": ~(trajectory.residual <= config.residual),
     }
-    return {name: int(np.argmax(at)) if at.any() else None for name, at in wrong.items()}
+    return {name: int(np.argmax(at)) if at.any() else None for name, at in faults.items()}
 
 
 def in_words(replayed: Replay) -> str:
-    """A table of what was recorded and what came out, and the verdict."""
+    """Format the recorded and the repeated numbers as a table, with the verdict."""
     labels = {"gradient": "largest gradient", "fallen": "share fallen", "residual": "QP residual"}
     cell = lambda x: x if isinstance(x, str) else f"{x:.17g}"  # noqa: E731
     lines = [f"{replayed.name}, iteration {replayed.iteration}", f"{'':18s}{'recorded':32s}again"]

@@ -30,28 +30,28 @@ from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import rollout, rollout_config
 
-# modules that decide the numbers, for `content_key`
+# modules that determine the numbers, for `content_key`
 _CODE = ("sim.diagnosis", "runs.metrics")
 
 Case = tuple[str, int]
-"""A set, with what else tells its walk from others on the same plant, and a seed."""
+"""Name of a set, with further labels if its plant walks several times, and seed."""
 
 
 class ScoredWalk(NamedTuple):
-    """What is kept of one walk."""
+    """Stored results of one walk."""
 
     score: metrics.Score
-    upright: Float[np.ndarray, ""]  # [s] until a fall, below zero in the start-up; or all of it
-    last: State  # the last one upright, or of the walk
-    commit: str  # at which it was walked; empty where that is not known
-    startup: str  # what is to be said of a fall in the start-up; empty where there is none
+    upright: Float[np.ndarray, ""]  # [s] until a fall or the end; below zero in the start-up
+    last: State  # last upright state
+    commit: str  # of the code that walked; empty if unknown
+    startup: str  # description of a fall in the start-up; empty if there is none
 
 
 class ScoredWalks(NamedTuple):
     """Walks of several sets on the same plants."""
 
     walks: dict[str, list[ScoredWalk]]  # by set, in the order of the plants
-    first: dict[str, Trajectory]  # by set, the walk on the first plant; empty where none is kept
+    first: dict[str, Trajectory]  # by set, the walk on the first plant; empty if none is stored
 
     @property
     def scores(self) -> dict[str, list[metrics.Score]]:
@@ -67,20 +67,19 @@ def walk_jobs(
     title: str,
     engine: Engine = MUJOCO_C,
 ) -> Iterator[Trajectory]:
-    """The walks of jobs, in order, as they come."""
-    with bar(title) as tell:
-        tell(0, len(jobs), "compiling")
+    """Yield the walks of jobs in order, each when it is available."""
+    with bar(title) as report_progress:
+        report_progress(0, len(jobs), "compiling")
         for done, walk in enumerate(engine.walk(pool, config.rollout.walk, robot, jobs), 1):
             yield walk
-            tell(done, len(jobs), "")
+            report_progress(done, len(jobs), "")
 
 
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
-    """A walk on the plain single rigid body, `seconds` long, begun as a rollout of a tuning."""
+    """Return a walk of `seconds` on the plain single rigid body, which starts as in a tuning."""
     config = rollout_config(robot, round(seconds / walk_config(robot).gait.tick))
-    roll_out = jax.jit(rollout, static_argnums=0)
-    anchor = standing_anchor(robot)
-    return jax.device_get(roll_out(config, robot, weights, command, anchor, last_command))
+    inputs = config, robot, weights, command, standing_anchor(robot), last_command
+    return jax.device_get(jax.jit(rollout, static_argnums=0)(*inputs))
 
 
 def _score_walk(
@@ -92,47 +91,48 @@ def _score_walk(
     commit: str,
     engine: Engine,
 ) -> ScoredWalk:
-    up, text = int(np.sum(~np.asarray(walk.fallen))), ""
-    upright = up * float(walk.period)
-    if not up and not engine.differs:  # the fall is walked once more, in MuJoCo C
+    """Score a walk; simulate it again in MuJoCo C if it fell in the start-up."""
+    samples, text = int(np.sum(~np.asarray(walk.fallen))), ""  # upright samples
+    upright = samples * float(walk.period)
+    if not samples and not engine.differs:
         inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
         if startup := pool.submit(startup_fall, *inputs).result():
             upright, text = startup.time, str(startup)
-    last = jax.tree.map(lambda x: np.asarray(x)[max(up - 1, 0)], walk.state)
+    last = jax.tree.map(lambda x: np.asarray(x)[max(samples - 1, 0)], walk.state)
     score = metrics.score(config.loss, walk)
     return ScoredWalk(score, np.asarray(upright), last, commit, text)
 
 
 def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
-    """Layout of the artefact of one walk, with its trajectory or without."""
+    """Return the structure of the artefact of one walk, with or without its trajectory."""
     walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(robot).trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
-    one: Any = ScoredWalk(metrics.score_like(loss=loss), np.zeros(()), last, *[np.array("")] * 2)  # pyright: ignore
-    return one, walk if with_walk else None
+    score, text = metrics.score_like(loss=loss), np.array("")
+    return ScoredWalk(score, np.zeros(()), last, text, text), walk if with_walk else None  # pyright: ignore
 
 
 def _file_name(
     config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk: bool, engine: Engine
 ) -> str:
-    parts = engine.name, engine.version, config.rollout.walk, repr(config.loss), robot, job
-    key = content_key(*parts, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
-    (name, seed), stem = case, "walk" if with_walk else "score"
-    return f"{stem}-{name}-{seed}-{key}.npz"
+    inputs = engine.name, engine.version, config.rollout.walk, repr(config.loss), robot, job
+    key = content_key(*inputs, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
+    name, seed = case
+    return f"{'walk' if with_walk else 'score'}-{name}-{seed}-{key}.npz"
 
 
 def say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
-    """Say which sets have walks with an unsolved QP or a fall in the start-up."""
-    for name, each in walks.items():
-        worst = np.max([walk.score.residual for walk in each])
+    """Print which sets have walks with an unsolved QP or a fall in the start-up."""
+    for name, group in walks.items():
+        worst = np.max([walk.score.residual for walk in group])
         if not worst <= SOLVED:
             say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
-        if falls := [walk.startup for walk in each if walk.startup]:
-            say(f"{name}: {len(falls)} of {plural(len(each), 'walk')} {falls[0]}")
+        if falls := [walk.startup for walk in group if walk.startup]:
+            say(f"{name}: {len(falls)} of {plural(len(group), 'walk')} {falls[0]}")
 
 
-def _restored(one: ScoredWalk) -> ScoredWalk:
-    """A walk from a file, where texts are arrays."""
-    return one._replace(commit=str(one.commit), startup=str(one.startup))
+def _restored(walk: ScoredWalk) -> ScoredWalk:
+    """Convert a walk from a file, in which strings are arrays."""
+    return walk._replace(commit=str(walk.commit), startup=str(walk.startup))
 
 
 def score_jobs(
@@ -147,17 +147,17 @@ def score_jobs(
     engine: Engine = MUJOCO_C,
     with_walk: Callable[[Case], bool] = lambda case: False,
 ) -> dict[Case, tuple[ScoredWalk, Trajectory | None]]:
-    """Walk jobs and score the walks; those that are in the folder are not walked again.
+    """Walk jobs and score the walks; walks whose scores are in the folder are not repeated.
 
     Args:
         pool: worker processes.
         config, robot: controller and loss, nominal body.
-        jobs: by case; the names of cases are parts of the names of files.
-        title: for the person who waits.
-        folder: of the scores; None: keep none.
-        commit: to note with what is walked now.
-        engine: that walks.
-        with_walk: whether the walk of a case is kept beside its score.
+        jobs: jobs by case; the names of cases are parts of the names of files.
+        title: title of the progress bar.
+        folder: folder of the scores; None: nothing is saved.
+        commit: commit to record with new walks.
+        engine: engine of the walks.
+        with_walk: tells whether the walk of a case is saved beside its score.
 
     Raises:
         InputError: the folder cannot be written, or the engine cannot walk a job.
@@ -165,9 +165,9 @@ def score_jobs(
     tick = config.rollout.walk.gait.tick
 
     def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
-        there = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
-        asked = [jobs[case] for case in missing]
-        walks = walk_jobs(pool, config, robot, asked, title + there, engine)
+        remark = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
+        new_jobs = [jobs[case] for case in missing]
+        walks = walk_jobs(pool, config, robot, new_jobs, title + remark, engine)
         for case, walk in zip(missing, walks, strict=True):
             samples = at_interval(walk, tick) if with_walk(case) else None
             score = _score_walk(pool, config, robot, jobs[case], walk, commit, engine)
@@ -181,7 +181,7 @@ def score_jobs(
     }
     like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
     results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
-    return {case: (_restored(one), walk) for case, (one, walk) in results.items()}
+    return {case: (_restored(scored), walk) for case, (scored, walk) in results.items()}
 
 
 def judge(
@@ -206,13 +206,14 @@ def judge(
         pool: worker processes.
         config, robot: controller and loss, nominal body.
         sets: weights by name.
-        command, seconds: what to walk, and how long.
-        plants, seeds: the plants, and the seeds of their estimators.
-        title: for the person who waits.
-        folder: of the scores, where walks that are there are not walked again; None: keep none.
-        commit: to note with what is walked now.
-        plant: another model of the robot, of which the plants are.
-        engine: that walks.
+        command, seconds: command to walk, and length of the walks.
+        plants, seeds: plants, and the seeds of their estimators.
+        title: title of the progress bar.
+        folder: folder of the scores; walks whose scores are in it are not repeated; None: nothing
+            is saved.
+        commit: commit to record with new walks.
+        plant: another model of the robot, to which the plants belong.
+        engine: engine of the walks.
 
     Raises:
         InputError: the folder cannot be written, or the engine cannot walk a plant.
@@ -227,5 +228,5 @@ def judge(
     results = score_jobs(pool, config, robot, jobs, engine=engine, with_walk=with_walk, **notes)
     by_set = {name: [results[name, seed][0] for seed in seeds] for name in sets}
     say_faults(by_set)
-    kept = {name: results[name, seeds[0]][1] for name in sets}
-    return ScoredWalks(by_set, {name: walk for name, walk in kept.items() if walk is not None})
+    first = {name: results[name, seeds[0]][1] for name in sets}
+    return ScoredWalks(by_set, {name: walk for name, walk in first.items() if walk is not None})

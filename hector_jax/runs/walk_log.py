@@ -1,4 +1,4 @@
-"""Logs of walks, of this simulator or of a robot: what is read of them, and what they say."""
+"""Logs of walks of this simulator or of a robot: their entries, loading and loss."""
 
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from hector_jax.tuning.loss import loss_of
 
 
 class Log(NamedTuple):
-    """What is measured on a walk: the entries of this name in the file of `hector walk --out`."""
+    """Measurements of a walk: the entries of these names in the file of `hector walk --out`."""
 
     initial: State  # at t = 0, when the command begins
     state: State  # (T, 3) each, at the end of each sample
@@ -28,27 +28,32 @@ class Log(NamedTuple):
     residual: Float[Any, " T"]  # of the plans
 
 
-class Seen(NamedTuple):
-    """What the log of a case says."""
+class LogScore(NamedTuple):
+    """Score of the log of one case."""
 
-    loss: float  # L; infinite where it fell or a QP was not solved
-    margin: float  # share of the way to a fall, of tilt and height; 1 likewise
+    loss: float  # L; infinite if the robot fell or a QP was not solved
+    margin: float  # share of the way to a fall, of tilt and height; 1 where the loss is infinite
 
 
-def log_of(walked: Trajectory) -> Log:
-    """What is read of a walk."""
-    return Log(*(getattr(walked, name) for name in Log._fields))
+ScoredLog = tuple[LogScore, Log]
+"""The score of a log of 1 ms, and the log at the plan interval."""
+
+
+def log_of(trajectory: Trajectory) -> Log:
+    """Return the log of a walk."""
+    return Log(*(getattr(trajectory, name) for name in Log._fields))
 
 
 def read_log(path: Path, robot: Robot, seconds: float) -> Log:
-    """The log of a walk: an .npz with the entries of `Log`, such as `hector walk --out` writes.
+    """Read the log of a walk: an .npz with the entries of `Log`, as `hector walk --out` writes it.
 
-    `period`, `fallen` and `residual` may be left out. A log that ends early is that of a fall.
+    `period`, `fallen` and `residual` may be left out. A log that ends early
+    counts as a fall from its end on.
 
     Args:
-        path: of the file.
-        robot: that walked.
-        seconds: that it should have walked; samples are of 1 ms.
+        path: the file.
+        robot: the robot that walked.
+        seconds: expected length of the walk; samples are of 1 ms.
 
     Raises:
         InputError: one line naming the file and the entry that is missing, of another shape, or not
@@ -57,7 +62,7 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files if name != "card"}
-    except Exception as error:  # whoever made the archive chose what goes wrong
+    except Exception as error:  # a foreign archive can fail in any way
         raise InputError(f"{path}: not a log (.npz): {one_line(error)}") from None
     wanted, joints, feet = round(seconds / TIME_STEP), len(robot.joint_lower), len(robot.foot_point)
     count = next(iter(arrays.get("joints", np.zeros(())).shape), 0)
@@ -72,8 +77,8 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
         "fallen": (count,),
         "residual": (count,),
     }
-    none = {"fallen": np.zeros(count, bool), "residual": np.zeros(count)}
-    arrays = {"period": np.array(TIME_STEP), **none, **arrays}
+    defaults = {"fallen": np.zeros(count, bool), "residual": np.zeros(count)}
+    arrays = {"period": np.array(TIME_STEP), **defaults, **arrays}
     for name, shape in shapes.items():
         if name not in arrays:
             raise InputError(f"{path}: {name} is missing; expected {', '.join(shapes)}")
@@ -85,15 +90,14 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
         raise InputError(f"{path}: samples must be of {TIME_STEP} s, got {arrays['period']}")
     rows = np.minimum(np.arange(wanted), count - 1)
     state = State(*(arrays[f"state.{name}"][rows].astype(float) for name in State._fields))
-    command = Wrench(*(arrays[f"command.{name}"][rows].astype(float) for name in Wrench._fields))
     down = np.asarray(has_fallen(state, *robot.description.limits))
-    fell = np.maximum.accumulate(down | arrays["fallen"][rows].astype(bool))
+    fallen = np.maximum.accumulate(down | arrays["fallen"][rows].astype(bool))
     return Log(
         State(*(arrays[f"initial.{name}"].astype(float) for name in State._fields)),
         state,
         arrays["joints"][rows].astype(float),
-        command,
-        fell | (np.arange(wanted) >= count),
+        Wrench(*(arrays[f"command.{name}"][rows].astype(float) for name in Wrench._fields)),
+        fallen | (np.arange(wanted) >= count),
         arrays["residual"][rows].astype(float),
     )
 
@@ -104,28 +108,28 @@ def _references(tick: float, robot: Robot, command: Command, initial: State, tic
     return jax.vmap(lambda t: reference_at(tick, command, anchor, t))(ticks)
 
 
-def bare(log: Log, period: float) -> Trajectory:
-    """A trajectory of what a log holds, sampled every `period` [s]; all else is empty."""
+def trajectory_of(log: Log, period: float) -> Trajectory:
+    """Return the trajectory of a log sampled every `period` [s]; entries not in a log are empty."""
     empty = no_samples(log.joints.shape[1], log.command.force.shape[1])
     return empty._replace(period=np.asarray(period), **log._asdict())
 
 
-def read_loss(config: TuneConfig, robot: Robot, command: Command, log: Log) -> tuple[Seen, Log]:
-    """What a log of 1 ms says of its command, and the log at the plan interval.
+def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -> ScoredLog:
+    """Return the score of a log of 1 ms against its command, and the log at the plan interval.
 
     Source: Eq. 11.
     """
-    tick, count = config.rollout.walk.gait.tick, len(log.fallen)
-    each = round(tick / TIME_STEP)
-    ticks = (np.arange(count) + 1.0) / each
+    tick = config.rollout.walk.gait.tick
+    stride = round(tick / TIME_STEP)
+    ticks = (np.arange(len(log.fallen)) + 1.0) / stride
     reference = _references(tick, robot, command, log.initial, ticks)
-    loss = float(loss_of(config.loss, bare(log, TIME_STEP)._replace(reference=reference)))
-    least, most = robot.description.limits
-    stood = ~log.fallen
-    tilt = np.abs(log.state.euler[stood, :2]).max(initial=0.0) / most
-    standing = float(robot.standing_height)
-    sunk = (standing - log.state.position[stood, 2].min(initial=standing)) / (standing - least)
-    bad = log.fallen.any() or not log.residual.max() <= SOLVED
-    seen = Seen(np.inf, 1.0) if bad else Seen(loss, float(max(tilt, sunk)))
-    thin = jax.tree.map(lambda x: x[each - 1 :: each], log._replace(initial=None))
-    return seen, thin._replace(initial=log.initial)
+    loss = float(loss_of(config.loss, trajectory_of(log, TIME_STEP)._replace(reference=reference)))
+    min_height, max_tilt = robot.description.limits
+    upright = ~log.fallen
+    tilt = np.abs(log.state.euler[upright, :2]).max(initial=0.0) / max_tilt
+    height = float(robot.standing_height)
+    sunk = (height - log.state.position[upright, 2].min(initial=height)) / (height - min_height)
+    failed = log.fallen.any() or not log.residual.max() <= SOLVED
+    score = LogScore(np.inf, 1.0) if failed else LogScore(loss, float(max(tilt, sunk)))
+    samples = jax.tree.map(lambda x: x[stride - 1 :: stride], log._replace(initial=None))
+    return score, samples._replace(initial=log.initial)

@@ -1,13 +1,13 @@
 """Tuning on few walks: a folder in which proposals and the logs of their walks alternate.
 
-Whoever walks, a simulator here (`tune_on_walks`) or a robot elsewhere (`hector propose`, `hector
-report`), the same functions read the logs and make the proposals (search/few_walks.py), and all
-that they know is in the folder:
+Whether a simulator (`tune_on_walks`) or a real robot (`hector propose`, `hector report`) walks, the
+same functions read the logs and make the proposals (search/few_walks.py), and all that they use is
+in the folder:
 
 - `walks.jsonl`: settings, then a line for each proposal that was walked.
 - `logs/3-0.npz`: the log of walk 3 in case 0, at the plan interval.
-- `proposal.json`: what is to be walked next, until it was.
-- `metric.npz`: the Gauss-Newton matrix at the start, which all points are in.
+- `proposal.json`: the proposal whose walk is not yet reported.
+- `metric.npz`: the Gauss-Newton matrix at the start, which defines the coordinates of all points.
 
 A weight set is walked in each case: all commands, on each plant. Its loss is the mean over the
 cases, each divided by its loss at the start, so that all count alike.
@@ -15,6 +15,7 @@ cases, each divided by its loss at the start, so that all count alike.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from itertools import product, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +30,7 @@ from hector_jax.control.weights import (
     Weights,
     direction_names,
     directions,
-    moved_most,
+    largest_changes,
     weights_to_vector,
 )
 from hector_jax.control.weights_file import save_weights, weights_tree
@@ -43,10 +44,10 @@ from hector_jax.grfm import network
 from hector_jax.robot.model import Robot
 from hector_jax.runs import tunings
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.walk_log import Log, Seen, bare, log_of, read_loss
+from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, log_bounds, project, read_journal
-from hector_jax.search.few_walks import Proposal, Space, Walked
+from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections
@@ -56,11 +57,11 @@ from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_groundi
 from hector_jax.tuning.status import StepStatus
 
 _PROPOSAL = "proposal.json"
-_REFUSED = 20.0  # log-loss of what the model cannot walk
+_REFUSED = 20.0  # log-loss of weights with which the model falls or has an unsolved QP
 
 
 class Row(NamedTuple):
-    """A proposal, and what its walks came to."""
+    """A proposal and the results of its walks."""
 
     point: Float[np.ndarray, " n"]
     method: str
@@ -69,21 +70,26 @@ class Row(NamedTuple):
     margin: float  # share of the way to a fall, the largest of the cases
 
 
-class Campaign(NamedTuple):
-    """What is tuned, where, and from where."""
+@dataclass(frozen=True)
+class Campaign:
+    """Settings of a tuning on walks."""
 
     folder: Path
     config: TuneConfig  # its rollout as long as the walks
     robot: Robot
-    start: Weights  # with all numbers that are tuned, feet tied
+    start: Weights  # completed by all numbers that are tuned; the feet share one R
     commands: Mapping[str, Command]
-    plants: Sequence[Imperfections | None]  # None: somebody else walks
-    seed: int
+    plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        start = jax.tree.map(np.asarray, init(self.config, self.start).best)
+        object.__setattr__(self, "start", start)
 
     @property
-    def cases(self) -> list[tuple[Imperfections | None, str]]:
-        """What a weight set is walked in."""
-        return list(product(self.plants, self.commands))
+    def cases(self) -> list[tuple[Imperfections | None, Command]]:
+        """Plant and command of each walk of a weight set."""
+        return list(product(self.plants, self.commands.values()))
 
     @property
     def seconds(self) -> float:
@@ -91,292 +97,283 @@ class Campaign(NamedTuple):
         return self.config.rollout.ticks * self.config.rollout.walk.gait.tick
 
 
-def campaign(
-    folder: Path,
-    config: TuneConfig,
-    robot: Robot,
-    start: Weights,
-    commands: Mapping[str, Command],
-    plants: Sequence[Imperfections | None] = (None,),
-    seed: int = 0,
-) -> Campaign:
-    """Settings of a tuning on walks; see `Campaign`."""
-    start = jax.tree.map(np.asarray, init(config, start).best)
-    return Campaign(folder, config, robot, start, commands, plants, seed)
-
-
 # Points and weights
 
 
-def _box(one: Campaign) -> Float[np.ndarray, "n 2"]:
-    """Least and largest steps: of the log-weights, and of other numbers in tenths of their box."""
-    rows = [log_bounds(one.start)]
-    for name in one.config.others:
-        part, at = TUNABLES[name], float(one.start.others[name])
-        rows.append((np.array([[part.lower, part.upper]]) - at) / _unit(name))
-    return np.concatenate(rows)
+def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
+    """Return bounds of the steps: of log-weights, and of other numbers in tenths of their range."""
+    bounds = [log_bounds(campaign.start)]
+    for name in campaign.config.others:
+        tunable, start = TUNABLES[name], float(campaign.start.others[name])
+        bounds.append((np.array([[tunable.lower, tunable.upper]]) - start) / _unit(name))
+    return np.concatenate(bounds)
 
 
 def _unit(name: str) -> float:
+    """Return the unit step of a tunable number: a tenth of its range."""
     return 0.1 * (TUNABLES[name].upper - TUNABLES[name].lower)
 
 
-def weights_at(one: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
-    """The weights of a point."""
-    steps, count = space.to_steps @ point, len(direction_names(one.start))
-    weights = project(one.start, steps[:count])
-    moved = {
-        name: np.clip(
-            weights.others[name] + step * _unit(name), TUNABLES[name].lower, TUNABLES[name].upper
-        )
-        for name, step in zip(one.config.others, steps[count:], strict=True)
-    }
-    return weights._replace(others={**weights.others, **moved})
+def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
+    """Return the weights of a point."""
+    steps, count = space.to_steps @ point, len(direction_names(campaign.start))
+    weights = project(campaign.start, steps[:count])
+    others = dict(weights.others)
+    for name, step in zip(campaign.config.others, steps[count:], strict=True):
+        tunable, value = TUNABLES[name], others[name] + step * _unit(name)
+        others[name] = np.clip(value, tunable.lower, tunable.upper)
+    return weights._replace(others=others)
 
 
-def _slope(one: Campaign, space: Space, weights: Weights, gradient: Weights) -> np.ndarray:
-    """Gradient by the point, of that by the weights."""
+def _slope(campaign: Campaign, space: Space, weights: Weights, gradient: Weights) -> np.ndarray:
+    """Return the gradient with respect to the point from that with respect to the weights."""
     by_log = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
-    others = [float(gradient.others[name]) * _unit(name) for name in one.config.others]
+    others = [float(gradient.others[name]) * _unit(name) for name in campaign.config.others]
     return space.to_steps.T @ np.append(directions(weights) @ by_log, others)
 
 
 # Jobs of worker processes
 
 
-def _walk_job(one: Campaign, weights: Weights, case: int) -> tuple[Seen, Log]:
-    plant, name = one.cases[case]
-    assert plant is not None  # else somebody else walks
-    command = one.commands[name]
-    walked = walk(
-        one.config.rollout.walk, one.robot, Job(weights, command, plant, one.seconds, case)
-    )
-    return read_loss(one.config, one.robot, command, jax.tree.map(np.asarray, log_of(walked)))
+def _walk_job(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
+    config, robot = campaign.config, campaign.robot
+    plant, command = campaign.cases[case]
+    assert plant is not None  # None: the walks are made elsewhere
+    job = Job(weights, command, plant, campaign.seconds, case)
+    log = jax.tree.map(np.asarray, log_of(walk(config.rollout.walk, robot, job)))
+    return evaluate_log(config, robot, command, log)
 
 
-def _effect(one: Campaign) -> jax.tree_util.Partial:
-    """The plain rigid body: what the ground is like, the walks tell."""
-    return network.effect_of(None, one.config.rollout.walk.gait)
+def _rollout_inputs(campaign: Campaign, weights: Weights, command: Command) -> tuple[Any, ...]:
+    """Return the arguments of a rollout on the plain rigid body, which the walks correct."""
+    config = campaign.config.rollout
+    return config, campaign.robot, weights, command, network.effect_of(None, config.walk.gait)
 
 
-def _ground_job(one: Campaign, weights: Weights, name: str, log: Log) -> Grounding:
-    walked = bare(log, one.config.rollout.walk.gait.tick)
-    inputs = one.config.rollout, one.robot, weights, one.commands[name], _effect(one), walked
-    return jax.device_get(fit_grounding(*inputs))
+def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log) -> Grounding:
+    trajectory = trajectory_of(log, campaign.config.rollout.walk.gait.tick)
+    return jax.device_get(fit_grounding(*_rollout_inputs(campaign, weights, command), trajectory))
 
 
-def _evaluate_job(one: Campaign, weights: Weights, name: str, grounding: Grounding) -> Evaluation:
-    inputs = one.config.rollout, one.robot, weights, one.commands[name], _effect(one), grounding
-    return jax.device_get(evaluate_grounded(*inputs, one.config.loss))
+def _evaluate_job(
+    campaign: Campaign, weights: Weights, command: Command, grounding: Grounding
+) -> Evaluation:
+    inputs = _rollout_inputs(campaign, weights, command)
+    return jax.device_get(evaluate_grounded(*inputs, grounding, campaign.config.loss))
 
 
 # The folder
 
 
-def space_of(pool: Executor, one: Campaign) -> Space:
-    """The coordinates of a campaign, from the model at its start; kept, as all points are in them.
+def space_of(pool: Executor, campaign: Campaign) -> Space:
+    """Return the coordinates of all points, from the model at the start or from their file.
 
     Raises:
         InputError: the file of the matrix is damaged, or of another robot.
     """
-    path, like = one.folder / "metric.npz", {"matrix": np.zeros((0, 0))}
+    path = campaign.folder / "metric.npz"
     if not path.exists():
-        first, *others = one.commands.values()
-        inputs = one.config, one.robot, one.start, tunings.Problem(first, None, tuple(others))
+        first, *others = campaign.commands.values()
+        problem = tunings.Problem(first, None, tuple(others))
+        inputs = campaign.config, campaign.robot, campaign.start, problem
         matrix = pool.submit(tunings.gauss_newton_job, *inputs).result()
-        save_tree(path, {"matrix": matrix}, kind="metric", robot=one.robot)
-    tree, _ = load_tree(path, like, kind="metric", robot=one.robot)
-    return few_walks.space_of(tree["matrix"], _box(one))
+        save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
+    tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=campaign.robot)
+    return few_walks.space_of(tree["matrix"], _box(campaign))
 
 
-def read_history(one: Campaign) -> list[Row]:
-    """What was walked so far; begins the record of a new campaign.
+def read_history(campaign: Campaign) -> list[Row]:
+    """Return the walks so far; begin the record if the campaign is new.
 
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size = len(_box(one))
+    size = len(_box(campaign))
     head = {
         "format": 1,
-        "robot": robot_hash(one.robot),
-        "settings": content_key(one.config, code=()),
-        "start": weights_tree(one.start),
-        "commands": {name: tree_hash(command) for name, command in one.commands.items()},
-        "plants": [plant and tree_hash(plant) for plant in one.plants],
-        "seed": one.seed,
+        "robot": robot_hash(campaign.robot),
+        "settings": content_key(campaign.config, code=()),
+        "start": weights_tree(campaign.start),
+        "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
+        "plants": [plant and tree_hash(plant) for plant in campaign.plants],
+        "seed": campaign.seed,
     }
 
     def parse(row: Mapping[str, Any]) -> Row:
         point, losses = np.array(row["point"], float), np.array(row["losses"], float)
-        if (got := (point.shape, losses.shape)) != ((size,), (len(one.cases),)):
+        if (got := (point.shape, losses.shape)) != ((size,), (len(campaign.cases),)):
             raise ValueError(f"point and losses of shapes {got}")
         losses = np.where(np.isfinite(losses), losses, np.inf)
         return Row(point, row["method"], row["predicted"], losses, float(row["margin"]))
 
-    return read_journal(one.folder / "walks.jsonl", head, what="tuning on walks", parse=parse)
+    return read_journal(campaign.folder / "walks.jsonl", head, what="tuning on walks", parse=parse)
 
 
-def _walked(rows: Sequence[Row]) -> list[Walked]:
-    """The rows with one loss each, of the mean over the cases."""
-    return [
-        Walked(row.point, row.method, row.predicted, _log_loss(rows, row), row.margin)
-        for row in rows
-    ]
+def _walked(rows: Sequence[Row]) -> list[WalkResult]:
+    """Return the rows with their mean loss over the cases."""
+    return [WalkResult(*row[:3], _log_loss(rows, row), row.margin) for row in rows]
 
 
 def _log_loss(rows: Sequence[Row], row: Row) -> float:
+    """Return the logarithm of the mean loss relative to the start; infinite if not finite."""
     with np.errstate(invalid="ignore"):
         ratio = np.mean(row.losses / rows[0].losses)
     return float(np.log(ratio)) if np.isfinite(ratio) else np.inf
 
 
 def next_proposal(
-    pool: Executor, one: Campaign, space: Space, rows: Sequence[Row]
+    pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
 ) -> tuple[Proposal, Weights]:
-    """What to walk next, written into the folder; the same until it was walked.
+    """Return the next proposal, saved in the folder; it stays the same until it is walked.
 
     Raises:
         InputError: the start fell, the file of the proposal is damaged, or packages of the extra
             `search` are missing.
     """
     if rows and not _stood(rows[0]):
-        raise InputError(f"{one.folder}: the start fell, or a QP was not solved; tune from another")
-    if (given := pending(one, rows)) is not None:
-        return given, weights_at(one, space, given.point)
+        raise InputError(
+            f"{campaign.folder}: the start fell, or a QP was not solved; tune from another"
+        )
+    if (proposal := pending(campaign, rows)) is not None:
+        return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
-    model = _model(pool, one, space, rows) if few_walks.needs_model(history) else None
-    proposal = few_walks.propose(space, history, model, one.seed)
-    weights = weights_at(one, space, proposal.point)
-    save_weights(weights_path(one, len(rows)), weights)
-    listed = {**proposal._asdict(), "point": proposal.point.tolist()}
-    write_json(one.folder / _PROPOSAL, {"walk": len(rows), **listed})
+    model = _model(pool, campaign, space, rows) if few_walks.needs_model(history) else None
+    proposal = few_walks.propose(space, history, model, campaign.seed)
+    weights = weights_at(campaign, space, proposal.point)
+    save_weights(weights_path(campaign, len(rows)), weights)
+    fields = {**proposal._asdict(), "point": proposal.point.tolist()}
+    write_json(campaign.folder / _PROPOSAL, {"walk": len(rows), **fields})
     return proposal, weights
 
 
-def pending(one: Campaign, rows: Sequence[Row]) -> Proposal | None:
-    """The proposal that waits for its walk, if any.
+def pending(campaign: Campaign, rows: Sequence[Row]) -> Proposal | None:
+    """Return the proposal that waits for its walk, if any.
 
     Raises:
         InputError: its file is damaged.
     """
-    path = one.folder / _PROPOSAL
-    given = read_json(path, "a proposal") if path.exists() else {}
+    path = campaign.folder / _PROPOSAL
+    table = read_json(path, "a proposal") if path.exists() else {}
     try:
-        if given.get("walk") != len(rows):
+        if table.get("walk") != len(rows):
             return None
-        point = np.array(given["point"], float)
-        if point.shape != (len(_box(one)),):
+        point = np.array(table["point"], float)
+        if point.shape != (len(_box(campaign)),):
             raise ValueError(f"a point of shape {point.shape}")
-        return Proposal(point, given["method"], given["predicted"])
+        return Proposal(point, table["method"], table["predicted"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged: {one_line(error)}; remove it") from None
 
 
-def weights_path(one: Campaign, number: int) -> Path:
-    """File of the weights of a walk."""
-    return one.folder / "weights" / f"{number}.json"
+def weights_path(campaign: Campaign, number: int) -> Path:
+    """Return the file of the weights of a walk."""
+    return campaign.folder / "weights" / f"{number}.json"
 
 
-def see(pool: Executor, one: Campaign, logs: Sequence[Log]) -> list[tuple[Seen, Log]]:
-    """What the logs of all cases say, and they at the plan interval."""
-    commands = [one.commands[name] for _, name in one.cases]
-    return list(pool.map(read_loss, repeat(one.config), repeat(one.robot), commands, logs))
+def evaluate_logs(pool: Executor, campaign: Campaign, logs: Sequence[Log]) -> list[ScoredLog]:
+    """Evaluate the logs of all cases; see `evaluate_log`."""
+    commands = [command for _, command in campaign.cases]
+    inputs = repeat(campaign.config), repeat(campaign.robot), commands, logs
+    return list(pool.map(evaluate_log, *inputs))
 
 
-def _model(pool: Executor, one: Campaign, space: Space, rows: Sequence[Row]) -> few_walks.Model:
-    """The model grounded on the best walk: its loss there is that of the walk."""
+def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]) -> Model:
+    """Return the model grounded on the best walk, where its loss is that of the walk."""
     best = few_walks.best_walk(_walked(rows))
-    weights, names = weights_at(one, space, rows[best].point), [name for _, name in one.cases]
-    like = log_of(no_samples(len(one.robot.joint_lower), len(one.robot.foot_point)))
+    weights = weights_at(campaign, space, rows[best].point)
+    commands = [command for _, command in campaign.cases]
+    like = log_of(no_samples(len(campaign.robot.joint_lower), len(campaign.robot.foot_point)))
     logs = [
-        load_tree(_log_path(one, best, case), like, kind="log", robot=one.robot)[0]
-        for case in range(len(names))
+        load_tree(_log_path(campaign, best, case), like, kind="log", robot=campaign.robot)[0]
+        for case in range(len(commands))
     ]
-    groundings = list(pool.map(_ground_job, repeat(one), repeat(weights), names, logs))
+    groundings = list(pool.map(_ground_job, repeat(campaign), repeat(weights), commands, logs))
 
     def evaluate(weights: Weights) -> list[Evaluation]:
-        return list(pool.map(_evaluate_job, repeat(one), repeat(weights), names, groundings))
+        inputs = repeat(campaign), repeat(weights), commands, groundings
+        return list(pool.map(_evaluate_job, *inputs))
 
     shares = rows[best].losses / rows[0].losses
-    scales = shares / np.array([seen.loss for seen in evaluate(weights)]) / len(names)
+    model_losses = np.array([evaluation.loss for evaluation in evaluate(weights)])
+    scales = shares / model_losses / len(commands)
 
     def model(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
-        weights = weights_at(one, space, point)
-        each = evaluate(weights)
-        if any(step_status(one.config, seen) != StepStatus.ACCEPTED for seen in each):
+        weights = weights_at(campaign, space, point)
+        cases = list(zip(scales, evaluate(weights), strict=True))
+        if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for _, case in cases):
             return _REFUSED, np.zeros_like(point)
-        loss = sum(scale * float(seen.loss) for scale, seen in zip(scales, each, strict=True))
-        slopes = [_slope(one, space, weights, seen.gradient) for seen in each]
-        slope = sum(scale * of for scale, of in zip(scales, slopes, strict=True)) / loss
-        return float(np.log(loss)), np.asarray(slope)
+        loss = sum(scale * float(case.loss) for scale, case in cases)
+        grad = sum(scale * _slope(campaign, space, weights, case.gradient) for scale, case in cases)
+        return float(np.log(loss)), np.asarray(grad / loss)
 
     return model
 
 
-def _log_path(one: Campaign, number: int, case: int) -> Path:
-    return one.folder / "logs" / f"{number}-{case}.npz"
+def _log_path(campaign: Campaign, number: int, case: int) -> Path:
+    return campaign.folder / "logs" / f"{number}-{case}.npz"
 
 
 def add_walk(
-    one: Campaign, rows: Sequence[Row], proposal: Proposal, seen: Sequence[tuple[Seen, Log]]
+    campaign: Campaign, rows: Sequence[Row], proposal: Proposal, cases: Sequence[ScoredLog]
 ) -> list[Row]:
-    """The history with one walk more, kept in the folder: first its logs, then its row."""
-    for case, (_, log) in enumerate(seen):
-        save_tree(_log_path(one, len(rows), case), log, kind="log", robot=one.robot)
-    losses = np.array([each.loss for each, _ in seen])
-    row = Row(*proposal, losses, max(each.margin for each, _ in seen))
-    listed = {"point": row.point.tolist(), "losses": row.losses.tolist()}
-    add_row(one.folder / "walks.jsonl", row._asdict() | listed)
+    """Append a walk to the history and save it in the folder: first its logs, then its row."""
+    for case, (_, log) in enumerate(cases):
+        save_tree(_log_path(campaign, len(rows), case), log, kind="log", robot=campaign.robot)
+    losses = np.array([score.loss for score, _ in cases])
+    row = Row(*proposal, losses, max(score.margin for score, _ in cases))
+    arrays = {"point": row.point.tolist(), "losses": row.losses.tolist()}
+    add_row(campaign.folder / "walks.jsonl", row._asdict() | arrays)
     return [*rows, row]
 
 
-def answer(one: Campaign, space: Space, rows: Sequence[Row]) -> tuple[Weights, int]:
-    """The weights to believe in, and which walk they are of; see `few_walks.incumbent`."""
-    which = few_walks.incumbent(space, _walked(rows))
-    return weights_at(one, space, rows[which].point), which
+def answer(campaign: Campaign, space: Space, rows: Sequence[Row]) -> tuple[Weights, int]:
+    """Return the best weights and the number of their walk; see `few_walks.incumbent`."""
+    number = few_walks.incumbent(space, _walked(rows))
+    return weights_at(campaign, space, rows[number].point), number
 
 
-def tune_on_walks(pool: Executor, one: Campaign, walks: int) -> tuple[Weights, list[Row]]:
-    """Spend walks on the plants of a campaign, taking up what is in its folder.
+def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> tuple[Weights, list[Row]]:
+    """Walk and tune on the plants of a campaign, continuing from the walks in its folder.
 
     Args:
         pool: worker processes.
-        one: the campaign.
-        walks: to spend; whole rounds of all cases are walked, at least the start.
+        campaign: settings, all of whose plants are present.
+        walks: budget; whole rounds of all cases are walked, at least the start.
 
     Returns:
-        The weights to believe in, and all that was walked. A start that falls is not tuned from.
+        The best weights and all rows. If the start falls, nothing is tuned.
 
     Raises:
         InputError: see `next_proposal` and `read_history`.
     """
-    rows, space, cases = read_history(one), space_of(pool, one), len(one.cases)
-    with bar(f"tuning with {plural(walks, 'walk')}") as tell:
+    rows, space, cases = read_history(campaign), space_of(pool, campaign), len(campaign.cases)
+    with bar(f"tuning with {plural(walks, 'walk')}") as report_progress:
         while not rows or (_stood(rows[0]) and (len(rows) + 1) * cases <= walks):
-            tell(len(rows) * cases, walks, _progress(one, space, rows))
-            proposal, weights = next_proposal(pool, one, space, rows)
-            seen = list(pool.map(_walk_job, repeat(one), repeat(weights), range(cases)))
-            rows = add_walk(one, rows, proposal, seen)
-        tell(len(rows) * cases, walks, _progress(one, space, rows))
+            report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
+            proposal, weights = next_proposal(pool, campaign, space, rows)
+            inputs = repeat(campaign), repeat(weights), range(cases)
+            rows = add_walk(campaign, rows, proposal, list(pool.map(_walk_job, *inputs)))
+        report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
     if not _stood(rows[0]):
         say("the set from which to tune on walks fell, or a QP was not solved; it is kept as it is")
-    return answer(one, space, rows)[0], rows
+    return answer(campaign, space, rows)[0], rows
 
 
 def _stood(row: Row) -> bool:
+    """Tell whether no case fell and all QPs were solved."""
     return bool(np.isfinite(row.losses).all())
 
 
 class Change(NamedTuple):
-    """What a proposal came to, against the start."""
+    """Result of a proposal relative to the start."""
 
     method: str
-    predicted: float | None  # [%] None where nothing was
+    predicted: float | None  # [%] None where nothing was predicted
     change: float | None  # [%] of L; None where the robot fell or a QP was not solved
 
 
 def changes(rows: Sequence[Row]) -> list[Change]:
-    """What each proposal came to."""
+    """Return the result of each proposal."""
     percent = lambda loss: 100.0 * float(np.expm1(loss))  # noqa: E731
     return [
         Change(
@@ -388,11 +385,11 @@ def changes(rows: Sequence[Row]) -> list[Change]:
     ]
 
 
-def _progress(one: Campaign, space: Space, rows: Sequence[Row]) -> str:
+def _progress(campaign: Campaign, space: Space, rows: Sequence[Row]) -> str:
     if not rows:
         return "compiling"
     history = _walked(rows)
     best = few_walks.best_walk(history)
-    moved = moved_most(one.start, weights_at(one, space, rows[best].point))
+    moved = largest_changes(campaign.start, weights_at(campaign, space, rows[best].point))
     change = changes(rows)[best].change or 0.0
     return f"best L {change:+.0f} % against the start" + (f"; {moved}" if best else "")

@@ -1,14 +1,14 @@
-"""Search without derivatives: CMA-ES in the logarithms of the weights, all feet sharing one R.
+"""Search without derivatives: CMA-ES in the logarithms of the weights, with one R for all feet.
 
-What a gradient has to be measured against. The objective is whatever `walk` says a weight set
-costs; several searches go in lock-step, so that a whole generation of all is walked at once.
+The benchmark of the gradient. The objective is the loss that `walk` returns for a weight set;
+several searches run in lock-step, so that the generations of all are walked in parallel.
 
 Each search keeps a journal, FOLDER/NAME.jsonl: its settings, then a line per generation with the
-steps and their losses. A search that finds a journal asks for the same steps again, is told the
-same losses and goes on where it ends: the result is that of a search that was never cut. The budget
-is no part of the settings, so a journal can be carried on to a larger one, and a search of the same
-population and seed is its beginning. On a machine whose linear algebra rounds differently the
-search carries on from all losses that it was told, with other draws.
+steps and their losses. A search with a journal replays its steps and losses and continues after
+them: the result is that of a search without interruption. The budget is no part of the settings, so
+a journal can be continued to a larger budget, and begins like that of a smaller one with the same
+population and seed. On a machine whose linear algebra rounds differently the search continues from
+all losses of the journal, with other draws.
 """
 
 import json
@@ -42,9 +42,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How far and how wide."""
+    """Settings of a search."""
 
-    budget: int = 200  # walks, at most; whole generations are walked
+    budget: int = 200  # walks, at most; only whole generations are walked
     population: int = 10  # walks in a generation
     seed: int = 0
     spread: float = 1.0  # first standard deviation of each log-weight
@@ -59,29 +59,29 @@ class SearchConfig:
 
     @property
     def generations(self) -> int:
-        """Whole generations in the budget."""
+        """Number of whole generations in the budget."""
         return self.budget // self.population
 
 
 class Generation(NamedTuple):
-    """Steps that were walked at once, and their losses."""
+    """Steps of a generation, and their losses."""
 
-    steps: Float[np.ndarray, "population directions"]  # log-weights, less those of the start
-    losses: Float[np.ndarray, " population"]  # infinite where there is no number
+    steps: Float[np.ndarray, "population directions"]  # log-weights less those of the start
+    losses: Float[np.ndarray, " population"]  # infinite if not a finite number
 
 
 class SearchResult(NamedTuple):
-    """The best of a search."""
+    """Best weights of a search."""
 
     weights: Weights
     loss: float
-    walk: int  # which one it was, counted from 1
+    walk: int  # number of the walk, counted from 1
     history: list[Generation]
-    stop: str  # why the search ended
+    stop: str  # reason of the end
 
 
 Walk = Callable[[Mapping[str, list[Weights]]], Mapping[str, Float[np.ndarray, " population"]]]
-"""Losses of a generation of each search; a loss that is not finite counts as the worst."""
+"""Function that returns the losses of a generation of each search; not finite is the worst."""
 
 
 def search(
@@ -93,65 +93,61 @@ def search(
     about: Mapping[str, Any],
     on_generation: Callable[[Mapping[str, list[Generation]]], None] = lambda histories: None,
 ) -> dict[str, SearchResult]:
-    """Search from several starts in lock-step, taking up the journals under `folder`.
+    """Search from several starts in lock-step, continuing the journals in `folder`.
 
     Args:
-        config: how.
-        starts: where each search starts, by its name.
-        walk: the objective; it is given those searches that have not ended.
+        config: the settings.
+        starts: start of each search, by its name.
+        walk: the objective; called with the searches that have not ended.
         folder: of the journals.
-        about: JSON values on which the losses depend; kept in the journals and held to.
-        on_generation: called with the histories once the journals are read and after each
+        about: JSON values on which the losses depend; a journal with other values is refused.
+        on_generation: called with the histories after the journals are read and after each
             generation.
 
     Raises:
-        InputError: a start outside the box or with feet that differ, a journal of another search
-            or a damaged one, or cmaes, of the extra `search`, is not installed.
+        InputError: a start is outside the box or has unequal feet, a journal is damaged or of
+            another search, or cmaes, of the extra `search`, is not installed.
         WriteError: a journal cannot be written.
     """
     searches = {name: CmaSearch(config, start) for name, start in starts.items()}
     paths = {name: Path(folder) / f"{name}.jsonl" for name in starts}
-    for name, one in searches.items():
+    for name, search in searches.items():
         head = {
             "format": FORMAT,
             "name": name,
             "population": config.population,
             "seed": config.seed,
             "spread": config.spread,
-            "start": np.asarray(weights_to_vector(one.start), float).tolist(),
-            "directions": list(direction_names(one.start)),
-            **({"others": weights_tree(one.start)["others"]} if one.start.others else {}),
+            "start": np.asarray(weights_to_vector(search.start), float).tolist(),
+            "directions": list(direction_names(search.start)),
+            **({"others": weights_tree(search.start)["others"]} if search.start.others else {}),
             **about,
         }
-        one.replay(read_journal(paths[name], head, what="search", parse=one.parse))
-    histories = {name: one.history for name, one in searches.items()}
+        search.replay(read_journal(paths[name], head, what="search", parse=search.parse))
+    histories = {name: search.history for name, search in searches.items()}
     on_generation(histories)
-    while waiting := {name: one for name, one in searches.items() if not one.stop}:
-        # a cut may have left one journal a generation behind another
-        number = min(len(one.history) for one in waiting.values())
-        steps = {name: one.ask() for name, one in waiting.items() if len(one.history) == number}
+    while active := {name: search for name, search in searches.items() if not search.stop}:
+        # an interruption may have left one journal a generation behind another
+        number = min(len(search.history) for search in active.values())
+        steps = {name: s.ask() for name, s in active.items() if len(s.history) == number}
         losses = walk({n: [project(starts[n], step) for step in s] for n, s in steps.items()})
         for name in steps:
             generation = to_generation(steps[name], losses[name])
             add_row(paths[name], {k: v.tolist() for k, v in generation._asdict().items()})
             searches[name].tell(generation)
         on_generation(histories)
-    results = {}
-    for name, one in searches.items():
-        step, loss, number = best(one.history)
-        results[name] = SearchResult(project(one.start, step), loss, number, one.history, one.stop)
-    return results
+    return {name: search.result() for name, search in searches.items()}
 
 
 def best(history: Sequence[Generation]) -> tuple[Float[np.ndarray, " directions"], float, int]:
-    """Steps, loss and number of the best walk; the number counts from 1."""
+    """Return steps, loss and number of the best walk; the number counts from 1."""
     steps, losses = map(np.concatenate, zip(*history, strict=True))
-    which = int(np.argmin(losses))
-    return steps[which], float(losses[which]), which + 1
+    index = int(np.argmin(losses))
+    return steps[index], float(losses[index]), index + 1
 
 
 class CmaSearch:
-    """CMA-ES about a start, asked for steps and told their losses.
+    """CMA-ES about a start, by an ask-and-tell interface.
 
     Raises:
         InputError: the start lies outside the box or its feet differ, or cmaes is not installed.
@@ -174,7 +170,7 @@ class CmaSearch:
 
     @property
     def stop(self) -> str:
-        """Why the search has ended; empty while it goes on."""
+        """Reason of the end of the search; empty before it."""
         if len(self.history) >= self.config.generations:
             return "the budget is spent"
         return "CMA-ES has converged" if self.optimizer.should_stop() else ""
@@ -184,49 +180,54 @@ class CmaSearch:
         return np.stack([self.optimizer.ask() for _ in range(self.config.population)])
 
     def tell(self, generation: Generation) -> None:
-        """Take in the losses of the steps that were asked for."""
+        """Update with the losses of the generation drawn last."""
         self.history.append(generation)
         self.optimizer.tell(list(zip(generation.steps, generation.losses.tolist(), strict=True)))
 
     def replay(self, history: Sequence[Generation]) -> None:
-        """Go through an earlier history, as far as the budget reaches."""
+        """Repeat an earlier history, up to the budget."""
         for generation in history[: self.config.generations]:
-            self.ask()  # draws what was drawn then
+            self.ask()  # repeats the draws of that generation
             self.tell(generation)
 
+    def result(self) -> SearchResult:
+        """Return the best weights so far."""
+        steps, loss, number = best(self.history)
+        return SearchResult(project(self.start, steps), loss, number, self.history, self.stop)
+
     def parse(self, row: Mapping[str, Any]) -> Generation:
-        """Generation of a row of the journal; ValueError where its size is another."""
+        """Return the generation of a row of the journal; ValueError if its size is wrong."""
         generation, size = to_generation(row["steps"], row["losses"]), self.config.population
         steps, losses = (x.shape for x in generation)
-        wanted = (size, len(direction_names(self.start))), (size,)
-        if (steps, losses) != wanted:
+        expected = (size, len(direction_names(self.start))), (size,)
+        if (steps, losses) != expected:
             raise ValueError(
-                f"steps {steps} and losses {losses}, expected {wanted[0]} and {wanted[1]}"
+                f"steps {steps} and losses {losses}, expected {expected[0]} and {expected[1]}"
             )
         return generation
 
 
 def to_generation(steps: Any, losses: Any) -> Generation:
-    """Generation of nested numbers; a loss that is null or not finite becomes infinite."""
+    """Return a generation from nested lists; a loss that is null or not finite becomes infinite."""
     numbers = np.array(losses, float)
     return Generation(np.array(steps, float), np.where(np.isfinite(numbers), numbers, np.inf))
 
 
 def project(start: Weights, steps: Float[np.ndarray, " directions"]) -> Weights:
-    """Weights after steps, inside the box to the last digit, whatever the logarithm rounds to."""
+    """Return the weights after steps, clipped to the box against rounding of the logarithm."""
     scaled = jax.device_get(scale_weights(start, steps))
     return jax.tree.map(np.clip, scaled, *bounds(start.others, start))
 
 
 def log_bounds(start: Weights) -> Float[np.ndarray, "directions 2"]:
-    """Largest steps from a start that stay in the box, down and up.
+    """Return the lower and upper bounds of the steps from a start in the box.
 
     Raises:
-        InputError: it lies outside the box, or its feet differ.
+        InputError: the start lies outside the box, or its feet differ.
     """
-    tied = directions(start).argmax(axis=1)  # of the first foot, where there are several
-    box = (start, *bounds(like=start))
-    at, low, high = (np.asarray(weights_to_vector(w), float) for w in box)
+    first = directions(start).argmax(axis=1)  # index of the first foot's weight
+    trees = (start, *bounds(like=start))
+    at, low, high = (np.asarray(weights_to_vector(w), float) for w in trees)
     if any(np.any(part != part[:1]) for part in start.R):
         raise InputError("a search needs a start whose feet share one R; these differ")
     if not ((low <= at) & (at <= high)).all():
@@ -234,25 +235,25 @@ def log_bounds(start: Weights) -> Float[np.ndarray, "directions 2"]:
             f"{part.path.rpartition('.')[2]} {part.lower:g} to {part.upper:g}" for part in (Q, R)
         )
         raise InputError(f"the start lies outside the box of weights: {box}")
-    return np.log(np.stack([low, high], axis=1) / at[:, None])[tied]
+    return np.log(np.stack([low, high], axis=1) / at[:, None])[first]
 
 
 def read_journal(
     path: Path, head: Mapping[str, Any], *, what: str, parse: Callable[[Any], T]
 ) -> list[T]:
-    """Rows of a journal of JSON lines after its settings; one is begun where there is none.
+    """Read the rows of a journal of JSON lines after its settings; create the file if missing.
 
-    A last line that was cut short is dropped from the file.
+    An incomplete last line is dropped from the file.
 
     Args:
         path: of the journal.
-        head: settings that its first line has to hold.
-        what: it is a journal of, for who reads the error.
-        parse: makes a row of a line's value; ValueError, TypeError or KeyError where it is damaged.
+        head: settings that its first line must have.
+        what: kind of the journal, for error messages.
+        parse: converts a line's value to a row; ValueError, TypeError or KeyError if damaged.
 
     Raises:
-        InputError: it is no journal, one of other settings, or damaged.
-        WriteError: it cannot be written.
+        InputError: the file is no journal, has other settings, or is damaged.
+        WriteError: the file cannot be written.
     """
     if not path.exists():
         write_file(path, (json.dumps(head, allow_nan=False) + "\n").encode())
@@ -267,9 +268,9 @@ def read_journal(
         raise InputError(f"{path}: not the record of a {what}: {error}") from error
     if differs:
         name = differs[0]
-        before, now = (str(of.get(name))[:80] for of in (written, head))
+        got, expected = (str(settings.get(name))[:80] for settings in (written, head))
         raise InputError(
-            f"{path}: record of another {what}: its {name} is {before}, expected {now}; "
+            f"{path}: record of another {what}: its {name} is {got}, expected {expected}; "
             "choose another folder"
         )
     rows = []

@@ -1,9 +1,9 @@
-"""Motors with a memory: what a torque command becomes at the joints.
+"""Motor dynamics: from commanded torques to torques at the joints.
 
-A command is scaled by the motor's own gain, saturates at the motor's limit, arrives late (delay),
-builds up slowly (first-order lag), and the ankle's linkage leaks a share of the ankle torque into
-the knee (the ankle motor acts on knee + ankle; the public controllers compensate half of the map).
-All of it is linear after the limit and cheap, and the same function serves MuJoCo and MJX.
+A command is scaled by the motor's own gain, saturates at the motor's limit, is delayed, passes a
+first-order lag, and the ankle's linkage adds a share of the ankle torque at the knee (the ankle
+motor acts on knee + ankle; the public controllers compensate half of the map). All of it is linear
+after the limit and cheap, and the same function serves MuJoCo and MJX.
 """
 
 from typing import NamedTuple
@@ -16,41 +16,41 @@ from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim.world import MAX_DELAY, Imperfections
 
-MEMORY = round(MAX_DELAY / TIME_STEP) + 1  # commands remembered, the present one included
+MEMORY = round(MAX_DELAY / TIME_STEP) + 1  # stored commands, the present one included
 
 
 class Motors(NamedTuple):
-    """What the motors remember."""
+    """State of the motors."""
 
     commands: Float[Array, "*batch m joints"]  # [N m] newest first
     torque: Float[Array, "*batch joints"]  # [N m] after the lag
 
 
 def init_actuators(joints: int) -> Motors:
-    """Motors at rest, one for each joint."""
+    """Return motors at rest, one for each joint."""
     return Motors(jnp.zeros((MEMORY, joints)), jnp.zeros(joints))
 
 
 def step_actuators(
     robot: Robot, imperfections: Imperfections, motors: Motors, command: Float[Array, " joints"]
 ) -> tuple[Motors, Float[Array, " joints"]]:
-    """Torque at the joints [N m] over the next millisecond for what is commanded now.
+    """Return the motors and the torque at the joints [N m] over the next millisecond.
 
     A delay between whole milliseconds is interpolated between two commands; a lag of zero
     passes the torque through.
     """
     limit = robot.torque_limit
-    sent = jnp.clip(imperfections.torque_gain * command, -limit, limit)
-    commands = jnp.concatenate([sent[None], motors.commands[:-1]])
+    limited = jnp.clip(imperfections.torque_gain * command, -limit, limit)
+    commands = jnp.concatenate([limited[None], motors.commands[:-1]])
     age = jnp.arange(MEMORY) - imperfections.delay / TIME_STEP
-    arrived = jnp.maximum(1.0 - jnp.abs(age), 0.0) @ commands
+    delayed = jnp.maximum(1.0 - jnp.abs(age), 0.0) @ commands
     lag = jnp.maximum(imperfections.lag, 1e-9)
-    torque = arrived + jnp.exp(-TIME_STEP / lag) * (motors.torque - arrived)
+    torque = delayed + jnp.exp(-TIME_STEP / lag) * (motors.torque - delayed)
     motors = Motors(commands, torque)
     if robot.description.linkage is None:
         return motors, torque
-    joints = robot.description.leg_joints
-    for first in range(0, len(torque), joints):  # one by one: a scatter is a kernel of its own
-        motor, turned = (first + i - 1 for i in robot.description.linkage)
-        torque = torque.at[turned].add(imperfections.linkage * torque[motor])
+    # leg by leg: one scatter over all legs would be a kernel of its own
+    for first in range(0, len(torque), robot.description.leg_joints):
+        driving, driven = (first + i - 1 for i in robot.description.linkage)
+        torque = torque.at[driven].add(imperfections.linkage * torque[driving])
     return motors, torque

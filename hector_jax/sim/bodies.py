@@ -26,11 +26,11 @@ class Hinge(NamedTuple):
 
     name: str
     axis: Float[np.ndarray, "3"]  # body frame
-    dof: int  # its place in MuJoCo's velocities
+    dof: int  # its index in MuJoCo's velocities
     damping: float  # [N m s/rad]
     armature: float  # [kg m2]
     friction: float  # [N m] dry
-    limits: tuple[float, float]  # [rad], infinite where there are none
+    limits: tuple[float, float]  # [rad], infinite for a joint without limits
 
 
 class Body(NamedTuple):
@@ -44,7 +44,7 @@ class Body(NamedTuple):
     mass: float  # [kg]
     com: Float[np.ndarray, "3"]  # [m] body frame
     inertia: Float[np.ndarray, "3 3"]  # [kg m2] about the centre of mass, body frame
-    hinges: tuple[Hinge, ...]  # of a leg's link: the motor's and then, with backlash, the gear's
+    hinges: tuple[Hinge, ...]  # for a leg's link: the motor's, then with backlash the gear's
 
 
 class Shape(NamedTuple):
@@ -59,21 +59,21 @@ class Shape(NamedTuple):
 
 
 def rotation_of(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Rotation of a quaternion (w, x, y, z)."""
+    """Return the rotation matrix of a quaternion (w, x, y, z)."""
     R = np.zeros(9)
     mujoco.mju_quat2Mat(R, quaternion)
     return R.reshape(3, 3)
 
 
 def bodies(world: World) -> list[Body]:
-    """The robot's bodies, parents before their children."""
+    """Return the robot's bodies, parents before their children."""
     return [_body(world.model, i) for i in range(1, world.model.nbody)]
 
 
 def _body(model: mujoco.MjModel, i: int) -> Body:
     R = rotation_of(model.body_iquat[i])
     first, count = model.body_jntadr[i], model.body_jntnum[i]
-    hinges = (_hinge(model, j) for j in range(first, first + count) if model.jnt_type[j])
+    joints = range(first, first + count)
     return Body(
         id=i,
         name=model.body(i).name,
@@ -83,7 +83,7 @@ def _body(model: mujoco.MjModel, i: int) -> Body:
         mass=float(model.body_mass[i]),
         com=model.body_ipos[i],
         inertia=R @ np.diag(model.body_inertia[i]) @ R.T,
-        hinges=tuple(hinges),
+        hinges=tuple(_hinge(model, j) for j in joints if model.jnt_type[j]),  # 0: the free joint
     )
 
 
@@ -102,9 +102,8 @@ def _hinge(model: mujoco.MjModel, j: int) -> Hinge:
 
 
 def shapes(world: World) -> list[Shape]:
-    """The geoms that may touch something, the floor among them."""
-    model, pairs = world.model, touching_pairs(world)
-    ids = sorted({geom for pair in pairs for geom in pair})
+    """Return the geoms that may touch something, including the floor."""
+    model = world.model
     return [
         Shape(
             id=i,
@@ -114,64 +113,64 @@ def shapes(world: World) -> list[Shape]:
             position=model.geom_pos[i],
             rotation=rotation_of(model.geom_quat[i]),
         )
-        for i in ids
+        for i in sorted({geom for pair in touching_pairs(world) for geom in pair})
     ]
 
 
 def soles(world: World) -> list[Shape]:
-    """The spheres on which the feet stand: of all shapes they alone rub."""
+    """Return the spheres on which the feet stand, the only shapes with friction."""
     feet = world.foot_of_geom
-    return [one for one in shapes(world) if one.kind == "sphere" and feet[one.id] >= 0]
+    return [shape for shape in shapes(world) if shape.kind == "sphere" and feet[shape.id] >= 0]
 
 
 def touching_pairs(world: World) -> set[tuple[int, int]]:
-    """Pairs of geoms (the smaller id first) that may touch, by MuJoCo's rules.
+    """Return the pairs of geoms (the smaller id first) that may touch, by MuJoCo's rules.
 
-    The bits of the geoms allow it, and the bodies are not the same, parent and child or excluded.
+    The geoms' contact bits match, and their bodies are not the same, parent and child or excluded.
     """
     model = world.model
     bits, mask, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid.tolist()
     excluded = {(signature >> 16, signature & 0xFFFF) for signature in model.exclude_signature}
 
-    def apart(one: int, other: int) -> bool:
-        related = one > 0 and model.body_parentid[other] == one
-        return one == other or related or (one, other) in excluded
+    def filtered(first: int, second: int) -> bool:
+        is_parent = first > 0 and model.body_parentid[second] == first
+        return first == second or is_parent or (first, second) in excluded
 
     return {
         (a, b)
         for a, b in combinations(range(model.ngeom), 2)
         if (bits[a] & mask[b] or bits[b] & mask[a])
-        and not (apart(body[a], body[b]) or apart(body[b], body[a]))
+        and not (filtered(body[a], body[b]) or filtered(body[b], body[a]))
     }
 
 
 class Spring(NamedTuple):
-    """A contact's give in numbers that every engine understands."""
+    """Compliance of a contact in numbers that every engine understands."""
 
-    stiffness: float  # [N/m] at each point that touches
-    damping: float  # [s/m] of Hunt and Crossley: force = stiffness * sink * (1 + damping * speed)
+    stiffness: float  # [N/m] at each contact point
+    damping: float  # [s/m] of Hunt and Crossley: force = stiffness * depth * (1 + damping * speed)
 
 
 def contact_spring(world: World, points: int) -> Spring:
-    """The spring and damper under each of some points, all of which carry the robot standing.
+    """Return spring and damper under each of the `points` that together carry the standing robot.
 
-    A contact of time constant T gives way under the robot's weight by g T^2 / 3, which is what
-    MuJoCo's does (measured: 0.31 to 0.47 mm at 10 ms), and its damper is 2 / (g T).
+    A contact of time constant T yields under the robot's weight by g T^2 / 3, as MuJoCo's does
+    (measured: 0.31 to 0.47 mm at 10 ms), and its damping is 2 / (g T).
     """
     time, mass = world.model.geom_solref[world.floor, 0], world.model.body_subtreemass[0]
     gravity = np.linalg.norm(world.model.opt.gravity)
     return Spring(float(3.0 * mass / time**2 / points), float(2.0 / (gravity * time)))
 
 
-STICTION = 0.05  # [rad/s] from which on dry friction has its full size
+STICTION = 0.05  # [rad/s] above which dry friction has its full size
 
 
 def dry_friction(
     hinges: list[Hinge],
 ) -> tuple[Float[np.ndarray, " hinges"], Float[np.ndarray, " hinges"]]:
-    """Size [N m] and speed [rad/s] of dry friction as a torque -size tanh(rate / speed).
+    """Return size [N m] and speed [rad/s] of dry friction as a torque -size tanh(rate / speed).
 
-    The speed is `STICTION` or, where that would not be stable over a step, as much larger.
+    The speed is `STICTION`, or larger if that would not be stable over a step.
     """
     size = np.array([hinge.friction for hinge in hinges])
     inertia = np.array([hinge.armature for hinge in hinges])

@@ -1,12 +1,12 @@
-"""What becomes of a plant while it is walked on: payload, slippery floor, slope.
+"""Changes of the plant during a walk: payload, slippery floor, slope.
 
-A change lasts for a while of the walk and the controller never learns of it. MuJoCo C goes from one
-model to the next, state kept: a payload that arrives moves with the trunk at once.
+A change lasts for a part of the walk and is unknown to the controller. MuJoCo C switches from one
+model to the next and keeps the state: a new payload moves with the trunk at once.
 
-The world's frame is that of the floor, on a slope too: there gravity is tilted and all else stays.
-So the robot of the flat floor stands on it, reference, fall and wrenches mean what they mean
-elsewhere, and the controller takes the floor for level: what it never learns is the share of the
-weight that pulls along the floor, as under an attitude estimate that was set to zero there.
+The world's frame is that of the floor, on a slope too, which only tilts gravity. So the robot
+stands on a slope as on the flat floor, reference, fall and wrenches keep their meaning, and the
+controller takes the floor for level: it does not know the component of the weight along the floor,
+as with an attitude estimate that was set to zero on the slope.
 """
 
 from collections.abc import Sequence
@@ -19,6 +19,7 @@ import numpy as np
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.mjcf import TIME_STEP
+from hector_jax.sim.bodies import rotation_of
 from hector_jax.sim.world import World
 
 TRUNK_TOP = (0.0, 0.0, 0.124)  # [m] in the trunk's frame
@@ -26,19 +27,19 @@ STEEPEST = 0.5  # [rad]
 
 
 class Change(NamedTuple):
-    """What is different over a while of a walk; changes whose times overlap add up."""
+    """A change of the plant during a part of a walk; changes whose times overlap add up."""
 
-    start: float = -np.inf  # [s] after t = 0; by default from the first moment, start-up included
-    end: float = np.inf  # [s] likewise
+    start: float = -np.inf  # [s] after t = 0; by default the first moment, start-up included
+    end: float = np.inf  # [s] after t = 0
     payload: float = 0.0  # [kg] point mass that is fixed to the trunk
     payload_at: tuple[float, float, float] = TRUNK_TOP  # [m] in the trunk's frame
-    # in the place of the plant's own, of several the last; below the soles' own 0.1 it stays 0.1
+    # replaces the plant's; of several changes the last counts; never below the soles' own 0.1
     floor_friction: float | None = None
     slope: tuple[float, float] = (0.0, 0.0)  # [rad] by which the floor rises towards x and y
 
 
 def _check(change: Change) -> None:
-    for name, good, expected in (
+    for name, valid, expected in (
         ("start", not np.isnan(change.start), "be a number"),
         ("end", change.end > change.start, "be after its start"),
         ("payload", 0.0 <= change.payload < np.inf, "be finite and >= 0"),
@@ -46,32 +47,31 @@ def _check(change: Change) -> None:
         ("floor_friction", 0.0 <= (change.floor_friction or 0.0) < np.inf, "be finite and >= 0"),
         ("slope", np.hypot(*change.slope) <= STEEPEST, f"be at most {STEEPEST} rad in all"),
     ):
-        if not good:
+        if not valid:
             raise InputError(f"Change.{name} must {expected}, got {getattr(change, name)}")
 
 
-def _loaded(model: mujoco.MjModel, body: int, mass: float, at: Sequence[float]) -> None:
-    """Fix a point mass to a body."""
-    R, own = np.zeros(9), model.body_mass[body]
-    mujoco.mju_quat2Mat(R, model.body_iquat[body])
-    R = R.reshape(3, 3)
-    lever = np.asarray(at) - model.body_ipos[body]
-    apart = lever @ lever * np.eye(3) - np.outer(lever, lever)
-    inertia = R @ np.diag(model.body_inertia[body]) @ R.T + own * mass / (own + mass) * apart
+def _add_payload(model: mujoco.MjModel, body: int, mass: float, place: Sequence[float]) -> None:
+    """Fix a point mass to a body, in place."""
+    R, body_mass = rotation_of(model.body_iquat[body]), model.body_mass[body]
+    lever = np.asarray(place) - model.body_ipos[body]
+    steiner = lever @ lever * np.eye(3) - np.outer(lever, lever)
+    reduced = body_mass * mass / (body_mass + mass)
+    inertia = R @ np.diag(model.body_inertia[body]) @ R.T + reduced * steiner
     moments, axes = np.linalg.eigh(inertia)
-    axes[:, 0] *= np.linalg.det(axes)  # a rotation
+    axes[:, 0] *= np.linalg.det(axes)  # makes them a rotation
     mujoco.mju_mat2Quat(model.body_iquat[body], axes.ravel())
     model.body_inertia[body] = moments
-    model.body_ipos[body] += mass / (own + mass) * lever
-    model.body_mass[body] = own + mass
+    model.body_ipos[body] += mass / (body_mass + mass) * lever
+    model.body_mass[body] = body_mass + mass
 
 
 def changed_world(world: World, changes: Sequence[Change]) -> World:
-    """The world while these changes last."""
+    """Return the world while these changes last."""
     model = copy(world.model)
     for change in changes:
         if change.payload:
-            _loaded(model, world.trunk, change.payload, change.payload_at)
+            _add_payload(model, world.trunk, change.payload, change.payload_at)
         if change.floor_friction is not None:
             model.geom_friction[world.floor, 0] = change.floor_friction
     rise = np.sum([change.slope for change in changes], axis=0)
@@ -84,13 +84,13 @@ def changed_world(world: World, changes: Sequence[Change]) -> World:
 def worlds_by_step(
     world: World, changes: Sequence[Change], first: int, end: int
 ) -> dict[int, World]:
-    """The worlds of a walk, each by the millisecond after t = 0 from which on it holds.
+    """Return the worlds of a walk by the millisecond after t = 0 at which each begins.
 
     Args:
-        world: without changes.
-        changes: what is to happen.
+        world: the world without changes.
+        changes: changes of the walk.
         first: the walk's first millisecond.
-        end: the one after its last.
+        end: the millisecond after its last.
 
     Raises:
         InputError: a number of a change is out of its range.
@@ -98,10 +98,10 @@ def worlds_by_step(
     for change in changes:
         _check(change)
     spans = [(np.round(c.start / TIME_STEP), np.round(c.end / TIME_STEP)) for c in changes]
-    moments = {first} | {int(t) for span in spans for t in span if first < t < end}
+    steps = {first} | {int(t) for span in spans for t in span if first < t < end}
 
-    def at(moment: int) -> World:
-        on = [c for c, (begin, over) in zip(changes, spans, strict=True) if begin <= moment < over]
-        return changed_world(world, on) if on else world
+    def world_at(step: int) -> World:
+        active = [c for c, (start, end) in zip(changes, spans, strict=True) if start <= step < end]
+        return changed_world(world, active) if active else world
 
-    return {moment: at(moment) for moment in sorted(moments)}
+    return {step: world_at(step) for step in sorted(steps)}

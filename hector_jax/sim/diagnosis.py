@@ -1,8 +1,8 @@
-"""Why a walk in MuJoCo C goes wrong in ways that are not the weights' fault.
+"""Diagnosis of walks in MuJoCo C that go wrong for other reasons than the weights.
 
-A trajectory has the samples from t = 0 on. What became of a robot that falls before, in the
-start-up, and what its motors did, is found by walking once more, which gives the same walk, with
-each millisecond recorded: a walk that goes well pays nothing for it.
+A trajectory has the samples from t = 0 on. To see a fall in the start-up, or the motors' torques,
+the same walk is simulated once more with each millisecond recorded, so that a normal walk costs
+nothing extra.
 """
 
 from functools import partial
@@ -16,18 +16,19 @@ from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import SOLVED, Trajectory
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
+from hector_jax.sim.bodies import rotation_of
 from hector_jax.sim.loop import Job, first_tick, substeps
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import World
 
-AT_LIMIT = 0.98  # of a torque limit: behind a lag the limit is only approached
+AT_LIMIT = 0.98  # share of a torque limit: behind a lag the limit is only approached
 MOST_AT_LIMIT = 0.05  # share of a walk for which a motor may be at its limit
-MOST_BEFORE_FALL = 0.1  # the same before a fall, where something has to be to blame
-# [m] of a height that is off all along; [s] after t = 0. HECTOR is off by 1.7 cm on its curves.
+MOST_BEFORE_FALL = 0.1  # the same before a fall, which must have some cause
+# [m] least steady error of the height; [s] after t = 0. HECTOR is off by 1.7 cm on its curves.
 STEADY, SETTLED = 0.02, 1.0
-FALLING = 0.5  # [s] before a fall of which nothing is told
-SUNK = 0.03  # [m] of a height that is lost while the robot is upright
+FALLING = 0.5  # [s] before a fall that are not evaluated
+SUNK = 0.03  # [m] least loss of height of an upright robot that sinks
 
 
 class Record(NamedTuple):
@@ -37,13 +38,13 @@ class Record(NamedTuple):
     height: Float[np.ndarray, " n"]  # [m] of the centre of mass
     angles: Float[np.ndarray, "n 2"]  # roll, pitch [rad]
     torque: Float[np.ndarray, "n joints"]  # as a share of the motor's limit
-    touching: str  # what touches the floor at the end and is no foot; empty where nothing does
-    fallen: bool  # the last row is that of a fall
+    touching: str  # parts other than feet that touch the floor at the end; empty if none do
+    fallen: bool  # the last row is a fall
     trajectory: Trajectory
 
     @property
     def tilt(self) -> Float[np.ndarray, " n"]:
-        """The larger of roll and pitch [rad], without sign."""
+        """Larger of roll and pitch [rad], without sign."""
         return np.abs(self.angles).max(axis=1)
 
 
@@ -66,25 +67,22 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
     """Walk once with each millisecond recorded.
 
     Args:
-        config, robot, job: as those of `walk`.
+        config, robot, job: as for `walk`.
     """
     rows, touching = [], []
-    low, tilted = robot.description.limits
+    min_height, max_tilt = robot.description.limits
 
     def append(world: World, data: mujoco.MjData) -> None:
         if rows and rows[-1][-1]:
             return  # the rest of the tick in which it fell
-        R_wb = np.zeros(9)
-        mujoco.mju_quat2Mat(R_wb, data.qpos[3:7])
-        below = R_wb[6:]  # z of the trunk's axes in the world
-        roll, pitch = np.arctan2(below[1], below[2]), -np.arcsin(np.clip(below[0], -1.0, 1.0))
-        height = data.qpos[2] + below @ robot.com_offset
-        share = data.ctrl[world.actuator] / world.model.actuator_ctrlrange[world.actuator, 1]
-        parts = _on_floor(world, data)
-        upright = height >= low and max(abs(roll), abs(pitch)) <= tilted  # not if not finite
-        fallen = bool(parts) or not upright
-        rows.append((height, roll, pitch, share, fallen))
-        touching[:] = parts
+        up = rotation_of(data.qpos[3:7])[2]  # z of the trunk's axes in the world
+        roll, pitch = np.arctan2(up[1], up[2]), -np.arcsin(np.clip(up[0], -1.0, 1.0))
+        height = data.qpos[2] + up @ robot.com_offset
+        torque = data.ctrl[world.actuator] / world.model.actuator_ctrlrange[world.actuator, 1]
+        touching[:] = _on_floor(world, data)
+        # false for values that are not finite
+        upright = height >= min_height and max(abs(roll), abs(pitch)) <= max_tilt
+        rows.append((height, roll, pitch, torque, bool(touching) or not upright))
 
     trajectory = walk(config, robot, job, build=partial(MujocoPlant, on_step=append))
     heights, rolls, pitches, torques, fallen = zip(*rows, strict=True)
@@ -101,18 +99,18 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
 
 
 def _on_floor(world: World, data: mujoco.MjData) -> list[str]:
-    """Geoms, or their bodies, that touch the floor and are of no foot."""
+    """Return the names of geoms, or of their bodies, that touch the floor and are of no foot."""
     names = set()
-    for one, other in data.contact.geom[: data.ncon]:
-        geom = other if one == world.floor else one
-        if world.floor in (one, other) and world.foot_of_geom[geom] < 0:
+    for first, second in data.contact.geom[: data.ncon]:
+        geom = second if first == world.floor else first
+        if world.floor in (first, second) and world.foot_of_geom[geom] < 0:
             part = world.model.geom(geom)
             names.add(part.name or world.model.body(part.bodyid[0]).name)
     return sorted(names)
 
 
 def at_limit(robot: Robot, torque: Float[np.ndarray, "n joints"], most: float) -> list[str]:
-    """A line for each motor that is at its limit for a larger share of the time than `most`."""
+    """Return a line for each motor that is at its limit for a share of the time above `most`."""
     shares = (np.abs(torque) >= AT_LIMIT).mean(axis=0) if len(torque) else np.zeros(0)
     names = robot.description.joints
     return [
@@ -124,10 +122,10 @@ def at_limit(robot: Robot, torque: Float[np.ndarray, "n joints"], most: float) -
 
 
 def startup_fall(config: WalkConfig, robot: Robot, job: Job) -> StartupFall | None:
-    """When, how and why a robot falls before t = 0; None where it does not.
+    """Return time, pose and cause of a robot's fall before t = 0; None if it does not fall.
 
     Args:
-        config, robot, job: as those of `walk`.
+        config, robot, job: as for `walk`.
     """
     record = record_walk(config, robot, job._replace(seconds=config.gait.tick))
     if not np.asarray(record.trajectory.fallen)[0]:
@@ -143,40 +141,40 @@ def startup_fall(config: WalkConfig, robot: Robot, job: Job) -> StartupFall | No
 
 
 def likeliest_cause(robot: Robot, record: Record) -> str:
-    """The likeliest cause of a fall, from what came before the robot was half over."""
+    """Return the likeliest cause of a fall, from the record before the robot was half over."""
     if not record.fallen or not np.isfinite(record.height[-1]):
         return "the physics diverges (joint gains too large, masses or inertias too small)"
     if not np.max(record.trajectory.residual) <= SOLVED:
         return "a QP of the MPC is not solved"
-    low, tilted = robot.description.limits
+    min_height, max_tilt = robot.description.limits
     standing = float(robot.standing_height)
-    over = (record.tilt > 0.5 * tilted) | (record.height < 0.5 * (standing + low))
+    over = (record.tilt > 0.5 * max_tilt) | (record.height < 0.5 * (standing + min_height))
     count = max(int(np.argmax(over)) if over.any() else len(over), 1)
     if lines := at_limit(robot, record.torque[:count], MOST_BEFORE_FALL):
         return lines[0]
     error = record.height[:count] - standing
-    if _grows(error, record.tilt[:count] / tilted):
-        way = "sinks" if error[-1] < 0.0 else "rises"
+    if _grows(error, record.tilt[:count] / max_tilt):
+        motion = "sinks" if error[-1] < 0.0 else "rises"
         return (
-            f"the centre of mass {way} steadily, by {100 * abs(error[-1]):.0f} cm while still "
+            f"the centre of mass {motion} steadily, by {100 * abs(error[-1]):.0f} cm while still "
             "upright (the feet do not reach the floor as planned, joint gains or mass are wrong)"
         )
-    if record.touching and record.tilt[-1] <= tilted and record.height[-1] >= low:
+    if record.touching and record.tilt[-1] <= max_tilt and record.height[-1] >= min_height:
         return f"{record.touching} touches the floor"
     roll, pitch = record.angles[-1]
     if abs(roll) > abs(pitch):
-        way = "to the right" if roll > 0.0 else "to the left"
+        direction = "to the right" if roll > 0.0 else "to the left"
     else:
-        way = "forwards" if pitch > 0.0 else "backwards"
-    return f"it tips over {way} (standing pose, joint gains, gait)"
+        direction = "forwards" if pitch > 0.0 else "backwards"
+    return f"it tips over {direction} (standing pose, joint gains, gait)"
 
 
 def _grows(error: Float[np.ndarray, " n"], tilt: Float[np.ndarray, " n"]) -> bool:
-    """Whether an error of the height grows all along, and tells before the tilt does.
+    """Return whether the height's error grows steadily, and shows before the tilt does.
 
     Args:
-        error: [m].
-        tilt: as a share of that of a fall.
+        error: of the height [m].
+        tilt: as a share of the tilt of a fall.
     """
     if len(error) < 3 or abs(error[-1]) < SUNK or tilt[np.argmax(np.abs(error) >= SUNK)] > 0.25:
         return False
@@ -191,20 +189,20 @@ def _steady_height(trajectory: Trajectory, rows: Bool[np.ndarray, " T"]) -> list
     error, parts = errors.mean(), [part.mean() for part in np.array_split(errors, 3)]
     if abs(error) <= STEADY or min(part / error for part in parts) < 0.5:
         return []
-    way = "above" if error > 0.0 else "below"
+    side = "above" if error > 0.0 else "below"
     return [
-        f"the centre of mass is {100 * abs(error):.1f} cm {way} its reference all along: wrong "
+        f"the centre of mass is {100 * abs(error):.1f} cm {side} its reference all along: wrong "
         "mass, or joint gains (kp) that are too small"
     ]
 
 
 def not_the_weights(config: WalkConfig, robot: Robot, job: Job) -> list[str]:
-    """What is wrong with a walk and likely not the weights' fault, a line each; mostly none.
+    """Return a line for each fault of a walk that is likely not due to the weights; mostly none.
 
-    A fall in the start-up; otherwise a height that is off all along, and motors at their limits.
+    Faults are a fall in the start-up, or a height with a steady error and motors at their limits.
 
     Args:
-        config, robot, job: as those of `walk`.
+        config, robot, job: as for `walk`.
     """
     record = record_walk(config, robot, job)
     if np.asarray(record.trajectory.fallen)[0]:

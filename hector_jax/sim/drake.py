@@ -2,8 +2,8 @@
 """A plant in Drake: compliant contact at points, solved as a convex problem (the extra `drake`).
 
 It is built from a world's bodies, not by Drake's own reader of MJCF, which reads two joints on one
-body wrong and leaves out contact bits and dry friction. A link with a gear's backlash hangs on a
-body of a milligram between its two hinges. Dry friction is a torque of ours: Drake has none.
+body wrong and leaves out contact bits and dry friction. With backlash, a body of a milligram lies
+between the motor's and the gear's hinge. Dry friction is a torque added here: Drake has none.
 """
 
 import logging
@@ -13,51 +13,34 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
-from pydrake.geometry import (
-    AddContactMaterial,
-    Box,
-    Capsule,
-    CollisionFilterDeclaration,
-    GeometrySet,
-    HalfSpace,
-    ProximityProperties,
-    SceneGraph,
-    Sphere,
-)
-from pydrake.geometry import Shape as DrakeShape
+from pydrake import geometry
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import (
-    AddMultibodyPlantSceneGraph,
-    CoulombFriction,
-    DiscreteContactApproximation,
-    MultibodyPlant,
-)
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    RevoluteJoint,
-    RigidBody,
-    RotationalInertia,
-    SpatialInertia,
-    UnitInertia,
-)
+from pydrake.multibody import plant as multibody
+from pydrake.multibody import tree
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
-from hector_jax.sim.bodies import Body, Shape
+from hector_jax.sim.bodies import Body
 from hector_jax.sim.loop import Job
 from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts, lasting_world
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import World, standing_qpos
 
-_BETWEEN = 1e-6  # [kg] of the body between a motor's hinge and a gear's
+_SMALL_MASS = 1e-6  # [kg] of the body between a motor's hinge and a gear's
+_SHAPES = {
+    "plane": lambda size: geometry.HalfSpace(),
+    "sphere": lambda size: geometry.Sphere(size[0]),
+    "capsule": lambda size: geometry.Capsule(size[0], 2.0 * size[1]),
+    "box": lambda size: geometry.Box(*(2.0 * size)),
+}
 
 
 @contextmanager
 def _quiet_drake() -> Iterator[None]:
-    """Without the warning that deformable bodies, of which there are none, miss half spaces."""
+    """Silence the warning that deformable bodies, of which there are none, miss half spaces."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -74,8 +57,8 @@ class DrakePlant(Plant):
         """Build as a `BuildPlant` does."""
         world = lasting_world("drake", job, body, first, end)
         builder = DiagramBuilder()
-        plant, scene = AddMultibodyPlantSceneGraph(builder, TIME_STEP)
-        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+        plant, scene = multibody.AddMultibodyPlantSceneGraph(builder, TIME_STEP)
+        plant.set_discrete_contact_approximation(multibody.DiscreteContactApproximation.kLagged)
         plant.mutable_gravity_field().set_gravity_vector(world.model.opt.gravity)
         links, joints = _add_bodies(plant, bodies.bodies(world))
         _add_shapes(plant, scene, links, world)
@@ -96,14 +79,14 @@ class DrakePlant(Plant):
         self.stand(standing_qpos(world, body.standing_joints, float(body.trunk_height)))
 
     def _index(self, world: World) -> None:
-        """Find out where Drake has what."""
+        """Look up Drake's indices of base, motors, backlash and hinges."""
         joints, nq, nv = self.joints, self.plant.num_positions(), self.plant.num_velocities()
         motors = [joints[dof] for dof in world.joint_dof]
         slack = [joints[world.model.jnt_dofadr[j]].position_start() for j in world.slack]
         base = self._trunk.floating_positions_start()
         self._base_rates = self._trunk.floating_velocities_start_in_v()
         self._motors = np.array([joint.velocity_start() for joint in motors])
-        self._where = np.concatenate(
+        self._reading_index = np.concatenate(
             [
                 base + np.r_[4:7, 0:4],
                 nq + self._base_rates + np.r_[3:6, 0:3],
@@ -127,14 +110,14 @@ class DrakePlant(Plant):
         for dof, joint in self.joints.items():
             joint.set_angle(self.context, qpos[dof + 1])  # the trunk's quaternion has one more
         self._simulator.Initialize()
-        self._look()
+        self._read_state()
 
-    def _look(self) -> None:
+    def _read_state(self) -> None:
         self._state[:-1] = self.plant.GetPositionsAndVelocities(self.context)
 
     @property
     def broken(self) -> bool:
-        """Whether Drake's solver failed."""
+        """Return whether Drake's solver failed."""
         return self._failed
 
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
@@ -147,17 +130,17 @@ class DrakePlant(Plant):
         force[self._hinges] = -self._friction * np.tanh(rates[self._hinges] / self._stiction)
         force[self._motors] += torque
         if push.any():
-            lever = bodies.rotation_of(self._state[self._where[3:7]]) @ self._com
+            lever = bodies.rotation_of(self._state[self._reading_index[3:7]]) @ self._com
             force[self._base_rates : self._base_rates + 6] = *np.cross(lever, push), *push
         self._input.set_value(force)
         self._time += 1
         try:
-            # a time of whole steps: a sum of steps drifts, and a step is made twice or not at all
+            # a multiple of the step: a sum of steps drifts, and a step is made twice or not at all
             self._simulator.AdvanceTo(self._time * TIME_STEP)
         except RuntimeError:
             self._failed = True
         else:
-            self._look()
+            self._read_state()
             self._note_contacts()
         self._contacts.end_step()
 
@@ -165,15 +148,15 @@ class DrakePlant(Plant):
         contacts = self.plant.get_contact_results_output_port().Eval(self.context)
         for i in range(contacts.num_point_pair_contacts()):
             info = contacts.point_pair_contact_info(i)
-            one, other = int(info.bodyA_index()), int(info.bodyB_index())
-            force = info.contact_force() if other else -info.contact_force()  # 0 is the world
-            foot = LEGS if one and other else self._foot_of_body.get(one or other, OTHER)
+            body_a, body_b = int(info.bodyA_index()), int(info.bodyB_index())
+            force = info.contact_force() if body_b else -info.contact_force()  # 0 is the world
+            foot = LEGS if body_a and body_b else self._foot_of_body.get(body_a or body_b, OTHER)
             self._contacts.note(foot, force, info.contact_point())
 
     def read(self, row: Float[np.ndarray, " reading"]) -> None:
         """See `Plant`."""
-        self._state.take(self._where, out=row)
-        row[3:7] /= np.linalg.norm(row[3:7])  # Drake lets it drift
+        self._state.take(self._reading_index, out=row)
+        row[3:7] /= np.linalg.norm(row[3:7])  # Drake lets the quaternion's norm drift
         row[10:13] = row[10:13] @ bodies.rotation_of(row[3:7])  # into the trunk's frame
 
     def ground(self) -> Ground:
@@ -182,9 +165,9 @@ class DrakePlant(Plant):
 
 
 def _add_bodies(
-    plant: MultibodyPlant, robot: list[Body]
-) -> tuple[dict[int, RigidBody], dict[int, RevoluteJoint]]:
-    """Links by MuJoCo's number of the body, and joints by that of the degree of freedom."""
+    plant: multibody.MultibodyPlant, robot: list[Body]
+) -> tuple[dict[int, tree.RigidBody], dict[int, tree.RevoluteJoint]]:
+    """Add links and joints; return links by MuJoCo's body and joints by its degree of freedom."""
     links, joints = {0: plant.world_body()}, {}
     for body in robot:
         parent = links[body.parent]
@@ -193,56 +176,46 @@ def _add_bodies(
         for hinge in body.hinges:
             child = link
             if hinge is not body.hinges[-1]:
-                ball = UnitInertia.SolidSphere(0.01)
-                small = SpatialInertia(_BETWEEN, np.zeros(3), ball)
+                ball = tree.UnitInertia.SolidSphere(0.01)
+                small = tree.SpatialInertia(_SMALL_MASS, np.zeros(3), ball)
                 child = plant.AddRigidBody(f"{hinge.name} side", small)
-            name = hinge.name
-            anchor = FixedOffsetFrame(f"{name} anchor", parent.body_frame(), place)
+            anchor = tree.FixedOffsetFrame(f"{hinge.name} anchor", parent.body_frame(), place)
             frames = plant.AddFrame(anchor), child.body_frame()
-            joint = RevoluteJoint(name, *frames, hinge.axis, hinge.damping)
+            joint = tree.RevoluteJoint(hinge.name, *frames, hinge.axis, hinge.damping)
             joints[hinge.dof] = joint = plant.AddJoint(joint)
             joint.set_position_limits([hinge.limits[0]], [hinge.limits[1]])
-            plant.AddJointActuator(name, joint).set_default_rotor_inertia(hinge.armature)
+            plant.AddJointActuator(hinge.name, joint).set_default_rotor_inertia(hinge.armature)
             parent, place = child, RigidTransform()
     return links, joints
 
 
-def _inertia(body: Body) -> SpatialInertia:
+def _inertia(body: Body) -> tree.SpatialInertia:
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia
-    central = RotationalInertia(xx, yy, zz, xy, xz, yz)
-    return SpatialInertia.MakeFromCentralInertia(body.mass, body.com, central)
+    central = tree.RotationalInertia(xx, yy, zz, xy, xz, yz)
+    return tree.SpatialInertia.MakeFromCentralInertia(body.mass, body.com, central)
 
 
 def _add_shapes(
-    plant: MultibodyPlant, scene: SceneGraph, links: Mapping[int, RigidBody], world: World
+    plant: multibody.MultibodyPlant,
+    scene: geometry.SceneGraph,
+    links: Mapping[int, tree.RigidBody],
+    world: World,
 ) -> None:
-    """Geoms that may touch something, and which of them may touch which."""
-    rough, places = {world.floor, *(one.id for one in bodies.soles(world))}, {}
+    """Add the geoms that may touch something, and a filter of the pairs that may not."""
+    rough, ids = {world.floor, *(sole.id for sole in bodies.soles(world))}, {}
     spring = bodies.contact_spring(world, len(rough) - 1)
     for shape in bodies.shapes(world):
         friction = world.model.geom_friction[world.floor, 0] * (shape.id in rough)
-        properties = ProximityProperties()
+        properties = geometry.ProximityProperties()
         # two springs in a row have half the stiffness of one
-        stiffness, cone = 2.0 * spring.stiffness, CoulombFriction(friction, friction)
-        AddContactMaterial(spring.damping, stiffness, cone, properties)
+        stiffness, cone = 2.0 * spring.stiffness, multibody.CoulombFriction(friction, friction)
+        geometry.AddContactMaterial(spring.damping, stiffness, cone, properties)
         place = RigidTransform(RotationMatrix(shape.rotation), shape.position)
-        places[shape.id] = plant.RegisterCollisionGeometry(
-            links[shape.body], place, _shape(shape), str(shape.id), properties
+        ids[shape.id] = plant.RegisterCollisionGeometry(
+            links[shape.body], place, _SHAPES[shape.kind](shape.size), str(shape.id), properties
         )
-    touching, apart = bodies.touching_pairs(world), CollisionFilterDeclaration()
-    for pair in combinations(sorted(places), 2):
+    touching, excluded = bodies.touching_pairs(world), geometry.CollisionFilterDeclaration()
+    for pair in combinations(sorted(ids), 2):
         if pair not in touching:
-            apart.ExcludeBetween(*(GeometrySet(places[geom]) for geom in pair))
-    scene.collision_filter_manager().Apply(apart)
-
-
-def _shape(shape: Shape) -> DrakeShape:
-    match shape.kind:
-        case "plane":
-            return HalfSpace()
-        case "sphere":
-            return Sphere(shape.size[0])
-        case "capsule":
-            return Capsule(shape.size[0], 2.0 * shape.size[1])
-        case _:
-            return Box(*(2.0 * shape.size))
+            excluded.ExcludeBetween(*(geometry.GeometrySet(ids[geom]) for geom in pair))
+    scene.collision_filter_manager().Apply(excluded)

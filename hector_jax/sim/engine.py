@@ -1,6 +1,6 @@
-"""The physics engines as values: which there are, and what each does with jobs.
+"""The physics engines as values: their names, packages, and functions that walk jobs.
 
-An engine is chosen once, by `choose_engine`, and passed down; no other module asks which one it is.
+An engine is chosen once, by `choose_engine`, and passed down; no other module asks which it is.
 """
 
 import sys
@@ -27,28 +27,28 @@ from hector_jax.sim.walk import walk_many
 class Engine(NamedTuple):
     """A physics engine.
 
-    `walk(pool, config, robot, jobs, *, exact, batch)` gives the trajectories of the jobs in their
-    order, as they come:
+    `walk(pool, config, robot, jobs, *, exact, batch)` yields the trajectories of the jobs in their
+    order, as they are done:
 
-    - pool: worker processes, for an engine that walks on several; None walks in this one.
+    - pool: worker processes, for an engine that walks on several; None walks in this process.
     - config, robot: the controller.
-    - exact: samples of 1 ms and physics in 64 bits. Otherwise one sample per tick will do, and 32
-      bits where they are faster.
-    - batch: as many jobs as a program is compiled for at least; fewer are filled up, so that the
-      next ones need no new compilation.
+    - exact: samples of 1 ms and physics in 64 bits. Otherwise an engine may give one sample per
+      tick, and use 32 bits if that is faster.
+    - batch: least number of jobs that a program is compiled for; fewer jobs are filled up, so that
+      later calls need no new compilation.
     """
 
     name: str  # in flags, logs and cards
     title: str  # in reports
     walk: Callable[..., Iterator[Trajectory]]
     bits: Callable[[bool], int]  # of the physics, by `exact`
-    modules: tuple[str, ...] = ("sim.walk",)  # of this package, that decide its numbers
-    package: str = "mujoco"  # that it needs; the extra of its name installs it
-    differs: str = ""  # what its plants have otherwise than in MuJoCo C; nothing: the same physics
+    modules: tuple[str, ...] = ("sim.walk",)  # modules of this package that decide its numbers
+    package: str = "mujoco"  # its Python package; the extra with the engine's name installs it
+    differs: str = ""  # differences of its plants from MuJoCo C; empty: the same physics
 
     @property
     def version(self) -> str | None:
-        """Version of its package; None where that is not installed."""
+        """Version of its package; None if that is not installed."""
         try:
             return version(self.package)
         except PackageNotFoundError:
@@ -63,20 +63,18 @@ MUJOCO_C = Engine("c", "MuJoCo C", walk_many, _double)
 """MuJoCo C, one walk per process."""
 
 
-def _build_late(name: str, plant: str, job: Job, body: Robot, first: int, end: int) -> Plant:
-    """Build a plant of an engine whose package is an extra, which nothing else imports."""
-    module = import_module(f"hector_jax.sim.{name}")
-    return getattr(module, plant)(job, body, first, end)
+def _import_and_build(name: str, plant: str, job: Job, body: Robot, first: int, end: int) -> Plant:
+    """Import an optional engine's module, which nothing else imports, and build a plant of it."""
+    return getattr(import_module(f"hector_jax.sim.{name}"), plant)(job, body, first, end)
 
 
-def _extra(name: str, title: str, plant: str, package: str, differs: str) -> Engine:
-    """An engine of an extra, one walk per process; `plant` is its class in sim/NAME.py."""
-    walk = partial(walk_many, build=partial(_build_late, name, plant))
-    modules = "sim.walk", f"sim.{name}"
-    return Engine(name, title, walk, _double, modules, package, differs)
+def _optional_engine(name: str, title: str, plant: str, package: str, differs: str) -> Engine:
+    """Return an engine of an extra, one walk per process; `plant` is its class in sim/NAME.py."""
+    walk = partial(walk_many, build=partial(_import_and_build, name, plant))
+    return Engine(name, title, walk, _double, ("sim.walk", f"sim.{name}"), package, differs)
 
 
-DRAKE = _extra(
+DRAKE = _optional_engine(
     "drake",
     "Drake",
     "DrakePlant",
@@ -85,7 +83,7 @@ DRAKE = _extra(
 )
 """Drake: compliant contact, solved as a convex problem."""
 
-PINOCCHIO = _extra(
+PINOCCHIO = _optional_engine(
     "pinocchio",
     "Pinocchio",
     "PinocchioPlant",
@@ -97,7 +95,7 @@ PINOCCHIO = _extra(
 
 
 def _mjx_bits(exact: bool) -> int:
-    # on a CPU 32 bits gain nothing
+    # on a CPU 32 bits are not faster
     return 64 if exact or jax.default_backend() == "cpu" else 32
 
 
@@ -110,11 +108,11 @@ def _walk_mjx(
     exact: bool = True,
     batch: int = 0,
 ) -> Iterator[Trajectory]:
-    with redirect_stdout(sys.stderr):  # MJX takes a second to import and prints what it misses
+    with redirect_stdout(sys.stderr):  # MJX takes a second to import and prints missing packages
         from hector_jax.sim.parallel import walk_batch
 
-    filled = [*jobs, *list(jobs[-1:]) * (batch - len(jobs))]
-    walks = walk_batch(config, robot, filled, fine=exact, single=_mjx_bits(exact) == 32)
+    padded = [*jobs, *list(jobs[-1:]) * (batch - len(jobs))]
+    walks = walk_batch(config, robot, padded, fine=exact, single=_mjx_bits(exact) == 32)
     return (walk for _, walk in zip(jobs, walks, strict=False))
 
 
@@ -126,7 +124,7 @@ ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX, DRAKE, PINOCCHIO)}
 
 
 def choose_engine(name: str) -> Engine:
-    """The engine of a name; `auto` is MJX where JAX sees an accelerator, MuJoCo C elsewhere.
+    """Return the engine of a name; `auto` is MJX if JAX has an accelerator, else MuJoCo C.
 
     Raises:
         InputError: no such engine, or its package is not installed.

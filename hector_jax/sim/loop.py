@@ -2,9 +2,9 @@
 
 A walk starts with double stance under the MPC, then gait cycles in place; at t = 0 the reference is
 anchored at the true centre of mass and yaw. Per tick `plan_tick` solves the MPC, per millisecond
-`motor_torques` turns the plan into torques, the engine steps its physics and reads its
-contacts, and `sample` says what became of the robot. An engine gives its coordinates as a flat
-reading (`sensing.unpack_reading`); the continuous yaw is carried beside it.
+`motor_torques` turns the plan into torques, the engine steps its physics and reads its contacts,
+and `sample` returns the true state. An engine gives its coordinates as a flat reading
+(`sensing.unpack_reading`); the continuous yaw is passed separately.
 """
 
 from typing import NamedTuple
@@ -41,13 +41,13 @@ class Job(NamedTuple):
     start_tick: int = 0  # gait tick of t = 0: the phase at which the command starts
     push: Push = NO_PUSH
     changes: tuple[Change, ...] = ()  # of the plant
-    plant: Robot | None = None  # another model, which is walked on in place of the controller's own
+    plant: Robot | None = None  # another model that walks in place of the controller's own
 
     def body(self, robot: Robot) -> Robot:
-        """The robot whose file and standing pose the plant has; that of the controller by default.
+        """Return the robot of the plant's file and standing pose; by default the controller's.
 
         Raises:
-            InputError: its joints are not those of the controller's.
+            InputError: its joints are not those of the controller's robot.
         """
         if self.plant is None:
             return robot
@@ -55,16 +55,16 @@ class Job(NamedTuple):
         return self.plant
 
 
-def check_plant(ours: Description, theirs: Description) -> None:
-    """Check that one robot can be the plant of the controller of another.
+def check_plant(robot: Description, plant: Description) -> None:
+    """Check that a robot can be the plant of the controller of another robot.
 
     Raises:
-        InputError: its joints are others, or in another order.
+        InputError: the plant has other joints, or in another order.
     """
-    if ours.joints != theirs.joints:
+    if robot.joints != plant.joints:
         raise InputError(
-            f"{theirs.path}: joints are {', '.join(theirs.joints)}; as a plant of {ours.path} "
-            f"expected {', '.join(ours.joints)}"
+            f"{plant.path}: joints are {', '.join(plant.joints)}; as a plant of {robot.path} "
+            f"expected {', '.join(robot.joints)}"
         )
 
 
@@ -86,7 +86,7 @@ def measure(
     yaw: Float[Array, ""],
     error: Float[Array, " errors"],
 ) -> Measurement:
-    """What the controller measures: the truth and `error`; `yaw` [rad] is that shortly before."""
+    """Return the measurement, truth plus `error`; `yaw` [rad] is the true one shortly before."""
     return sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)[0]
 
 
@@ -108,15 +108,14 @@ def plan_tick(
 
     Args:
         config, robot, weights: the controller.
-        command, anchor: what to walk, and from where.
-        tick: gait tick now.
+        command, anchor: command, and where its reference starts.
+        tick: current gait tick.
         memory: of the controller.
         yaw: a true yaw [rad] shortly before.
-        reading: coordinates now.
-        error: of the state estimate now.
+        reading: current coordinates.
+        error: of the current state estimate.
         max_contacts: feet that may stand at once, from `contacts_needed` (static).
     """
-    measurement = measure(robot, reading, yaw, error)
     return step_plan(
         config,
         robot,
@@ -125,7 +124,7 @@ def plan_tick(
         anchor=anchor,
         tick=tick,
         memory=memory,
-        measurement=measurement,
+        measurement=measure(robot, reading, yaw, error),
         max_contacts=max_contacts,
     )
 
@@ -143,7 +142,7 @@ def motor_torques(
     reading: Float[Array, " reading"],
     error: Float[Array, " errors"],
 ) -> tuple[Motors, Float[Array, ""], Float[Array, " joints"]]:
-    """Motors, true yaw [rad] and the torque at the joints [N m] over the next millisecond.
+    """Return motors, true yaw [rad] and the joint torques [N m] over the next millisecond.
 
     Args:
         config, robot, legs: the controller.
@@ -152,23 +151,24 @@ def motor_torques(
         motors: of the millisecond before.
         yaw: a true yaw [rad] shortly before.
         substep: milliseconds since the plan.
-        reading: coordinates now.
-        error: of the state estimate now.
+        reading: current coordinates.
+        error: of the current state estimate.
     """
     measurement, yaw = sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)
-    now = {"substep": substep, "measurement": measurement}
-    torque = actuate(config, robot, legs, plan=plan, memory=memory, **now)
+    torque = actuate(
+        config, robot, legs, plan=plan, memory=memory, substep=substep, measurement=measurement
+    )
     motors, applied = step_actuators(robot, imperfections, motors, torque)
     return motors, yaw, applied
 
 
 def effect_of(robot: Robot, before: Float[Array, " reading"], ground: Ground) -> Wrench:
-    """The ground's wrench over a millisecond, its moments about the foot points.
+    """Return the ground's wrench over a millisecond, its moments about the foot points.
 
     Args:
-        robot: nominal body.
-        before: coordinates at its start.
-        ground: what touched over it.
+        robot: nominal robot.
+        before: coordinates at the start of the millisecond.
+        ground: contacts in the millisecond.
     """
     points = sensing.foot_points(robot, sensing.unpack_reading(before))
     return Wrench(ground.force, ground.moment - jnp.cross(points, ground.force))
@@ -186,17 +186,17 @@ def sample(
     effect: Wrench,
     touches: Touches,
 ) -> Sample:
-    """The truth about one sample.
+    """Return the true values of one sample.
 
     Args:
-        config: times.
-        robot: nominal body.
-        command, anchor: what is walked, and from where.
-        time: gait time at its end, in ticks.
+        config: the gait's tick.
+        robot: nominal robot.
+        command, anchor: command, and where its reference starts.
+        time: gait time at the end of the sample, in ticks.
         yaw: a true yaw [rad] shortly before.
-        after: coordinates at its end.
-        effect: mean wrench of the ground over it.
-        touches: what touched in it, feet on the floor apart.
+        after: coordinates at the end of the sample.
+        effect: mean wrench of the ground over the sample.
+        touches: contacts in the sample other than feet on the floor.
     """
     reading = sensing.unpack_reading(after)
     state = sensing.base_state(robot, reading, yaw)
@@ -214,7 +214,7 @@ def sample(
 def as_trajectory(
     period: Float[Array | np.ndarray, ""], initial: State, plan: Plan, samples: Sample
 ) -> Trajectory:
-    """The walk of these samples, each with the plan in force."""
+    """Return the trajectory of samples, each with the plan in force."""
     return Trajectory(
         period=period,
         initial=initial,
@@ -226,7 +226,7 @@ def as_trajectory(
 
 
 def substeps(config: WalkConfig) -> int:
-    """Milliseconds in a tick.
+    """Return the number of milliseconds in a tick.
 
     Raises:
         InputError: a tick is no whole number of milliseconds.
@@ -240,15 +240,15 @@ def substeps(config: WalkConfig) -> int:
 
 
 def first_tick(config: WalkConfig) -> int:
-    """Tick at which a walk in MuJoCo begins, standing."""
+    """Return the tick at which a simulated walk begins, standing."""
     return config.gait.first_tick - config.gait.stand
 
 
 def walk_ticks(config: WalkConfig, seconds: float, start_tick: int) -> int:
-    """Ticks of a walk from t = 0 on.
+    """Return the number of ticks of a walk from t = 0 on.
 
     Raises:
-        InputError: there are none, or t = 0 is not after the walk's first tick.
+        InputError: the number is zero, or t = 0 is not after the walk's first tick.
     """
     ticks = round(seconds / config.gait.tick)
     if ticks < 1:

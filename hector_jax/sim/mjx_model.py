@@ -1,8 +1,8 @@
-"""The plants of a batch as one MJX model, and what is read off MJX's data.
+"""The plants of a batch as one MJX model, and contacts read from MJX's data.
 
-What differs between the plants' MuJoCo models becomes batched leaves. Nothing but the feet may
-touch the floor without ending the walk, so MJX looks for contacts of the feet and between the legs
-alone, and whether anything else is in the floor is read off the geoms' poses.
+Fields that differ between the plants' MuJoCo models become batched leaves. A walk ends when parts
+other than the feet touch the floor, so MJX detects contacts of the feet and between the legs only,
+and the floor's contact with other parts is computed from the geoms' poses.
 """
 
 from collections.abc import Sequence
@@ -25,12 +25,12 @@ from hector_jax.sim import sensing
 from hector_jax.sim.sensing import Contacts
 from hector_jax.sim.world import World
 
-# Newton steps and steps of their line search: under vmap every walk takes each of them. MJX's own
-# search needs fewer than the C engine's. In 32 bits the fewer move contact forces by 2 mN in the
-# median of 4096 walks; with four and six it is 2 N.
+# Newton steps and steps of their line search: under vmap every walk takes all of them. MJX's own
+# search needs fewer than the C engine's. In 32 bits the smaller numbers change contact forces by
+# 2 mN in the median of 4096 walks; four and six steps change them by 2 N.
 STEPS, SINGLE_STEPS = (10, 10), (6, 6)
 
-# Fields of a model that a plant's numbers change.
+# Fields of a model that depend on a plant's numbers.
 _VARIED = (
     "body_inertia body_invweight0 body_ipos body_mass body_subtreemass dof_armature dof_damping "
     "dof_frictionloss dof_invweight0 dof_M0 geom_friction geom_solref jnt_range"
@@ -39,7 +39,7 @@ _VARIED = (
 
 @dataclass(frozen=True)
 class Places:
-    """Where the robot's parts are, for the compiler."""
+    """Indices of the robot's parts in the model, hashable for the compiler."""
 
     coordinates: tuple[int, ...]
     actuator: tuple[int, ...]
@@ -53,7 +53,7 @@ class Places:
 def batched_model(
     worlds: Sequence[World], single: bool = False
 ) -> tuple[mjx.Model, dict[str, np.ndarray]]:
-    """One MJX model, to be stepped in 32 bits or 64, and the leaves that may differ, stacked.
+    """Return one MJX model, to be stepped in 32 or 64 bits, and the leaves that vary, stacked.
 
     Raises:
         ValueError: the models do not have the same joints.
@@ -62,30 +62,28 @@ def batched_model(
         raise ValueError("plants of one batch must all have backlash or none")
     first = copy(worlds[0].model)
     first.opt.iterations, first.opt.ls_iterations = SINGLE_STEPS if single else STEPS
-    for geom in _falling(worlds[0]):
+    for geom in _fall_geoms(worlds[0]):
         first.geom_contype[geom] &= ~first.geom_conaffinity[worlds[0].floor]
         first.geom_conaffinity[geom] &= ~first.geom_contype[worlds[0].floor]
     varied = {name: np.stack([getattr(w.model, name) for w in worlds]) for name in _VARIED}
     return mjx.put_model(first), varied
 
 
-def _falling(world: World) -> list[int]:
-    """Geoms that collide with the floor and are of no foot."""
-    model, floor = world.model, world.floor
-    meets = (model.geom_contype[floor] & model.geom_conaffinity) | (
-        model.geom_conaffinity[floor] & model.geom_contype
-    )
+def _fall_geoms(world: World) -> list[int]:
+    """Return the geoms that collide with the floor and are of no foot."""
+    types, affinities, floor = world.model.geom_contype, world.model.geom_conaffinity, world.floor
+    meets = types[floor] & affinities | affinities[floor] & types
     return [g for g in np.flatnonzero(meets).tolist() if g != floor and world.foot_of_geom[g] < 0]
 
 
 def find_places(world: World) -> Places:
-    """Where the robot's parts are in a world.
+    """Find the robot's parts in a world.
 
     Raises:
         InputError: a geom that may touch the floor is neither box nor capsule.
     """
     kinds = {mujoco.mjtGeom.mjGEOM_BOX: [], mujoco.mjtGeom.mjGEOM_CAPSULE: []}
-    for geom in _falling(world):
+    for geom in _fall_geoms(world):
         kind = mujoco.mjtGeom(world.model.geom_type[geom])
         if kind not in kinds:
             name = world.model.geom(geom).name or f"number {geom}"
@@ -107,7 +105,7 @@ def find_places(world: World) -> Places:
 
 
 def mjx_contacts(data: mjx.Data) -> Contacts:
-    """Contacts of the last MJX step; slots whose bodies are apart have geoms -1."""
+    """Return the contacts of the last MJX step; slots whose bodies are apart have geoms -1."""
     contact = data._impl.contact
     rows = np.maximum(contact.efc_address, 0)[:, None] + np.arange(4)
     edges = data._impl.efc_force[np.minimum(rows, data._impl.efc_force.shape[0] - 1)]
@@ -121,19 +119,19 @@ def mjx_contacts(data: mjx.Data) -> Contacts:
 
 
 def in_floor(places: Places, model: mjx.Model, data: mjx.Data) -> Bool[Array, ""]:
-    """Whether a part that may not touch the floor does; poses are those of the step's start."""
+    """Return whether a part that may not touch the floor does, at the poses of the step's start."""
     boxes, capsules = np.array(places.boxes, int), np.array(places.capsules, int)
-    up = data.geom_xmat[:, 2]  # of each geom's axes, their z in the world
-    of_box = jnp.abs(up[boxes] * model.geom_size[boxes]).sum(axis=1)
-    radius, half = model.geom_size[capsules, 0], model.geom_size[capsules, 1]
-    of_capsule = radius + half * jnp.abs(up[capsules, 2])
-    both = np.concatenate([boxes, capsules])
-    lowest = data.geom_xpos[both, 2] - jnp.concatenate([of_box, of_capsule])
+    up = data.geom_xmat[:, 2]  # z of each geom's axes in the world
+    box_extent = jnp.abs(up[boxes] * model.geom_size[boxes]).sum(axis=1)
+    radius, half_length = model.geom_size[capsules, 0], model.geom_size[capsules, 1]
+    capsule_extent = radius + half_length * jnp.abs(up[capsules, 2])
+    centre = data.geom_xpos[np.concatenate([boxes, capsules]), 2]
+    lowest = centre - jnp.concatenate([box_extent, capsule_extent])
     return (lowest < data.geom_xpos[places.floor, 2]).any()
 
 
 def to_single(tree: Any) -> Any:
-    """The same in 32 bits."""
+    """Return the same tree in 32 bits."""
     narrow = {np.dtype(np.float64): np.float32, np.dtype(np.int64): np.int32}
     cast = lambda x: x.astype(narrow[x.dtype]) if x.dtype in narrow else x  # noqa: E731
     return jax.tree.map(cast, tree)

@@ -32,33 +32,33 @@ class MujocoPlant(Plant):
     ) -> None:
         """Build as a `BuildPlant` does.
 
-        `on_step` is called after each step with the world of that moment.
+        `on_step` is called after each step with the world then in force.
         """
         world = self.world = build_world(job.imperfections, body.description)
         self.data = mujoco.MjData(world.model)
         self.data.qpos[:] = standing_qpos(world, body.standing_joints, float(body.trunk_height))
         self._contacts, self._steps = sensing.empty_contacts(end - first), 0
-        self._now, self._where = first, sensing.coordinates(world)
+        self._time, self._reading_index = first, sensing.coordinates(world)
         self._place = jax.device_put((np.array(world.floor), world.foot_of_geom))
         self._worlds, self._on_step = worlds_by_step(world, job.changes, first, end), on_step
-        # views, which stay: each look-up in MjData costs half a microsecond
+        # views that remain valid: each look-up in MjData costs half a microsecond
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._push = self.data.xfrc_applied[world.trunk, :3]
         self._flat = np.zeros(len(self._qpos) + len(self._qvel) + 1)
 
     @property
     def broken(self) -> bool:
-        """Whether MuJoCo warned."""
+        """Return whether MuJoCo warned."""
         return bool(self.data.warning.number.any())
 
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
         """See `Plant`."""
-        world = self.world = self._worlds.get(self._now, self.world)
+        world = self.world = self._worlds.get(self._time, self.world)
         self._ctrl[world.actuator] = torque
         self._push[:] = push
         mujoco.mj_step(world.model, self.data)
         sensing.read_contacts(world, self.data, self._contacts, self._steps)
-        self._now, self._steps = self._now + 1, self._steps + 1
+        self._time, self._steps = self._time + 1, self._steps + 1
         if self._on_step is not None:
             self._on_step(world, self.data)
 
@@ -66,7 +66,7 @@ class MujocoPlant(Plant):
         """See `Plant`."""
         split = len(self._qpos)
         self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
-        self._flat.take(self._where, out=row, mode="clip")
+        self._flat.take(self._reading_index, out=row, mode="clip")
 
     def ground(self) -> tuple[Contacts, Array, Array]:
         """See `Plant`."""
@@ -77,5 +77,5 @@ class MujocoPlant(Plant):
     @staticmethod
     def ground_of(robot: Robot, contacts: tuple[Contacts, Array, Array]) -> Ground:
         """See `Plant`."""
-        of_one = partial(sensing.ground_of, feet=len(robot.foot_point))
-        return jax.vmap(of_one, in_axes=(0, None, None))(*contacts)
+        ground_of = partial(sensing.ground_of, feet=len(robot.foot_point))
+        return jax.vmap(ground_of, in_axes=(0, None, None))(*contacts)

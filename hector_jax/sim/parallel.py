@@ -1,9 +1,9 @@
 """The closed loop in MJX: many walks at once under one jit, for data and for accelerators.
 
 The walks of a batch differ in weights, command, start, push and plant; all plants have backlash or
-none has. A robot that falls is frozen where it was, its samples are held and marked. The state is
-known exactly here. Physics may run in 32 bits below a controller in 64: the cast stands at the door
-of `mjx.step`.
+none has. A robot that falls is frozen in its last state, which its samples repeat, marked as
+fallen. The state estimate has no errors. Physics may run in 32 bits with a controller in 64: the
+cast is at `mjx.step`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,13 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from hector_jax.control.controller import (
-    Memory,
-    Plan,
-    WalkConfig,
-    contacts_needed,
-    init_memory,
-)
+from hector_jax.control.controller import Memory, Plan, WalkConfig, contacts_needed, init_memory
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -39,14 +33,14 @@ from hector_jax.sim.mjx_model import mjx
 from hector_jax.sim.sensing import Touches
 from hector_jax.sim.world import Imperfections, Push, build_worlds, push_force, standing_qpos
 
-# On a CPU jaxlib shares a batched Cholesky out to the threads that run the program and waits for
-# them; from a batch of 64 on two cores both threads wait for each other (seen in 0.10.2).
+# On a CPU jaxlib distributes a batched Cholesky to the threads that run the program and waits for
+# them; from a batch of 64 on two cores both threads wait for each other (observed in 0.10.2).
 CPU_CHUNK, DEVICE_CHUNK = 32, 4096
 
 
 @dataclass(frozen=True)
 class _Program:
-    """What the walks of a batch are compiled for."""
+    """Static settings that the walks of a batch are compiled for."""
 
     config: WalkConfig
     places: mjx_model.Places
@@ -67,7 +61,7 @@ class _Program:
 
 
 class WalkBatch(NamedTuple):
-    """What differs between the walks of a batch."""
+    """Inputs that differ between the walks of a batch."""
 
     weights: Weights
     command: Command
@@ -78,17 +72,17 @@ class WalkBatch(NamedTuple):
 
 
 class _Walk(NamedTuple):
-    """One walk, and the plant that it is walked on."""
+    """Constants of one walk and its plant."""
 
     robot: Robot
     job: WalkBatch  # of one walk
     model: mjx.Model
-    data: mjx.Data  # filled in at each step
-    error: Float[Array, " errors"]  # of the state estimate: none
+    data: mjx.Data  # its state is set at each step
+    error: Float[Array, " errors"]  # of the state estimate: zero
 
 
 class _Physics(NamedTuple):
-    """What MJX carries from one millisecond to the next."""
+    """State of MJX from one millisecond to the next."""
 
     qpos: Float[Array, " nq"]
     qvel: Float[Array, " nv"]
@@ -96,7 +90,7 @@ class _Physics(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """One walk between two milliseconds."""
+    """State of one walk between two milliseconds."""
 
     memory: Memory
     plan: Plan
@@ -105,13 +99,13 @@ class _Carry(NamedTuple):
     yaw: Float[Array, ""]
     physics: _Physics
     fallen: Bool[Array, ""]
-    effect: Wrench  # summed over the sample so far
-    legs: Bool[Array, ""]  # touched in the sample so far
+    effect: Wrench  # summed over the current sample
+    legs: Bool[Array, ""]  # legs touched in the current sample
     last: Sample
 
 
 def _read(program: _Program, walk: _Walk, physics: _Physics) -> Float[Array, " reading"]:
-    """Flat reading in the precision of the controller."""
+    """Return the flat reading in the precision of the controller."""
     flat = jnp.concatenate([physics.qpos, physics.qvel, jnp.zeros(1, physics.qpos.dtype)])
     return flat[np.array(program.places.coordinates)].astype(walk.error.dtype)
 
@@ -124,7 +118,7 @@ def _step_physics(
     torque: Float[Array, " joints"],
     force: Float[Array, "3"],
 ) -> tuple[_Physics, mjx.Data]:
-    """One millisecond of MJX under joint torques [N m] and a force [N] on the trunk."""
+    """Step MJX by a millisecond under joint torques [N m] and a force [N] on the trunk."""
     data, places = walk.data, program.places
     torque, force = torque.astype(data.ctrl.dtype), force.astype(data.ctrl.dtype)
     data = data.replace(
@@ -140,28 +134,28 @@ def _step_physics(
 
 
 def _millisecond(
-    program: _Program, walk: _Walk, carry: _Carry, when: tuple[Array, Array]
+    program: _Program, walk: _Walk, carry: _Carry, clock: tuple[Array, Array]
 ) -> tuple[_Carry, None]:
-    tick, substep = when
+    tick, substep = clock
     robot, job, places = walk.robot, walk.job, program.places
     before = _read(program, walk, carry.physics)
     legs = program.config.parameters(job.weights).legs
-    held = carry.memory, carry.plan, carry.motors, carry.yaw
+    state = carry.memory, carry.plan, carry.motors, carry.yaw
     motors, yaw, torque = loop.motor_torques(
-        program.config, robot, legs, job.plant, *held, substep, before, walk.error
+        program.config, robot, legs, job.plant, *state, substep, before, walk.error
     )
     force = push_force(job.push, (tick - job.start_tick) * program.substeps + substep)
     physics, data = _step_physics(program, walk, carry.physics, torque=torque, force=force)
-    wide = lambda x: x.astype(before.dtype) if x.dtype == data.qpos.dtype else x  # noqa: E731
-    contacts = jax.tree.map(wide, mjx_model.mjx_contacts(data))
-    place = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
-    ground = sensing.ground_of(contacts, *place, len(robot.foot_point))
+    widen = lambda x: x.astype(before.dtype) if x.dtype == data.qpos.dtype else x  # noqa: E731
+    contacts = jax.tree.map(widen, mjx_model.mjx_contacts(data))
+    floor, foot_of_geom = jnp.asarray(places.floor), jnp.asarray(places.foot_of_geom)
+    ground = sensing.ground_of(contacts, floor, foot_of_geom, len(robot.foot_point))
     effect, touches = loop.effect_of(robot, before, ground), ground.touches
     reading = sensing.unpack_reading(_read(program, walk, physics))
-    down = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
-    fallen = carry.fallen | down | touches.floor | mjx_model.in_floor(places, walk.model, data)
-    moved = carry._replace(physics=physics, motors=motors, yaw=yaw)
-    return where(fallen, carry, moved)._replace(
+    fell = has_fallen(sensing.base_state(robot, reading, yaw), *robot.description.limits)
+    fallen = carry.fallen | fell | touches.floor | mjx_model.in_floor(places, walk.model, data)
+    stepped = carry._replace(physics=physics, motors=motors, yaw=yaw)
+    return where(fallen, carry, stepped)._replace(
         fallen=fallen,
         effect=jax.tree.map(jnp.add, carry.effect, effect),
         legs=carry.legs | touches.legs,
@@ -169,18 +163,19 @@ def _millisecond(
 
 
 def _sample(
-    program: _Program, walk: _Walk, carry: _Carry, when: tuple[Array, Array]
+    program: _Program, walk: _Walk, carry: _Carry, clock: tuple[Array, Array]
 ) -> tuple[_Carry, Sample]:
-    none = zero_wrench(len(walk.robot.foot_point))
-    carry = carry._replace(effect=none, legs=jnp.zeros((), bool))
-    carry, _ = jax.lax.scan(partial(_millisecond, program, walk), carry, when)
-    time = when[0][-1] + (when[1][-1] + 1) / program.substeps
+    no_effect = zero_wrench(len(walk.robot.foot_point))
+    carry = carry._replace(effect=no_effect, legs=jnp.zeros((), bool))
+    carry, _ = jax.lax.scan(partial(_millisecond, program, walk), carry, clock)
+    tick, substep = clock
+    time = tick[-1] + (substep[-1] + 1) / program.substeps
     after = _read(program, walk, carry.physics)
-    truth = walk.robot, walk.job.command, carry.anchor, time, carry.yaw, after
+    inputs = walk.robot, walk.job.command, carry.anchor, time, carry.yaw, after
     effect = jax.tree.map(lambda w: w / program.period, carry.effect)
     touches = Touches(carry.fallen, carry.legs)
-    now = loop.sample(program.config, *truth, effect=effect, touches=touches)
-    carry = carry._replace(last=where(carry.fallen, carry.last, now))
+    sample = loop.sample(program.config, *inputs, effect=effect, touches=touches)
+    carry = carry._replace(last=where(carry.fallen, carry.last, sample))
     return carry, carry.last._replace(fallen=carry.fallen)
 
 
@@ -198,38 +193,34 @@ def _tick(
     program: _Program, walk: _Walk, carry: _Carry, tick: Int[Array, ""]
 ) -> tuple[_Carry, tuple[Plan, Sample]]:
     config, start_tick, count = program.config, walk.job.start_tick, program.substeps
-    moves = config.gait.first_tick
+    first_step = config.gait.first_tick
     anchor = anchor_at(walk.robot, carry.last.state, start_tick)
     carry = carry._replace(anchor=where(tick == start_tick, anchor, carry.anchor))
-    standing, walking = (
-        partial(_plan, program, walk, tick, max_contacts=contacts_needed(config, when))
-        for when in (moves - 1, moves)
-    )
-    if contacts_needed(config, moves) == contacts_needed(config, moves - 1):
-        memory, plan = standing(carry)
+    contacts = [contacts_needed(config, t) for t in (first_step - 1, first_step)]
+    stand, step = (partial(_plan, program, walk, tick, max_contacts=n) for n in contacts)
+    if contacts[0] == contacts[1]:
+        memory, plan = stand(carry)
     else:
-        memory, plan = jax.lax.cond(tick < moves, standing, walking, carry)
+        memory, plan = jax.lax.cond(tick < first_step, stand, step, carry)
     carry = where(carry.fallen, carry, carry._replace(memory=memory, plan=plan))
-    when = jnp.full(count, tick), jnp.arange(count)
-    when = jax.tree.map(lambda x: x.reshape(-1, program.period), when)
-    carry, samples = jax.lax.scan(partial(_sample, program, walk), carry, when)
+    clock = jnp.full(count, tick), jnp.arange(count)
+    clock = jax.tree.map(lambda x: x.reshape(-1, program.period), clock)
+    carry, samples = jax.lax.scan(partial(_sample, program, walk), carry, clock)
     return carry, (carry.plan, samples)
 
 
-def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
-    """A robot that stands at the walk's first tick, before its first plan."""
+def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
+    """Return the state of a robot that stands at the walk's first tick, before its first plan."""
     robot, job, config = walk.robot, walk.job, program.config
-    yaw, never, tick = jnp.zeros(()), jnp.zeros((), bool), jnp.asarray(first_tick(config))
-    reading = _read(program, walk, physics)
+    yaw, false, tick = jnp.zeros(()), jnp.zeros((), bool), jnp.asarray(first_tick(config))
+    reading, effect = _read(program, walk, physics), zero_wrench(len(robot.foot_point))
     anchor = standing_anchor(robot)._replace(tick=job.start_tick)
     memory = init_memory(robot, loop.measure(robot, reading, yaw, walk.error))
     inputs = anchor, tick, memory, yaw, reading, walk.error
-    feet = len(robot.foot_point)
     plan = partial(loop.plan_tick, config, robot, job.weights, job.command, *inputs)
-    shapes = jax.eval_shape(lambda: plan(max_contacts=feet)[1])
-    truth = robot, job.command, anchor, 1.0 * tick, yaw, reading
-    touches = Touches(never, never)
-    now = loop.sample(config, *truth, effect=zero_wrench(feet), touches=touches)
+    shapes = jax.eval_shape(lambda: plan(max_contacts=len(robot.foot_point))[1])
+    inputs = robot, job.command, anchor, 1.0 * tick, yaw, reading
+    sample = loop.sample(config, *inputs, effect=effect, touches=Touches(false, false))
     return _Carry(
         memory=memory,
         plan=jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
@@ -237,10 +228,10 @@ def _standing(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
         anchor=anchor,
         yaw=yaw,
         physics=mjx_model.to_single(physics) if program.single else physics,
-        fallen=never,
-        effect=zero_wrench(feet),
-        legs=never,
-        last=now,
+        fallen=false,
+        effect=effect,
+        legs=false,
+        last=sample,
     )
 
 
@@ -252,18 +243,18 @@ def _walk_one(
     if program.single:
         model, data = mjx_model.to_single((model, data))
     walk = _Walk(robot, job, model, data, error=sensing.no_error(robot))
-    carry = _standing(program, walk, _Physics(qpos, jnp.zeros(model.nv), jnp.zeros(model.nv)))
-    begin, each = first_tick(program.config), program.substeps // program.period
+    carry = _init_carry(program, walk, _Physics(qpos, jnp.zeros(model.nv), jnp.zeros(model.nv)))
+    begin, rate = first_tick(program.config), program.substeps // program.period
     ticks = jnp.arange(begin, program.last_start + program.ticks)
     _, (plans, samples) = jax.lax.scan(partial(_tick, program, walk), carry, ticks)
 
-    # Each walk's own part, from its t = 0 on.
-    lead = (job.start_tick - begin) * each
-    plans = jax.tree.map(lambda x: jnp.repeat(x, each, axis=0), plans)
+    # The part of this walk from its t = 0 on; `rate` is the number of samples in a tick.
+    lead = (job.start_tick - begin) * rate
+    plans = jax.tree.map(lambda x: jnp.repeat(x, rate, axis=0), plans)
     samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     initial = jax.tree.map(lambda x: x[lead - 1], samples.state)
-    own = partial(jax.lax.dynamic_slice_in_dim, start_index=lead, slice_size=program.ticks * each)
-    plans, samples = jax.tree.map(own, (plans, samples))
+    cut = partial(jax.lax.dynamic_slice_in_dim, start_index=lead, slice_size=program.ticks * rate)
+    plans, samples = jax.tree.map(cut, (plans, samples))
     return loop.as_trajectory(jnp.asarray(TIME_STEP * program.period), initial, plans, samples)
 
 
@@ -292,14 +283,14 @@ def _check_batch(jobs: Sequence[Job]) -> None:
 
 
 def _in_chunks(jobs: WalkBatch, chunk: int, walk: Any) -> Iterator[Trajectory]:
-    """Walks by chunks of one size, the last one filled up."""
+    """Yield the walks, computed in chunks of one size, the last chunk filled up."""
     count = len(jobs.start_tick)
     size = ceil(count / ceil(count / chunk))
     for first in range(0, count, size):
         rows = np.minimum(np.arange(first, first + size), count - 1)
-        done = jax.device_get(walk(jax.tree.map(lambda x, rows=rows: x[rows], jobs)))
+        walks = jax.device_get(walk(jax.tree.map(lambda x, rows=rows: x[rows], jobs)))
         for i in range(min(size, count - first)):
-            yield jax.tree.map(lambda x, i=i: x[i], done)
+            yield jax.tree.map(lambda x, i=i: x[i], walks)
 
 
 def walk_batch(
@@ -315,8 +306,8 @@ def walk_batch(
 
     Args:
         config: the controller.
-        robot: its nominal body; the plants are its MJCF, or that of the jobs.
-        jobs: what to walk, all of one length; plants that do not change, without errors of the
+        robot: its nominal robot; the plants are its MJCF, or that of the jobs.
+        jobs: walks of one length, on plants that do not change, without errors of the
             estimator.
         chunk: walks at once, at most; by default 32 on a CPU and 4096 elsewhere.
         fine: samples of 1 ms; by default one per tick, its effect the mean over the tick.
@@ -329,8 +320,8 @@ def walk_batch(
         InputError: the joints of the jobs' plant are not those of the robot, or a plant changes or
             has errors of the estimator.
         ValueError: the jobs differ in their plant's model, in length, in the pieces of their
-            commands, in the number of their pushes or in their joints, or a number of one is out of
-            its range; or a geom that may touch the floor has a shape unknown here.
+            commands, in the number of their pushes or in their joints, or a number of a plant is
+            out of its range; or a geom that may touch the floor has an unsupported shape.
     """
     if chunk is None:
         chunk = CPU_CHUNK if jax.default_backend() == "cpu" else DEVICE_CHUNK
@@ -354,8 +345,6 @@ def walk_batch(
         start_tick=jnp.asarray(starts),
         model=varied,
     )
-    program = _Program(
-        config, mjx_model.find_places(worlds[0]), int(starts.max()), ticks, fine, single
-    )
-    walk = partial(_walk_all, program, robot, model, qpos)
-    return _in_chunks(batch, chunk, walk)
+    places = mjx_model.find_places(worlds[0])
+    program = _Program(config, places, int(starts.max()), ticks, fine, single)
+    return _in_chunks(batch, chunk, partial(_walk_all, program, robot, model, qpos))

@@ -2,9 +2,9 @@
 """A plant in Pinocchio: rigid contact with Coulomb's law (the extra `pinocchio`).
 
 Dynamics and contact solver are Pinocchio's, the time stepping is Moreau's: the velocities at the
-end of a step follow from impulses that keep the soles' points out of the floor. The floor does
-not give way, and friction is Coulomb's cone itself, not a convex relaxation of it. Legs that touch
-are told of and pass through each other.
+end of a step follow from impulses that keep the soles' points out of the floor. The floor is
+rigid, and friction is Coulomb's cone itself, not a convex relaxation of it. Legs that touch are
+reported and pass through each other.
 """
 
 import coal
@@ -15,19 +15,25 @@ from jaxtyping import Float
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
-from hector_jax.sim.bodies import Body, Shape
+from hector_jax.sim.bodies import Body
 from hector_jax.sim.loop import Job
 from hector_jax.sim.plant import LEGS, OTHER, Plant, PointContacts, lasting_world
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import STOP_TIME, World, standing_qpos
 
-_NEAR = 1e-3  # [m] above the floor from where on a point may touch within the step
-_BEND = 0.1  # of a backlash, by which the largest torque bends the gear's teeth
-_CLOSE = 1e-9  # [m/s], of the contact solver
-# shares of the mean diagonal that are added, as four points of a flat sole have no one answer; the
-# larger ones where the solver does not end with a smaller one
-_SOFT = 1e-6, 1e-3, 1e-2
-_FAR = 1e-4  # [m/s], its residual from which on a step counts as failed
+_NEAR = 1e-3  # [m] height above the floor below which a point may touch within the step
+_BEND = 0.1  # share of the backlash by which the largest torque bends the gear's teeth
+_TOLERANCE = 1e-9  # [m/s], of the contact solver
+# shares of the mean diagonal that are added, as impulses at four points of a flat sole are not
+# unique; the larger shares are tried if the solver does not end with a smaller one
+_REGULARISATION = 1e-6, 1e-3, 1e-2
+_MAX_RESIDUAL = 1e-4  # [m/s], of the solver, above which a step counts as failed
+_SHAPES = {
+    "plane": lambda size: coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0),
+    "sphere": lambda size: coal.Sphere(size[0]),
+    "capsule": lambda size: coal.Capsule(size[0], 2.0 * size[1]),
+    "box": lambda size: coal.Box(*(2.0 * size)),
+}
 
 
 class PinocchioPlant(Plant):
@@ -38,15 +44,17 @@ class PinocchioPlant(Plant):
         world = lasting_world("pinocchio", job, body, first, end)
         robot = bodies.bodies(world)
         self.model, joint_of = _model(robot, world)
-        self.data, self.failed = self.model.createData(), False
-        hinges = [hinge for one in robot for hinge in one.hinges]
-        at = {h.dof: self.model.idx_vs[self.model.getJointId(h.name)] for h in hinges}
-        self._motors = np.array([at[dof] for dof in world.joint_dof])
-        self._slack = np.array([at[world.model.jnt_dofadr[j]] for j in world.slack], int)
-        self.order = np.array([at[hinge.dof] for hinge in hinges])
+        hinges = [hinge for part in robot for hinge in part.hinges]
+        index = {h.dof: self.model.idx_vs[self.model.getJointId(h.name)] for h in hinges}
+        self._motors = np.array([index[dof] for dof in world.joint_dof])
+        self._slack = np.array([index[world.model.jnt_dofadr[j]] for j in world.slack], int)
+        self.order = np.array([index[hinge.dof] for hinge in hinges])
         self._friction, self._stiction = bodies.dry_friction(hinges)
-        self._damping = np.zeros(self.model.nv)
+        armature, self._damping = np.zeros((2, self.model.nv))
+        armature[self.order] = [hinge.armature for hinge in hinges]
         self._damping[self.order] = [hinge.damping for hinge in hinges]
+        self.model.armature = armature
+        self.data, self.failed = self.model.createData(), False
         width = float(job.imperfections.backlash)
         self._width, self._teeth = width, np.asarray(body.torque_limit) / (_BEND * (width or 1.0))
         self._com, self._trunk = world.model.body_ipos[world.trunk], joint_of[world.trunk]
@@ -63,7 +71,7 @@ class PinocchioPlant(Plant):
 
     @property
     def broken(self) -> bool:
-        """Whether the contact solver failed, or the state is no number."""
+        """Return whether the contact solver failed, or the state is not finite."""
         return self.failed or not np.isfinite(self.v).all()
 
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
@@ -71,12 +79,11 @@ class PinocchioPlant(Plant):
         if self.broken:
             self._contacts.end_step()
             return
-        model, data, q, v = self.model, self.data, self.q, self.v
-        pin.computeAllTerms(model, data, q, v)  # mass matrix, nonlinear effects, Jacobians
+        model, data, v = self.model, self.data, self.v
+        pin.computeAllTerms(model, data, self.q, v)  # mass matrix, nonlinear effects, Jacobians
         A = np.triu(data.M) + np.triu(data.M, 1).T  # the lower half is not filled in
         force = -data.nle - self._damping * v
-        rates = v[self.order]
-        force[self.order] -= self._friction * np.tanh(rates / self._stiction)
+        force[self.order] -= self._friction * np.tanh(v[self.order] / self._stiction)
         force[self._motors] += torque
         if push.any():
             R = data.oMi[self._trunk].rotation
@@ -88,29 +95,27 @@ class PinocchioPlant(Plant):
         A[np.diag_indices_from(A)] += TIME_STEP * stiff
         self.v = v + np.linalg.solve(A, TIME_STEP * force)
         self._add_impulses(A)
-        self.q = pin.integrate(model, q, TIME_STEP * self.v)
+        self.q = pin.integrate(model, self.q, TIME_STEP * self.v)
         self._others.note(model, data, self._contacts)
         self._contacts.end_step()
 
     def _add_stops(self, force: Float[np.ndarray, " nv"], stiff: Float[np.ndarray, " nv"]) -> None:
-        """Teeth at the ends of the backlash, springs and dampers that are linear over the step."""
+        """Add teeth at the ends of the backlash, springs and dampers linear over the step."""
         gap = self.q[self._slack + 1]
         over = gap - np.clip(gap, -self._width, self._width)
-        on, teeth = over != 0.0, self._teeth
-        slope = on * teeth * STOP_TIME  # of damper and spring over a step together
-        force[self._slack] -= teeth * over + slope * self.v[self._slack]
+        slope = (over != 0.0) * self._teeth * STOP_TIME  # damper and spring over a step together
+        force[self._slack] -= self._teeth * over + slope * self.v[self._slack]
         stiff[self._slack] += slope
 
     def _add_impulses(self, A: Float[np.ndarray, "nv nv"]) -> None:
-        """Impulses at the points that would sink in."""
+        """Add impulses at the points that would sink in."""
         feet, points, J = self._soles.near(self.model, self.data)
         if not len(points):
             return
-        height = points[:, 2]
         inverse = np.linalg.solve(A, J.T)
-        aim = (J @ self.v).reshape(-1, 3)
-        aim[:, 2] += height / TIME_STEP  # at most down to the floor, and out of it at once
-        impulse, self.failed = self._soles.solve(J @ inverse, aim.ravel())
+        free = (J @ self.v).reshape(-1, 3)
+        free[:, 2] += points[:, 2] / TIME_STEP  # at most down to the floor, and out of it at once
+        impulse, self.failed = self._soles.solve(J @ inverse, free.ravel())
         self.v = self.v + inverse @ impulse
         forces = impulse.reshape(-1, 3) / TIME_STEP
         for foot, force, point in zip(feet, forces, points, strict=True):
@@ -132,10 +137,9 @@ class PinocchioPlant(Plant):
 
 
 def _model(robot: list[Body], world: World) -> tuple[pin.Model, dict[int, int]]:
-    """Pinocchio's model, and its joint of each body of MuJoCo's."""
+    """Return Pinocchio's model without armature, and its joint for each body of MuJoCo's."""
     model, joint_of = pin.Model(), {0: 0}
     model.gravity.linear = np.array(world.model.opt.gravity)
-    armature = {}
     for body in robot:
         joint, place = joint_of[body.parent], pin.SE3(body.rotation, body.position)
         if not body.hinges:
@@ -144,14 +148,9 @@ def _model(robot: list[Body], world: World) -> tuple[pin.Model, dict[int, int]]:
         for hinge in body.hinges:
             turn = pin.JointModelRevoluteUnaligned(np.array(hinge.axis))
             joint, place = model.addJoint(joint, turn, place, hinge.name), pin.SE3.Identity()
-            armature[joint] = hinge.armature
         inertia = pin.Inertia(body.mass, np.array(body.com), body.inertia)
         model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
         joint_of[body.id] = joint
-    rotors = np.zeros(model.nv)
-    for joint, value in armature.items():
-        rotors[model.idx_vs[joint]] = value
-    model.armature = rotors
     return model, joint_of
 
 
@@ -160,13 +159,13 @@ class _Soles:
 
     def __init__(self, world: World, model: pin.Model, joint_of: dict[int, int]) -> None:
         spheres = bodies.soles(world)
-        self._joints = [joint_of[one.body] for one in spheres]
-        self._centres = np.array([one.position for one in spheres])
-        self._radii = np.array([one.size[0] for one in spheres])
-        self._foot = world.foot_of_geom[[one.id for one in spheres]]
+        self._joints = [joint_of[sphere.body] for sphere in spheres]
+        self._centres = np.array([sphere.position for sphere in spheres])
+        self._radii = np.array([sphere.size[0] for sphere in spheres])
+        self._foot = world.foot_of_geom[[sphere.id for sphere in spheres]]
         self._solver, self._settings = pin.ADMMConstraintSolver(), pin.ADMMSolverSettings()
-        self._settings.absolute_feasibility_tol = _CLOSE
-        self._settings.absolute_complementarity_tol = _CLOSE
+        self._settings.absolute_feasibility_tol = _TOLERANCE
+        self._settings.absolute_complementarity_tol = _TOLERANCE
         self._settings.admm_update_rule = pin.ADMMUpdateRule.SPECTRAL  # the default cycles at times
         friction = float(world.model.geom_friction[world.floor, 0])
         self._cones = [_cones(model, count, friction) for count in range(len(spheres) + 1)]
@@ -174,86 +173,72 @@ class _Soles:
     def near(
         self, model: pin.Model, data: pin.Data
     ) -> tuple[list[int], Float[np.ndarray, "n 3"], Float[np.ndarray, "m nv"]]:
-        """Feet of the points near the floor, these [m], and their Jacobian in the world's frame."""
+        """Return feet and positions [m] of the points near the floor, and their world Jacobian."""
         places = [data.oMi[joint] for joint in self._joints]
-        centres = np.array([at.act(c) for at, c in zip(places, self._centres, strict=True)])
+        centres = np.array([place.act(c) for place, c in zip(places, self._centres, strict=True)])
         points = centres - np.outer(self._radii, [0.0, 0.0, 1.0])
         rows = np.flatnonzero(points[:, 2] < _NEAR)
         J = np.zeros((len(rows), 3, model.nv))
         for row, i in enumerate(rows):
-            frame = pin.getJointJacobian(
-                model, data, self._joints[i], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-            )
-            J[row] = frame[:3] - pin.skew(points[i] - places[i].translation) @ frame[3:]
+            J_joint = pin.getJointJacobian(model, data, self._joints[i], pin.LOCAL_WORLD_ALIGNED)
+            J[row] = J_joint[:3] - pin.skew(points[i] - places[i].translation) @ J_joint[3:]
         return self._foot[rows].tolist(), points[rows], J.reshape(-1, model.nv)
 
     def solve(
         self, G: Float[np.ndarray, "m m"], free: Float[np.ndarray, " m"]
     ) -> tuple[Float[np.ndarray, " m"], bool]:
-        """Impulses [N s] that satisfy Signorini's and Coulomb's laws; whether the solver failed.
+        """Solve Signorini's and Coulomb's laws for impulses [N s]; return whether that failed too.
 
         Args:
-            G: velocities of the points for impulses at them.
+            G: Delassus matrix, velocities of the points per unit impulse at them [1/kg].
             free: velocities without impulses [m/s].
         """
         cones, mean = self._cones[len(free) // 3], np.trace(G) / len(G)
         result = pin.ADMMSolverResult()
-        for share in _SOFT:
+        for share in _REGULARISATION:
             delassus = pin.DelassusOperatorDense(G + share * mean * np.eye(len(G)))
             result.reset()
             if self._solver.solve(delassus, free, *cones, self._settings, result):
                 break
         residual = max(result.primal_feasibility, result.dual_feasibility, result.complementarity)
-        return np.array(result.retrieveConstraintImpulses()), not residual < _FAR
+        return np.array(result.retrieveConstraintImpulses()), not residual < _MAX_RESIDUAL
 
 
 def _cones(
     model: pin.Model, count: int, friction: float
 ) -> tuple[pin.StdVec_ConstraintModel, pin.StdVec_ConstraintData]:
-    """Friction cones about the world's z axis, for so many points."""
+    """Return friction cones about the world's z axis, for `count` points."""
     models, datas = pin.StdVec_ConstraintModel(), pin.StdVec_ConstraintData()
     for _ in range(count):
-        one = pin.PointContactConstraintModel(model, 1)
-        one.setFriction(friction)
-        models.append(pin.ConstraintModel(one))
-        datas.append(pin.ConstraintModel(one).createData())
+        contact = pin.PointContactConstraintModel(model, 1)
+        contact.setFriction(friction)
+        models.append(pin.ConstraintModel(contact))
+        datas.append(pin.ConstraintModel(contact).createData())
     return models, datas
 
 
 class _Others:
-    """What touches beside the soles and the floor: looked for, without forces."""
+    """Contacts other than those of soles and floor: detected, without forces."""
 
     def __init__(self, world: World, model: pin.Model, joint_of: dict[int, int]) -> None:
-        self._geometry, shapes, index = pin.GeometryModel(), bodies.shapes(world), {}
-        soles = {one.id for one in bodies.soles(world)}
-        for shape in shapes:
-            place = pin.SE3(shape.rotation, shape.position)
-            one = pin.GeometryObject(str(shape.id), joint_of[shape.body], place, _shape(shape))
-            index[shape.id] = self._geometry.addGeometryObject(one)
+        self._geometry, index = pin.GeometryModel(), {}
+        soles = {sole.id for sole in bodies.soles(world)}
+        for shape in bodies.shapes(world):
+            place, solid = pin.SE3(shape.rotation, shape.position), _SHAPES[shape.kind](shape.size)
+            geometry = pin.GeometryObject(str(shape.id), joint_of[shape.body], place, solid)
+            index[shape.id] = self._geometry.addGeometryObject(geometry)
         self._kinds = []
         for pair in sorted(bodies.touching_pairs(world)):
             if not (world.floor in pair and soles & set(pair)):
                 self._geometry.addCollisionPair(pin.CollisionPair(*(index[i] for i in pair)))
                 self._kinds.append(OTHER if world.floor in pair else LEGS)
-        self._found = self._geometry.createData()
+        self._data = self._geometry.createData()
 
     def note(self, model: pin.Model, data: pin.Data, contacts: PointContacts) -> None:
-        """Note what touches, at the poses of `data`."""
-        pin.updateGeometryPlacements(model, data, self._geometry, self._found)
-        if pin.computeCollisions(self._geometry, self._found, True):
-            pin.computeCollisions(self._geometry, self._found, False)
-            for kind, result in zip(self._kinds, self._found.collisionResults, strict=True):
+        """Note the collisions at the poses of `data`."""
+        pin.updateGeometryPlacements(model, data, self._geometry, self._data)
+        if pin.computeCollisions(self._geometry, self._data, True):
+            pin.computeCollisions(self._geometry, self._data, False)
+            for kind, result in zip(self._kinds, self._data.collisionResults, strict=True):
                 if result.isCollision():
                     contacts.note(kind, np.zeros(3), np.zeros(3))
-
-
-def _shape(shape: Shape) -> coal.CollisionGeometry:
-    match shape.kind:
-        case "plane":
-            return coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
-        case "sphere":
-            return coal.Sphere(shape.size[0])
-        case "capsule":
-            return coal.Capsule(shape.size[0], 2.0 * shape.size[1])
-        case _:
-            return coal.Box(*(2.0 * shape.size))

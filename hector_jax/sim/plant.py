@@ -1,6 +1,6 @@
-"""What the closed loop needs of a physics engine: a plant that stands, steps and is read.
+"""Interface of the closed loop to a physics engine: a plant that stands, steps and is read.
 
-Whatever speaks an engine's own language (geoms, solvers, contact models) stays behind it.
+Details of an engine (geoms, solvers, contact models) stay behind it.
 """
 
 from abc import ABC, abstractmethod
@@ -24,7 +24,7 @@ class Plant(ABC):
     @property
     @abstractmethod
     def broken(self) -> bool:
-        """Whether the engine warned or failed: what follows means nothing."""
+        """Return whether the engine warned or failed: later samples are invalid."""
 
     @abstractmethod
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
@@ -32,39 +32,39 @@ class Plant(ABC):
 
     @abstractmethod
     def read(self, row: Float[np.ndarray, " reading"]) -> None:
-        """Write the coordinates now, in the order of `sensing.Reading`, into `row`."""
+        """Write the current coordinates, in the order of `sensing.Reading`, into `row`."""
 
     @abstractmethod
     def ground(self) -> Any:
-        """Contacts of each of the n milliseconds since the last call, as `ground_of` takes them."""
+        """Return the contacts of the n milliseconds since the last call, for `ground_of`."""
 
     @staticmethod
     def ground_of(robot: Robot, contacts: Any) -> Ground:
-        """Sum up the contacts that `ground` returned, in JAX, as a Ground with a leading axis n.
+        """Sum the contacts that `ground` returned, in JAX, to a Ground with a leading axis n.
 
         The closed loop calls it within its compiled program of a tick: with a compiled call of its
-        own, walks in MuJoCo C take 7 to 9 % longer. By default `ground` has summed them up already.
+        own, walks in MuJoCo C take 7 to 9 % longer. By default `ground` has summed them already.
         """
         return contacts
 
 
 BuildPlant = Callable[[Job, Robot, int, int], Plant]
-"""Makes the plant of a job.
+"""Function that builds the plant of a job.
 
 It takes the job, the robot of the plant (`Job.body`), which stands at the origin, and the
-milliseconds after t = 0 at which the walk begins and ends. It raises an InputError where the engine
-cannot have such a plant.
+milliseconds after t = 0 at which the walk begins and ends. It raises an InputError if the engine
+does not support such a plant.
 """
 
 
-OTHER, LEGS = -1, -2  # in the place of a foot: another part on the floor; a leg on another
+OTHER, LEGS = -1, -2  # instead of a foot: another part on the floor; one leg on another
 
 
 class PointContacts:
-    """Forces at points, noted step by step and summed up into a `Ground`."""
+    """Forces at points, noted step by step and summed to a `Ground`."""
 
     def __init__(self, feet: int) -> None:
-        """Of a robot with so many feet."""
+        """Start without contacts, for a robot with `feet` feet."""
         self._feet, self._steps = feet, 0
         self._rows: list[tuple[float, ...]] = []
 
@@ -73,24 +73,24 @@ class PointContacts:
         self._rows.append((self._steps, foot, *force, *point))
 
     def end_step(self) -> None:
-        """What follows is of the next step."""
+        """Begin the next step."""
         self._steps += 1
 
     def ground(self) -> Ground:
-        """Return the sums of each step, and begin anew."""
+        """Return the sums of each step, and clear them."""
         rows, steps = np.array(self._rows).reshape(-1, 8), self._steps
         self._rows, self._steps = [], 0
         step, foot = rows[:, :2].astype(int).T
         other, legs = (np.isin(np.arange(steps), step[foot == kind]) for kind in (OTHER, LEGS))
         force, moment = np.zeros((2, steps, self._feet, 3))
-        rows, where = rows[foot >= 0], (step[foot >= 0], foot[foot >= 0])
-        np.add.at(force, where, rows[:, 2:5])
-        np.add.at(moment, where, np.cross(rows[:, 5:], rows[:, 2:5]))
+        rows, index = rows[foot >= 0], (step[foot >= 0], foot[foot >= 0])
+        np.add.at(force, index, rows[:, 2:5])
+        np.add.at(moment, index, np.cross(rows[:, 5:], rows[:, 2:5]))
         return Ground(force, moment, Touches(other, legs))
 
 
 def lasting_world(engine: str, job: Job, body: Robot, first: int, end: int) -> World:
-    """The world of a walk for an engine whose plants do not change on the way.
+    """Return the world of a walk for an engine whose plants cannot change during it.
 
     Raises:
         InputError: a change begins or ends within the walk, or a number of it is out of its range.

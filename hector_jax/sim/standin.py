@@ -1,8 +1,8 @@
-"""The stand-in for hardware: families of plants, one per seed, that only verdicts may walk.
+"""The stand-in for hardware: families of plants, one plant per seed, for verdicts only.
 
 No collection, training, tuning, search or choice reads this module; tests/test_architecture.py
-holds that. The plants differ from the hfs in strength and in kind (masses, ground, an estimator
-that errs and drifts), so that a map learned on the hfs is not tested on its own simulator. Seeds
+checks that. The plants differ from the hfs in strength and in kind (masses, ground, an estimator
+with noise and drift), so that a map learned on the hfs is not tested on its own simulator. Seeds
 0-31 are for development, 1000-1031 for the final verdict.
 
 There are two families. `standin` draws masses of 0.95 to 1.08 times the nominal ones, so most of
@@ -16,21 +16,21 @@ from hector_jax.sim.world import Estimator, Imperfections
 
 
 def standin(seed: int, description: Description = HECTOR) -> Imperfections:
-    """The plant of a seed of the first family.
+    """Draw the plant of a seed of the first family.
 
     Args:
-        seed: which plant.
-        description: of the robot, HECTOR by default; joint friction and damping and the shift of
-            the trunk's centre of mass are times its sizes.
+        seed: number of the plant.
+        description: of the robot, HECTOR by default; its sizes scale joint friction and damping
+            and the shift of the trunk's centre of mass.
     """
     return _draw(np.random.default_rng([0x57A, seed]), (0.95, 1.08), description)
 
 
 def even(seed: int, description: Description = HECTOR) -> Imperfections:
-    """The plant of a seed of the second family, with masses drawn evenly about the nominal ones.
+    """Draw the plant of a seed of the second family, its masses evenly about the nominal ones.
 
     Args:
-        seed: which plant.
+        seed: number of the plant.
         description: of the robot, as for `standin`.
     """
     return _draw(np.random.default_rng([0xE7E, seed]), (0.85, 1.15), description)
@@ -43,7 +43,7 @@ FAMILIES = {"standin": standin, "even": even}
 def _draw(
     rng: np.random.Generator, mass: tuple[float, float], description: Description
 ) -> Imperfections:
-    """A plant; every number is drawn uniformly from its range, each on its own."""
+    """Draw a plant, every number independently and uniformly from its range."""
     sizes = description.plants
     draw = lambda low, high, size=(): np.asarray(rng.uniform(low, high, size))  # noqa: E731
     return Imperfections(

@@ -2,9 +2,9 @@
 
 Controller and sensing are compiled once per process and serve every walk, whatever its weights,
 command, plant and engine: per tick one program plans and one samples, per millisecond one turns the
-plan into torques, and the engine steps between. What that one takes and gives is packed into a few
-flat arrays, because a call costs by the array. A fall ends the walk: what is missing is held and
-marked, never started afresh.
+plan into torques, and the engine steps in between. Inputs and outputs of the torques are packed
+into a few flat arrays, because the cost of a call grows with their number. A fall ends the walk:
+later samples repeat the last valid one and are marked as fallen.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -49,21 +49,21 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
     count = substeps(config)
 
     def begin(robot: Robot, reading: Array) -> Memory:
-        still = jnp.zeros(()), sensing.no_error(robot)
-        return init_memory(robot, loop.measure(robot, reading, *still))
+        measurement = loop.measure(robot, reading, jnp.zeros(()), sensing.no_error(robot))
+        return init_memory(robot, measurement)
 
     def plan(*inputs: Any, max_contacts: int) -> tuple[Memory, Plan, Array]:
         memory, plan = loop.plan_tick(config, *inputs, max_contacts=max_contacts)
         return memory, plan, pack((memory, plan))
 
     def samples(robot, command, anchor, tick, yaw, readings, contacts, *, ground_of) -> Sample:
-        def one(time: Array, before: Array, after: Array, ground: Ground) -> Sample:
+        def sample(time: Array, before: Array, after: Array, ground: Ground) -> Sample:
             effect = loop.effect_of(robot, before, ground)
-            truth = robot, command, anchor, time, yaw, after
-            return loop.sample(config, *truth, effect=effect, touches=ground.touches)
+            inputs = robot, command, anchor, time, yaw, after
+            return loop.sample(config, *inputs, effect=effect, touches=ground.touches)
 
         times = tick + (1 + jnp.arange(count)) / count
-        return jax.vmap(one)(times, readings[:-1], readings[1:], ground_of(robot, contacts))
+        return jax.vmap(sample)(times, readings[:-1], readings[1:], ground_of(robot, contacts))
 
     return SimpleNamespace(
         begin=jax.jit(begin),
@@ -75,31 +75,32 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
 
 @cache
 def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
-    """The compiled torques of a millisecond, from packed trees to the next state, packed.
+    """Compile the torques of a millisecond, from packed trees to the next state, packed.
 
-    XLA runs a kernel for each of a hundred operations and shares them out to its threads, which
-    takes several times as long as they do: a call with this mark is compiled into one. Where that
-    fails, as an operation has code in a kernel of its own only, they are compiled as ever.
+    XLA runs a kernel for each of a hundred operations and distributes them to its threads, which
+    takes several times as long as the operations: a call marked as small is compiled into one
+    kernel. If that fails, because an operation exists only as a kernel of its own, the call is
+    compiled as usual.
     """
 
     def torques(*packed: Array) -> Array:
-        fixed, held, (_, yaw, motors), millisecond = map(unpack, layouts, packed)
-        inputs: Any = *fixed, *held, motors, yaw, *millisecond
+        constants, tick, (_, yaw, motors), millisecond = map(unpack, layouts, packed)
+        inputs: Any = *constants, *tick, motors, yaw, *millisecond
         motors, yaw, torque = loop.motor_torques(config, *inputs)
         return pack((torque, yaw, motors))
 
-    def marked(*packed: Array) -> Array:
+    def small_call(*packed: Array) -> Array:
         with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
             return jax.jit(torques)(*packed)
 
     shapes = [jax.eval_shape(pack, leaves) for _, leaves in layouts]
     if jax.default_backend() == "cpu":
         with suppress(jax.errors.JaxRuntimeError):
-            return jax.jit(marked, compiler_options=_LOOPS).lower(*shapes).compile()
+            return jax.jit(small_call, compiler_options=_LOOPS).lower(*shapes).compile()
     return jax.jit(torques).lower(*shapes).compile()
 
 
-_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""}  # products are loops, not calls of a library
+_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""}  # products are loops, not library calls
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
 
@@ -116,36 +117,30 @@ def walk(
 
     Args:
         config: the controller.
-        robot: its nominal body; the plant is its MJCF, or that of the job.
-        job: what to walk.
-        build: makes the plant in an engine.
-        retune: gives the weights to plan with at each tick from t = 0 on, instead of the job's.
+        robot: its nominal robot; the plant is its MJCF, or that of the job.
+        job: the walk.
+        build: builds the plant in an engine.
+        retune: returns the weights to plan with at each tick from t = 0 on, instead of the job's.
 
     Returns:
-        Samples of 1 ms from t = 0 (numpy). After a fall they are held and `fallen`.
+        Samples of 1 ms from t = 0 (numpy). After a fall they repeat the last valid sample and are
+        marked `fallen`.
 
     Raises:
-        InputError: the plant's file or numbers are wrong, the engine cannot have them, or the
+        InputError: the plant's file or numbers are wrong or not supported by the engine, or the
             length is no positive number of ticks.
     """
-    count = substeps(config)
-    length = loop.walk_ticks(config, job.seconds, job.start_tick) * count
-    lead = (job.start_tick - first_tick(config)) * count
+    count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
+    lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    ticks = list(_walk_ticks(config, robot, job, plant, length // count, retune))
-    plans, samples = zip(*ticks, strict=True)
+    plans, samples = zip(*_walk_ticks(config, robot, job, plant, ticks, retune), strict=True)
     return _trajectory(plans, samples, count, lead, length, plant.broken)
 
 
 def _walk_ticks(
-    config: WalkConfig,
-    robot: Robot,
-    job: Job,
-    plant: Plant,
-    ticks: int,
-    retune: Retune | None,
+    config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Retune | None
 ) -> Iterator[tuple[Plan, Sample]]:
-    """Plan and samples of each tick, until t = `ticks` or a fall."""
+    """Yield plan and samples of each tick, until t = `ticks` or a fall."""
     programs, count, begin = _programs(config), substeps(config), first_tick(config)
     start, steps = job.start_tick, (job.start_tick - begin + ticks) * count
     body, weights, command, imperfections = jax.device_put((robot, *job[:3]))
@@ -153,12 +148,12 @@ def _walk_ticks(
     forces = np.asarray(_push_forces(job.push, np.arange(-lead, ticks * count)))
     errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
     anchor = jax.device_put(standing_anchor(robot, start))
-    fixed = body, config.parameters(weights).legs, imperfections
+    constants = body, config.parameters(weights).legs, imperfections
     readings = np.zeros((count + 1, 13 + 3 * joints))
     plant.read(readings[0])
     memory, yaw = programs.begin(body, readings[0]), np.zeros(())
     state = np.zeros(joints), yaw, init_actuators(joints)
-    constants, packed = pack(fixed), pack(state)
+    packed_constants, packed_state = pack(constants), pack(state)
     millisecond = np.array(0, np.int32), readings[0], errors[0]
     rows = np.zeros((count, pack(millisecond).size))
     rows[:, 0] = np.arange(count)
@@ -169,28 +164,28 @@ def _walk_ticks(
             assert samples is not None  # `walk_ticks` refuses a walk that begins at t = 0
             last = jax.tree.map(lambda x: x[-1], samples.state)
             anchor = jax.device_put(anchor_at(robot, last, start))
-        done = (tick - begin) * count
-        error, yaw_before, now = errors[done : done + count], yaw, np.array(tick, np.int32)
-        inputs = yaw, readings[0], error[0]
+        step = (tick - begin) * count
+        error, yaw_before, tick_array = errors[step : step + count], yaw, np.array(tick, np.int32)
+        inputs = tick_array, memory, yaw, readings[0], error[0]
         if retune is not None and plan is not None and tick >= start:
-            measurement = programs.measure(body, inputs[1], yaw, error[0])
+            measurement = programs.measure(body, readings[0], yaw, error[0])
             carry, weights = retune.step(carry, tick, anchor, measurement, plan.wrench)
             weights = jax.device_put(weights)
-        max_contacts = contacts_needed(config, tick)
-        memory, plan, held = programs.plan(
-            body, weights, command, anchor, now, memory, *inputs, max_contacts=max_contacts
+        memory, plan, packed_tick = programs.plan(
+            body, weights, command, anchor, *inputs, max_contacts=contacts_needed(config, tick)
         )
         if torques is None:
-            torques = _torques(config, *map(layout, (fixed, (memory, plan), state, millisecond)))
+            trees = constants, (memory, plan), state, millisecond
+            torques = _torques(config, *map(layout, trees))
         rows[:, -error.shape[1] :] = error
         for i in range(count):
             rows[i, 1 : -error.shape[1]] = readings[i]
-            packed = torques(constants, held, packed, rows[i])
-            plant.step(np.asarray(packed)[:joints], forces[done + i])
+            packed_state = torques(packed_constants, packed_tick, packed_state, rows[i])
+            plant.step(np.asarray(packed_state)[:joints], forces[step + i])
             plant.read(readings[i + 1])
-        yaw = np.asarray(packed)[joints]
-        truth = now, yaw_before, readings, plant.ground()
-        samples = programs.samples(body, command, anchor, *truth, ground_of=plant.ground_of)
+        yaw = np.asarray(packed_state)[joints]
+        measured = tick_array, yaw_before, readings, plant.ground()
+        samples = programs.samples(body, command, anchor, *measured, ground_of=plant.ground_of)
         yield plan, samples
         if np.asarray(samples.fallen).any() or plant.broken:
             return
@@ -205,23 +200,23 @@ def _trajectory(
     length: int,
     broken: bool,
 ) -> Trajectory:
-    """The samples from t = 0 on; the last good one is held from a fall on."""
+    """Return the samples from t = 0 on; from a fall on they repeat the last valid one."""
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), stack(samples))
     fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
     if len(fell):
         good = max(fell[0] - 1, 0)
     elif broken:  # the engine warned within the last tick and the state does not show it
         good = max(len(flat.fallen) - count - 1, 0)
-    wanted = lead + np.arange(length)
-    rows = np.minimum(wanted, good)
+    steps = lead + np.arange(length)
+    rows = np.minimum(steps, good)
     plan = jax.tree.map(lambda x: x[rows // count], stack(plans))
     initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
-    held = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=wanted > good)
-    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, held)
+    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
+    return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
 def on_host(job: Job) -> Job:
-    """The job with arrays of the host: what a process is sent must not sit on a device."""
+    """Return the job with arrays on the host: arrays on a device cannot be sent to a process."""
     arrays = {name: getattr(job, name) for name in ("weights", "command", "imperfections", "plant")}
     return job._replace(**jax.tree.map(np.asarray, arrays))
 
@@ -236,10 +231,10 @@ def walk_many(
     batch: int = 0,
     build: BuildPlant = MujocoPlant,
 ) -> Iterator[Trajectory]:
-    """Walk all jobs in a pool (`runtime.workers`) or here; gives the walks in order, as they come.
+    """Walk all jobs in a pool (`runtime.workers`) or this process; yields the walks in order.
 
     `exact` and `batch` are those of an `Engine`: this one is always exact and compiles no batch.
     """
-    sent, walk_in = map(on_host, jobs), partial(walk, build=build)
-    many = map if pool is None else pool.map
-    yield from many(walk_in, repeat(config), repeat(jax.tree.map(np.asarray, robot)), sent)
+    map_jobs, walk_in = map if pool is None else pool.map, partial(walk, build=build)
+    host_robot = jax.tree.map(np.asarray, robot)
+    yield from map_jobs(walk_in, repeat(config), repeat(host_robot), map(on_host, jobs))

@@ -1,12 +1,12 @@
-"""The MuJoCo worlds: a robot's MJCF and what is wrong with a plant's joints, ground and masses.
+"""The MuJoCo worlds: a robot's MJCF with the imperfections of a plant's joints, ground and masses.
 
 Imperfections are numbers, so that a world is data: `ideal`, `hfs` (the high-fidelity simulator) and
-plants drawn around the hfs. They are those of HECTOR; a robot's description says how much larger
-its own are (`PlantSizes`), and one without a linkage has none. What a number means is stated here;
-the motors' part of it (delay, lag, gain, linkage) lives in sim.actuators, the estimator's in
-sim.sensing, the rest becomes a field of the MuJoCo model. Backlash is a second hinge on the axis of
-each joint, free within +-b between motor and link; the encoder sits on the motor's side. Everything
-is looked up by name, so that nothing depends on how many joints there are.
+plants drawn around the hfs. They are those of HECTOR; another robot's description has their scale
+(`PlantSizes`), and a robot without a linkage has no such term. The numbers are defined here;
+the motors' (delay, lag, gain, linkage) act in sim.actuators, the estimator's in sim.sensing, the
+others become fields of the MuJoCo model. Backlash is a second hinge on the axis of each joint, free
+within +-b between motor and link; the encoder sits on the motor's side. All parts are looked up by
+name, so that nothing depends on the number of joints.
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,9 @@ from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import build_model, quiet_mujoco
 
-LINE_SEARCH = 50  # steps of the solver's; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
+LINE_SEARCH = 50  # of the solver, steps; with 10 the hfs is off by 0.02 rad/s in 1 of 400 steps
 MAX_DELAY = 0.008  # [s] that the motors' memory can hold
-SLACK = "_backlash"  # ending of the names of backlash joints
+SLACK = "_backlash"  # suffix of the names of backlash joints
 SLACK_DAMPING = 0.01  # [N m s/rad] of a backlash joint
 STOP_TIME = 0.004  # [s] solref of the backlash's end stops: gear teeth are hard
 
@@ -42,11 +42,11 @@ class Estimator(NamedTuple):
     ang_velocity: Float[Array, "*batch"]  # [rad/s]
     joint: Float[Array, "*batch"]  # [rad] encoders
     drift: Float[Array, "*batch"]  # [m] of a random walk, 4 s after t = 0, each horizontal axis
-    drift_yaw: Float[Array, "*batch"]  # [rad] likewise
+    drift_yaw: Float[Array, "*batch"]  # [rad] of a random walk, 4 s after t = 0
 
 
 class Push(NamedTuple):
-    """Forces on the trunk at its centre of mass, from outside; any number of them, n."""
+    """External forces on the trunk at its centre of mass; any number n of them."""
 
     force: Float[Array, "*batch n 3"]  # [N] world frame
     start: Float[Array, "*batch n"]  # [s] after t = 0
@@ -57,7 +57,7 @@ NO_PUSH = Push(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
 class Imperfections(NamedTuple):
-    """What a plant has that the controller does not know."""
+    """Properties of a plant that are unknown to the controller."""
 
     joint_friction: Float[Array, "*batch"]  # [N m] dry, each joint
     joint_damping: Float[Array, "*batch"]  # [N m s/rad]
@@ -75,19 +75,19 @@ class Imperfections(NamedTuple):
 
 
 def push_force(push: Push, step: Int[Array, ""]) -> Float[Array, "3"]:
-    """Force on the trunk [N] over the millisecond that begins `step` milliseconds after t = 0."""
+    """Return the force on the trunk [N] in the millisecond that begins `step` ms after t = 0."""
     first = jnp.round(push.start / TIME_STEP)
     last = jnp.round((push.start + push.duration) / TIME_STEP)
     return jnp.where((first <= step) & (step < last), push.force.T, 0.0).sum(axis=1)
 
 
 def truth() -> Estimator:
-    """The state is known exactly."""
+    """Return an estimator without errors."""
     return Estimator(*(np.zeros(()) for _ in Estimator._fields))
 
 
 def ideal(description: Description = HECTOR) -> Imperfections:
-    """For checking the controller: firm ground, joint damping 0.1, nothing else.
+    """Return an ideal plant to check the controller: firm ground, joint damping 0.1, nothing else.
 
     Args:
         description: of the robot, HECTOR by default.
@@ -111,7 +111,7 @@ def ideal(description: Description = HECTOR) -> Imperfections:
 
 
 def hfs(description: Description = HECTOR) -> Imperfections:
-    """The high-fidelity simulator: friction, backlash, delay, lag and linkage as in the paper's."""
+    """Return the high-fidelity simulator's plant: friction, backlash, motors as in the paper's."""
     sizes = description.plants
     return ideal(description)._replace(
         joint_friction=np.asarray(0.3 * sizes.joint_friction),
@@ -124,33 +124,33 @@ def hfs(description: Description = HECTOR) -> Imperfections:
 
 
 def hfs_drawn(seed: int, share: float = 0.2, description: Description = HECTOR) -> Imperfections:
-    """A plant around the hfs: each number drawn uniformly within +-`share` of its own.
+    """Draw a plant around the hfs, each number uniformly within +-`share` of the hfs's.
 
-    Of mass, whose number is known better, a tenth of the share; the trunk's centre of mass moves
-    by up to 2.5 cm times the share, of another robot times its size. The floor keeps a friction of
-    at least 0.6 (that with which the MPC plans), and no motor gives more than it is told to: a gain
-    falls short of 1 by up to a quarter of the share.
+    Mass, which is known better, varies by a tenth of the share; the trunk's centre of mass moves by
+    up to 2.5 cm times the share, for another robot times its size. The floor keeps a friction of at
+    least 0.6 (that with which the MPC plans), and no motor exceeds its command: a gain is below 1
+    by up to a quarter of the share.
 
     Args:
-        seed: which plant.
+        seed: number of the plant.
         share: 0.2 for collection, 0.4 for `hfs-varied`.
         description: of the robot, HECTOR by default.
     """
     base, rng = hfs(description), np.random.default_rng([0x4F5, round(1000 * share), seed])
-    within = lambda value, part: np.asarray(value * rng.uniform(1 - part, 1 + part))  # noqa: E731
-    apart = ("torque_gain", "mass", "trunk_com", "estimator")  # drawn after the others
-    names = [name for name in base._fields if name not in apart]
-    drawn = base._replace(**{name: within(getattr(base, name), share) for name in names})
+    vary = lambda value, part: np.asarray(value * rng.uniform(1 - part, 1 + part))  # noqa: E731
+    special = ("torque_gain", "mass", "trunk_com", "estimator")  # drawn after the others
+    names = [name for name in base._fields if name not in special]
+    drawn = base._replace(**{name: vary(getattr(base, name), share) for name in names})
     return drawn._replace(
         floor_friction=np.maximum(drawn.floor_friction, 0.6),
         torque_gain=rng.uniform(1 - share / 4, 1.0, len(description.joints)),
-        mass=within(base.mass, share / 10),
+        mass=vary(base.mass, share / 10),
         trunk_com=rng.uniform(-1.0, 1.0, 3) * share * 0.025 * description.plants.trunk_com,
     )
 
 
 def hfs_varied(seed: int, description: Description = HECTOR) -> Imperfections:
-    """One of the 20 plants around the hfs by which we choose between variants of ours."""
+    """Draw one of the 20 plants around the hfs on which our variants are compared."""
     return hfs_drawn(seed, 0.4, description)
 
 
@@ -158,15 +158,15 @@ WORLDS = ("ideal", "hfs", "hfs-varied")
 
 
 def named_world(name: str, seed: int = 0, description: Description = HECTOR) -> Imperfections:
-    """Imperfections of a world with a name.
+    """Return the imperfections of a named world.
 
     Args:
         name: of WORLDS.
-        seed: which plant, where there are several.
+        seed: number of the plant, for a world with several.
         description: of the robot, HECTOR by default.
 
     Raises:
-        InputError: the name is none of WORLDS.
+        InputError: the name is not in WORLDS.
     """
     if name not in WORLDS:
         raise InputError(unknown("world", name, WORLDS))
@@ -176,15 +176,15 @@ def named_world(name: str, seed: int = 0, description: Description = HECTOR) -> 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A MuJoCo model and where the robot's parts are in it."""
+    """A MuJoCo model and the indices of the robot's parts in it."""
 
     model: mujoco.MjModel
     joint_qpos: np.ndarray  # (joints,) motor side, leg by leg
     joint_dof: np.ndarray  # (joints,)
-    slack: np.ndarray  # (joints,) backlash joints; empty where there are none
-    slack_qpos: np.ndarray  # (joints,) likewise
+    slack: np.ndarray  # (joints,) backlash joints; empty without backlash
+    slack_qpos: np.ndarray  # (joints,) of the backlash joints; empty without backlash
     actuator: np.ndarray  # (joints,)
-    foot_of_geom: np.ndarray  # (ngeom,) its foot; -1: none
+    foot_of_geom: np.ndarray  # (ngeom,) foot of each geom; -1: none
     floor: int  # geom
     trunk: int  # body
 
@@ -205,13 +205,13 @@ def _check(imperfections: Imperfections) -> None:
 
 def _model(description: Description, slack: bool) -> mujoco.MjModel:
     spec, _ = build_model(description)
-    # what is only looked at, and gives its body no mass, costs time and room in every plant
+    # purely visual geoms, which give their body no mass, cost time and memory in every plant
     for geom in list(spec.geoms):
         geom.material = ""
         if not geom.contype and not geom.conaffinity and geom.parent.explicitinertial:
             spec.delete(geom)
-    for looks in (*spec.materials, *spec.textures):
-        spec.delete(looks)
+    for visual in (*spec.materials, *spec.textures):
+        spec.delete(visual)
     if not slack:
         return spec.compile()
     for name in description.joints:
@@ -222,14 +222,14 @@ def _model(description: Description, slack: bool) -> mujoco.MjModel:
             axis=motor.axis,
             pos=motor.pos,
             limited=True,
-            range=[-1.0, 1.0],  # of the plant, set later
+            range=[-1.0, 1.0],  # set to the plant's backlash later
             solref_limit=[STOP_TIME, 1.0],
             armature=0.0,
             damping=[SLACK_DAMPING, 0.0, 0.0],
             frictionloss=0.0,
             stiffness=[0.0, 0.0, 0.0],
         )
-    for key in list(spec.keys):  # their length is that of the joints
+    for key in list(spec.keys):  # their length no longer fits the joints
         spec.delete(key)
     return spec.compile()
 
@@ -244,8 +244,8 @@ def _compile(description: Description, slack: bool) -> World:
     joints = [model.joint(name) for name in names]
     slacks = [model.joint(name + SLACK) for name in names] if slack else []
     of_joint = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
-    each = description.leg_joints
-    feet = [joint.bodyid[0] for joint in joints[each - 1 :: each]]
+    count = description.leg_joints
+    feet = [joint.bodyid[0] for joint in joints[count - 1 :: count]]
     return World(
         model=model,
         joint_qpos=np.array([joint.qposadr[0] for joint in joints]),
@@ -263,14 +263,14 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
     model, dof = copy(world.model), world.joint_dof
     model.opt.timestep = TIME_STEP
     model.opt.ls_iterations = LINE_SEARCH
-    # A blown-up state must stay blown up: a reset to the initial pose would pass for a fresh start.
+    # A diverged state must stay so: a reset to the initial pose would look like a new start.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     model.dof_frictionloss[dof] = imperfections.joint_friction
     model.dof_damping[dof] = imperfections.joint_damping
     model.dof_armature[dof] *= imperfections.armature
     model.jnt_range[world.slack] = imperfections.backlash * np.array([-1.0, 1.0])
-    # The floor alone decides these: in the MJCF the robot's geoms have less friction and no
-    # share in the mix.
+    # The floor's values alone count: in the MJCF the robot's geoms have less friction and no
+    # weight in the mix.
     model.geom_friction[world.floor, 0] = imperfections.floor_friction
     model.geom_solref[world.floor] = imperfections.contact_time, 1.0
     model.body_mass *= imperfections.mass
@@ -284,10 +284,10 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
 def build_worlds(
     imperfections: Sequence[Imperfections], description: Description | None = None
 ) -> list[World]:
-    """The MuJoCo models of several plants.
+    """Build the MuJoCo models of several plants.
 
     Args:
-        imperfections: what is wrong with each; `backlash` above zero adds ten joints.
+        imperfections: of each plant; `backlash` above zero adds a hinge for each joint.
         description: of the robot, HECTOR by default.
 
     Raises:
@@ -296,19 +296,19 @@ def build_worlds(
     for plant in imperfections:
         _check(plant)
     slack = [bool(plant.backlash > 0.0) for plant in imperfections]
-    blank = {kind: _compile(description or HECTOR, kind) for kind in set(slack)}
-    return [_with_numbers(blank[s], p) for s, p in zip(slack, imperfections, strict=True)]
+    compiled = {value: _compile(description or HECTOR, value) for value in set(slack)}
+    return [_with_numbers(compiled[s], p) for s, p in zip(slack, imperfections, strict=True)]
 
 
 def build_world(imperfections: Imperfections, description: Description | None = None) -> World:
-    """The MuJoCo model of one plant; see `build_worlds`."""
+    """Build the MuJoCo model of one plant; see `build_worlds`."""
     return build_worlds([imperfections], description)[0]
 
 
 def standing_qpos(
     world: World, joints: Float[np.ndarray, " joints"], height: float
 ) -> Float[np.ndarray, " nq"]:
-    """Coordinates of a robot standing at the origin: trunk at `height` [m], `joints` [rad]."""
+    """Return coordinates of a robot standing at the origin: trunk `height` [m], `joints` [rad]."""
     qpos = np.zeros(world.model.nq)
     qpos[2], qpos[3] = height, 1.0
     qpos[world.joint_qpos] = joints

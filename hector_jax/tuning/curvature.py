@@ -1,4 +1,4 @@
-"""Which directions of the weights matter: eigenvectors of the loss's Gauss-Newton matrix.
+"""Directions of the weights that matter: eigenvectors of the loss's Gauss-Newton matrix.
 
 The loss is nearly quadratic in a walk, so along a step s in the log-weights it is curved by
 s' H s with H = J' (d2L / dw2) J, where w are the states and commands of the walk and J is their
@@ -21,32 +21,32 @@ from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-_NAMED = 0.35  # least share of the largest entry with which a weight is named in a direction
-_FLAT = 1e-3  # least share of the loss that a direction or a weight that matters changes
+_NAMED = 0.35  # a direction is named by the weights of at least this share of its largest entry
+_FLAT = 1e-3  # a direction or weight that changes the loss by less than this share does not matter
 
 
 class Direction(NamedTuple):
     """A direction in the log-weights."""
 
-    change: float  # share of the loss, in second order, after a step as long as a doubled weight's
-    steps: dict[str, float]  # by weight: entry of the unit vector
+    change: float  # share of the loss, to second order, for a step as long as doubling a weight
+    steps: dict[str, float]  # entries of the unit vector, by name of the weight
 
     @property
     def text(self) -> str:
-        """The weights that matter in it, at most three a side: "`Q_pitch` against `Q_x`"."""
+        """The weights that matter, at most three of each sign: "`Q_pitch` against `Q_x`"."""
         ordered = sorted(self.steps, key=lambda name: -abs(self.steps[name]))
-        largest = self.steps[ordered[0]]  # its side is named first
+        largest = self.steps[ordered[0]]  # its sign is named first
         shares = {name: self.steps[name] / largest for name in ordered}
         sides = ([n for n in ordered if s * shares[n] >= _NAMED][:3] for s in (1.0, -1.0))
         return " against ".join(", ".join(f"`{n}`" for n in side) for side in sides if side)
 
 
 class Curvature(NamedTuple):
-    """How the loss is curved in the weights."""
+    """Curvature of the loss in the weights."""
 
-    directions: list[Direction]  # those that matter, the strongest first
+    directions: list[Direction]  # that matter, the strongest first
     number: int  # of all directions
-    flat: list[str]  # weights that by themselves do not matter
+    flat: list[str]  # names of the weights that alone do not matter
 
 
 @partial(jax.jit, static_argnums=0)
@@ -59,11 +59,11 @@ def gauss_newton(
     effect: jax.tree_util.Partial,
     loss: Loss,
 ) -> tuple[Float[Array, ""], Float[Array, "n n"]]:
-    """The loss of a rollout and its Gauss-Newton matrix.
+    """Return the loss of a rollout and its Gauss-Newton matrix.
 
     Args:
         config, robot, command, anchor, effect: of the rollout.
-        weights: at which it is taken.
+        weights: the point of evaluation.
         loss: terms and their weights.
 
     Returns:
@@ -72,40 +72,41 @@ def gauss_newton(
     count = len(direction_names(weights))
 
     def walk(logs: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
-        moved = scale_weights(weights, logs)
-        walked = rollout(config, robot, moved, command, anchor, effect)
-        return (walked.state, walked.command), walked
+        scaled = scale_weights(weights, logs)
+        trajectory = rollout(config, robot, scaled, command, anchor, effect)
+        return (trajectory.state, trajectory.command), trajectory
 
-    def move(direction: Float[Array, " n"]) -> tuple:
+    def tangent_of(direction: Float[Array, " n"]) -> tuple:
         return jax.jvp(walk, (jnp.zeros(count),), (direction,), has_aux=True)
 
-    at, tangents, walked = jax.vmap(move, out_axes=(None, 0, None))(jnp.eye(count))
+    point, tangents, trajectory = jax.vmap(tangent_of, out_axes=(None, 0, None))(jnp.eye(count))
 
-    def objective(of: tuple[State, Wrench]) -> Float[Array, ""]:
-        state, commands = of
-        return total(loss, losses(loss, walked._replace(state=state, command=commands)))
+    def objective(point: tuple[State, Wrench]) -> Float[Array, ""]:
+        state, command = point
+        return total(loss, losses(loss, trajectory._replace(state=state, command=command)))
 
-    curved = jax.vmap(lambda tangent: jax.jvp(jax.grad(objective), (at,), (tangent,))[1])(tangents)
-    changes, slopes = (
+    gradient = jax.grad(objective)
+    products = jax.vmap(lambda tangent: jax.jvp(gradient, (point,), (tangent,))[1])(tangents)
+    rows, columns = (
         jnp.concatenate([x.reshape(count, -1) for x in jax.tree.leaves(tree)], axis=1)
-        for tree in (tangents, curved)
+        for tree in (tangents, products)
     )
-    return objective(at), changes @ slopes.T
+    return objective(point), rows @ columns.T
 
 
 def main_directions(matrix: Float[np.ndarray, "n n"], like: Weights) -> Curvature:
-    """The eigenvectors that matter of a Gauss-Newton matrix divided by the loss.
+    """Find the eigenvectors that matter of a Gauss-Newton matrix divided by the loss.
 
     Args:
         matrix: see `gauss_newton`.
         like: weights of its shape.
     """
-    names, doubled = direction_names(like), 0.5 * np.log(2.0) ** 2
-    sizes, vectors = np.linalg.eigh(matrix)
+    names, of_doubling = direction_names(like), 0.5 * np.log(2.0) ** 2
+    eigenvalues, vectors = np.linalg.eigh(matrix)
     strongest = [
-        Direction(doubled * size, dict(zip(names, vector.tolist(), strict=True)))
-        for size, vector in zip(sizes[::-1], vectors.T[::-1], strict=True)
-        if doubled * size > _FLAT
+        Direction(change, dict(zip(names, vector.tolist(), strict=True)))
+        for change, vector in zip(of_doubling * eigenvalues[::-1], vectors.T[::-1], strict=True)
+        if change > _FLAT
     ]
-    alone = zip(names, doubled * np.diag(matrix), strict=True)
-    return Curvature(strongest, len(names), [name for name, change in alone if change < _FLAT])
+    changes = zip(names, of_doubling * np.diag(matrix), strict=True)
+    return Curvature(strongest, len(names), [name for name, change in changes if change < _FLAT])

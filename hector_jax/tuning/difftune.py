@@ -4,14 +4,14 @@ theta <- P_Theta(theta - beta theta g), with g the gradient in log-weights, divi
 magnitude inside Q and inside R: a weight moves by at most beta_Q or beta_R of itself, whatever the
 size of the loss. Other numbers of the controller (`TuneConfig.others`), which may be zero, move by
 at most beta_others of the width of their box. A step that ends in a fall, a bad solve or a number
-that is not finite is rejected: the weights go back and the step is halved.
+that is not finite is rejected: the weights are reset and the step is halved.
 
-Two results come out of one run: the weights after the paper's `ten` iterations, each accepted
-unless it is refused, and the `converged` ones, for which steps that raise the loss are halved too
-until nothing is gained any more.
+A tuning has two results: the weights after the paper's `ten` iterations, whose steps may raise the
+loss, and the `converged` weights, for which steps that raise the loss are rejected too until the
+loss falls no more.
 
-The rule by which all that is decided is `init` and `update`, functions of arrays: `tune` asks them
-from Python, one iteration after the other; `batch` compiles them into its loop on the device.
+`init` and `update` are this rule as functions of arrays: `tune` calls them from Python, once per
+iteration; `batch` compiles them into its loop on the device.
 """
 
 from collections.abc import Callable
@@ -45,21 +45,21 @@ PAPER_ITERATIONS = 10
 
 @dataclass(frozen=True)
 class TuneConfig:
-    """How the weights are tuned."""
+    """Settings of a tuning."""
 
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     loss: tuple = PAPER_LOSS  # of `LossTerm`
     beta_q: float = 0.05  # largest relative step of a weight in Q
-    beta_r: float = 0.08  # and in R
-    others: tuple[str, ...] = ()  # of `parameters.TUNABLES`, tuned beside Q and R
-    beta_others: float = 0.02  # largest step of one, as a share of its box
+    beta_r: float = 0.08  # largest relative step of a weight in R
+    others: tuple[str, ...] = ()  # names in `parameters.TUNABLES`, tuned with Q and R
+    beta_others: float = 0.02  # largest step of the others, as a share of their box
     update: str = "relative"  # or "literal": the paper's theta - beta dL/dtheta
     tie_feet: bool = True  # one R for all feet, as the robot is its own mirror image
     iterations: int = 100  # at most
-    patience: int = 10  # iterations over which the loss must fall
-    gain: float = 5e-3  # by this share at least, or the tuning has converged
+    patience: int = 10  # iterations in which the loss must fall
+    gain: float = 5e-3  # by at least this share, or the tuning has converged
     smallest_step: float = 1 / 128  # of the full step; below it the tuning has converged
-    residual: float = 1e-8  # worst relative KKT residual that is believed: that of a solved QP
+    residual: float = 1e-8  # largest accepted relative KKT residual: that of a solved QP
 
     def __post_init__(self) -> None:
         check(
@@ -79,33 +79,33 @@ class TuneConfig:
         if self.others and self.update != "relative":
             raise InputError(f"TuneConfig.others must be empty with update literal, got {got}")
         for name in self.others:
-            if fault := _fault(self.rollout.walk, name):
+            if reason := _why_not_tunable(self.rollout.walk, name):
                 expected = "must be numbers that a gradient can tune"
-                raise InputError(f"TuneConfig.others {expected}, got {got}: {fault}")
+                raise InputError(f"TuneConfig.others {expected}, got {got}: {reason}")
 
     def as_table(self) -> dict[str, Any]:
-        """The settings as JSON values; of the loss its weights."""
+        """Return the settings as JSON values; of the loss only its weights."""
         return asdict(replace(self, loss=PAPER_LOSS)) | {"loss": alphas(self.loss)}
 
     @classmethod
     def from_table(cls, where: str, table: Any, loss: Loss = PAPER_LOSS) -> "TuneConfig":
-        """Settings of JSON values, with the terms of a loss.
+        """Read the settings from JSON values, with the terms of a loss.
 
         Raises:
-            InputError: one line with `where`, for settings that there are not.
+            InputError: one line that begins with `where`, for an unknown or wrong setting.
         """
         if not isinstance(table, dict) or not isinstance(table.get("loss", {}), dict):
-            return from_table(where, cls, table)  # refuses it
-        rest = {name: value for name, value in table.items() if name != "loss"}
+            return from_table(where, cls, table)  # raises the error
+        others = {name: value for name, value in table.items() if name != "loss"}
         try:
             weighted = with_alphas(table.get("loss", {}), loss)
         except InputError as error:
             raise InputError(f"{where}: loss: {error}") from None
-        return replace(from_table(where, cls, rest), loss=weighted)
+        return replace(from_table(where, cls, others), loss=weighted)
 
 
-def _fault(walk: WalkConfig, name: str) -> str:
-    """Why a number cannot be tuned by the gradient of the rigid-body model; empty if it can."""
+def _why_not_tunable(walk: WalkConfig, name: str) -> str:
+    """Return why gradients of the rigid-body model cannot tune a number; empty if they can."""
     if name not in TUNABLES:
         return unknown("tunable", name, TUNABLES)
     path, lower, upper, _ = TUNABLES[name]
@@ -121,46 +121,46 @@ def _fault(walk: WalkConfig, name: str) -> str:
 
 
 class TuneState(NamedTuple):
-    """Where a tuning stands between two rollouts: the state of the rule."""
+    """State of a tuning between two rollouts."""
 
     trial: Weights  # to be evaluated next
-    step_scale: Float[Array, "*batch"]  # of the full step that leads from `best` to `trial`
-    iteration: Int[Array, "*batch"]  # of the trial; the start is 0
-    best: Weights  # the last that were accepted
-    loss: Float[Array, "*batch"]  # theirs
-    gradient: Weights  # theirs
-    recent: Float[Array, "*batch kept"]  # losses accepted last, newest first; NaN before the first
+    step_scale: Float[Array, "*batch"]  # share of the full step from `best` to `trial`
+    iteration: Int[Array, "*batch"]  # number of the trial; the start is 0
+    best: Weights  # the last accepted weights
+    loss: Float[Array, "*batch"]  # of `best`
+    gradient: Weights  # of `best`
+    recent: Float[Array, "*batch recent"]  # last accepted losses, newest first; NaN where none
     ten: Weights  # best after at most the paper's ten iterations
     stop: Int[Array, "*batch"]  # a `Stop`
 
 
 class Iteration(NamedTuple):
-    """An iteration of a tuning; with leading axes, a history of them."""
+    """An iteration of a tuning; with leading axes, a history of iterations."""
 
-    iteration: Int[Array, "*batch"]  # its number; the start is 0
+    iteration: Int[Array, "*batch"]  # number; the start is 0
     weights: Weights
     evaluation: Evaluation
     status: Int[Array, "*batch"]  # a `StepStatus`
-    step_scale: Float[Array, "*batch"]  # of the full step that led here; 0 at the start
+    step_scale: Float[Array, "*batch"]  # share of the full step to these weights; 0 at the start
 
     @property
     def accepted(self) -> Any:
-        """Whether the weights became the best so far."""
+        """True if the weights were accepted."""
         return self.status == StepStatus.ACCEPTED
 
     @property
     def reason(self) -> str:
-        """Why the weights of one iteration were rejected; empty when accepted."""
+        """Reason of the rejection; empty if accepted."""
         return status_text(StepStatus(int(self.status)), self.evaluation)
 
 
 class Tuning(NamedTuple):
-    """A whole tuning."""
+    """Result of a tuning."""
 
     history: list[Iteration]
     ten: Weights
     converged: Weights
-    stop: str  # why it ended
+    stop: str  # reason of the end
 
 
 def tune_step(
@@ -171,14 +171,14 @@ def tune_step(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> Evaluation:
-    """`evaluate` with the rollout and the loss of a tuning, compiled."""
+    """Evaluate weights with the rollout and the loss of a tuning, compiled."""
     return evaluate_jit(config.rollout, robot, weights, command, anchor, effect, config.loss)
 
 
 def relative_step(
     beta_q: float, beta_r: float, beta_others: float = 0.0
 ) -> optax.GradientTransformation:
-    """Downhill in log-weights, the largest relative step being beta inside Q and inside R.
+    """Return steps downhill in log-weights; the largest relative step is beta, in Q and in R.
 
     Other numbers step by at most `beta_others` of the width of their box.
     """
@@ -190,16 +190,15 @@ def relative_step(
         largest = jnp.max(
             jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in jax.tree.leaves(products)])
         )
-        by = beta / jnp.where(largest > 0.0, largest, 1.0)
-        return jax.tree.map(lambda x, size: -by * x * size, products, sizes)
+        factor = beta / jnp.where(largest > 0.0, largest, 1.0)
+        return jax.tree.map(lambda x, size: -factor * x * size, products, sizes)
 
     def update(updates: Any, state: optax.OptState, params: Any = None):
-        gradient, weights = updates, params
-        if weights is None:
+        if params is None:
             raise ValueError("relative_step needs the weights: pass params to update")
-        widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in weights.others}
-        sizes = weights._replace(others=widths)
-        return Weights(*map(scaled, gradient, sizes, (beta_q, beta_r, beta_others))), state
+        widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in params.others}
+        sizes = params._replace(others=widths)
+        return Weights(*map(scaled, updates, sizes, (beta_q, beta_r, beta_others))), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
 
@@ -218,7 +217,7 @@ def _mean_over_feet(R: Wrench) -> Wrench:
 def step_weights(
     config: TuneConfig, weights: Weights, gradient: Weights, step_scale: float | Float[Array, ""]
 ) -> Weights:
-    """Weights after `step_scale` of a full step downhill, projected onto the box."""
+    """Step the weights downhill by `step_scale` of a full step and project them onto the box."""
     if config.tie_feet:
         gradient = gradient._replace(R=_mean_over_feet(gradient.R))
     zero = jax.tree.map(jnp.zeros_like, gradient.others)
@@ -226,23 +225,23 @@ def step_weights(
     gradient = gradient._replace(others={**zero, **tuned})
     optimiser = _optimiser(config)
     updates, _ = optimiser.update(gradient, optimiser.init(weights), weights)
-    moved = optax.apply_updates(weights, jax.tree.map(lambda u: step_scale * u, updates))
-    return optax.projections.projection_box(moved, *bounds(weights.others, weights))
+    stepped = optax.apply_updates(weights, jax.tree.map(lambda u: step_scale * u, updates))
+    return optax.projections.projection_box(stepped, *bounds(weights.others, weights))
 
 
 def step_status(config: TuneConfig, evaluation: Evaluation) -> Int[Array, ""]:
-    """`StepStatus` of an evaluation by itself, whatever the loss was before."""
-    # squares, because a gradient near the largest number overflows where a step is made of it
+    """Return the `StepStatus` of an evaluation, without comparing its loss to others."""
+    # squares, because a gradient near the largest number overflows in the step
     squares = [jnp.square(x) for x in (evaluation.loss, *jax.tree.leaves(evaluation.gradient))]
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in squares]))
     solved = jnp.asarray(evaluation.residual) <= config.residual
-    reason = jnp.where(solved, StepStatus.ACCEPTED, StepStatus.UNSOLVED)
-    reason = jnp.where(jnp.asarray(evaluation.fallen) > 0, StepStatus.FELL, reason)
-    return jnp.where(finite, reason, StepStatus.NOT_FINITE).astype(jnp.int32)
+    status = jnp.where(solved, StepStatus.ACCEPTED, StepStatus.UNSOLVED)
+    status = jnp.where(jnp.asarray(evaluation.fallen) > 0, StepStatus.FELL, status)
+    return jnp.where(finite, status, StepStatus.NOT_FINITE).astype(jnp.int32)
 
 
 def init(config: TuneConfig, weights: Weights, first: int = 0) -> TuneState:
-    """A tuning before its first rollout, which is iteration `first`.
+    """Return the state before the first rollout, which is iteration `first`.
 
     With `tie_feet` all feet start from the geometric mean of their weights in R.
     """
@@ -251,14 +250,14 @@ def init(config: TuneConfig, weights: Weights, first: int = 0) -> TuneState:
     if config.tie_feet:
         equal = jnp.all(jnp.stack([jnp.all(w == w[:1]) for w in weights.R]))
         tied = jax.tree.map(jnp.exp, _mean_over_feet(jax.tree.map(jnp.log, weights.R)))
-        # weights that are equal stay so to the last bit
+        # equal weights stay equal to the last bit
         weights = weights._replace(R=where(equal, weights.R, tied))
     return TuneState(
         trial=weights,
         step_scale=jnp.asarray(1.0),
         iteration=jnp.asarray(first, jnp.int32),
         best=weights,
-        loss=jnp.asarray(jnp.inf, float),  # typed as later ones, or `update` is compiled again
+        loss=jnp.asarray(jnp.inf, float),  # of the later type, or `update` is compiled again
         gradient=jax.tree.map(jnp.zeros_like, weights),
         recent=jnp.full(config.patience + 1, jnp.nan, float),
         ten=weights,
@@ -269,9 +268,9 @@ def init(config: TuneConfig, weights: Weights, first: int = 0) -> TuneState:
 def update(
     config: TuneConfig, state: TuneState, evaluation: Evaluation
 ) -> tuple[TuneState, Iteration]:
-    """Accept or reject the trial by its evaluation; returns the next state and the iteration.
+    """Accept or reject the trial by its evaluation; return the next state and the iteration.
 
-    The first `PAPER_ITERATIONS` are accepted whatever the loss; later ones must lower it. A
+    The first `PAPER_ITERATIONS` may raise the loss; later iterations must lower it. A
     rejection halves the step, an acceptance doubles it up to the full one. After the paper's
     iterations the tuning stops where the step has become too small or `patience` accepted
     iterations gained less than `gain`.
@@ -286,11 +285,10 @@ def update(
     if_accepted = partial(where, accepted)
     best = if_accepted(state.trial, state.best)
     gradient = if_accepted(evaluation.gradient, state.gradient)
-    recent = jnp.append(jnp.asarray(evaluation.loss), state.recent[:-1])
-    recent = if_accepted(recent, state.recent)
+    recent = if_accepted(jnp.append(jnp.asarray(evaluation.loss), state.recent[:-1]), state.recent)
     scale = jnp.where(accepted, jnp.minimum(1.0, 2.0 * state.step_scale), state.step_scale / 2.0)
 
-    little = recent[0] > (1 - config.gain) * recent[-1]  # false before there are enough
+    little = recent[0] > (1 - config.gain) * recent[-1]  # false while the last is NaN
     stop = jnp.where(iteration >= config.iterations, Stop.LIMIT, Stop.GOING)
     stop = jnp.where(late & little, Stop.NO_GAIN, stop)
     stop = jnp.where(late & (scale < config.smallest_step), Stop.SMALL_STEP, stop)
@@ -306,17 +304,17 @@ def update(
         ten=jax.tree.map(lambda x, y: jnp.where(late, y, x), best, state.ten),
         stop=stop.astype(jnp.int32),
     )
-    led = jnp.where(start, 0.0, state.step_scale)
-    return after, Iteration(iteration, state.trial, evaluation, status.astype(jnp.int32), led)
+    scale = jnp.where(start, 0.0, state.step_scale)
+    return after, Iteration(iteration, state.trial, evaluation, status.astype(jnp.int32), scale)
 
 
 def rejection_reason(config: TuneConfig, evaluation: Evaluation) -> str:
-    """Why an evaluation cannot be used; empty when it can."""
+    """Return why an evaluation is rejected; empty if it is not."""
     return status_text(StepStatus(int(step_status(config, evaluation))), evaluation)
 
 
 def stop_reason(config: TuneConfig, stop: Stop) -> str:
-    """Why a tuning ended, in words."""
+    """Describe why a tuning ended."""
     return {
         Stop.GOING: "not ended",
         Stop.LIMIT: f"{config.iterations} iterations",
@@ -340,22 +338,21 @@ def tune(
     """Tune the weights on the model.
 
     Args:
-        config: how.
+        config: the settings.
         robot, command, anchor, effect: the model, see `rollout`.
-        weights: where to start.
-        on_iteration: called after each iteration, the start being iteration 0.
+        weights: the start.
+        on_iteration: called after each iteration; the start is iteration 0.
 
     Raises:
         InputError: the starting weights fall or cannot be solved on the model.
 
     Source: problem P and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
     """
-    return descend(
-        config,
-        weights,
-        lambda trial: tune_step(config, robot, trial, command, anchor, effect),
-        on_iteration,
-    )
+
+    def evaluate(trial: Weights) -> Evaluation:
+        return tune_step(config, robot, trial, command, anchor, effect)
+
+    return descend(config, weights, evaluate, on_iteration)
 
 
 def descend(
@@ -365,17 +362,17 @@ def descend(
     on_iteration: Callable[[Iteration], None] = lambda iteration: None,
     first: int = 0,
 ) -> Tuning:
-    """The rule, driven from Python: step down whatever loss `evaluate` finds.
+    """Minimise the loss of `evaluate` by the rule of a tuning, as a loop in Python.
 
     Args:
-        config: how.
-        weights: where to start.
+        config: the settings.
+        weights: the start.
         evaluate: loss and gradient of weights.
         on_iteration: called after each iteration.
-        first: number of the first one; from the paper's ten on every step has to lower the loss.
+        first: number of the first iteration; after the paper's ten every step must lower the loss.
 
     Raises:
-        InputError: the starting weights were rejected; `on_iteration` was called before.
+        InputError: the starting weights are rejected, after a call of `on_iteration`.
     """
     history: list[Iteration] = []
     state = init(config, weights, first)
@@ -388,8 +385,8 @@ def descend(
     stop, last = Stop(int(state.stop)), history[-1]
     if stop == Stop.BAD_START:
         raise InputError(f"the starting weights cannot be tuned from: {last.reason}")
-    words = stop_reason(config, stop)
+    reason = stop_reason(config, stop)
     if stop == Stop.SMALL_STEP and rejection_reason(config, last.evaluation):
-        words = f"{words}, the last refused: {last.reason}"
+        reason = f"{reason}, the last refused: {last.reason}"
     ten, converged = jax.tree.map(np.asarray, (state.ten, state.best))
-    return Tuning(history, ten, converged, words)
+    return Tuning(history, ten, converged, reason)

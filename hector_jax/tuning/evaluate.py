@@ -1,7 +1,7 @@
 """Loss of a weight set on the model and its gradient, by reverse mode (Eq. 9, 11)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,27 +19,26 @@ from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 
 
 class Evaluation(NamedTuple):
-    """One rollout of a weight set on the model, with the gradient of its loss."""
+    """Loss of a weight set on the model, its gradient, and the checks of the rollout."""
 
     loss: Float[Array, "*batch"]
-    terms: Terms  # without their weights
+    terms: Terms  # unweighted
     gradient: Weights  # dL/dtheta
     fallen: Float[Array, "*batch"]  # share of the ticks after a fall
-    residual: Float[Array, "*batch"]  # largest of the rollout; infinite where a QP is not unique
+    residual: Float[Array, "*batch"]  # largest of a QP; infinite if a solution is not unique
 
 
 def evaluation(walk: Callable[[Weights], Trajectory], weights: Weights, loss: Loss) -> Evaluation:
-    """Loss of what weights walk, and its gradient by the weights."""
+    """Compute the loss of the walk of a weight set and its gradient by the weights."""
 
     def objective(weights: Weights) -> tuple[Array, tuple]:
         trajectory = walk(weights)
         terms = losses(loss, trajectory)
-        seen = terms, jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
-        return total(loss, terms), seen
+        checks = jnp.mean(1.0 * trajectory.fallen), jnp.max(trajectory.residual)
+        return total(loss, terms), (terms, *checks)
 
-    (value, (terms, fallen, residual)), gradient = jax.value_and_grad(objective, has_aux=True)(
-        weights
-    )
+    value_and_grad = jax.value_and_grad(objective, has_aux=True)
+    (value, (terms, fallen, residual)), gradient = value_and_grad(weights)
     return Evaluation(value, terms, gradient, fallen, residual)
 
 
@@ -72,21 +71,24 @@ need no compilation."""
 
 
 def mean_of(evaluations: Sequence[Evaluation], scales: Float[np.ndarray, " n"]) -> Evaluation:
-    """The mean of evaluations, each divided by its scale, with the worst fall and residual."""
-    each = jax.device_get(evaluations)
-    whole = jax.tree.map(
-        lambda *x: np.mean([one / k for one, k in zip(x, scales, strict=True)], axis=0), *each
+    """Average evaluations, each divided by its scale; `fallen` and `residual` are the worst."""
+    evaluations = jax.device_get(evaluations)
+
+    def mean(*values: Any) -> Any:
+        return np.mean([value / k for value, k in zip(values, scales, strict=True)], axis=0)
+
+    return jax.tree.map(mean, *evaluations)._replace(
+        fallen=np.max([e.fallen for e in evaluations]),
+        residual=np.max([e.residual for e in evaluations]),
     )
-    worst = {name: np.max([getattr(e, name) for e in each]) for name in ("fallen", "residual")}
-    return whole._replace(**worst)
 
 
 def mean_over_commands(
     evaluations: Sequence[Callable[[Weights], Evaluation]], start: Weights
 ) -> Callable[[Weights], Evaluation]:
-    """One evaluation for several: their mean, with the worst fall and residual of all.
+    """Return the function that averages several evaluations, see `mean_of`.
 
-    Each is divided by its share of the losses at `start`, so that all count alike.
+    Each is divided by its share of the losses at `start`, so that all have equal influence.
     """
     scales = np.ones(1)
     if len(evaluations) > 1:
@@ -105,11 +107,11 @@ def gradient_norms(
     effect: jax.tree_util.Partial,
     loss: Loss,
 ) -> dict[str, float]:
-    """Norms of the gradients of the terms in log-weights, each without its alpha."""
+    """Return the norm of each term's gradient in log-weights, without its alpha."""
 
     def norm(name: str) -> float:
-        alone = tuple(term._replace(weight=float(term.name == name)) for term in loss)
-        evaluation = evaluate_jit(config, robot, weights, command, anchor, effect, alone)
+        single = tuple(term._replace(weight=float(term.name == name)) for term in loss)
+        evaluation = evaluate_jit(config, robot, weights, command, anchor, effect, single)
         logs = jax.tree.map(jnp.multiply, evaluation.gradient, weights)
         return float(jnp.linalg.norm(weights_to_vector(logs)))
 
@@ -117,27 +119,24 @@ def gradient_norms(
 
 
 def aligned(loss: Loss, norms: Mapping[str, float], to: str = "") -> Loss:
-    """Loss whose terms have gradients of the order of that of one of them (footnote of Eq. 11).
+    """Weigh the terms so that their gradients have the order of that of one (footnote of Eq. 11).
 
     Args:
         loss: terms and weights.
         norms: of the gradient of each term, see `gradient_norms`.
-        to: the term that keeps its weight; by default L_ctrl, or the last where there is none.
+        to: the term that keeps its weight; by default L_ctrl, or the last if the loss has none.
 
     Raises:
-        InputError: a term that the loss does not have, or without a norm.
+        InputError: `to` is no term of the loss, or a term has no norm.
     """
     weights = {term.name: term.weight for term in loss}
     to = to or ("L_ctrl" if "L_ctrl" in weights else loss[-1].name)
     for name in (to, *weights):
         if name not in weights or name not in norms:
             raise InputError(unknown("term of the loss", name, weights.keys() & norms.keys()))
-    one = weights[to]
 
-    def power(ratio: float) -> float:
-        return float(10.0 ** np.round(np.log10(max(ratio, 1e-12))))
+    def weight(norm: float) -> float:
+        ratio = norms[to] / max(norm, 1e-12 * norms[to])
+        return weights[to] * float(10.0 ** np.round(np.log10(max(ratio, 1e-12))))
 
-    ratios = {
-        name: norms[to] / max(norm, 1e-12 * norms[to]) for name, norm in norms.items() if name != to
-    }
-    return with_alphas({name: one * power(ratio) for name, ratio in ratios.items()}, loss)
+    return with_alphas({name: weight(norm) for name, norm in norms.items() if name != to}, loss)

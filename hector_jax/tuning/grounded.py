@@ -1,49 +1,47 @@
-"""Rollouts grounded on a measured walk: the model, and at each tick what it missed there.
+"""Rollouts grounded on a measured walk: the model plus its residual at each tick of the walk.
 
-With the weights that were walked such a rollout is the walk itself, so its errors are the measured
-ones and its gradient is that along the walk (Eq. 9, 10). With weights nearby it is what the model
-says that they change: good for some steps, and then for another walk.
+With the weights of the walk such a rollout is the walk itself, so its errors are the measured
+errors and its gradient is that along the walk (Eq. 9, 10). With weights nearby it differs from the
+walk by what the model predicts: good for some steps, then another walk is needed.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Int
 
 from hector_jax import qp
-from hector_jax.control.controller import measured_feet
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet
-from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
-from hector_jax.grfm.effect import HISTORY
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluation
 from hector_jax.tuning.loss import Loss
+from hector_jax.tuning.online import carry_from, command_history, measured_states
 from hector_jax.tuning.rollout import Carry, RolloutConfig, step_carry
 
 
-class Missed(NamedTuple):
-    """What a model misses in a tick: measured less modelled, at its end."""
+class ModelResidual(NamedTuple):
+    """Measured less modelled values at the end of a tick."""
 
     state: State
     feet: Feet
 
 
 class Grounding(NamedTuple):
-    """What grounds rollouts on a measured walk of T ticks.
+    """Start and residuals of rollouts grounded on a measured walk of T ticks.
 
-    Estimates play no part: commands are planned anew, from the true states of the walk.
+    Estimates are not used: commands are planned anew, from the true states of the walk.
     """
 
     start: Carry  # at the end of the first tick
-    tick: Int[Array, ""]  # gait tick there
-    missed: Missed  # (T - 1, ...)
+    tick: Int[Array, ""]  # gait tick at the start
+    residuals: ModelResidual  # (T - 1, ...)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -56,12 +54,12 @@ def fit_grounding(
     walk: Trajectory,
     start_tick: Int[Array, ""] | int = 0,
 ) -> Grounding:
-    """Find what the model missed of a walk.
+    """Compute the residuals of the model along a walk.
 
     Args:
         config: controller, and the T ticks of the walk.
         robot: nominal body.
-        weights, command: that were walked.
+        weights, command: of the walk.
         effect: phi.
         walk: true states, joints and commands, sampled at the plan interval: T samples.
         start_tick: gait tick of t = 0.
@@ -74,28 +72,21 @@ def fit_grounding(
     ticks = config.ticks
     if len(walk.fallen) != ticks:
         raise ValueError(f"a walk of {ticks} ticks has {len(walk.fallen)} samples")
-
-    def feet_of(state: State, joints: Array) -> Feet:
-        return measured_feet(robot, Measurement(state, joints, jnp.zeros_like(joints)))
-
-    measured = Missed(walk.state, jax.vmap(feet_of)(walk.state, walk.joints))
-    held = jax.tree.map(lambda w: jnp.broadcast_to(w[0], (HISTORY, *w.shape[1:])), walk.command)
+    measured = measured_states(robot, walk.state, walk.joints)
+    first, command_before = jax.tree.map(lambda x: x[0], (measured, walk.command))
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
 
-    def at(now: Missed, commands: Wrench, disturbance: Disturbance) -> Carry:
-        return Carry(now.state, now.feet, commands, anchor, disturbance, jnp.asarray(False))
+    def step(memory: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[tuple, ModelResidual]:
+        begin, end, tick = inputs
+        carry = carry_from(begin, anchor, *memory)
+        after, _ = step_carry(config, robot, weights, command, effect, carry, tick)
+        residual = jax.tree.map(jnp.subtract, tuple(end), (after.state, after.feet))
+        return (after.commands, after.disturbance), ModelResidual(*residual)
 
-    def one(carried: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[Any, Missed]:
-        now, then, tick = inputs
-        after, _ = step_carry(config, robot, weights, command, effect, at(now, *carried), tick)
-        missed = jax.tree.map(jnp.subtract, then, Missed(after.state, after.feet))
-        return (after.commands, after.disturbance), missed
-
-    now, then = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
-    first = jax.tree.map(lambda x: x[0], measured)
-    carried = held, NO_DISTURBANCE
-    _, missed = jax.lax.scan(one, carried, (now, then, tick + jnp.arange(ticks - 1)))
-    return Grounding(at(first, *carried), tick, missed)
+    begins, ends = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
+    memory = command_history(command_before), NO_DISTURBANCE
+    _, residuals = jax.lax.scan(step, memory, (begins, ends, tick + jnp.arange(ticks - 1)))
+    return Grounding(carry_from(first, anchor, *memory), tick, residuals)
 
 
 def grounded_rollout(
@@ -106,32 +97,32 @@ def grounded_rollout(
     effect: jax.tree_util.Partial,
     grounding: Grounding,
 ) -> Trajectory:
-    """Walk on the model from the end of a walk's first tick, adding what it missed of the walk.
+    """Walk on the model from the end of a walk's first tick, adding its residuals.
 
     Args:
         config, robot, command, effect: those of the grounding.
-        weights: any; the gradient is taken with respect to these.
+        weights: theta; the gradient is taken with respect to these.
         grounding: see `fit_grounding`.
 
     Returns:
-        Trajectory of T - 1 samples. Nothing raises: read `fallen` and `residual`.
+        Trajectory of T - 1 samples. Nothing raises: check `fallen` and `residual`.
 
-    Source: Eq. 12, 13 and the measured remainder.
+    Source: Eq. 12, 13 and the measured residuals.
     """
 
     @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
-    def one(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
-        missed, tick = inputs
+    def step(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
+        residual, tick = inputs
         after, sample = step_carry(config, robot, weights, command, effect, carry, tick)
-        state, feet = jax.tree.map(jnp.add, Missed(after.state, after.feet), missed)
+        state, feet = jax.tree.map(jnp.add, (after.state, after.feet), tuple(residual))
         fallen = carry.fallen | has_fallen(state, *robot.description.limits)
         after = after._replace(state=state, feet=feet, fallen=fallen)
         return after, sample._replace(state=state, feet=feet.position, fallen=fallen)
 
-    ticks = grounding.tick + jnp.arange(len(grounding.missed.feet.yaw))
-    _, samples = jax.lax.scan(one, grounding.start, (grounding.missed, ticks))
-    initial = grounding.start.state
-    return samples._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
+    start, tick, residuals = grounding
+    ticks = tick + jnp.arange(len(residuals.feet.yaw))
+    _, samples = jax.lax.scan(step, start, (residuals, ticks))
+    return samples._replace(initial=start.state, period=jnp.asarray(config.walk.gait.tick))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -144,11 +135,11 @@ def evaluate_grounded(
     grounding: Grounding,
     loss: Loss,
 ) -> Evaluation:
-    """Loss of a grounded rollout and its gradient by the weights, as `evaluate` of a plain one.
+    """Compute the loss of a grounded rollout and its gradient, as `evaluate` of a plain rollout.
 
     Args:
         config, robot, weights, command, effect, grounding: see `grounded_rollout`.
-        loss: terms and their weights; the changes of the command are those after the first tick.
+        loss: terms and their weights; changes of the command count after the first tick.
 
     Source: Eq. 9, 11.
     """

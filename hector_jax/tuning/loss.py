@@ -1,17 +1,16 @@
 """Tracking and smoothness of a walk as one number (Eq. 11), the same in every world.
 
-    L = alpha_1 sum |e - e_ref|^2 + alpha_2 sum |p - p_ref|^2 + sum |u_j - u_{j-1}|^2      over 1
-    kHz samples
+    L = alpha_1 sum |e - e_ref|^2 + alpha_2 sum |p - p_ref|^2 + sum |u_j - u_{j-1}|^2
 
-A loss is a tuple of terms, each a function of a trajectory with a weight alpha; `PAPER_LOSS` has
-the three of the paper. A term of one's own goes into that tuple (docs/howto/loss.md): gradients,
-logs, tables and files go through the terms by name. The forward recursion, and with it tuning along
-measured walks, follows a term through the states and commands of a walk only.
+over 1 kHz samples. A loss is a tuple of terms, each a function of a trajectory with a weight alpha;
+`PAPER_LOSS` has the three of the paper. Further terms go into such a tuple (docs/howto/loss.md):
+gradients, logs, tables and files iterate over the terms by name. The forward recursion, and with it
+tuning along measured walks, differentiates a term by the states and commands of a walk only.
 
-A world that ticks slower weighs its tracking sums by the milliseconds a tick stands for; the
-smoothness counts the changes of the held command. A fall is a fall: every missing sample is charged
-the larger of the last error and a least one, and smoothness stops. The least error in position is
-the height of the reference, so that a tall robot has farther to fall.
+A world with longer ticks multiplies its tracking sums by the milliseconds of a tick; the smoothness
+term sums the changes of the held command. After a fall every missing sample counts the larger of
+the last error and a minimum, and the smoothness term ends. The minimum error in position is the
+height of the reference, so that it grows with the robot.
 
 The terms grow with the robot: L_pos with the square of its height, L_ctrl with that of its weight.
 A robot's description may weigh them otherwise (`loss_of_robot`).
@@ -32,16 +31,16 @@ from hector_jax.core.settings import NOT_NEGATIVE
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.description import Description
 
-SAMPLE = 1e-3  # [s] the rate at which the paper sums
-FALL_POSITION = 0.5  # [m] least error charged after a fall from less than this height
-FALL_EULER = 0.8  # [rad]
+SAMPLE = 1e-3  # [s] period of the paper's sums
+FALL_POSITION = 0.5  # [m] minimum error after a fall, if the height is less
+FALL_EULER = 0.8  # [rad] minimum error after a fall
 
 
 class LossTerm(NamedTuple):
-    """One term of the loss.
+    """A term of the loss.
 
     As a pytree it has one leaf, its weight: another weight needs no compilation, another function
-    does. In cache keys a function is known by its name.
+    does. In cache keys a function is identified by its name.
     """
 
     name: str  # "L_Eul": in tables, logs and files; begins with L_
@@ -61,19 +60,21 @@ jax.tree_util.register_pytree_node(
 )
 
 Loss = tuple[LossTerm, ...]
-"""What a walk costs: the sum of some terms, each times its weight."""
+"""The loss of a walk is the sum of these terms, each times its weight."""
 
 Terms = Mapping[str, Float[Array, "*batch"]]
-"""A number for each term of a loss, by its name."""
+"""Values of the terms of a loss, by name."""
 
 
-def _charged(
-    error: Float[Array, " T"], fallen: Bool[Array, " T"], least: float | Float[Array, " T"]
-) -> Float[Array, " T"]:
-    """Squared errors with those after the fall replaced by what a fall is charged."""
-    before = jnp.where(fallen, 0.0, error)
+def _tracking_loss(
+    trajectory: Trajectory, error: Float[Array, "T 3"], minimum: float | Float[Array, " T"]
+) -> Float[Array, ""]:
+    """Sum a squared error over 1 kHz samples; after a fall it is the last, at least a minimum."""
+    fallen, squares = trajectory.fallen, jnp.sum(error**2, axis=-1)
+    before = jnp.where(fallen, 0.0, squares)
     last = jnp.maximum(jnp.sum(~fallen) - 1, 0)
-    return jnp.where(fallen, jnp.maximum(before[last], least**2), before)
+    charged = jnp.where(fallen, jnp.maximum(before[last], minimum**2), before)
+    return trajectory.period / SAMPLE * jnp.sum(charged)
 
 
 def _squared_changes(command: Wrench, fallen: Bool[Array, " T"]) -> Float[Array, " T-1"]:
@@ -83,22 +84,20 @@ def _squared_changes(command: Wrench, fallen: Bool[Array, " T"]) -> Float[Array,
 
 
 def euler_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Squared error of roll, pitch and yaw [rad^2], summed over 1 kHz samples."""
-    error = jnp.sum((trajectory.state.euler - trajectory.reference.euler) ** 2, axis=-1)
-    samples = trajectory.period / SAMPLE
-    return samples * jnp.sum(_charged(error, trajectory.fallen, FALL_EULER))
+    """Sum the squared error of roll, pitch and yaw [rad^2] over 1 kHz samples."""
+    error = trajectory.state.euler - trajectory.reference.euler
+    return _tracking_loss(trajectory, error, FALL_EULER)
 
 
 def position_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Squared error of the centre of mass [m^2], summed over 1 kHz samples."""
-    error = jnp.sum((trajectory.state.position - trajectory.reference.position) ** 2, axis=-1)
-    samples = trajectory.period / SAMPLE
-    least = jnp.maximum(trajectory.reference.position[..., 2], FALL_POSITION)
-    return samples * jnp.sum(_charged(error, trajectory.fallen, least))
+    """Sum the squared error of the centre of mass [m^2] over 1 kHz samples."""
+    error = trajectory.state.position - trajectory.reference.position
+    minimum = jnp.maximum(trajectory.reference.position[..., 2], FALL_POSITION)
+    return _tracking_loss(trajectory, error, minimum)
 
 
 def control_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """Squared changes of the commanded wrench [N^2 and (N m)^2], summed over a walk."""
+    """Sum the squared changes of the commanded wrench [N^2 and (N m)^2] over a walk."""
     return jnp.sum(_squared_changes(trajectory.command, trajectory.fallen))
 
 
@@ -111,20 +110,20 @@ PAPER_LOSS: Loss = (
 
 
 def losses(loss: Loss, trajectory: Trajectory) -> Terms:
-    """Unweighted terms of the loss of one walk. Source: Eq. 11."""
-    trajectory = jax.tree.map(jnp.asarray, trajectory)  # MuJoCo's walks come as numpy
+    """Compute the unweighted terms of the loss of a walk. Source: Eq. 11."""
+    trajectory = jax.tree.map(jnp.asarray, trajectory)  # the simulators return NumPy arrays
     return {term.name: term.of(trajectory) for term in loss}
 
 
 def switch_loss(trajectory: Trajectory) -> Float[Array, ""]:
-    """The part of L_ctrl at changes of stance: about 2 (m g)^2 each, whatever the weights."""
+    """Compute the part of L_ctrl at changes of stance: about 2 (m g)^2 each for all weights."""
     trajectory = jax.tree.map(jnp.asarray, trajectory)
     switched = jnp.any(trajectory.contact[1:] != trajectory.contact[:-1], axis=-1)
     return jnp.sum(jnp.where(switched, _squared_changes(trajectory.command, trajectory.fallen), 0))
 
 
 def total(loss: Loss, terms: Mapping[str, Any]) -> Float[Array, "*batch"]:
-    """L of its terms. Source: Eq. 11.
+    """Sum the weighted terms to L. Source: Eq. 11.
 
     >>> total(PAPER_LOSS, {"L_Eul": 1.0, "L_pos": 2.0, "L_ctrl": 3e5}).item()
     800000.0
@@ -134,7 +133,7 @@ def total(loss: Loss, terms: Mapping[str, Any]) -> Float[Array, "*batch"]:
 
 @jax.jit
 def loss_of(loss: Loss, trajectory: Trajectory) -> Float[Array, ""]:
-    """L of one walk. Source: Eq. 11."""
+    """Compute L of a walk. Source: Eq. 11."""
     return total(loss, losses(loss, trajectory))
 
 
@@ -142,8 +141,8 @@ def check_loss(loss: Any) -> None:
     """Check the terms of a loss.
 
     Raises:
-        InputError: no term, two of one name, a name that does not begin with `L_`, or a weight that
-            is negative or not finite.
+        InputError: no term, two terms of one name, a name that does not begin with `L_`, or a
+            weight that is negative or not finite.
     """
     what = "TuneConfig.loss"
     if not all(isinstance(term, LossTerm) for term in loss):
@@ -159,11 +158,11 @@ def check_loss(loss: Any) -> None:
             raise InputError(f"{what}: {term.name} must be a number of at least 0, got {got}")
 
 
-_KEYS = {"L_Eul": "euler", "L_pos": "position"}  # names of the weights in files
+_KEYS = {"L_Eul": "euler", "L_pos": "position"}  # keys of the weights in files
 
 
 def alphas(loss: Loss) -> dict[str, float]:
-    """Weights of a loss as JSON values, by the name that files have for them.
+    """Return the weights of a loss as JSON values, by their keys in files.
 
     >>> alphas(PAPER_LOSS)
     {'euler': 100000.0, 'position': 200000.0, 'L_ctrl': 1.0}
@@ -172,7 +171,7 @@ def alphas(loss: Loss) -> dict[str, float]:
 
 
 def with_alphas(weights: Mapping[str, float], loss: Loss = PAPER_LOSS) -> Loss:
-    """A loss with other weights of some terms, each by the name of the term or its key in files.
+    """Replace weights of a loss, by the name of the term or its key in files.
 
     Raises:
         InputError: the loss has no such term, or a weight is negative or not finite.
@@ -184,17 +183,17 @@ def with_alphas(weights: Mapping[str, float], loss: Loss = PAPER_LOSS) -> Loss:
     for key in weights:
         if key not in names:
             raise InputError(unknown("term", key, (term.name for term in loss)))
-    given = {names[key]: weight for key, weight in weights.items()}
-    weighted = tuple(t._replace(weight=given.get(t.name, t.weight)) for t in loss)
+    by_name = {names[key]: weight for key, weight in weights.items()}
+    weighted = tuple(t._replace(weight=by_name.get(t.name, t.weight)) for t in loss)
     check_loss(weighted)
     return weighted
 
 
 def loss_of_robot(description: Description) -> Loss:
-    """The paper's loss with the weights that a robot's description gives.
+    """Return the paper's loss with the weights of a robot's description.
 
     Raises:
-        InputError: one line naming the file, for a term that there is not or a wrong weight.
+        InputError: one line naming the file, for an unknown term or a wrong weight.
     """
     try:
         return with_alphas(dict(description.loss))

@@ -1,11 +1,11 @@
-"""DiffTune along walks that were measured, on a better simulator or on the robot (Eq. 9, 10).
+"""DiffTune along measured walks, of a better simulator or of the robot (Eq. 9, 10).
 
-The tracking errors in the loss are the measured ones, and dynamics, phi and controller are
-differentiated at the measured states: the model is asked only how a state would have changed with
-the weights, not what it was. The changes of the command in the loss are those of commands planned
-anew from the true states and joints; what was sent was planned from an estimate, so that on a plant
-with backlash or an estimator that errs the two differ. Tuning on the model's own walk ends where
-the model errs; from there this goes on, at the price of a walk for every step.
+The tracking errors in the loss are measured, and dynamics, phi and controller are differentiated at
+the measured states: the model gives only the derivative of a state by the weights, not the state.
+The changes of the command in the loss are those of commands planned anew from the true states and
+joints; the commands of the walk were planned from an estimate, so the two differ on a plant with
+backlash or with errors of the estimator. Tuning on rollouts of the model is limited by the model's
+error; this method continues from there and costs a walk for every step.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,25 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax.control.controller import measured_feet
-from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
-from hector_jax.core.arrays import Array
-from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.online import MeasuredState, follow, init_trace
+from hector_jax.tuning.online import follow, init_trace, measured_states
 
-
-@jax.jit
-def _measured_states(robot: Robot, state: State, joints: Array) -> MeasuredState:
-    def one(state: State, joints: Array) -> MeasuredState:
-        measurement = Measurement(state, joints, jnp.zeros_like(joints))
-        return MeasuredState(state, measured_feet(robot, measurement))
-
-    return jax.vmap(one)(state, joints)
+_measured_states = jax.jit(measured_states)
 
 
 def evaluate_walk(
@@ -44,15 +34,14 @@ def evaluate_walk(
     walk: Trajectory,
     start_tick: int = 0,
 ) -> Evaluation:
-    """Loss of a measured walk, and its gradient through the model along what was measured.
+    """Compute the loss of a measured walk, and its gradient through the model along the walk.
 
     The first tick is left out: the reference is anchored in it.
 
     Args:
         config: controller and loss.
         robot: nominal body.
-        weights: that were walked with.
-        command: that was walked.
+        weights, command: of the walk.
         effect: phi; its Jacobian is used.
         walk: of `config.rollout.ticks` ticks, sampled at the plan interval or finer.
         start_tick: gait tick of t = 0.
@@ -71,12 +60,12 @@ def evaluate_walk(
     first = Wrench(*(w[0] for w in walk.command))
     anchor = anchor_at(robot, walk.initial, start_tick)
     trace = init_trace(anchor, jax.tree.map(lambda x: x[0], states), first, weights)
-    used = jax.tree.map(lambda w: np.broadcast_to(w, (ticks - 1, *np.shape(w))), weights)
+    stacked = jax.tree.map(lambda w: np.broadcast_to(w, (ticks - 1, *np.shape(w))), weights)
     tick = np.asarray(start_tick + 1, np.int32)
-    _, evaluation = follow(config, robot, command, anchor, effect, trace, used, tick, states)
+    _, evaluation = follow(config, robot, command, anchor, effect, trace, stacked, tick, states)
     fallen = jnp.maximum(evaluation.fallen, jnp.mean(1.0 * jnp.asarray(walk.fallen)))
-    worst = jnp.maximum(evaluation.residual, jnp.max(jnp.asarray(walk.residual)))
-    return jax.tree.map(np.asarray, evaluation._replace(fallen=fallen, residual=worst))
+    residual = jnp.maximum(evaluation.residual, jnp.max(jnp.asarray(walk.residual)))
+    return jax.tree.map(np.asarray, evaluation._replace(fallen=fallen, residual=residual))
 
 
 def tune_measured(
@@ -87,22 +76,22 @@ def tune_measured(
 ) -> Tuning:
     """Tune on measured walks, from weights that have been tuned on the model.
 
-    A step is accepted only where the mean loss over the walks falls, as in every tuning after the
+    A step is accepted only if the mean loss over the walks falls, as in every tuning after the
     paper's ten iterations.
 
     Args:
-        config: how; these iterations count from the paper's ten on.
-        weights: where to start.
-        evaluate: walks with weights on each plant and differentiates, see `evaluate_walk`.
+        config: the settings; the iterations count from the paper's ten on.
+        weights: the start.
+        evaluate: walks with the weights on each plant and differentiates, see `evaluate_walk`.
         on_iteration: called after each iteration.
 
     Raises:
-        InputError: a walk with the starting weights falls or cannot be believed.
+        InputError: a walk with the starting weights falls or is not solved.
     """
 
     def mean(weights: Weights) -> Evaluation:
         evaluations = evaluate(weights)
-        both = jax.tree.map(lambda *x: np.mean(x, axis=0), *evaluations)
-        return both._replace(residual=np.max([one.residual for one in evaluations]))
+        average = jax.tree.map(lambda *x: np.mean(x, axis=0), *evaluations)
+        return average._replace(residual=np.max([e.residual for e in evaluations]))
 
     return descend(config, weights, mean, on_iteration, PAPER_ITERATIONS)

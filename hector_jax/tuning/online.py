@@ -1,16 +1,16 @@
-"""DiffTune while walking: weights stepped by the gradient over the walk that was just measured.
+"""DiffTune while walking: steps of the weights along the gradient over the last measured window.
 
-Every `window` ticks the loss of these ticks is differentiated by the weights in force, and the
-weights take one of DiffTune's steps, inside its guards. The states, feet and contacts along which
-dynamics and controller are differentiated are the measured ones (Eq. 9, 10), and so are the errors
-that enter the loss: what the model does not know, such as a load on the trunk, is in both. A
-sagging trunk is the example: under the error e = d / k that a load d leaves, the recursion along
-the measured states settles at -(dk / dtheta) e / k, the derivative of d / k itself; a model that is
-rolled out from the measured state sees the error die away and with it the reason to stiffen.
+Every `window` ticks the loss of these ticks is differentiated by the weights in use, and the
+weights take one step of DiffTune, with its checks. Dynamics and controller are differentiated at
+the measured states, feet and contacts (Eq. 9, 10), and the loss has the measured errors: both
+contain what the model does not know, such as a load on the trunk. A sagging trunk is the example:
+at the error e = d / k under a load d, the recursion along the measured states converges to
+-(dk / dtheta) e / k, the derivative of d / k itself; in a rollout of the model from the measured
+state the error decays, and with it the gradient towards more stiffness.
 
-The sensitivities are carried on from window to window: a window is shorter than the answer of the
-closed loop to a weight, and a recursion begun anew in each would see the first of it only. On the
-hfs, from nominal weights, the three ways of `ESTIMATORS` gain about the same.
+The sensitivities are carried on from window to window: the response of the closed loop to a weight
+is longer than a window, and a recursion restarted in each would cover its beginning only. On the
+hfs, from nominal weights, the three `ESTIMATORS` gain about the same.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,13 +47,13 @@ ESTIMATORS = ("carried", "cut", "model")
 
 @dataclass(frozen=True)
 class OnlineConfig:
-    """How weights are tuned while walking."""
+    """Settings of tuning while walking."""
 
-    tune: TuneConfig = field(default_factory=TuneConfig)  # controller, loss, steps and guards
-    window: int = 40  # ticks between steps, and of the loss of a step; a gait cycle
-    late: int = 0  # ticks after a window's end at which its step comes into force
-    step: float = 1.0  # of the full step of `tune`
-    estimator: str = "carried"  # along measured states; "cut": begun anew in each window; "model"
+    tune: TuneConfig = field(default_factory=TuneConfig)  # controller, loss, steps and checks
+    window: int = 40  # ticks of the loss of a step, and between steps; a gait cycle
+    late: int = 0  # ticks from a window's end to the use of its step
+    step: float = 1.0  # share of the full step of `tune`
+    estimator: str = "carried"  # along measured states; "cut": restarted in each window; "model"
 
     def __post_init__(self) -> None:
         check(self, window=Range(2), late=NOT_NEGATIVE, step=SHARE, estimator=ESTIMATORS)
@@ -62,39 +62,54 @@ class OnlineConfig:
 
 
 class MeasuredState(NamedTuple):
-    """What is measured at the start of a tick."""
+    """Measurements at the start of a tick."""
 
     state: State  # of the base
-    feet: Feet  # where the feet are; of one in the air it is not used
+    feet: Feet  # positions of the feet; those in the air are not used
+
+
+def measured_states(robot: Robot, state: State, joints: Array) -> MeasuredState:
+    """Compute the feet of measured states and joints; all with one leading axis."""
+
+    def measured_state(state: State, joints: Array) -> MeasuredState:
+        measurement = Measurement(state, joints, jnp.zeros_like(joints))
+        return MeasuredState(state, measured_feet(robot, measurement))
+
+    return jax.vmap(measured_state)(state, joints)
+
+
+def command_history(command: Wrench) -> Wrench:
+    """Return past commands (HISTORY, feet, 3) that all equal `command`."""
+    return jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), command)
+
+
+def carry_from(
+    measured: MeasuredState, anchor: Anchor, commands: Wrench, disturbance: Disturbance
+) -> Carry:
+    """Return the carry of a robot that has not fallen, from its measured state."""
+    return Carry(*measured, commands, anchor, disturbance, fallen=jnp.asarray(False))
 
 
 class Trace(NamedTuple):
-    """What a window hands to the next."""
+    """State of the recursion between two windows."""
 
     commands: Wrench  # (HISTORY, feet, 3) each, world frame, newest first
-    disturbance: Disturbance  # of the controller, at its end
-    tangents: Varied  # of the carry at its end
+    disturbance: Disturbance  # of the controller
+    tangents: Varied  # of the carry
 
 
 def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench, weights: Weights) -> Trace:
-    """No weight has a part in what was measured so far.
+    """Start the recursion: the past does not depend on the weights.
 
     Args:
         anchor: of the reference.
-        measured: now.
-        last: wrench commanded over the last tick, taken for those before it too.
-        weights: whose numbers are counted.
+        measured: at the start of the tick.
+        last: wrench commanded over the last tick, also used for the ticks before it.
+        weights: of the shape that the tangents are taken by.
     """
-    commands = jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), last)
-    carry = _carry(anchor, measured, commands, NO_DISTURBANCE)
+    commands = command_history(last)
+    carry = carry_from(measured, anchor, commands, NO_DISTURBANCE)
     return Trace(commands, NO_DISTURBANCE, no_tangents(carry, weights))
-
-
-def _carry(
-    anchor: Anchor, measured: MeasuredState, commands: Wrench, disturbance: Disturbance
-) -> Carry:
-    never = jnp.asarray(False)
-    return Carry(measured.state, measured.feet, commands, anchor, disturbance, never)
 
 
 def window_gradient(
@@ -110,50 +125,50 @@ def window_gradient(
     states: MeasuredState,
     measured: bool = True,
 ) -> tuple[Trace, Evaluation]:
-    """Loss of the ticks of a window and its gradient by the weights.
+    """Compute the loss of the ticks of a window and its gradient by the weights.
 
     Args:
         config: controller.
         loss: terms and their weights.
         robot: nominal body.
-        command, anchor: what was walked, from where.
+        command, anchor: of the walk.
         effect: phi, `Window -> Effect`; its Jacobian is used.
         trace: of the window before, see `init_trace`.
-        weights: in force over each of the n ticks, stacked.
+        weights: in use over each of the n ticks, stacked.
         tick: gait tick at the window's start, later than t = 0.
         states: n + 1 measurements, stacked: at the start of each tick and at the end of the last.
-        measured: along what was measured; or along the model's own walk from the first measurement
-            on (static).
+        measured: True along the measured states, False along a rollout of the model from the first
+            measurement (static).
 
     Returns:
-        The trace for the next window, and the evaluation. The change from the command before the
-        window to its first is priced in it.
+        The trace for the next window, and the evaluation, which includes the change from the
+        command before the window to its first.
 
     Source: Eq. 9-11, along measured states.
     """
 
-    def one(carried: tuple[Carry, Varied], inputs: tuple) -> tuple:
+    def step(carried: tuple[Carry, Varied], inputs: tuple) -> tuple:
         carry, tangents = carried
-        tick, weights, now, after = inputs
+        tick, weights, begin, end = inputs
         if measured:
-            carry = _carry(anchor, now, carry.commands, carry.disturbance)
-        then, tangents, sample, columns = step_sensitivities(
+            carry = carry_from(begin, anchor, carry.commands, carry.disturbance)
+        after, tangents, sample, columns = step_sensitivities(
             config, robot, weights, command, effect, carry, tangents, tick
         )
         if measured:
-            fallen = has_fallen(after.state, *robot.description.limits)
-            sample = sample._replace(state=after.state, fallen=fallen)
-        return (then, tangents), (sample, columns)
+            fallen = has_fallen(end.state, *robot.description.limits)
+            sample = sample._replace(state=end.state, fallen=fallen)
+        return (after, tangents), (sample, columns)
 
-    now, after = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
-    begin = jax.tree.map(lambda x: x[0], states), trace.commands, trace.disturbance
-    ticks = tick + jnp.arange(len(now.feet.yaw))
+    begins, ends = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
+    state, first_weights = jax.tree.map(lambda x: x[0], (states, weights))
+    carry = carry_from(state, anchor, trace.commands, trace.disturbance)
+    ticks = tick + jnp.arange(len(begins.feet.yaw))
     (last, tangents), (samples, columns) = jax.lax.scan(
-        one, (_carry(anchor, *begin), trace.tangents), (ticks, weights, now, after)
+        step, (carry, trace.tangents), (ticks, weights, begins, ends)
     )
     walk, columns = _with_command_before(samples, columns, trace)
-    first = jax.tree.map(lambda x: x[0], weights)
-    value, gradient = sensitivity.gradient(loss, walk, columns, first)
+    value, gradient = sensitivity.gradient(loss, walk, columns, first_weights)
     fallen, residual = jnp.mean(1.0 * samples.fallen), jnp.max(samples.residual)
     evaluation = Evaluation(value, losses(loss, walk), gradient, fallen, residual)
     return Trace(last.commands, last.disturbance, tangents), evaluation
@@ -165,26 +180,26 @@ _window_gradient = jax.jit(window_gradient, static_argnums=0, static_argnames="m
 def follow(
     config: TuneConfig, robot: Robot, *window: Any, measured: bool = True
 ) -> tuple[Trace, Evaluation]:
-    """`window_gradient` with the rollout and the loss of a tuning, compiled."""
+    """Run `window_gradient` with the rollout and the loss of a tuning, compiled."""
     return _window_gradient(config.rollout, config.loss, robot, *window, measured=measured)
 
 
 def _with_command_before(
     samples: Trajectory, columns: Sensitivities, trace: Trace
 ) -> tuple[Trajectory, Sensitivities]:
-    """Samples after one that has no error and the command before the window."""
+    """Prepend a sample that has no error and the command before the window."""
 
-    def after(first: Any, rest: Any) -> Any:
-        return jax.tree.map(lambda one, more: jnp.concatenate([one[None], more]), first, rest)
+    def prepend(first: Any, rest: Any) -> Any:
+        return jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), first, rest)
 
     newest = jax.tree.map(lambda w: w[0], trace.commands)
     first = jax.tree.map(lambda x: x[0], samples)
-    walk = after(first._replace(state=first.reference, command=newest), samples)
+    walk = prepend(first._replace(state=first.reference, command=newest), samples)
     before = Sensitivities(
         jax.tree.map(lambda s: jnp.zeros_like(s[0]), columns.state),
         jax.tree.map(lambda w: w[:, 0], trace.tangents.commands),
     )
-    columns = jax.tree.map(lambda s: jnp.swapaxes(s, 0, 1), after(before, columns))
+    columns = jax.tree.map(lambda s: jnp.swapaxes(s, 0, 1), prepend(before, columns))
     return walk._replace(period=first.period, initial=first.initial), columns
 
 
@@ -192,22 +207,22 @@ _feet = jax.jit(measured_feet)
 
 
 class Adaptation(NamedTuple):
-    """Where online tuning stands between two ticks."""
+    """State of online tuning between two ticks."""
 
-    weights: Weights  # in force
-    newest: Weights  # that come into force at tick `due`
-    sound: Weights  # of the last window that was not refused
+    weights: Weights  # in use
+    newest: Weights  # in use from tick `due` on
+    sound: Weights  # of the last accepted window
     scale: float  # of the next step, 1 for a full one
-    led: float  # scale of the step that led to `newest`
-    windows: int  # so far
+    newest_scale: float  # of the step that gave `newest`
+    windows: int  # number so far
     due: int  # gait tick
     trace: Trace | None  # of the windows so far; None before the first
-    states: tuple[MeasuredState, ...]  # measured since the window began
-    used: tuple[Weights, ...]  # in force over its ticks
+    states: tuple[MeasuredState, ...]  # since the start of the window
+    used: tuple[Weights, ...]  # over the ticks of the window
 
 
 def init_adaptation(weights: Weights) -> Adaptation:
-    """Online tuning before its first tick, from some weights."""
+    """Return the state of online tuning before its first tick."""
     start = jax.tree.map(np.asarray, weights)
     return Adaptation(start, start, start, 1.0, 0.0, 0, 0, None, (), ())
 
@@ -223,15 +238,15 @@ def step_adaptation(
     measurement: Measurement,
     last: Wrench,
 ) -> tuple[Adaptation, Iteration | None]:
-    """Weights for one tick of a walk; at the end of a window, what its step was.
+    """Choose the weights for a tick of a walk; at the end of a window, also return its iteration.
 
-    A window that fell, was not solved or is not finite is refused: the weights go back to those of
-    the last window that was sound, the step is halved and the sensitivities begin anew.
+    A window with a fall, an unsolved QP or a number that is not finite is rejected: the weights are
+    reset to those of the last accepted window, the step is halved and the sensitivities restart.
 
     Args:
-        config: how.
+        config: the settings.
         robot: nominal body.
-        command, anchor: what is walked, from where.
+        command, anchor: of the walk.
         effect: phi.
         carry: from `init_adaptation` or the tick before.
         tick: gait tick, from t = 0 on.
@@ -242,26 +257,24 @@ def step_adaptation(
         return carry, None
     state = MeasuredState(measurement.state, _feet(robot, measurement))
     states = (*carry.states, jax.tree.map(np.asarray, state))
-    carry, iteration = carry._replace(states=states), None
     trace = carry.trace or init_trace(anchor, state, last, carry.weights)
-    carry = carry._replace(trace=trace)
+    carry, iteration = carry._replace(states=states, trace=trace), None
     if len(carry.used) == config.window:
-        window = carry.states, carry.used, tick - config.window
+        window = states, carry.used, tick - config.window
         trace, evaluation = _follow_window(config, robot, command, anchor, effect, trace, *window)
         status = step_status(config.tune, evaluation)
-        row = carry.windows, carry.weights, evaluation, status, carry.led
+        row = carry.windows, carry.weights, evaluation, status, carry.newest_scale
         iteration = Iteration(*jax.tree.map(np.asarray, row))
-        if not iteration.accepted:
-            scale, led, newest, sound = carry.scale / 2.0, 0.0, carry.sound, carry.sound
-            trace = init_trace(anchor, state, last, carry.weights)
+        if iteration.accepted:
+            step = config.step * carry.scale
+            sound, scale = carry.newest, min(1.0, 2.0 * carry.scale)
+            newest = step_weights(config.tune, sound, evaluation.gradient, step)
         else:
-            scale, led, sound = min(1.0, 2.0 * carry.scale), config.step * carry.scale, carry.newest
-            newest = step_weights(config.tune, sound, evaluation.gradient, led)
-        due, states = tick + config.late, carry.states[-1:]
-        windows = carry.windows + 1
-        carry = Adaptation(
-            carry.weights, newest, sound, scale, led, windows, due, trace, states, ()
-        )
+            step, sound, newest, scale = 0.0, carry.sound, carry.sound, carry.scale / 2.0
+            trace = init_trace(anchor, state, last, carry.weights)
+        carry = carry._replace(newest=newest, sound=sound, scale=scale, newest_scale=step)
+        carry = carry._replace(windows=carry.windows + 1, due=tick + config.late)
+        carry = carry._replace(trace=trace, states=states[-1:], used=())
     weights = carry.newest if tick >= carry.due else carry.weights
     return carry._replace(weights=weights, used=(*carry.used, weights)), iteration
 
@@ -277,21 +290,12 @@ def _follow_window(
     used: Sequence[Weights],
     begin: int,
 ) -> tuple[Trace, Evaluation]:
-    """`window_gradient` of the window from tick `begin`, as numbers of NumPy."""
+    """Run `window_gradient` on the window from tick `begin`; returns NumPy arrays."""
     if config.estimator != "carried":
         trace = trace._replace(tangents=jax.tree.map(jnp.zeros_like, trace.tangents))
-    result = follow(
-        config.tune,
-        robot,
-        command,
-        anchor,
-        effect,
-        trace,
-        stack(used),
-        np.asarray(begin, np.int32),
-        stack(states),
-        measured=config.estimator != "model",
-    )
+    window = trace, stack(used), np.asarray(begin, np.int32), stack(states)
+    measured = config.estimator != "model"
+    result = follow(config.tune, robot, command, anchor, effect, *window, measured=measured)
     return jax.tree.map(np.asarray, result)
 
 
@@ -303,12 +307,12 @@ def retuner(
     effect: jax.tree_util.Partial,
     on_step: Callable[[Iteration], None] = lambda iteration: None,
 ) -> Retune:
-    """Online tuning for `sim.walk.walk`.
+    """Return online tuning as a callback of `sim.walk.walk`.
 
     Args:
         config, robot, command, effect: see `step_adaptation`.
-        weights: where to start.
-        on_step: called after each window, with the weights in force at its end.
+        weights: the start.
+        on_step: called after each window, with the weights in use at its end.
     """
 
     def step(carry: Adaptation, *tick: Any) -> tuple[Adaptation, Weights]:

@@ -1,11 +1,11 @@
 """The closed loop on the single rigid body, with phi between command and effect (Eq. 12, 13).
 
-This is the only world that is differentiated. A tick solves the MPC, asks phi what the ground
-returns and moves the body; in between, nothing is remembered but what `Carry` holds. A foot in the
-air is carried where phi says that it lands, and an early touchdown that phi predicts acts there.
+This is the only world that is differentiated. A tick solves the MPC, evaluates phi for the reaction
+of the ground and moves the body; its only memory is `Carry`. A foot in the air moves to the
+touchdown that phi predicts, and an early touchdown that phi predicts acts there.
 
-A `Variation` makes the body and its ground differ from what the controller believes, for weights
-that have to bear with that.
+A `Variation` makes the body and its ground differ from the controller's model, for weights that
+have to be robust to that.
 """
 
 from dataclasses import dataclass
@@ -38,12 +38,12 @@ from hector_jax.robot.model import Robot
 
 @dataclass(frozen=True)
 class RolloutConfig:
-    """What a rollout is compiled for."""
+    """Static settings of a rollout."""
 
     walk: WalkConfig = WalkConfig()
     ticks: int = 400  # T; 4 s
     lead: int = 0  # ticks in place before t = 0, outside the loss
-    block: int = 500  # most ticks whose solves are stored; longer rollouts are computed twice
+    block: int = 500  # most ticks with stored solves; longer rollouts are computed twice
 
     def __post_init__(self) -> None:
         check(self, ticks=Range(2), lead=NOT_NEGATIVE, block=AT_LEAST_ONE)
@@ -55,7 +55,7 @@ class RolloutConfig:
 
 
 def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutConfig:
-    """The rollout that a robot's description asks for.
+    """Return the settings of a rollout from a robot's description.
 
     Raises:
         InputError: one line naming the file, the key and what was expected.
@@ -68,66 +68,62 @@ def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutCon
 
 
 class Variation(NamedTuple):
-    """How the world differs from what the controller believes; see `no_variation`."""
+    """Difference of the world from the controller's model; see `no_variation`."""
 
-    mass: Float[Array, "*batch"]  # times the robot's
-    inertia: Float[Array, "*batch"]  # likewise, all of it
-    com: Float[Array, "*batch 3"]  # true centre of mass from the believed one, trunk axes [m]
-    friction: Float[Array, "*batch"]  # of the ground: most |F_x| + |F_y| by F_z, as in the plants
-    delay: Float[Array, "*batch"]  # by which effects come late [s], at most a tick
-    noise: State  # standard deviations of what the controller sees, white from tick to tick
+    mass: Float[Array, "*batch"]  # factor on the robot's mass
+    inertia: Float[Array, "*batch"]  # factor on the whole inertia matrix
+    com: Float[Array, "*batch 3"]  # true less modelled centre of mass, trunk axes [m]
+    friction: Float[Array, "*batch"]  # of the ground: bound on (|F_x| + |F_y|) / F_z, as in plants
+    delay: Float[Array, "*batch"]  # of the effects [s], at most a tick
+    noise: State  # standard deviations of the estimated base state, white from tick to tick
     seed: Int[Array, "*batch"]  # of the noise
 
 
 def no_variation() -> Variation:
-    """The world is as the controller believes."""
-    one, zero, none = np.asarray(1.0), np.asarray(0.0), np.zeros(3)
-    grips = np.asarray(1e3)
-    return Variation(one, one, none, grips, zero, State(none, none, none, none), np.asarray(0))
+    """Return the variation under which the world equals the controller's model."""
+    one, zero, zeros = np.asarray(1.0), np.asarray(0.0), np.zeros(3)
+    noise = State(zeros, zeros, zeros, zeros)
+    return Variation(one, one, zeros, np.asarray(1e3), zero, noise, np.asarray(0))
 
 
 class Carry(NamedTuple):
-    """What one tick hands to the next."""
+    """State of the closed loop between two ticks."""
 
     state: State
     feet: Feet
     commands: Wrench  # (HISTORY, feet, 3) each, world frame, newest first
-    anchor: Anchor  # taken anew at t = 0
+    anchor: Anchor  # reset at t = 0
     disturbance: Disturbance  # of the controller
     fallen: Bool[Array, ""]
-    before: Effect | None = None  # of the last tick, world frame; where there is a variation
+    before: Effect | None = None  # of the last tick, world frame; None without a variation
 
 
 def init_carry(robot: Robot, anchor: Anchor) -> Carry:
-    """A robot that stands still at its standing anchor, its feet commanded to share the weight."""
+    """Return the carry of a robot standing at its anchor, its weight shared by all feet."""
     zero = jnp.zeros(3)
     trunk = anchor.position - robot.com_offset
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
     share = robot.mass / len(local) * jnp.asarray(robot.gravity)
-    standing = jnp.broadcast_to(share, (HISTORY, *local.shape))
-    return Carry(
-        state=State(zero, anchor.position, zero, zero),
-        feet=Feet(trunk + local, jnp.zeros(len(local))),
-        commands=Wrench(standing, jnp.zeros_like(standing)),
-        anchor=anchor,
-        disturbance=NO_DISTURBANCE,
-        fallen=jnp.asarray(False),
-    )
+    force = jnp.broadcast_to(share, (HISTORY, *local.shape))
+    state = State(zero, anchor.position, zero, zero)
+    feet = Feet(trunk + local, jnp.zeros(len(local)))
+    commands = Wrench(force, jnp.zeros_like(force))
+    return Carry(state, feet, commands, anchor, NO_DISTURBANCE, jnp.asarray(False))
 
 
 def _estimate_error(variation: Variation, state: State, tick: Int[Array, ""]) -> State:
-    """Error of what the controller sees of the base."""
+    """Draw the error of the estimated base state."""
     key = jax.random.fold_in(jax.random.key(variation.seed), tick)
-    drawn = jax.random.normal(key, (4, 3), state.position.dtype)
-    return State(*(sigma * error for sigma, error in zip(variation.noise, drawn, strict=True)))
+    draws = jax.random.normal(key, (4, 3), state.position.dtype)
+    return State(*(sigma * draw for sigma, draw in zip(variation.noise, draws, strict=True)))
 
 
 def _within_friction(wrench: Wrench, friction: Float[Array, ""]) -> Wrench:
-    """A foot slips: its horizontal force is cut to what the friction pyramid can hold."""
-    across = jnp.sum(jnp.abs(wrench.force[:, :2]), axis=-1)
-    held = friction * jnp.maximum(wrench.force[:, 2], 0.0)
-    slips = across > held
-    share = jnp.where(slips, held / jnp.where(slips, across, 1.0), 1.0)
+    """Scale the horizontal forces of feet that slip down to the friction pyramid."""
+    horizontal = jnp.sum(jnp.abs(wrench.force[:, :2]), axis=-1)
+    limit = friction * jnp.maximum(wrench.force[:, 2], 0.0)
+    slips = horizontal > limit
+    share = jnp.where(slips, limit / jnp.where(slips, horizontal, 1.0), 1.0)
     return wrench._replace(force=wrench.force.at[:, :2].multiply(share[:, None]))
 
 
@@ -141,7 +137,7 @@ def _moved_by(
     feet_before: Float[Array, "feet 3"],
     dt: float,
 ) -> State:
-    """`srbm.step` of the body as it is; what is delayed acts where the feet were."""
+    """Step the body with its variation; the delayed share acts at the last tick's feet."""
     share = variation.delay / dt
     mixed = jax.tree.map(lambda new, old: (1.0 - share) * new + share * old, now, before)
     lever = share * jnp.cross(feet_before - feet, before.wrench.force)
@@ -150,13 +146,13 @@ def _moved_by(
         mass=variation.mass * robot.mass, inertia=variation.inertia * jnp.asarray(robot.inertia)
     )
 
-    def seen_from(state: State, offset: Float[Array, "3"]) -> State:
+    def shifted(state: State, offset: Float[Array, "3"]) -> State:
         arm = rotation_from_euler(state.euler) @ offset
         velocity = state.velocity + jnp.cross(state.ang_velocity, arm)
         return state._replace(position=state.position + arm, velocity=velocity)
 
-    moved = srbm.step(body, seen_from(state, variation.com), wrench, feet, dt, mixed.legs)
-    return seen_from(moved, -variation.com)
+    stepped = srbm.step(body, shifted(state, variation.com), wrench, feet, dt, mixed.legs)
+    return shifted(stepped, -variation.com)
 
 
 def _respond(
@@ -166,61 +162,33 @@ def _respond(
     contact: Bool[Array, " feet"],
     since_switch: Float[Array, ""],
 ) -> Effect:
-    """What acts on the body by phi, which sees and answers in the yaw frame."""
+    """Evaluate phi, whose input and output are in the yaw frame; returns the world frame."""
     yaw = state.euler[2]
-    seen = Window(
-        commands=turn(commands, -yaw),
-        contact=contact,
-        since_switch=since_switch,
-        base=from_yaw_frame(state),
-    )
-    answer = effect(seen)
-    return turn(answer, yaw)
+    window = Window(turn(commands, -yaw), contact, since_switch, base=from_yaw_frame(state))
+    return turn(effect(window), yaw)
 
 
-def _move(
-    robot: Robot,
-    carry: Carry,
-    acting: Effect,
-    feet: Float[Array, "feet 3"],
-    dt: float,
-    variation: Variation | None,
-) -> State:
-    """State at the end of a tick."""
+def _estimate(
+    carry: Carry, tick: Int[Array, ""], variation: Variation | None
+) -> tuple[State, Feet, State | None]:
+    """Return the estimated state and feet, and the error of the state; None without variation."""
     if variation is None:
-        return srbm.step(robot, carry.state, acting.wrench, feet, dt, acting.legs)
-    before, there = carry.before, carry.feet.position
-    assert before is not None  # `rollout` begins with what acts in standing
-    return _moved_by(variation, robot, carry.state, acting, feet, before, there, dt)
-
-
-class _Belief(NamedTuple):
-    """What the controller sees of a carry."""
-
-    state: State
-    feet: Feet
-    error: State | None  # of `state`; None without a variation
-
-
-def _believe(carry: Carry, tick: Int[Array, ""], variation: Variation | None) -> _Belief:
-    if variation is None:
-        return _Belief(carry.state, carry.feet, None)
+        return carry.state, carry.feet, None
     error = _estimate_error(variation, carry.state, tick)
-    # the legs know where the feet are from the body, not from the world
+    # the legs measure the feet relative to the body, not to the world
     feet = carry.feet._replace(position=carry.feet.position + error.position)
-    return _Belief(jax.tree.map(jnp.add, carry.state, error), feet, error)
+    return jax.tree.map(jnp.add, carry.state, error), feet, error
 
 
 def _on_real_ground(
-    carry: Carry, acting: Effect, planned: Plan, belief: _Belief, variation: Variation | None
+    carry: Carry, response: Effect, planned: Plan, error: State | None, variation: Variation | None
 ) -> tuple[Effect, Feet]:
-    """What acts on the body within the ground's friction, and where the feet really are."""
-    position = planned.touchdown.position + acting.touchdown_error
-    if variation is not None:
-        assert belief.error is not None  # see `_believe`
-        position = position - belief.error.position
-        acting = acting._replace(wrench=_within_friction(acting.wrench, variation.friction))
-    return acting, feet_where(planned.contact, carry.feet, Feet(position, planned.touchdown.yaw))
+    """Return the effect on the body within the ground's friction, and the true feet."""
+    position = planned.touchdown.position + response.touchdown_error
+    if variation is not None and error is not None:
+        position = position - error.position
+        response = response._replace(wrench=_within_friction(response.wrench, variation.friction))
+    return response, feet_where(planned.contact, carry.feet, Feet(position, planned.touchdown.yaw))
 
 
 def _sample(
@@ -228,26 +196,25 @@ def _sample(
     robot: Robot,
     before: Carry,
     after: Carry,
-    acting: Effect,
+    response: Effect,
     planned: Plan,
     reference: State,
 ) -> Trajectory:
-    """The sample of a tick."""
+    """Return the sample of a tick."""
     return Trajectory(
         period=jnp.asarray(config.walk.gait.tick),
         initial=before.state,
         state=after.state,
         reference=reference,
         command=planned.wrench,
-        effect=acting.wrench,
+        effect=response.wrench,
         contact=planned.contact,
         feet=after.feet.position,
         joints=jnp.asarray(robot.standing_joints),
         fallen=after.fallen,
-        legs_touch=jnp.zeros_like(after.fallen),  # a rigid body has none
+        legs_touch=jnp.zeros_like(after.fallen),  # a rigid body has no legs
         # A plan whose QP has no unique minimiser can be walked, so `plan` and the simulators keep
-        # its residual. It has no derivative, for which alone a rollout is walked: whoever tunes
-        # looks at the residual and refuses.
+        # its residual. It has no derivative, which tuning needs: an infinite residual is rejected.
         residual=jnp.where(planned.status == qp.Status.NOT_UNIQUE, jnp.inf, planned.residual),
     )
 
@@ -266,10 +233,10 @@ def step_carry(
 
     Returns the next carry and the tick's sample of the trajectory.
     """
-    walk, ticks = config.walk, config.walk.gait
-    here = anchor_at(robot, carry.state, carry.anchor.tick)
-    anchor = where(tick == here.tick, here, carry.anchor)
-    belief = _believe(carry, tick, variation)
+    walk, dt = config.walk, config.walk.gait.tick
+    new_anchor = anchor_at(robot, carry.state, carry.anchor.tick)
+    anchor = where(tick == new_anchor.tick, new_anchor, carry.anchor)
+    estimated_state, estimated_feet, error = _estimate(carry, tick, variation)
     planned, disturbance = plan(
         walk,
         robot,
@@ -277,35 +244,40 @@ def step_carry(
         command=command,
         anchor=anchor,
         tick=tick,
-        state=belief.state,
-        feet=belief.feet,
+        state=estimated_state,
+        feet=estimated_feet,
         disturbance=carry.disturbance,
         max_contacts=contacts_needed(walk, 0),
     )
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), planned.wrench, carry.commands
     )
-    since = gait.since_switch(ticks, tick)
-    acting = _respond(effect, carry.state, commands, planned.contact, since)
-    acting, feet = _on_real_ground(carry, acting, planned, belief, variation)
-    moved = _move(robot, carry, acting, feet.position, ticks.tick, variation)
-    fallen = carry.fallen | has_fallen(moved, *robot.description.limits)
-    before = None if variation is None else acting
-    after = Carry(moved, feet, commands, anchor, disturbance, fallen, before)
-    reference = reference_at(ticks.tick, command, anchor, tick + 1.0)
-    return after, _sample(config, robot, carry, after, acting, planned, reference)
+    since = gait.since_switch(walk.gait, tick)
+    response = _respond(effect, carry.state, commands, planned.contact, since)
+    response, feet = _on_real_ground(carry, response, planned, error, variation)
+    if variation is None:
+        state = srbm.step(robot, carry.state, response.wrench, feet.position, dt, response.legs)
+    else:
+        assert carry.before is not None  # `rollout` starts with the effect of standing
+        last = carry.before, carry.feet.position
+        state = _moved_by(variation, robot, carry.state, response, feet.position, *last, dt)
+    fallen = carry.fallen | has_fallen(state, *robot.description.limits)
+    before = None if variation is None else response
+    after = Carry(state, feet, commands, anchor, disturbance, fallen, before)
+    reference = reference_at(dt, command, anchor, tick + 1.0)
+    return after, _sample(config, robot, carry, after, response, planned, reference)
 
 
 def walked_ticks(config: RolloutConfig, anchor: Anchor) -> Int[Array, " ticks"]:
-    """Gait ticks of a rollout, those before t = 0 included."""
+    """Return the gait ticks of a rollout, including those before t = 0."""
     return anchor.tick - config.lead + jnp.arange(config.lead + config.ticks)
 
 
 def from_start(config: RolloutConfig, samples: Trajectory) -> Trajectory:
-    """Trajectory from t = 0 on, of the samples of all ticks."""
+    """Cut the samples of all ticks to the trajectory from t = 0 on."""
     initial = jax.tree.map(lambda x: x[config.lead], samples.initial)
-    later = jax.tree.map(lambda x: x[config.lead :], samples)
-    return later._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
+    walk = jax.tree.map(lambda x: x[config.lead :], samples)
+    return walk._replace(initial=initial, period=jnp.asarray(config.walk.gait.tick))
 
 
 def rollout(
@@ -320,17 +292,17 @@ def rollout(
     """Walk on the single rigid body: `lead` ticks in place from standing, then the command.
 
     Args:
-        config: what is compiled.
+        config: static settings.
         robot: the body.
         weights: theta; the gradient is taken with respect to these.
-        command: what to walk.
-        anchor: where it stands and the gait tick of t = 0, see `reference.standing_anchor`.
+        command: commanded velocities.
+        anchor: standing pose and gait tick of t = 0, see `reference.standing_anchor`.
         effect: phi, `Window -> Effect`.
-        variation: what the controller does not know; None is compiled without any.
+        variation: difference from the controller's model; None compiles without it.
 
     Returns:
-        Trajectory of T samples from t = 0. Nothing raises: read `fallen` and `residual` before
-        believing it.
+        Trajectory of T samples from t = 0. Nothing raises: check `fallen` and `residual` before
+        using it.
 
     Source: Eq. 12, 13.
     """
@@ -350,10 +322,9 @@ def rollout(
     if blocks == 1:
         _, samples = walk(start, ticks)
     else:
-        # equal blocks compile to one loop: the last one walks on for a few ticks that are dropped
+        # equal blocks compile to one loop: the last block has a few more ticks, which are dropped
         size = -(-len(ticks) // blocks)
-        more = ticks[0] + jnp.arange(blocks * size).reshape(blocks, size)
-        _, samples = jax.lax.scan(jax.checkpoint(walk), start, more)
-        flat = lambda x: x.reshape(-1, *x.shape[2:])[: len(ticks)]  # noqa: E731
-        samples = jax.tree.map(flat, samples)
+        padded = ticks[0] + jnp.arange(blocks * size).reshape(blocks, size)
+        _, samples = jax.lax.scan(jax.checkpoint(walk), start, padded)
+        samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(ticks)], samples)
     return from_start(config, samples)

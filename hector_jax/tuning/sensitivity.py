@@ -1,9 +1,9 @@
-"""The paper's own way to the gradient: sensitivities carried forward (Eq. 9, 10).
+"""The paper's method for the gradient: sensitivities carried forward (Eq. 9, 10).
 
 The recursion needs no memory in T and no reverse mode; the columns of the sensitivity are tangents
 of one tick, so that each QP is solved and factorised once. With a network in the loop the past
-commands are part of what is carried. Reverse mode gives the same numbers faster
-(`evaluate.evaluate`); this is the check on it, and what online tuning steps along.
+commands are part of the state. Reverse mode gives the same numbers faster (`evaluate.evaluate`);
+the recursion checks it and gives the gradient of online tuning.
 """
 
 from typing import NamedTuple
@@ -32,14 +32,14 @@ from hector_jax.tuning.rollout import (
 
 
 class Sensitivities(NamedTuple):
-    """Derivatives of a rollout by the n numbers of theta, which are the first axis."""
+    """Derivatives of a rollout by the n numbers of theta; these are the first axis."""
 
     state: State  # (n, T, 3) each: dx_j+1 / dtheta
     command: Wrench  # (n, T, feet, 3) each: du_j / dtheta
 
 
 class Varied(NamedTuple):
-    """What of a `Carry` the weights have a part in; of this shape are its tangents too."""
+    """Parts of a `Carry` that depend on the weights; its tangents have the same structure."""
 
     state: State
     feet: Feet
@@ -50,13 +50,13 @@ class Varied(NamedTuple):
 
 
 def varied(carry: Carry) -> Varied:
-    """The part of a carry that the weights have a part in."""
+    """Return the parts of a carry that depend on the weights."""
     state, feet, commands, anchor, disturbance, *_ = carry
     return Varied(state, feet, commands, disturbance, anchor.position, anchor.yaw)
 
 
 def no_tangents(carry: Carry, weights: Weights) -> Varied:
-    """Tangents of a start in which no weight has a part: dx_0 / dtheta = 0."""
+    """Return the tangents of a start that does not depend on the weights: dx_0 / dtheta = 0."""
     count = ravel_pytree(weights)[0].size
     return jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), varied(carry))
 
@@ -71,34 +71,34 @@ def step_sensitivities(
     tangents: Varied,
     tick: Int[Array, ""],
 ) -> tuple[Carry, Varied, Trajectory, Sensitivities]:
-    """One tick of the closed loop with its tangents, all n at once.
+    """Walk one tick of the closed loop with its n tangents.
 
     Args:
-        config, robot, weights, command, effect, carry, tick: as for `step_carry`.
-        tangents: of the carry, the weights being their first axis.
+        config, robot, weights, command, effect, carry, tick: see `step_carry`.
+        tangents: of the carry; the weights are the first axis.
 
     Returns:
         The next carry and its tangents, the tick's sample, and the sample's sensitivities (n, 3).
 
     Source: Eq. 10.
     """
-    theta, as_weights = ravel_pytree(weights)
+    theta, to_weights = ravel_pytree(weights)
 
-    def move(parts: Varied, theta: Float[jax.Array, " n"]) -> tuple:
-        place = Anchor(parts.position, parts.yaw, carry.anchor.tick)
-        state, feet, commands, disturbance, *_ = parts
-        now = Carry(state, feet, commands, place, disturbance, carry.fallen)
-        then, sample = step_carry(config, robot, as_weights(theta), command, effect, now, tick)
-        return (varied(then), sample.state, sample.command), (then, sample)
+    def step(parts: Varied, theta: Float[jax.Array, " n"]) -> tuple:
+        state, feet, commands, disturbance, position, yaw = parts
+        anchor = Anchor(position, yaw, carry.anchor.tick)
+        before = Carry(state, feet, commands, anchor, disturbance, carry.fallen)
+        after, sample = step_carry(config, robot, to_weights(theta), command, effect, before, tick)
+        return (varied(after), sample.state, sample.command), (after, sample)
 
-    def along(tangent: Varied, direction: Float[Array, " n"]) -> tuple:
-        at = varied(carry), jnp.asarray(theta)
-        return jax.jvp(move, at, (tangent, direction), has_aux=True)
+    def tangent_of(tangent: Varied, direction: Float[Array, " n"]) -> tuple:
+        point = varied(carry), jnp.asarray(theta)
+        return jax.jvp(step, point, (tangent, direction), has_aux=True)
 
-    _, (later, state, wrench), (then, sample) = jax.vmap(along, out_axes=(None, 0, None))(
+    _, (tangents, state, wrench), (after, sample) = jax.vmap(tangent_of, out_axes=(None, 0, None))(
         tangents, jnp.eye(theta.size)
     )
-    return then, later, sample, Sensitivities(state, wrench)
+    return after, tangents, sample, Sensitivities(state, wrench)
 
 
 def propagate(
@@ -109,7 +109,7 @@ def propagate(
     anchor: Anchor,
     effect: jax.tree_util.Partial,
 ) -> tuple[Trajectory, Sensitivities]:
-    """Rollout and its sensitivities by forward recursion. Source: Eq. 10."""
+    """Compute a rollout and its sensitivities by forward recursion. Source: Eq. 10."""
 
     def tick(carried: tuple[Carry, Varied], j: Int[Array, ""]):
         carry, tangents, sample, columns = step_sensitivities(
@@ -117,24 +117,23 @@ def propagate(
         )
         return (carry, tangents), (sample, columns)
 
-    carry = init_carry(robot, anchor)
-    ticks = walked_ticks(config, anchor)
-    _, (samples, sensitivities) = jax.lax.scan(tick, (carry, no_tangents(carry, weights)), ticks)
-    later = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), sensitivities)
-    return from_start(config, samples), later
+    carry, ticks = init_carry(robot, anchor), walked_ticks(config, anchor)
+    _, (samples, columns) = jax.lax.scan(tick, (carry, no_tangents(carry, weights)), ticks)
+    columns = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), columns)
+    return from_start(config, samples), columns
 
 
 def gradient(
     loss: Loss, trajectory: Trajectory, sensitivities: Sensitivities, weights: Weights
 ) -> tuple[Float[Array, ""], Weights]:
-    """Loss and its gradient from the sensitivities by `weights`. Source: Eq. 9."""
+    """Compute the loss and its gradient by `weights` from the sensitivities. Source: Eq. 9."""
 
     def objective(state: State, command: Wrench) -> Float[Array, ""]:
-        walk = trajectory._replace(state=state, command=command)
-        return total(loss, losses(loss, walk))
+        return total(loss, losses(loss, trajectory._replace(state=state, command=command)))
 
-    value, pull = jax.value_and_grad(objective, argnums=(0, 1))(
-        trajectory.state, trajectory.command
+    value_and_grad = jax.value_and_grad(objective, argnums=(0, 1))
+    value, slopes = value_and_grad(trajectory.state, trajectory.command)
+    products = jax.tree.map(
+        lambda g, s: jnp.tensordot(s, g, axes=g.ndim), slopes, tuple(sensitivities)
     )
-    terms = jax.tree.map(lambda g, s: jnp.tensordot(s, g, axes=g.ndim), pull, tuple(sensitivities))
-    return value, ravel_pytree(weights)[1](jnp.asarray(sum(jax.tree.leaves(terms))))
+    return value, ravel_pytree(weights)[1](jnp.asarray(sum(jax.tree.leaves(products))))

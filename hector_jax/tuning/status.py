@@ -1,4 +1,4 @@
-"""Why an iteration was rejected and why a tuning ended."""
+"""Status of an iteration and reason of the end of a tuning."""
 
 from enum import IntEnum
 
@@ -6,7 +6,7 @@ from hector_jax.tuning.evaluate import Evaluation
 
 
 class StepStatus(IntEnum):
-    """Whether an iteration was accepted, or why it was rejected."""
+    """Acceptance of an iteration, or the reason of its rejection."""
 
     ACCEPTED = 0
     NOT_FINITE = 1
@@ -16,13 +16,13 @@ class StepStatus(IntEnum):
 
 
 class Stop(IntEnum):
-    """Why a tuning ended."""
+    """Reason of the end of a tuning."""
 
     GOING = 0
-    LIMIT = 1  # of iterations
+    LIMIT = 1  # all iterations are done
     SMALL_STEP = 2
     NO_GAIN = 3
-    BAD_START = 4  # refused
+    BAD_START = 4  # the start was rejected
 
 
 REASONS = {
@@ -31,16 +31,16 @@ REASONS = {
     StepStatus.UNSOLVED: "QP residual",
     StepStatus.ROSE: "the loss rose",
 }
-"""How the reasons of rejections begin."""
+"""Beginning of the reason of each rejection."""
 
 
 def status_text(status: StepStatus, evaluation: Evaluation) -> str:
-    """Why an iteration was rejected; empty for one that was accepted."""
+    """Describe why an iteration was rejected; empty if it was accepted."""
     residual = f" {float(evaluation.residual):.1e} too large"
     return REASONS.get(status, "") + (residual if status == StepStatus.UNSOLVED else "")
 
 
 def status_of(reason: str) -> StepStatus:
-    """Status of an iteration of which only the reason is there, such as from a file."""
+    """Return the status of an iteration from its reason, such as that of a file."""
     statuses = (status for status, text in REASONS.items() if reason.startswith(text))
     return next(statuses, StepStatus.NOT_FINITE if reason else StepStatus.ACCEPTED)

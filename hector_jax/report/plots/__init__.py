@@ -1,12 +1,13 @@
-"""The pictures of a run; matplotlib is imported in this package and nowhere else.
+"""The pictures of a run; only this package imports matplotlib.
 
-Each function draws one picture to a file (the ending of its name decides the format) and returns
-its caption. Weight sets keep their colour, line and marker through all pictures, so that they can
-be told apart in grey too. Figures are made without pyplot: no display, no global state. Scripts
-draw pictures of their own with `style`.
+Each function draws one picture to a file (the ending of its name sets the format) and returns its
+caption. A weight set has the same colour, line and marker in all pictures, so that it can be
+recognised in grey too. Figures are made without pyplot: no display, no global state. Scripts draw
+their own pictures with `style`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -41,13 +42,13 @@ def tracking(path: Path, walks: Mapping[str, Trajectory]) -> str:
 
 
 def _errors(walk: Trajectory) -> dict[str, Float[np.ndarray, " T"]]:
-    """Errors of the six coordinates, along the heading of the reference; NaN after a fall."""
+    """Return the errors of six coordinates in the reference's heading frame; NaN after a fall."""
     R = Rotation.from_euler("z", np.asarray(walk.reference.euler)[:, 2:])
-    away = R.apply(np.asarray(walk.state.position) - walk.reference.position, inverse=True)
+    error = R.apply(np.asarray(walk.state.position) - walk.reference.position, inverse=True)
     angles = np.rad2deg(np.asarray(walk.state.euler) - walk.reference.euler)
-    labels = [f"error {way} [cm]" for way in ("ahead", "left", "up")]
+    labels = [f"error {direction} [cm]" for direction in ("ahead", "left", "up")]
     labels += [f"error in {angle} [deg]" for angle in ("roll", "pitch", "yaw")]
-    values = np.where(walk.fallen[:, None], np.nan, np.hstack([100 * away, angles]))
+    values = np.where(walk.fallen[:, None], np.nan, np.hstack([100 * error, angles]))
     return dict(zip(labels, values.T, strict=True))
 
 
@@ -67,29 +68,30 @@ def draw_tracking(panels: np.ndarray, walks: Mapping[str, Trajectory]) -> None:
 def distances(
     path: Path, motions: Mapping[str, Motion], width: int, height: int
 ) -> tuple[int, int, int, int]:
-    """Draw the distance from the reference in the plane by time, to stand below a film.
+    """Draw the distance from the reference in the plane by time, for the lower part of a film.
 
     Args:
         path: file to write.
-        motions: two, by the words for them, before and after.
-        width: of the picture [pixel].
-        height: of the picture [pixel].
+        motions: two motions by title, before and after.
+        width: width of the picture [pixel].
+        height: height of the picture [pixel].
 
     Returns:
         Left, top, right and bottom of the axes in the picture [pixel].
     """
-    dpi = height / 1.2  # a figure of 1.2 inches, however many pixels
+    dpi = height / 1.2  # the figure is always 1.2 inches high
     last = max(motion.times[-1] for motion in motions.values())
     with drawing(path, width / dpi, height / dpi, dpi=dpi, legend_columns=0) as figure:
         axes = figure.subplots()
         looks = zip(COLOURS, ((0, (5, 1.5)), "-"), strict=True)
         for (name, motion), (colour, line) in zip(motions.items(), looks, strict=True):
             upright = motion.times <= motion.fall_time
-            away = np.where(upright, 100 * motion.distance, np.nan)
-            mean = np.sqrt(np.mean(away[upright] ** 2)) if upright.any() else np.nan
-            rms = f"{mean:.1f} cm RMS" if upright.any() else "fell at once"
-            label = f"{label_of(name)}: {rms}"
-            axes.plot(motion.times, away, color=np.divide(colour, 255), ls=line, label=label)
+            distance = np.where(upright, 100 * motion.distance, np.nan)
+            rms = "fell at once"
+            if upright.any():
+                rms = f"{np.sqrt(np.mean(distance[upright] ** 2)):.1f} cm RMS"
+            style_of_line = {"color": np.divide(colour, 255), "linestyle": line}
+            axes.plot(motion.times, distance, **style_of_line, label=f"{label_of(name)}: {rms}")
         axes.set_title("distance from the reference [cm]", loc="left")
         axes.set(xlabel="time [s]", xlim=(0.0, last), ylim=(0.0, None))
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderaxespad=0.1)
@@ -108,16 +110,15 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
     walks = {name: from_start(walk) for name, walk in walks.items()}
     span, width = span_of(walks), 7.0
     height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9
-    columns = (
-        4 if next(iter(walks.values())).contact.shape[-1] == 2 else 3
-    )  # names of feet are long
+    feet = next(iter(walks.values())).contact.shape[-1]
+    columns = 4 if feet == 2 else 3  # names of four feet are long
     with drawing(path, width, height, legend_columns=columns) as figure:
         draw_path(figure.subplots(), walks)
     return caption("path_from_above", last=list(walks)[-1])
 
 
 def span_of(walks: Mapping[str, Trajectory]) -> Float[np.ndarray, "2"]:
-    """Extent of all paths in x and y [m], with room for the feet."""
+    """Return the extent of all paths in x and y [m], with a margin for the feet."""
     reference = next(iter(walks.values())).reference.position
     points = np.concatenate([walk.state.position[~walk.fallen, :2] for walk in walks.values()])
     return np.ptp(np.concatenate([points, reference[:, :2]]), axis=0) + 0.25
@@ -135,45 +136,45 @@ def draw_path(axes: Axes, walks: Mapping[str, Trajectory]) -> None:
     mark = {"linestyle": "none", "color": "0.6", "markersize": 6, "zorder": 1}
     names = FEET[touchdowns.shape[1]]
     for foot, (name, marker) in enumerate(zip(names, (4, 5, 6, 7), strict=False)):
-        spots = last.feet[touchdowns[:, foot] & ~last.fallen, foot]
+        points = last.feet[touchdowns[:, foot] & ~last.fallen, foot]
         label = f"{name.replace('_', ' ')} foot set down"
-        axes.plot(*spots[:, :2].T, **mark, marker=marker, label=label)
+        axes.plot(*points[:, :2].T, **mark, marker=marker, label=label)
     axes.set(xlabel="x, ahead [m]", ylabel="y, left [m]", aspect="equal")
     axes.margins(0.05, 0.1)
 
 
 def losses(path: Path, loss: Loss, histories: Mapping[str, Sequence[Iteration]]) -> str:
-    """Draw the loss on the model by iteration, whole and by part.
+    """Draw the total loss on the model and its parts by iteration.
 
     Args:
         path: file to write.
         loss: terms, which are multiplied by their weights.
-        histories: of the tunings, by weight set: `without` and `with`.
+        histories: histories of the tunings by weight set, `without` and `with`.
     """
     parts = {"$L$": lambda evaluation: evaluation.loss}
     for i, term in enumerate(loss, 1):
         alpha = "" if term.weight == 1.0 else rf"\alpha_{i} "
         title = rf"${alpha}L_\mathrm{{{term.name.removeprefix('L_')}}}$"
         parts[title] = lambda evaluation, term=term: term.weight * evaluation.terms[term.name]
-    accepted = {n: np.array([i.accepted for i in history]) for n, history in histories.items()}
     cross = {"linestyle": "none", "marker": "x", "color": "black", "markersize": 4.5}
     with drawing(path, 2.5 * len(parts), 2.7) as figure:
         panels = figure.subplots(1, len(parts))
         for panel, (title, part) in zip(panels, parts.items(), strict=True):
             panel.axvline(PAPER_ITERATIONS, **style.MARK)
             for name, look in looks_of(histories).items():
-                values = np.array([float(part(i.evaluation)) for i in histories[name]]) / 1e6
-                good, bad = np.flatnonzero(accepted[name]), np.flatnonzero(~accepted[name])
-                # a marker at each iteration would hide how the line is dashed
+                values = np.array([float(part(step.evaluation)) for step in histories[name]]) / 1e6
+                accepted = np.array([step.accepted for step in histories[name]])
+                good, bad = np.flatnonzero(accepted), np.flatnonzero(~accepted)
+                # a marker at every iteration would hide the dashes of the line
                 marks = {"marker": look.marker, "markersize": 3.2, "markevery": 10}
                 panel.plot(good, values[good], **look.line, **marks, label=label_of(name))
                 if title == "$L$":
-                    top = 1.1 * values[good].max()  # a rejected step need not have a finite loss
+                    top = 1.1 * values[good].max()  # the loss of a rejected step may be infinite
                     panel.plot(bad, np.where(values < top, values, top)[bad], **cross)
             panel.set(title=title, xlabel="iteration", ylim=(0, 1.12 * panel.get_ylim()[1]))
             panel.xaxis.get_major_locator().set_params(integer=True)
         panels[0].set_ylabel("loss on the model [10$^6$]")
-        if not all(flags.all() for flags in accepted.values()):
+        if not all(step.accepted for history in histories.values() for step in history):
             panels[0].plot([], [], **cross, label="refused step")
     return caption("losses", ten=PAPER_ITERATIONS)
 
@@ -185,7 +186,7 @@ def weights(
 
     Args:
         path: file to write.
-        names: of the weights, `weight_names`.
+        names: names of the weights, from `weight_names`.
         sets: `nominal`, `expert` and the tuned `without`, `with`, flat in the order of `names`.
     """
     ratio = {name: np.divide(values, sets["nominal"]) for name, values in sets.items()}
@@ -215,10 +216,10 @@ def wrenches(
 
     Args:
         path: file to write.
-        period: [s] between samples.
-        curves: `commanded`, `predicted`, `paper`, `linear`, `measured`, or some of them, one per
-            period, (T, feet, 3) each; held over the period.
-        seconds: of the walk's beginning; two steps by default.
+        period: time between samples [s].
+        curves: some of `commanded`, `predicted`, `paper`, `linear`, `measured`, one sample per
+            period, (T, feet, 3) each; constant over the period.
+        seconds: length from the start of the walk [s]; two steps by default.
     """
     count = round(seconds / period)
     labels = ["$F_x$ [N]", "$F_y$ [N]", "$F_z$ [N]", "$M_x$ [N m]", "$M_y$ [N m]", "$M_z$ [N m]"]
@@ -226,9 +227,9 @@ def wrenches(
     with drawing(path, 10.0, 4.4) as figure:
         panels = figure.subplots(2, 3, sharex=True)
         for name in (name for name in order if name in curves):
-            both = np.concatenate([np.asarray(part)[:count, 0] for part in curves[name]], axis=1)
+            wrench = np.concatenate([np.asarray(part)[:count, 0] for part in curves[name]], axis=1)
             look = {"baseline": None, "label": label_of(name), **CURVES[name]}
-            for panel, values in zip(panels.flat, both.T, strict=True):
+            for panel, values in zip(panels.flat, wrench.T, strict=True):
                 panel.stairs(values, period * np.arange(count + 1), **look)
         for panel, label in zip(panels.flat, labels, strict=True):
             panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
@@ -240,11 +241,11 @@ def wrenches(
 
 
 def open_loop(path: Path, worlds: Mapping[str, Mapping[str, Drift]]) -> str:
-    """Draw how far the rigid body strays from the robot, by time ahead.
+    """Draw the open-loop prediction errors of the rigid body by time ahead.
 
     Args:
         path: file to write.
-        worlds: by the name of a world and of a phi.
+        worlds: errors by world and phi.
     """
     with drawing(path, 7.0, 2.6 * len(worlds) + 0.3, legend_columns=3) as figure:
         panels = figure.subplots(len(worlds), 2, squeeze=False, sharex=True)
@@ -274,7 +275,7 @@ def training(path: Path, history: History) -> str:
             panel.plot(epochs, train, **SETS["expert"], label="training walks")
             panel.plot(epochs, valid, color=ORANGE, label="validation walks")
             panel.plot(epochs[best], valid[best], "o", color=ORANGE, label="least")
-            # the first epochs of a fresh net may be far off: they need not be seen whole
+            # the first epochs of a new net may have large errors, which may be cut off
             top = 1.6 * np.percentile(np.concatenate([train, valid]), 90)
             panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
     return caption("training")
@@ -288,38 +289,37 @@ def matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
         cells: walks of all sets, by column and trajectory.
         title_of: words for a column.
     """
-    every, names, trajectories = columns_of(cells), sets_of(cells), trajectories_of(cells)
-    height = (0.15 * len(names) + 0.12) * len(every) + 1.1
+    columns, names, trajectories = columns_of(cells), sets_of(cells), trajectories_of(cells)
+    height = (0.15 * len(names) + 0.12) * len(columns) + 1.1
     width, labels = 2.9 * len(trajectories) + 1.5, 2 * len(trajectories)
     with drawing(path, width, height, legend_columns=labels) as figure:
         panels = figure.subplots(1, len(trajectories), sharex=True, sharey=True, squeeze=False)[0]
         for panel, trajectory in zip(panels, trajectories, strict=True):
             panel.axvline(0.0, color="black", linewidth=1.0, zorder=1)
-            _draw_sets(panel, [cells[column, trajectory] for column in every], names)
+            _draw_sets(panel, [cells[column, trajectory] for column in columns], names)
             panel.set(title=trajectory, xlabel=f"change of L against {BASELINES[0]} [%]")
             panel.grid(visible=False, axis="y")
-            for edge in range(1, len(every)):
-                other = every[edge].engine != every[edge - 1].engine
-                panel.axhline(edge - 0.5, color="0.4" if other else "0.9", linewidth=0.8, zorder=0)
-        panels[0].set_yticks(range(len(every)), [title_of(column) for column in every])
-        panels[0].set(ylim=(len(every) - 0.5, -0.5), xlim=(-100.0, _WORST + 45.0))
+            for edge, (above, below) in enumerate(pairwise(columns)):
+                color = "0.9" if above.engine == below.engine else "0.4"
+                panel.axhline(edge + 0.5, color=color, linewidth=0.8, zorder=0)
+        panels[0].set_yticks(range(len(columns)), [title_of(column) for column in columns])
+        panels[0].set(ylim=(len(columns) - 0.5, -0.5), xlim=(-100.0, _WORST + 45.0))
         setp(panels, xticks=[-100, -50, 0, 50])
     return caption("matrix")
 
 
-_WORST = 60.0  # [%] right of it a change is an arrow
+_WORST = 60.0  # [%] a larger change is drawn as an arrow
 
 
 def _draw_sets(panel: Axes, verdicts: Sequence[Verdict], names: Sequence[str]) -> None:
     for i, (name, look) in enumerate(looks_of(names).items()):
         edge = {"color": look.color, "ha": "right", "va": "center", "fontsize": 7}
         for row, verdict in enumerate(verdicts):
-            one = compare(verdict, name, BASELINES[0])
+            comparison = compare(verdict, name, BASELINES[0])
             y = row + 0.8 * ((i + 0.5) / len(names) - 0.5)
-            value, low, high = one.change["L"]
-            beyond = value > _WORST
-            dot = dict(look.dot, markerfacecolor=look.color if one.counts else "white")
-            dot |= {"marker": r"$\rightarrow$", "markersize": 9} if beyond else {}
+            value, low, high = comparison.change["L"]
+            dot = dict(look.dot, markerfacecolor=look.color if comparison.counts else "white")
+            dot |= {"marker": r"$\rightarrow$", "markersize": 9} if value > _WORST else {}
             panel.plot([low, min(high, _WORST)], [y, y], color=look.color, linewidth=1.6)
             label = label_of(name) if not row else None
             panel.plot(min(value, _WORST), y, **dot, zorder=3, label=label)

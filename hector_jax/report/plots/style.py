@@ -1,4 +1,4 @@
-"""Style of all pictures: figure and legend, axes, and the line and marker of each weight set."""
+"""Style of all pictures: figure and legend, axes, and line and marker of each weight set."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 T = TypeVar("T")
 
-# from dark to light in grey: green, purple, blue, grey, orange
+# from dark to light in greyscale
 GREEN, PURPLE, BLUE, GREY, ORANGE = "#00563f", "#7a3e9d", "#1480c4", "0.55", "#e07c24"
 
 SETS = {
@@ -31,7 +31,7 @@ SETS = {
     "shared_worst": {"color": "#d670a5", "linestyle": (0, (8, 1.5, 1, 1.5, 1, 1.5))},
     "ceiling": {"color": "#5c3a1e", "linestyle": (0, (8, 1.5, 1, 1.5))},
 }
-"""Lines of the weight sets that the package names; `looks_of` has a look for any set."""
+"""Lines of the package's weight sets; `looks_of` returns a look for any set."""
 
 CURVES = {
     "reference": {"color": "black", "linestyle": (0, (1, 1)), "linewidth": 1.1},
@@ -46,7 +46,7 @@ CURVES = {
 CURVES |= {"raw": CURVES["commanded"], "residual": SETS["with"]}
 
 MARK = {"color": "0.5", "linestyle": (0, (2, 2)), "linewidth": 0.9, "zorder": 0}
-"""A line across a panel: an iteration, or a moment."""
+"""A line across a panel at an iteration or time."""
 
 _MARKER = {"nominal": "v", "expert": "D", "without": "s", "with": "o", "best": "p"}
 _MARKER |= {"ceiling": "*", "shared_mean": "<", "shared_worst": ">"}
@@ -67,24 +67,24 @@ _NAMES = {
 
 
 class Look(NamedTuple):
-    """How a weight set or a curve is drawn."""
+    """Line and marker of a weight set or a curve."""
 
     line: dict[str, Any]  # arguments of plot: colour, style and, unless it is the default, width
     marker: str
 
     @property
     def color(self) -> str:
-        """Of line and marker."""
+        """Colour of line and marker."""
         return self.line["color"]
 
     @property
     def dot(self) -> dict[str, Any]:
-        """The marker in its colour, for sets drawn as points."""
+        """Arguments of plot for sets drawn as points."""
         return {"linestyle": "none", "color": self.color, "marker": self.marker}
 
 
 def looks_of(names: Iterable[str], table: Mapping[str, Any] = SETS) -> dict[str, Look]:
-    """How each weight set (or curve, of `CURVES`) is drawn; others take spare looks in turn."""
+    """Return the look of each weight set (or curve, from `CURVES`); others take spare looks."""
     looks, spare = {}, cycle(_SPARE)
     for name in names:
         if name in table:
@@ -96,29 +96,28 @@ def looks_of(names: Iterable[str], table: Mapping[str, Any] = SETS) -> dict[str,
 
 
 def label_of(name: str) -> str:
-    """Words of a legend for a weight set, by its name in the tables, or for a curve."""
+    """Return the legend text of a weight set, by its name in the tables, or of a curve."""
     return _NAMES.get(name, name)
 
 
 def titled(walks: Mapping[str, T]) -> dict[str, T]:
-    """Two walks by the words that stand above them, before and after."""
-    names = zip(("before", "after"), walks, strict=True)
-    titles = [f"{when}: {label_of(name)}" for when, name in names]
-    return dict(zip(titles, walks.values(), strict=True))
+    """Return two walks by their titles, before and after."""
+    items = zip(("before", "after"), walks.items(), strict=True)
+    return {f"{when}: {label_of(name)}": walk for when, (name, walk) in items}
 
 
 @contextmanager
 def drawing(
     path: Path, width: float, height: float, *, dpi: float = 160, legend_columns: int = 6
 ) -> Iterator[Figure]:
-    """Figure that is written to a file when its block ends, with one legend above all panels.
+    """Make a figure that is written to a file at the end of its block, with a legend above.
 
     Args:
         path: file to write.
-        width: of the figure [inch].
-        height: of the figure [inch].
+        width: width of the figure [inch].
+        height: height of the figure [inch].
         dpi: pixels per inch.
-        legend_columns: most labels beside each other; 0 for a figure without a common legend.
+        legend_columns: maximum number of legend columns; 0 for no common legend.
     """
     with matplotlib.rc_context(fname=Path(__file__).with_name("hector.mplstyle")):
         figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
@@ -130,26 +129,26 @@ def drawing(
         if legend_columns and handles:
             place, columns = "outside upper center", min(len(handles), legend_columns)
             figure.legend([*handles.values()], [*handles], loc=place, ncols=columns)
-        # no date and no version inside: the same picture gives the same bytes
-        dated = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
-        key = dated.get(path.suffix.lower())
-        figure.savefig(path, metadata={key: None} if key else None)
+        # without date or version, so that the same picture has the same bytes
+        fields = {".png": "Software", ".svg": "Date", ".pdf": "CreationDate"}
+        field = fields.get(path.suffix.lower())
+        figure.savefig(path, metadata={field: None} if field else None)
 
 
 def widen(axes: Axes, least: float) -> None:
-    """Let a y axis span at least `least` either side of its middle, so that noise stays small."""
+    """Widen a y axis to `least` on either side of its middle or more, so that noise stays small."""
     low, high = axes.get_ylim()
     if high - low < 2 * least:
         axes.set_ylim((low + high) / 2 - least, (low + high) / 2 + least)
 
 
 def weight_label(name: str) -> str:
-    """A weight's name as a tick's label."""
+    """Format a weight's name as a tick label."""
     return name.replace("_", " ")
 
 
 def category_axis(axes: Axes, labels: Sequence[str], group: int = 1, **text: Any) -> None:
-    """Name the places 0, 1, ... of an x axis, with a thin line between groups of them."""
+    """Label the positions 0, 1, ... of an x axis, with a thin line between groups of them."""
     axes.grid(visible=False, axis="x")
     axes.set_xticks(range(len(labels)), labels, **text)
     axes.tick_params(axis="x", length=0)
@@ -159,7 +158,7 @@ def category_axis(axes: Axes, labels: Sequence[str], group: int = 1, **text: Any
 
 
 def log_axis(axes: Axes, which: str) -> None:
-    """Make the axis `which` (x or y) logarithmic, with a few plain numbers whatever its span."""
+    """Make the axis `which` (x or y) logarithmic, with a few plain numbers for any range."""
     axes.set(**{f"{which}scale": "log"})
     axis = getattr(axes, f"{which}axis")
     low, high = axis.get_view_interval()
