@@ -328,6 +328,25 @@ def test_a_plan_obeys_an_input_and_a_state_constraint_of_ones_own():
     assert slower >= 0.5 * fall - 1e-6
 
 
+def test_the_first_pose_which_no_input_moves_can_be_left_unbounded():
+    """A body that is measured below its lowest height rises to it from the second step on."""
+    state, horizon = problem(3, push=2.0)
+    low = float(state.position[2]) + 0.002
+
+    def status(first):
+        def high(step):
+            bound = jnp.where(step.index == 0, first, low)
+            return Rows(step.state.position[2:], bound, jnp.inf)
+
+        constraints = (*CONFIG.constraints, StateConstraint(f"high {first}", of=high))
+        config = MpcConfig(constraints=constraints, max_force=2000.0)
+        return solve(config, ROBOT, expert(), state, horizon, DT, 1)[1].status
+
+    state = state._replace(velocity=state.velocity.at[2].set(0.0))
+    assert status(low) == Status.INFEASIBLE
+    assert status(-np.inf) == Status.SOLVED
+
+
 def test_constraints_are_chosen_by_name_in_files():
     names = ["friction", "unilateral_force", "line_pressure", "line_friction"]
     table = {"contact": "line", "constraints": names}

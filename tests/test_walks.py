@@ -60,7 +60,8 @@ def campaign(folder, robot, plants=(None,), seed=0):
 @pytest.fixture(scope="module")
 def in_process(robot, pool, tmp_path_factory):
     one = campaign(tmp_path_factory.mktemp("walked"), robot, [hfs()])
-    return one, *walks.tune_on_walks(pool, one, 10)
+    rows = walks.tune_on_walks(pool, one, 10)
+    return one, walks.answer(one, walks.space_of(pool, one), rows)[0], rows
 
 
 def walked(robot, weights, path):
@@ -90,8 +91,9 @@ def test_ten_walks_through_files_equal_ten_in_process_to_the_last_bit(
 def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
     one, weights, _ = in_process
     monkeypatch.setattr(walks, "_walk_job", None)
-    again, _ = walks.tune_on_walks(pool, one, 10)
-    np.testing.assert_array_equal(again.Q.euler, weights.Q.euler)
+    again = walks.tune_on_walks(pool, one, 10)
+    weights_again, _ = walks.answer(one, walks.space_of(pool, one), again)
+    np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
 
 
 def test_the_record_of_another_tuning_is_refused(robot, in_process):
@@ -179,9 +181,23 @@ def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in
     fell = walk_log.LogScore(np.inf, 1.0)
     log = walk_log.log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
     monkeypatch.setattr(walks, "_walk_job", lambda *_: (fell, log))
-    weights, rows = walks.tune_on_walks(pool, one, 10)
+    rows = walks.tune_on_walks(pool, one, 10)
     assert [change.change for change in walks.changes(rows)] == [None]
-    np.testing.assert_allclose(weights.Q.euler, nominal(robot).Q.euler, rtol=1e-12)
+    sets = walks.milestones(pool, one, rows)
+    assert list(sets) == ["set 0"]
+    np.testing.assert_allclose(sets["set 0"].Q.euler, nominal(robot).Q.euler, rtol=1e-12)
+
+
+def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in_process):
+    one, weights, rows = in_process
+    sets, losses = walks.milestones(pool, one, rows), [row.losses[0] for row in rows]
+    numbers = [int(name.removeprefix("set ")) for name in sets]
+    assert numbers[0] == 0
+    assert numbers == sorted(numbers)
+    gains = {n for n in range(1, 10) if losses[n] < 0.99 * min(losses[:n])}
+    assert gains < set(numbers)
+    assert len(set(numbers) - gains) <= 2  # the start and the answer
+    assert any(np.array_equal(each.Q.euler, weights.Q.euler) for each in sets.values())
 
 
 def test_the_points_of_a_folder_stay_in_one_metric(monkeypatch, pool, in_process):
@@ -232,12 +248,14 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
 
     def on_walks(pool, one, count):
         seen.update(plants=len(one.plants), commands=list(one.commands), count=count)
-        return expert(), [row]
+        return [row]
 
     monkeypatch.setattr(command.tunings, "tune", lambda *_, **__: {"without": there, "with": there})
     monkeypatch.setattr(command.choice, "choose", lambda *_, **__: {})
     monkeypatch.setattr(command.choice, "answer", lambda *_, **__: nominal())
     monkeypatch.setattr(command, "tune_on_walks", on_walks)
+    monkeypatch.setattr(command, "milestones", lambda *_: {"set 0": nominal(), "set 1": expert()})
+    monkeypatch.setattr(command.choice, "earliest", lambda *_, **__: "set 1")
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))
     notes = {"seconds": 4.0, "config": CONFIG, "net": net, "commit": ""}
@@ -245,7 +263,7 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     run = command._Run(tmp_path, args, robot, nominal(), (course,), **notes)
     tuned = command._tune_sets(Executor(), run)
     assert seen == {"plants": 3, "commands": ["straight"], "count": 12}
-    assert tuned.sets["best"] is not tuned.sets["before_walks"]
+    np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)
     assert (tmp_path / "weights" / "before_walks.json").exists()
     assert walks.changes(tuned.walked)[0].change == 0.0
     with pytest.raises(InputError, match=r"--walks must be 0 or at least 6 .*, got 5"):

@@ -38,7 +38,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.verdicts import ScoredWalks
-from hector_jax.runs.walks import Campaign, Row, changes, tune_on_walks
+from hector_jax.runs.walks import Campaign, Row, changes, milestones, tune_on_walks
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
@@ -228,10 +228,8 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     """Add the resolved settings to config.json; InputError if they differ from those recorded."""
     path = run.folder / CONFIG
     recorded = read_object(path)
-    commands = [
-        {name: np.asarray(x).tolist() for name, x in command._asdict().items()}
-        for command in run.commands.values()
-    ]
+    as_lists = partial(jax.tree.map, lambda x: np.asarray(x).tolist())
+    commands = [as_lists(command)._asdict() for command in run.commands.values()]
     settings = {
         "tune": run.config.as_table(),
         "net": tree_hash(run.net.params),
@@ -298,18 +296,22 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     walked: list[Row] = []
     if run.args.walks:
         sets["before_walks"] = sets.pop("best")
-        sets["best"], walked = _tune_on_walks(pool, run, sets["before_walks"])
+        sets["best"], walked = _tune_on_walks(pool, run, sets["before_walks"], options)
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
     return _Tuned(results, shifts, sets, choices, walked)
 
 
-def _tune_on_walks(pool: Executor, run: _Run, start: Weights) -> tuple[Weights, list[Row]]:
+def _tune_on_walks(
+    pool: Executor, run: _Run, start: Weights, options: Mapping[str, Any]
+) -> tuple[Weights, list[Row]]:
     """Tune further on the walks of --walks, starting from the result of the tunings."""
     count = run.args.walk_plants
     plants = choice.drawn_plants(run.robot, count) if count else [hfs(run.robot.description)]
     inputs = run.folder / "walks", run.config, run.robot, start, run.commands, plants
-    return tune_on_walks(pool, Campaign(*inputs), run.args.walks)
+    rows = tune_on_walks(pool, campaign := Campaign(*inputs), run.args.walks)
+    sets, commands = milestones(pool, campaign, rows), list(run.commands.values())
+    return sets[choice.earliest(pool, run.config, run.robot, sets, commands, **options)], rows
 
 
 def _walk_sets(

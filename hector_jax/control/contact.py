@@ -40,7 +40,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rot_z
@@ -91,10 +91,13 @@ class Contact(NamedTuple):
 class Step(NamedTuple):
     """Arguments of a constraint on the state at the end of an MPC step."""
 
+    index: Int[Array, ""]  # 0 for the first step
     state: State  # matrices (3, 12) that select each part of the state
-    reference: State  # desired state
+    reference: State  # desired state at the end of the step
     contact: Bool[Array, " feet"]  # stance feet of the step
-    lever: Float[Array, "feet 3"]  # planned centre of mass to foot points [m]
+    # centre of mass to foot points [m] at the start of the step, on the reference motion shifted to
+    # the current pose
+    lever: Float[Array, "feet 3"]
 
 
 class Rows(NamedTuple):
@@ -121,7 +124,9 @@ class InputConstraint(Constraint):
 class StateConstraint(Constraint):
     """Rows on the state at the end of each step, `of(step: Step)`.
 
-    They make A dense, which is slower, and may make the QP infeasible.
+    They make A dense, which is slower. The QP has no slack variables, so they can make it
+    infeasible. By forward Euler no input moves the pose at the end of the first step (index 0):
+    give its row infinite bounds there.
     """
 
     on = "states"

@@ -6,8 +6,8 @@ r"""The walking MPC as the smallest QP: cost and constraints of Eq. 3-4 -> stanc
                 F = M = 0                              each foot in the air
 
 States are eliminated. Feet in the air have no variables, nor do wrench components outside the
-contact model. `max_contacts` is the largest number of feet in stance at once; a contact without a
-foot has zero columns and a unit Hessian, so that shapes stay static.
+contact model. `max_contacts` is the largest number of feet in stance at once; if fewer feet stand,
+the inputs of the others have zero columns and a unit Hessian, so that shapes stay static.
 
 Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, because x_0 is given; a
 foot in the air has no M_z; see also `contact`.
@@ -270,8 +270,8 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
     selection = State(*jnp.split(jnp.eye(12, dtype=turn.dtype), 4))
 
     def of_step(data: tuple) -> Rows:
-        reference, contact, lever, states, free = data
-        step = Step(selection, reference, contact, lever)
+        index, reference, contact, lever, states, free = data
+        step = Step(index, selection, reference, contact, lever)
         parts = [rows(constraint, step, turn) for constraint in config.on("states")]
         C, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
         constant = C @ jnp.concatenate(free)
@@ -279,7 +279,8 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 
     flat = states.reshape(*states.shape[:2], -1)
     horizon = problem.horizon
-    steps = horizon.reference, horizon.contact, horizon.lever, flat, free
+    index = jnp.arange(len(flat))
+    steps = index, horizon.reference, horizon.contact, horizon.lever, flat, free
     A, lower, upper = jax.vmap(of_step)(steps)
     return Rows(A.reshape(-1, A.shape[-1]), lower.ravel(), upper.ravel())
 

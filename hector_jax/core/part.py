@@ -9,7 +9,8 @@ A kind of part is a subclass that annotates its functions; a part is an instance
 
 A part is a `str`, so that TOML, JSON and messages show its name. Two parts are equal if their names
 and functions are: a jitted function with a part in its static config is recompiled for another part
-of the same name. Its `repr`, which identifies stored results, names the functions.
+of the same name. Its `repr`, which identifies stored results, has only the names of the functions:
+use functions of a module, not closures or lambdas, which can share a name.
 """
 
 from collections.abc import Iterable

@@ -57,7 +57,8 @@ class Solver(Part):
 
     Attributes:
         approach: approaches a solution of the normalised problem; called as `approach(tolerances,
-            qp, enabled, max_iterations=...)`; its result is used only if `enabled`.
+            qp, enabled, max_iterations=...)`; unless `enabled` it returns infinite residuals and
+            no certificate.
         guess: returns point and active sides from the unconstrained minimiser, which are tried
             before `approach`; None starts with `approach`.
     """

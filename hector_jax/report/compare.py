@@ -125,7 +125,6 @@ def _cells(name: str, verdict: Mapping[str, Any]) -> dict[str, str]:
             ends = (math.nan if change[key] is None else change[key] for key in ("low", "high"))
             text = Interval(change["median"], *ends).text()
             cells[f"  against {baseline} [%]"] = text + VOID * (not change["counts"])
-    return cells | {
-        "  L_ctrl [1e6]": f"{verdict['L_ctrl']['mean'] / 1e6:.3f}",
-        "  falls": f"{verdict['falls']} of {verdict['seeds']}",
-    }
+    if "L_ctrl" in verdict:  # a loss of one's own may be without
+        cells["  L_ctrl [1e6]"] = f"{verdict['L_ctrl']['mean'] / 1e6:.3f}"
+    return cells | {"  falls": f"{verdict['falls']} of {verdict['seeds']}"}

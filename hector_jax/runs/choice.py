@@ -1,4 +1,7 @@
-"""Selection of the weights of a run: an iteration of each tuning (`choose`), and the set `best`.
+"""Selection of the weights of a run.
+
+`choose` takes an iteration of each tuning, `answer` the set `best`, and `earliest` the set `best`
+after a tuning on walks.
 
 The rigid-body model is inexact: from some iteration on a tuning can gain on the model and lose on
 the robot. A few points of the path, including its start, therefore walk on plants drawn around the
@@ -13,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command
@@ -27,7 +31,11 @@ from hector_jax.tuning.difftune import TuneConfig, Tuning
 # fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
 _FRICTION = 11 / 12  # of the controller's friction, with which the chosen weights plan
-_FIRST_SEED = 7000  # of the plants, drawn like `hfs-varied` but with other seeds
+# First seeds of plants that are drawn like `hfs-varied` but with other seeds: of those on which
+# weights are chosen or tuned, and of those on which the sets of a tuning on walks are compared.
+_FIRST_SEED, _HELD_OUT_SEED = 7000, 7500
+HELD_OUT = 8
+"""Number of the plants of `earliest`."""
 # Standard deviations of white noise: encoders of 14 bits; a gyroscope on a vibrating trunk;
 # velocity and position follow from both over a leg of about 0.7 m.
 _SIGMAS = {
@@ -47,12 +55,12 @@ class Choice(NamedTuple):
     of: int  # number of the last iteration
 
 
-def drawn_plants(robot: Robot, count: int) -> list[Imperfections]:
-    """Return the first plants on which weights of a robot are chosen and tuned."""
+def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> list[Imperfections]:
+    """Return plants drawn around the hfs; by default the first of those for choice and tuning."""
     noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
     return [
         hfs_drawn(seed, 0.4, robot.description)._replace(estimator=noisy)
-        for seed in range(_FIRST_SEED, _FIRST_SEED + count)
+        for seed in range(first_seed, first_seed + count)
     ]
 
 
@@ -62,17 +70,24 @@ def _ratios(
     robot: Robot,
     sets: Mapping[str, Weights],
     commands: Sequence[Command],
+    plants: Sequence[Imperfections],
     title: str,
     **notes: Any,
-) -> dict[str, float]:
-    """Return L of each set relative to the first set, mean over the drawn plants and commands."""
-    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
+) -> dict[str, Float[np.ndarray, " walks"]]:
+    """Return L of each set relative to the first set, by command and plant."""
     title = f"{title} on {plural(len(plants), 'plant')} drawn around the hfs"
     judge = partial(verdicts.judge, pool, config, robot, sets, title=title, **notes)
     results = [judge(command, plants, range(len(plants))).scores for command in commands]
     losses = {name: np.array([[s.L for s in scores[name]] for scores in results]) for name in sets}
     first = losses[next(iter(sets))]
-    return {name: float(np.mean(loss / first)) for name, loss in losses.items()}
+    return {name: (loss / first).ravel() for name, loss in losses.items()}
+
+
+def _mean_ratios(*inputs: Any, **notes: Any) -> dict[str, float]:
+    """Return the means of `_ratios` on the plants of the robot's description."""
+    _, _, robot, *_ = inputs
+    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
+    return {name: float(np.mean(r)) for name, r in _ratios(*inputs, plants, **notes).items()}
 
 
 def choose(
@@ -106,7 +121,8 @@ def choose(
     sets = {label: i.weights for labels in points.values() for label, i in labels.items()}
     sets = {"start": sets["start"], **sets}
     notes = {"seconds": seconds, "folder": folder, "commit": commit}
-    ratio = _ratios(pool, config, robot, sets, commands, "choosing an iteration", **notes)
+    inputs = pool, config, robot, sets, commands
+    ratio = _mean_ratios(*inputs, title="choosing an iteration", **notes)
     choices = {}
     for name, labels in points.items():
         *_, last = labels
@@ -151,7 +167,48 @@ def answer(
     if not robot.description.tuning.choice_plants:
         return mixture
     walked = {**sets, "between": mixture}
-    ratio = _ratios(pool, config, robot, walked, commands, "choosing the answer", **notes)
+    inputs = pool, config, robot, walked, commands
+    ratio = _mean_ratios(*inputs, title="choosing the answer", **notes)
     best = min((name for name in walked if name != "nominal"), key=ratio.__getitem__)
     say(f"best: {best} walks best on plants drawn around the hfs")
     return walked[best]
+
+
+def earliest(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    sets: Mapping[str, Weights],
+    commands: Sequence[Command],
+    **notes: Any,
+) -> str:
+    """Return the name of the first set that is as good as the best one on plants of its own.
+
+    A tuning on the walks of a few plants fits them better and better, from some walk on at the
+    expense of other plants. So its sets walk on plants on which none of them was tuned, and of
+    those that differ from the best by at most one standard error (of the paired differences of
+    log L) the earliest is taken.
+
+    Args:
+        pool, config, robot, commands, notes: see `choose`.
+        sets: sets by name in the order in which they were made, the start first.
+
+    Source: the one-standard-error rule of Breiman, Friedman, Olshen and Stone, "Classification and
+    Regression Trees", 1984.
+    """
+    plants = drawn_plants(robot, HELD_OUT, _HELD_OUT_SEED)
+    inputs, title = (pool, config, robot, sets, commands, plants), "comparing the sets walked"
+    losses = {name: np.log(r) for name, r in _ratios(*inputs, title=title, **notes).items()}
+    best = min(losses, key=lambda name: losses[name].mean())
+
+    def as_good(name: str) -> bool:
+        excess = losses[name] - losses[best]
+        return bool(excess.mean() <= excess.std(ddof=1) / np.sqrt(len(excess)))
+
+    chosen = next(filter(as_good, losses))
+    change = [100.0 * np.expm1(losses[name].mean()) for name in (chosen, best)]
+    say(
+        f"best: {chosen}, the earliest as good as {best} on {plural(HELD_OUT, 'other plant')}; "
+        f"L there against the start: {change[0]:+.0f} and {change[1]:+.0f} %"
+    )
+    return chosen

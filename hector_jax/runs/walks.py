@@ -83,8 +83,8 @@ class Campaign:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        start = jax.tree.map(np.asarray, init(self.config, self.start).best)
-        object.__setattr__(self, "start", start)
+        start = init(self.config, self.start).best
+        object.__setattr__(self, "start", jax.tree.map(np.asarray, start))
 
     @property
     def cases(self) -> list[tuple[Imperfections | None, Command]]:
@@ -166,7 +166,7 @@ def _evaluate_job(
 
 
 def space_of(pool: Executor, campaign: Campaign) -> Space:
-    """Return the coordinates of all points, from the model at the start or from their file.
+    """Return the coordinates of all points, from their file or from the model at the start.
 
     Raises:
         InputError: the file of the matrix is damaged, or of another robot.
@@ -293,9 +293,8 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
         inputs = repeat(campaign), repeat(weights), commands, groundings
         return list(pool.map(_evaluate_job, *inputs))
 
-    shares = rows[best].losses / rows[0].losses
     model_losses = np.array([evaluation.loss for evaluation in evaluate(weights)])
-    scales = shares / model_losses / len(commands)
+    scales = rows[best].losses / rows[0].losses / model_losses / len(commands)
 
     def model(point: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
         weights = weights_at(campaign, space, point)
@@ -332,16 +331,23 @@ def answer(campaign: Campaign, space: Space, rows: Sequence[Row]) -> tuple[Weigh
     return weights_at(campaign, space, rows[number].point), number
 
 
-def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> tuple[Weights, list[Row]]:
-    """Walk and tune on the plants of a campaign, continuing from the walks in its folder.
+def milestones(pool: Executor, campaign: Campaign, rows: Sequence[Row]) -> dict[str, Weights]:
+    """Return the start, each set that was 1 % better than all before it, and that of `answer`."""
+    space, history = space_of(pool, campaign), _walked(rows)
+    losses = np.array([result.loss for result in history])
+    better = losses[1:] < np.minimum.accumulate(losses)[:-1] - few_walks.GAIN
+    numbers = {0, *(1 + np.flatnonzero(better)), few_walks.incumbent(space, history)}
+    return {f"set {n}": weights_at(campaign, space, rows[n].point) for n in sorted(numbers)}
+
+
+def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
+    """Walk and tune on the plants of a campaign, from the walks in its folder on; return all rows.
 
     Args:
         pool: worker processes.
         campaign: settings, all of whose plants are present.
-        walks: budget; whole rounds of all cases are walked, at least the start.
-
-    Returns:
-        The best weights and all rows. If the start falls, nothing is tuned.
+        walks: budget; whole rounds of all cases are walked, at least the start. If that falls,
+            nothing is tuned.
 
     Raises:
         InputError: see `next_proposal` and `read_history`.
@@ -356,7 +362,7 @@ def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> tuple[Weigh
         report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
     if not _stood(rows[0]):
         say("the set from which to tune on walks fell, or a QP was not solved; it is kept as it is")
-    return answer(campaign, space, rows)[0], rows
+    return rows
 
 
 def _stood(row: Row) -> bool:
@@ -388,8 +394,7 @@ def changes(rows: Sequence[Row]) -> list[Change]:
 def _progress(campaign: Campaign, space: Space, rows: Sequence[Row]) -> str:
     if not rows:
         return "compiling"
-    history = _walked(rows)
-    best = few_walks.best_walk(history)
+    best = few_walks.best_walk(_walked(rows))
     moved = largest_changes(campaign.start, weights_at(campaign, space, rows[best].point))
     change = changes(rows)[best].change or 0.0
     return f"best L {change:+.0f} % against the start" + (f"; {moved}" if best else "")

@@ -31,11 +31,11 @@ from scipy.optimize import minimize
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 
-_FLAT = (
-    0.25  # added to the eigenvalues of the metric: a flat direction has a unit step of two e-folds
-)
+# added to the eigenvalues of the metric: a flat direction has a unit step of two e-folds
+_FLAT = 0.25
 _FIRST, _LEAST, _MOST = 1.0, 0.3, 4.0  # radius of the trust region
-_GAIN = 0.01  # smallest significant gain in log-loss
+GAIN = 0.01
+"""Smallest significant gain in log-loss."""
 _STALLED = 2  # walks of the model in a row without such a gain before the surrogate takes over
 _EVERY, _POPULATION, _SPREAD = 4, 8, 0.3  # CMA-ES: period [walks], population, first deviation
 _SAME = 0.02  # the model's point counts as walked within this distance of a walk
@@ -114,13 +114,13 @@ def _region(history: Sequence[WalkResult]) -> _Region:
         best_loss = history[best].loss
         gain = best_loss - row.loss
         if row.predicted is not None:
-            expected = max(best_loss - row.predicted, _GAIN)
+            expected = max(best_loss - row.predicted, GAIN)
             if gain < 0.1 * expected:
                 radius = max(radius / 1.6, _LEAST)
             elif gain > 0.5 * expected:
                 radius = min(radius * 1.6, _MOST)
         if row.method == "model":
-            stalls = 0 if gain > _GAIN else stalls + 1
+            stalls = 0 if gain > GAIN else stalls + 1
             if stalls == _STALLED:
                 stalled_at, radius = i + 1, _FIRST
         if gain > 0.0:

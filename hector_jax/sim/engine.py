@@ -44,7 +44,9 @@ class Engine(NamedTuple):
     bits: Callable[[bool], int]  # of the physics, by `exact`
     modules: tuple[str, ...] = ("sim.walk",)  # modules of this package that decide its numbers
     package: str = "mujoco"  # its Python package; the extra with the engine's name installs it
-    differs: str = ""  # differences of its plants from MuJoCo C; empty: the same physics
+    # differences of its plants from MuJoCo C, for reports; empty means the same physics, and a walk
+    # that falls in the start-up is then diagnosed in MuJoCo C
+    differs: str = ""
 
     @property
     def version(self) -> str | None:
@@ -120,7 +122,7 @@ MJX = Engine("mjx", "MJX", _walk_mjx, _mjx_bits, modules=("sim.parallel",), pack
 """MuJoCo in JAX, all walks at once."""
 
 ENGINES = {engine.name: engine for engine in (MUJOCO_C, MJX, DRAKE, PINOCCHIO)}
-"""Every engine by its name; whoever adds one adds it here."""
+"""Every engine by its name. A new one is added here and to the choices in cli/flags.py."""
 
 
 def choose_engine(name: str) -> Engine:

@@ -30,7 +30,7 @@ DRIFT_TIME = 4.0  # [s] after which the drift has its nominal size
 class Reading(NamedTuple):
     """Coordinates of the robot, those of MuJoCo in every engine."""
 
-    pose: Float[Array, "*batch 7"]  # trunk: position [m], quaternion
+    pose: Float[Array, "*batch 7"]  # trunk: position [m], quaternion (w, x, y, z)
     # trunk: linear velocity in the world [m/s], angular velocity in the trunk [rad/s]
     velocity: Float[Array, "*batch 6"]
     joints: Float[Array, "*batch joints"]  # [rad] motor side

@@ -3,8 +3,9 @@
     L = alpha_1 sum |e - e_ref|^2 + alpha_2 sum |p - p_ref|^2 + sum |u_j - u_{j-1}|^2
 
 over 1 kHz samples. A loss is a tuple of terms, each a function of a trajectory with a weight alpha;
-`PAPER_LOSS` has the three of the paper. Further terms go into such a tuple (docs/howto/loss.md):
-gradients, logs, tables and files iterate over the terms by name. The forward recursion, and with it
+`PAPER_LOSS` has the three of the paper, and the commands use it with the robot's own weights. A
+term that is added to it appears in gradients, logs, tables and files by its name; functions in
+Python take any such tuple (docs/howto/loss.md). The forward recursion, and with it
 tuning along measured walks, differentiates a term by the states and commands of a walk only.
 
 A world with longer ticks multiplies its tracking sums by the milliseconds of a tick; the smoothness
