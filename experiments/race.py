@@ -97,7 +97,7 @@ class ModelRun(NamedTuple):
 class Prices(NamedTuple):
     """Seconds of one core, measured on this machine."""
 
-    walk: float  # of a walk of the race on the hfs, in MuJoCo C
+    walk: float  # of a walk on the hfs in MuJoCo C, as long as those of the race
     iterations: dict[str, float]  # of an iteration on the model with its gradient, by method
     collection: float  # of the walks for the net, and of the plain tunings before them
     training: float  # of the net; zero if the net was given

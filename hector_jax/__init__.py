@@ -1,7 +1,14 @@
 """Gradient tuning of a walking robot's model predictive controller in JAX (DiffTune, GRFM-Net).
 
 The names below are the public surface; each package has its own. They are imported when they are
-first used, so that `import hector_jax` costs nothing.
+first used, so that `import hector_jax` costs nothing. Words of this code:
+
+- weights, theta: the diagonals of Q and R, with any further numbers that are tuned (`others`).
+- phi, effect: phi maps the commanded ground wrench to its effect on the body; GRFM-Net is a phi.
+- tick: 10 ms, the interval of gait, plan and rollout. An MPC step is some ticks, a sample 1 ms.
+- srbm, ideal, hfs: single rigid body; MuJoCo without and with imperfections (the high-fidelity
+  simulator, which the data of GRFM-Net are from). A plant is a robot with its imperfections.
+- stand-in: plants in the place of hardware, for evaluation only.
 """
 
 from importlib import import_module

@@ -70,11 +70,17 @@ def test_an_arrow_has_the_direction_of_its_force_and_the_scale_of_its_robot(robo
     robot = robot._replace(mass=size**3 * robot.mass, standing_height=size * robot.standing_height)
     weight, height = float(robot.mass * robot.gravity[2]), float(robot.standing_height)
     one = viewed(seconds=0.5)
-    ends = arrows(motion(robot, *one), "force", "measured")
+    moved = motion(robot, *one)
+    ends = arrows(moved, "force", "measured")
     expected = one.walk.effect.force / weight * 5 / 6 * height
     found = ends[:, :, 1] - ends[:, :, 0]
     np.testing.assert_allclose(found[..., 2], expected[..., 2])
     np.testing.assert_allclose(found, expected, atol=0.01)  # the pretended yaw sways a little
+    ends_of_moments = arrows(moved, "moment", "measured")
+    np.testing.assert_allclose(
+        (ends_of_moments[:, :, 1] - ends_of_moments[:, :, 0])[..., 2],
+        one.walk.effect.moment[..., 2] / weight * 5 / 6 / 0.24,  # the weight at 0.24 heights
+    )
     # beside the foot, outwards
     aside = ends[:, :, 0, 1] - one.walk.feet[..., 1]
     assert (aside[:, 0] > 0.05).all()

@@ -102,8 +102,9 @@ def _imported(tree: ast.Module) -> list[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(package):
             module = f"{node.module}."[len(package) :]
-            names = [module[:-1], *(f"{module}{alias.name}" for alias in node.names)]
-            modules += [name for name in names if name and _source(name).exists()]
+            names = [f"{module}{alias.name}" for alias in node.names]
+            modules += [name for name in names if _source(name).exists()]  # else not a module
+            modules += [module[:-1]] if module else []
     return modules
 
 

@@ -141,7 +141,7 @@ def all_devices() -> None:
 
 
 class _Process(SpawnProcess):
-    """A process that ignores SIGINT, which a terminal sends to all processes of a program."""
+    """A process with SIGINT blocked, which a terminal sends to all processes of a program."""
 
     def start(self) -> None:
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the child inherits it

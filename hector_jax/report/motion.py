@@ -13,7 +13,7 @@ from hector_jax.robot.model import Robot
 
 COLOURS = ((184, 33, 51), (0, 122, 94))  # before and after
 INK = (20, 20, 25)
-MIN_SOLE = 0.015  # [m] of a footprint ahead of and behind the foot point, also for point feet
+MIN_SOLE = 0.015  # [m] least length of a footprint ahead of and behind the foot point
 
 
 class Motion(NamedTuple):

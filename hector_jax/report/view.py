@@ -35,7 +35,7 @@ _WEIGHT = 5 / 6  # length of an arrow for the robot's weight
 _MIN_ARROW = 0.07  # shorter ones are not drawn
 _HEAD = 0.083  # of an arrow
 _RADII = {"force": 0.019, "moment": 0.033}  # of the shafts of arrows
-_LEVER = 0.1  # [m]; the moment that is drawn as long as the weight is the weight at this lever
+_LEVER = 0.24  # of the moment that is drawn as long as the weight: the weight at this lever
 # colours and dashes of lines in plots: before, after, further sets
 _STROKES = (
     *zip(COLOURS, ([6, 4], []), strict=True),
@@ -76,7 +76,7 @@ def arrows(motion: Motion, kind: str, source: str) -> Float[np.ndarray, "T feet 
         source: commanded, measured or predicted.
     """
     scale = _WEIGHT * motion.height / motion.weight
-    scale /= {"force": 1.0, "moment": _LEVER}[kind]
+    scale /= {"force": 1.0, "moment": _LEVER * motion.height}[kind]
     left = motion.R_yaw[:, :, 1]
     pairs = motion.feet.shape[1] // 2
     outwards = np.stack([left, -left] * pairs, axis=1)  # each pair is left, right
@@ -207,7 +207,7 @@ class Page:
         with gui.add_folder("Ground on the feet"):
             sources = {source: _SOURCES[source] for source in first.wrenches}
             drawn = {"weight": first.weight, "length": 100.0 * _WEIGHT * first.height}
-            drawn |= {"sources": sources.values(), "moment": _LEVER * first.weight}
+            drawn |= {"sources": sources.values(), "moment": _LEVER * first.height * first.weight}
             gui.add_html(render("legend.html.j2", **drawn))
             labels = {name: source.words for name, source in sources.items()}
             labels |= {"force": "forces", "moment": "moments"}

@@ -47,8 +47,8 @@ def log_of(trajectory: Trajectory) -> Log:
 def read_log(path: Path, robot: Robot, seconds: float) -> Log:
     """Read the log of a walk: an .npz with the entries of `Log`, as `hector walk --out` writes it.
 
-    `period`, `fallen` and `residual` may be left out. A log that ends early
-    counts as a fall from its end on.
+    `period`, `fallen` and `residual` may be left out. A log that ends early counts as a fall from
+    its end on.
 
     Args:
         path: the file.

@@ -70,7 +70,7 @@ class Row(NamedTuple):
     margin: float  # share of the way to a fall, the largest of the cases
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Campaign:
     """Settings of a tuning on walks."""
 
