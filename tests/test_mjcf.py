@@ -43,6 +43,10 @@ HOSTILE = {
     "a list": ("<list/>", ["<list>", "expected <mujoco> or <robot>"]),
     "urdf of nothing": ('<robot name="hector"/>', ["no joint 'left_hip_yaw'", "joints: none"]),
     "urdf with entities": (BOMB + "<robot>&i;</robot>", ["DOCTYPE"]),
+    "urdf with an empty mass": (
+        '<robot><link name="a"><inertial><mass value=""/></inertial></link></robot>',
+        ["<mass>", "value is ''", "least 0"],
+    ),
     "urdf with a mass below zero": (
         '<robot><link name="a"><inertial><mass value="-1"/></inertial></link></robot>',
         ["<mass>", "value is '-1'", "least 0"],

@@ -136,7 +136,8 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
         _remove(link, [part for part in link if part.tag not in _LINK_PARTS])
         for part in link.findall("inertial"):
             mass = part.find("mass")
-            if mass is None or float(mass.get("value", "0")) == 0.0:  # `read_mjcf` checked it
+            # `read_mjcf` found numbers in it; MuJoCo refuses more than one
+            if mass is None or float(mass.get("value", "0").split()[0]) == 0.0:
                 link.remove(part)
     for material in root.iter("material"):
         _remove(material, material.findall("texture"))

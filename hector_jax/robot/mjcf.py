@@ -131,7 +131,7 @@ def _expected(tag: str, name: str, value: str) -> str | None:
         valid = value == "-1" or (size and int(size[1]) * _MEMORY[size[2]] <= _MOST_MEMORY)
         return None if valid else "at most 1G"
     allowed = _RANGES_OF.get((tag, name)) or _RANGES.get(name)
-    if allowed and (numbers is None or not all(number in allowed for number in numbers)):
+    if allowed and not (numbers and all(number in allowed for number in numbers)):
         return f"numbers {allowed}"
     if numbers and not all(number in Range() for number in numbers):
         return "finite numbers"
