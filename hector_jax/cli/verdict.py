@@ -88,12 +88,9 @@ def plan_of(args: Verdict) -> Plan:
     """
     robot = load_robot(args.robot)
     trajectories = {}
-    for text in arguments.expand_all(args.traj):
+    for name, text in arguments.trajectories_by_name(args.traj).items():
         trajectory = arguments.load_trajectory(text, robot)
-        if trajectory.name in trajectories:
-            raise InputError(f"--traj names two trajectories {trajectory.name}")
-        seconds = arguments.walk_seconds(args.seconds, trajectory)
-        trajectories[trajectory.name] = trajectory, seconds
+        trajectories[name] = trajectory, arguments.walk_seconds(args.seconds, trajectory)
     models = {OWN: Model()} | (_OTHER_MASSES if args.light_heavy else {})
     for path in args.plant:
         plant = arguments.plant_of(path, robot)
