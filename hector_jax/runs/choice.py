@@ -83,13 +83,6 @@ def _ratios(
     return {name: (loss / first).ravel() for name, loss in losses.items()}
 
 
-def _mean_ratios(*inputs: Any, **notes: Any) -> dict[str, float]:
-    """Return the means of `_ratios` on the plants of the robot's description."""
-    _, _, robot, *_ = inputs
-    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
-    return {name: float(np.mean(r)) for name, r in _ratios(*inputs, plants, **notes).items()}
-
-
 def choose(
     pool: Executor,
     config: TuneConfig,
@@ -121,8 +114,9 @@ def choose(
     sets = {label: i.weights for labels in points.values() for label, i in labels.items()}
     sets = {"start": sets["start"], **sets}
     notes = {"seconds": seconds, "folder": folder, "commit": commit}
-    inputs = pool, config, robot, sets, commands
-    ratio = _mean_ratios(*inputs, title="choosing an iteration", **notes)
+    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
+    inputs, title = (pool, config, robot, sets, commands, plants), "choosing an iteration"
+    ratio = {name: float(r.mean()) for name, r in _ratios(*inputs, title, **notes).items()}
     choices = {}
     for name, labels in points.items():
         *_, last = labels
@@ -167,9 +161,10 @@ def answer(
     if not robot.description.tuning.choice_plants:
         return mixture
     walked = {**sets, "between": mixture}
-    inputs = pool, config, robot, walked, commands
-    ratio = _mean_ratios(*inputs, title="choosing the answer", **notes)
-    best = min((name for name in walked if name != "nominal"), key=ratio.__getitem__)
+    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
+    inputs, title = (pool, config, robot, walked, commands, plants), "choosing the answer"
+    ratio = _ratios(*inputs, title, **notes)
+    best = min((n for n in walked if n != "nominal"), key=lambda name: ratio[name].mean())
     say(f"best: {best} walks best on plants drawn around the hfs")
     return walked[best]
 
@@ -198,7 +193,7 @@ def earliest(
     """
     plants = drawn_plants(robot, HELD_OUT, _HELD_OUT_SEED)
     inputs, title = (pool, config, robot, sets, commands, plants), "comparing the sets walked"
-    losses = {name: np.log(r) for name, r in _ratios(*inputs, title=title, **notes).items()}
+    losses = {name: np.log(r) for name, r in _ratios(*inputs, title, **notes).items()}
     best = min(losses, key=lambda name: losses[name].mean())
 
     def as_good(name: str) -> bool:
