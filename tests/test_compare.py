@@ -51,6 +51,7 @@ def run_folder(folder, flags=None, versions=None):
     (folder / "config.json").write_text(json.dumps(config))
     (folder / "versions.json").write_text(json.dumps({"jax": "1"} | (versions or {})))
     lines = [line("with", 0), line("with", 1, accepted=False, L=None), line("with", 2, L=8e5)]
+    lines[2]["gradient"] = {"turn_lead": 3.0}
     (folder / "metrics.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     return folder
 
@@ -61,6 +62,18 @@ def runs(tmp_path):
         run_folder(tmp_path / "c" / "one", versions={"seconds": "150", "commit": "aaa"}),
         run_folder(tmp_path / "c" / "two", Tune(traj=("c",), seeds=32)),
     ]
+
+
+def test_runs_whose_loss_has_no_smoothness_term_are_compared(runs):
+    for folder in runs:
+        result = json.loads((folder / "result.json").read_text())
+        for each in result["sets"].values():
+            del each["standin"]["L_ctrl"]
+        (folder / "result.json").write_text(json.dumps(result))
+    shown = io.StringIO()
+    print_comparison(compare_runs([load_run(folder) for folder in runs]), Console(file=shown))
+    assert "with: L [1e6]" in shown.getvalue()
+    assert "L_ctrl [1e6]" not in shown.getvalue()
 
 
 def test_a_comparison_tells_losses_falls_iterations_and_what_differs(runs):
@@ -171,6 +184,7 @@ def test_tensorboard_gets_the_numbers_of_the_metrics(runs, tmp_path):
     assert [found["step/accepted", step] for step in range(3)] == [1.0, 0.0, 1.0]
     assert [found["weights/Q_x", step] for step in range(3)] == [50.0, 51.0, 52.0]
     assert found["gradient_log/Q_x", 1] == -1.0
+    assert found["gradient/turn_lead", 2] == 3.0
 
 
 def test_events_are_not_written_where_no_folder_can_be(runs, tmp_path):

@@ -12,9 +12,9 @@ from hector_jax.runs.folder import read_metrics
 def write_events(folder: Path, out: Path) -> list[Path]:
     """Write the tunings of a run as scalars, each in a folder of its own under `out`.
 
-    Scalars are `loss/*` in the units of metrics.jsonl, `step/*`, `weights/*` and `gradient_log/*`,
-    by iteration. Files of an earlier call are replaced, so it can be called again while the run
-    goes on.
+    Scalars are `loss/*` in the units of metrics.jsonl, `step/*`, `weights/*`, `gradient_log/*` and,
+    for numbers beside Q and R, `gradient/*`, by iteration. Files of an earlier call are replaced, so
+    it can be called again while the run goes on.
 
     Args:
         folder: folder of the run.
@@ -53,4 +53,5 @@ def _scalars(line: Mapping[str, Any]) -> dict[str, Any]:
         **{f"step/{name}": line.get(name) for name in ("step", "accepted", "residual")},
         **{f"weights/{name}": value for name, value in line["weights"].items()},
         **{f"gradient_log/{name}": value for name, value in line["gradient_log"].items()},
+        **{f"gradient/{name}": value for name, value in line.get("gradient", {}).items()},
     }
