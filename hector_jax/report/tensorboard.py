@@ -13,8 +13,8 @@ def write_events(folder: Path, out: Path) -> list[Path]:
     """Write the tunings of a run as scalars, each in a folder of its own under `out`.
 
     Scalars are `loss/*` in the units of metrics.jsonl, `step/*`, `weights/*`, `gradient_log/*` and,
-    for numbers beside Q and R, `gradient/*`, by iteration. Files of an earlier call are replaced, so
-    it can be called again while the run goes on.
+    for numbers beside Q and R, `gradient/*`, by iteration. Files of an earlier call are replaced,
+    so it can be called again while the run goes on.
 
     Args:
         folder: folder of the run.
