@@ -173,6 +173,14 @@ def test_the_report_names_the_iteration_that_was_taken_and_the_errors_of_touchdo
     assert "| touchdown, sideways [cm^2] | 4 | 4 | 4 |" in text
 
 
+def test_the_report_has_the_weight_of_each_term_of_the_loss(tmp_path):
+    verdict = pretend_verdict()
+    weighed = (*verdict.loss[:2], verdict.loss[2]._replace(weight=0.623))  # a robot's own
+    text = write_report(tmp_path, **_report(verdict._replace(loss=weighed))).read_text()
+    assert "This run: 1e5, 2e5, 0.623." in text
+    assert "| alpha_3 L_ctrl |" in text
+
+
 def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_path):
     plain = write_report(tmp_path, **_report()).read_text()
     assert "efresh" not in plain
