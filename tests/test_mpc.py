@@ -335,7 +335,7 @@ def test_the_first_pose_which_no_input_moves_can_be_left_unbounded():
 
     def status(first):
         def high(step):
-            bound = jnp.where(step.index == 0, first, low)
+            bound = jnp.where(step.number == 0, first, low)
             return Rows(step.state.position[2:], bound, jnp.inf)
 
         constraints = (*CONFIG.constraints, StateConstraint(f"high {first}", of=high))

@@ -91,7 +91,7 @@ class Contact(NamedTuple):
 class Step(NamedTuple):
     """Arguments of a constraint on the state at the end of an MPC step."""
 
-    index: Int[Array, ""]  # 0 for the first step
+    number: Int[Array, ""]  # 0 for the first step
     state: State  # matrices (3, 12) that select each part of the state
     reference: State  # desired state at the end of the step
     contact: Bool[Array, " feet"]  # stance feet of the step
@@ -125,7 +125,7 @@ class StateConstraint(Constraint):
     """Rows on the state at the end of each step, `of(step: Step)`.
 
     They make A dense, which is slower. The QP has no slack variables, so they can make it
-    infeasible. By forward Euler no input moves the pose at the end of the first step (index 0):
+    infeasible. By forward Euler no input moves the pose at the end of the first step (number 0):
     give its row infinite bounds there.
     """
 

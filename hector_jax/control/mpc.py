@@ -270,8 +270,8 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
     selection = State(*jnp.split(jnp.eye(12, dtype=turn.dtype), 4))
 
     def of_step(data: tuple) -> Rows:
-        index, reference, contact, lever, states, free = data
-        step = Step(index, selection, reference, contact, lever)
+        number, reference, contact, lever, states, free = data
+        step = Step(number, selection, reference, contact, lever)
         parts = [rows(constraint, step, turn) for constraint in config.on("states")]
         C, lower, upper = map(jnp.concatenate, zip(*parts, strict=True))
         constant = C @ jnp.concatenate(free)
@@ -279,8 +279,8 @@ def state_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
 
     flat = states.reshape(*states.shape[:2], -1)
     horizon = problem.horizon
-    index = jnp.arange(len(flat))
-    steps = index, horizon.reference, horizon.contact, horizon.lever, flat, free
+    numbers = jnp.arange(len(flat))
+    steps = numbers, horizon.reference, horizon.contact, horizon.lever, flat, free
     A, lower, upper = jax.vmap(of_step)(steps)
     return Rows(A.reshape(-1, A.shape[-1]), lower.ravel(), upper.ravel())
 
