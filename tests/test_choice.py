@@ -130,7 +130,7 @@ def test_after_walks_the_earliest_set_as_good_as_the_best_is_taken(
     def judge(pool, config, robot, sets, command, plants, seeds, **notes):
         del pool, config, robot, command, notes
         assert len(plants) == choice.HELD_OUT
-        tuned_on = choice.drawn_plants(ROBOT, 100)
+        tuned_on = choice.drawn_plants(ROBOT, 1000)  # the most of --walk-plants
         assert not {float(plant.mass) for plant in plants} & {float(p.mass) for p in tuned_on}
         score, spread = score_like(loss=CONFIG.loss), {"set 1": 0.06}
         return SimpleNamespace(

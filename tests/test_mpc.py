@@ -331,7 +331,8 @@ def test_a_plan_obeys_an_input_and_a_state_constraint_of_ones_own():
 def test_the_first_pose_which_no_input_moves_can_be_left_unbounded():
     """A body that is measured below its lowest height rises to it from the second step on."""
     state, horizon = problem(3, push=2.0)
-    low = float(state.position[2]) + 0.002
+    state = state._replace(velocity=state.velocity.at[2].set(0.0))
+    low = float(state.position[2]) + 0.002  # [m]
 
     def status(first):
         def high(step):
@@ -342,7 +343,6 @@ def test_the_first_pose_which_no_input_moves_can_be_left_unbounded():
         config = MpcConfig(constraints=constraints, max_force=2000.0)
         return solve(config, ROBOT, expert(), state, horizon, DT, 1)[1].status
 
-    state = state._replace(velocity=state.velocity.at[2].set(0.0))
     assert status(low) == Status.INFEASIBLE
     assert status(-np.inf) == Status.SOLVED
 

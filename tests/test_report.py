@@ -52,7 +52,8 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         environment=environment(),
         command="make tune TRAJ=straight",
         shifts=(),
-        walked=(),
+        proposals=(),
+        best_proposal="",
         cases=0,
         chosen={},
     )
@@ -200,7 +201,11 @@ def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_
 
 
 def test_every_table_of_the_report_is_well_formed(tmp_path):
-    report = _report(pretend_verdict(fallen={("with", 1)})) | {"walked": WALKED, "cases": 6}
+    report = _report(pretend_verdict(fallen={("with", 1)})) | {
+        "proposals": WALKED,
+        "best_proposal": "set 1",
+        "cases": 6,
+    }
     text = write_report(tmp_path, **report).read_text()
     for block in text.split("\n\n"):
         rows = [row for row in block.splitlines() if row.startswith("|")]
@@ -235,9 +240,10 @@ def test_the_report_says_what_was_tuned_beside_the_weights():
 
 
 def test_a_tuning_on_walks_shows_each_set_and_its_falls(tmp_path):
-    report = _report() | {"walked": WALKED, "cases": 6}
+    report = _report() | {"proposals": WALKED, "best_proposal": "set 1", "cases": 6}
     text = write_report(tmp_path, **report).read_text()
     assert "Each weight set was walked 6 times" in text
+    assert "within one standard error: set 1." in text
     assert "| 0, start |  | +0.0 |" in text
     assert "| 1, model | -12.3 | -10.0 |" in text
     assert "| 2, model | -5.0 | fell |" in text

@@ -183,14 +183,14 @@ def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in
     monkeypatch.setattr(walks, "_walk_job", lambda *_: (fell, log))
     rows = walks.tune_on_walks(pool, one, 10)
     assert [change.change for change in walks.changes(rows)] == [None]
-    sets = walks.milestones(pool, one, rows)
+    sets = walks.candidates(pool, one, rows)
     assert list(sets) == ["set 0"]
     np.testing.assert_allclose(sets["set 0"].Q.euler, nominal(robot).Q.euler, rtol=1e-12)
 
 
 def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in_process):
     one, weights, rows = in_process
-    sets, losses = walks.milestones(pool, one, rows), [row.losses[0] for row in rows]
+    sets, losses = walks.candidates(pool, one, rows), [row.losses[0] for row in rows]
     numbers = [int(name.removeprefix("set ")) for name in sets]
     assert numbers[0] == 0
     assert numbers == sorted(numbers)
@@ -254,7 +254,7 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     monkeypatch.setattr(command.choice, "choose", lambda *_, **__: {})
     monkeypatch.setattr(command.choice, "answer", lambda *_, **__: nominal())
     monkeypatch.setattr(command, "tune_on_walks", on_walks)
-    monkeypatch.setattr(command, "milestones", lambda *_: {"set 0": nominal(), "set 1": expert()})
+    monkeypatch.setattr(command, "candidates", lambda *_: {"set 0": nominal(), "set 1": expert()})
     monkeypatch.setattr(command.choice, "earliest", lambda *_, **__: "set 1")
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))
@@ -265,6 +265,6 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     assert seen == {"plants": 3, "commands": ["straight"], "count": 12}
     np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)
     assert (tmp_path / "weights" / "before_walks.json").exists()
-    assert walks.changes(tuned.walked)[0].change == 0.0
+    assert walks.changes(tuned.proposals)[0].change == 0.0
     with pytest.raises(InputError, match=r"--walks must be 0 or at least 6 .*, got 5"):
         command._trajectories(Tune(walks=5, walk_plants=3), robot)

@@ -38,7 +38,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.verdicts import ScoredWalks
-from hector_jax.runs.walks import Campaign, Row, changes, milestones, tune_on_walks
+from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
 from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
@@ -142,7 +142,8 @@ class _Tuned(NamedTuple):
     shifts: list[dict[str, Any]]  # of each refresh
     sets: dict[str, Weights]
     choices: dict[str, choice.Choice]  # empty if the last iterations are used
-    walked: list[Row]  # empty without tuning on walks
+    proposals: list[Row]  # of a tuning on walks; empty without
+    best_proposal: str  # "set 3", the one that is `best`; empty without
 
 
 def _tune_in(folder: Path, args: Tune) -> None:
@@ -187,8 +188,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
         errors=run.net.errors,
         tunings=tuned.tunings,
         shifts=tuned.shifts,
-        walked=changes(tuned.walked),
-        cases=len(tuned.walked[0].losses) if tuned.walked else 0,
+        proposals=changes(tuned.proposals),
+        best_proposal=tuned.best_proposal,
+        cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=result.get("chosen", {}),
         **_draw(run, tuned, *walks[trajectories[0].name]),
         config=settings,
@@ -279,9 +281,9 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
     done = tune_problems(run.problems, title=f"tuning {run.name} without and with GRFM-Net")
     shifts, name = _refresh(pool, run, done, tune_problems), list(done)[-1]
     results = {name: entry.tuning for name, entry in done.items()}
-    commands = list(run.commands.values())
+    inputs, commands = (pool, run.config, run.robot), list(run.commands.values())
     options = {"seconds": run.seconds, "folder": run.artefacts / "choice", "commit": run.commit}
-    choices = choice.choose(pool, run.config, run.robot, results, commands, **options)
+    choices = choice.choose(*inputs, results, commands, **options)
     sets = {
         "nominal": nominal(run.robot),
         "expert": expert(run.robot),
@@ -290,28 +292,25 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
         **{name: tuning.converged for name, tuning in results.items()},
         **{name: chosen.weights for name, chosen in choices.items()},
     }
-    candidates = {name: sets[name] for name in ("nominal", *results)}
-    inputs = pool, run.config, run.robot, candidates, ("without", name), run.args.share, commands
-    sets["best"] = choice.answer(*inputs, **options)
-    walked: list[Row] = []
+    compared, pair = {name: sets[name] for name in ("nominal", *results)}, ("without", name)
+    sets["best"] = choice.answer(*inputs, compared, pair, run.args.share, commands, **options)
+    proposals, best = [], ""
     if run.args.walks:
         sets["before_walks"] = sets.pop("best")
-        sets["best"], walked = _tune_on_walks(pool, run, sets["before_walks"], options)
+        campaign = _campaign(run, sets["before_walks"])
+        proposals = tune_on_walks(pool, campaign, run.args.walks)
+        stages = candidates(pool, campaign, proposals)
+        best = choice.earliest(*inputs, stages, commands, **options)
+        sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    return _Tuned(results, shifts, sets, choices, walked)
+    return _Tuned(results, shifts, sets, choices, proposals, best)
 
 
-def _tune_on_walks(
-    pool: Executor, run: _Run, start: Weights, options: Mapping[str, Any]
-) -> tuple[Weights, list[Row]]:
-    """Tune further on the walks of --walks, starting from the result of the tunings."""
-    count = run.args.walk_plants
-    plants = choice.drawn_plants(run.robot, count) if count else [hfs(run.robot.description)]
-    inputs = run.folder / "walks", run.config, run.robot, start, run.commands, plants
-    rows = tune_on_walks(pool, campaign := Campaign(*inputs), run.args.walks)
-    sets, commands = milestones(pool, campaign, rows), list(run.commands.values())
-    return sets[choice.earliest(pool, run.config, run.robot, sets, commands, **options)], rows
+def _campaign(run: _Run, start: Weights) -> Campaign:
+    """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
+    plants = choice.drawn_plants(run.robot, run.args.walk_plants) or [hfs(run.robot.description)]
+    return Campaign(run.folder / "walks", run.config, run.robot, start, run.commands, plants)
 
 
 def _walk_sets(
@@ -371,8 +370,9 @@ def _result(
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
     if tuned.shifts:
         result["refresh"] = tuned.shifts
-    if tuned.walked:
-        result["walks"] = [change._asdict() for change in changes(tuned.walked)]
+    if tuned.proposals:
+        result["walks"] = [change._asdict() for change in changes(tuned.proposals)]
+        result["best_of_walks"] = tuned.best_proposal
     if tuned.choices:
         choices = tuned.choices.items()
         result["chosen"] = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices}

@@ -63,9 +63,9 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
     walk = from_start(walk)
     count, fallen = len(walk.fallen), walk.fallen
     upright = int(np.argmax(fallen)) if fallen.any() else count
-    shown = np.minimum(np.arange(count), max(upright - 1, 0))  # index of the pose at each sample
+    pose = np.minimum(np.arange(count), max(upright - 1, 0))  # at each sample, the last upright one
     moving = walk.state, walk.feet, walk.joints
-    state, feet, joints = jax.tree.map(lambda x: np.asarray(x)[shown], moving)
+    state, feet, joints = jax.tree.map(lambda x: np.asarray(x)[pose], moving)
     heading = np.append(walk.initial.euler[2], state.euler[:-1, 2])
     R_yaw = Rotation.from_euler("z", heading[:, None]).as_matrix()
     ahead = R_yaw[:, None, :, 0]
@@ -83,7 +83,7 @@ def motion(robot: Robot, walk: Trajectory, ground: Mapping[str, Wrench] | None =
         feet=feet,
         R_yaw=R_yaw,
         wrenches={
-            source: Wrench(*(np.asarray(part)[shown] @ R_yaw.mT for part in wrench))
+            source: Wrench(*(np.asarray(part)[pose] @ R_yaw.mT for part in wrench))
             for source, wrench in (ground or {}).items()
         },
         soles=soles[:upright][touchdowns],

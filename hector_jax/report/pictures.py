@@ -112,8 +112,8 @@ def of_view(
     period = float(after.period)
     first = min(0.4, period * len(after.fallen))  # [s], two steps
     plots.wrenches(folder / "wrenches.png", period, ground, seconds=first)
-    if shown := {name: histories[name] for name in ("without", "with") if histories.get(name)}:
-        plots.losses(folder / "losses.png", loss, shown)
+    if tunings := {name: histories[name] for name in ("without", "with") if histories.get(name)}:
+        plots.losses(folder / "losses.png", loss, tunings)
     say("making the film")
     pair = motions(robot, plots.style.titled(walks))
     write_film(folder / "film.mp4", robot, pair)

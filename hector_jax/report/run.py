@@ -28,7 +28,8 @@ def write_report(folder: Path, **contents: Any) -> Path:
             curvature: of the loss at the starting weights.
             errors: held-out errors of `raw`, `linear`, `net`, from `training.report`.
             shifts: result of `nets.refresh` for each refresh.
-            walked, cases: `Change`s of the tuning on walks; number of walks per weight set.
+            proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
+                is `best`; number of walks per weight set.
             chosen: chosen iteration by set, if it is not the last.
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
             config, environment: resolved settings, as JSON values; versions and machine.

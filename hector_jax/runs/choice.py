@@ -31,11 +31,11 @@ from hector_jax.tuning.difftune import TuneConfig, Tuning
 # fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
 _FRICTION = 11 / 12  # of the controller's friction, with which the chosen weights plan
-# First seeds of plants that are drawn like `hfs-varied` but with other seeds: of those on which
-# weights are chosen or tuned, and of those on which the sets of a tuning on walks are compared.
-_FIRST_SEED, _HELD_OUT_SEED = 7000, 7500
 HELD_OUT = 8
 """Number of the plants of `earliest`."""
+# first seed of the plants for choice and tuning, drawn like `hfs-varied` but with other seeds; the
+# plants of `earliest` have the seeds before it, so that none is among them however many there are
+_FIRST_SEED = 7000
 # Standard deviations of white noise: encoders of 14 bits; a gyroscope on a vibrating trunk;
 # velocity and position follow from both over a leg of about 0.7 m.
 _SIGMAS = {
@@ -160,13 +160,13 @@ def answer(
     mixture = mixture._replace(others={"friction": friction, **mixture.others})
     if not robot.description.tuning.choice_plants:
         return mixture
-    walked = {**sets, "between": mixture}
+    candidates = {**sets, "between": mixture}
     plants = drawn_plants(robot, robot.description.tuning.choice_plants)
-    inputs, title = (pool, config, robot, walked, commands, plants), "choosing the answer"
+    inputs, title = (pool, config, robot, candidates, commands, plants), "choosing the answer"
     ratio = _ratios(*inputs, title, **notes)
-    best = min((n for n in walked if n != "nominal"), key=lambda name: ratio[name].mean())
+    best = min((n for n in candidates if n != "nominal"), key=lambda name: ratio[name].mean())
     say(f"best: {best} walks best on plants drawn around the hfs")
-    return walked[best]
+    return candidates[best]
 
 
 def earliest(
@@ -191,8 +191,8 @@ def earliest(
     Source: the one-standard-error rule of Breiman, Friedman, Olshen and Stone, "Classification and
     Regression Trees", 1984.
     """
-    plants = drawn_plants(robot, HELD_OUT, _HELD_OUT_SEED)
-    inputs, title = (pool, config, robot, sets, commands, plants), "comparing the sets walked"
+    plants = drawn_plants(robot, HELD_OUT, _FIRST_SEED - HELD_OUT)
+    inputs, title = (pool, config, robot, sets, commands, plants), "comparing the tuned sets"
     losses = {name: np.log(r) for name, r in _ratios(*inputs, title, **notes).items()}
     best = min(losses, key=lambda name: losses[name].mean())
 

@@ -331,7 +331,7 @@ def answer(campaign: Campaign, space: Space, rows: Sequence[Row]) -> tuple[Weigh
     return weights_at(campaign, space, rows[number].point), number
 
 
-def milestones(pool: Executor, campaign: Campaign, rows: Sequence[Row]) -> dict[str, Weights]:
+def candidates(pool: Executor, campaign: Campaign, rows: Sequence[Row]) -> dict[str, Weights]:
     """Return the start, each set that was 1 % better than all before it, and that of `answer`."""
     space, history = space_of(pool, campaign), _walked(rows)
     losses = np.array([result.loss for result in history])
