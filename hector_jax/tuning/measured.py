@@ -19,7 +19,7 @@ from hector_jax.control.weights import Weights
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend
-from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.evaluate import Evaluation, mean_of
 from hector_jax.tuning.online import follow, init_trace, measured_states
 
 _measured_states = jax.jit(measured_states)
@@ -91,7 +91,6 @@ def tune_measured(
 
     def mean(weights: Weights) -> Evaluation:
         evaluations = evaluate(weights)
-        average = jax.tree.map(lambda *x: np.mean(x, axis=0), *evaluations)
-        return average._replace(residual=np.max([e.residual for e in evaluations]))
+        return mean_of(evaluations, np.ones(len(evaluations)))
 
     return descend(config, weights, mean, on_iteration, PAPER_ITERATIONS)
