@@ -119,6 +119,21 @@ def test_the_path_of_a_straight_walk_is_a_flat_picture(tmp_path):
         assert picture.height < picture.width / 2
 
 
+@pytest.mark.parametrize("pairs", [1, 2])
+def test_a_straight_path_has_room_for_its_legend_and_labels(tmp_path, drawn, pairs):
+    """Also with the many names of four feet."""
+    walk = pretend_walk(seconds=4.0)
+    more = {name: np.repeat(getattr(walk, name), pairs, axis=1) for name in ("contact", "feet")}
+    names = ("nominal", "expert", "with", "best")
+    plots.path_from_above(tmp_path / "path.png", dict.fromkeys(names, walk._replace(**more)))
+    (figure,) = drawn
+    (axes,) = figure.axes
+    for text in (axes.xaxis.label, axes.yaxis.label, *figure.legends):
+        box = text.get_window_extent()
+        assert box.y0 >= 0.0
+        assert box.y1 <= figure.bbox.y1
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.8])
 def test_the_collective_figure_goes_with_and_without_snapshots(tmp_path, drawn, turn):
     """A straight path lies across, a bent one stands beside the panels."""

@@ -109,9 +109,10 @@ def path_from_above(path: Path, walks: Mapping[str, Trajectory]) -> str:
     """
     walks = {name: from_start(walk) for name, walk in walks.items()}
     span, width = span_of(walks), 7.0
-    height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.9
     feet = next(iter(walks.values())).contact.shape[-1]
     columns = 4 if feet == 2 else 3  # names of four feet are long
+    legend_rows = -(-(len(walks) + 1 + feet) // columns)
+    height = float(np.clip(width * span[1] / span[0], 0.8, 5.0)) + 0.5 + 0.2 * legend_rows
     with drawing(path, width, height, legend_columns=columns) as figure:
         draw_path(figure.subplots(), walks)
     return caption("path_from_above", last=list(walks)[-1])
