@@ -151,8 +151,10 @@ def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
 def test_a_fall_in_the_start_up_is_told_before_any_tuning(monkeypatch, capsys):
     monkeypatch.setattr(diagnosis, "record_walk", lambda *args: recorded())
     monkeypatch.setattr(diagnosis, "startup_fall", lambda *args: FALL)
+    monkeypatch.setattr(tuning.tunings, "compile_programs", lambda *args, walking: None)
     with ThreadPoolExecutor(1) as pool:
-        tuning._say_what_no_weights_mend(pool, TuneConfig(), ROBOT, command_of("straight"))
+        inputs = TuneConfig(), ROBOT, nominal(), command_of("straight")
+        tuning._say_what_no_weights_mend(pool, *inputs)
     said = capsys.readouterr().err
     assert f"before any tuning, straight on hfs with nominal weights: {TEXT}\n" in said
 

@@ -5,11 +5,13 @@ import pytest
 
 from hector_jax.control.reference import (
     COMMANDS,
+    PIECES,
     UNSEEN,
     Anchor,
     Command,
     named_command,
     reference_at,
+    with_pieces,
 )
 
 ANCHOR = Anchor(jnp.array([0.3, -0.2, 0.42]), jnp.array(0.7), jnp.array(10))
@@ -100,3 +102,12 @@ def test_stop_and_go_stands_in_every_other_second():
 def test_unknown_trajectory_is_named():
     with pytest.raises(ValueError, match="unknown trajectory 'circle'; known: straight, c, s, "):
         named_command("circle")
+
+
+def test_pieces_without_duration_change_nothing():
+    three = Command(np.array([0.7, 1.1, 0.4]), 0.1 * np.ones((3, 2)), np.arange(3.0))
+    for command in (named_command("s"), three):
+        padded = with_pieces(command)
+        assert len(padded.duration) == len(with_pieces(padded).duration) == PIECES
+        one, other = (path(c, np.arange(0, 13.0, 0.07)) for c in (command, padded))
+        jax.tree.map(np.testing.assert_array_equal, one, other)

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.control.parameters import tunables
-from hector_jax.control.reference import Command
+from hector_jax.control.reference import PIECES, Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
@@ -28,7 +28,6 @@ from hector_jax.core.files import as_json, locked, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.grfm.jobs import PIECES
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import Picture, print_table
@@ -43,6 +42,7 @@ from hector_jax.sim.diagnosis import not_the_weights
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
+from hector_jax.tuning.curvature import main_directions
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.evaluate import aligned
 
@@ -152,14 +152,15 @@ def _tune_in(folder: Path, args: Tune) -> None:
     robot = load_robot(args.robot)
     trajectories = _trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
+    start = arguments.weights(args.start, robot)
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
-        _say_what_no_weights_mend(pool, config, robot, trajectories[0])
+        _say_what_no_weights_mend(pool, config, robot, start, trajectories[0])
         run = _Run(
             folder=folder,
             args=args,
             robot=robot,
-            start=arguments.weights(args.start, robot),
+            start=start,
             trajectories=trajectories,
             seconds=trajectories[0].seconds or Walk.seconds,
             config=arguments.with_length(config, trajectories[0]),
@@ -172,7 +173,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
             run = run._replace(config=replace(run.config, loss=loss))
         settings = _note_settings(run)
-        curvature = tunings.curvature(pool, run.config, robot, run.start, run.problems["with"])
+        inputs = run.config, robot, run.start, run.problems["with"]
+        matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the tunings
         tuned = _tune_sets(pool, run)
         walks = _walk_sets(pool, run, tuned.sets)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
@@ -184,7 +186,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,
-        curvature=curvature,
+        curvature=main_directions(matrix.result(), run.start),
         errors=run.net.errors,
         tunings=tuned.tunings,
         shifts=tuned.shifts,
@@ -216,13 +218,19 @@ def _net(pool: Executor, args: Tune, robot: Robot) -> nets.TrainedNet:
 
 
 def _say_what_no_weights_mend(
-    pool: Executor, config: TuneConfig, robot: Robot, trajectory: NamedCommand
+    pool: Executor, config: TuneConfig, robot: Robot, start: Weights, trajectory: NamedCommand
 ) -> None:
-    """Walk once with nominal weights on the simulator; report faults that no weights can cure."""
+    """Walk once with nominal weights on the simulator; report faults that no weights can cure.
+
+    The programs of the tuning are compiled at the same time.
+    """
     seconds = trajectory.seconds or Walk.seconds
     job = Job(nominal(robot), trajectory.command, hfs(robot.description), seconds)
     inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-    for line in pool.submit(not_the_weights, *inputs).result():
+    walking = pool.submit(not_the_weights, *inputs)
+    command = trajectory.command
+    tunings.compile_programs(pool, config, robot, start, command, walking=walking)
+    for line in walking.result():
         say(f"before any tuning, {trajectory.name} on hfs with nominal weights: {line}")
 
 
@@ -384,10 +392,12 @@ def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -
     """Draw the pictures and the film of a run, for its report."""
     effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}
     batch = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
-    curves = fidelity.curves(run.robot, batch, effects)
-    inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
-    drawings = pictures.of_run(run.folder, run.config, *inputs)
-    return {"pictures": drawings, "film": _film(run, standin)}
+    with ThreadPoolExecutor(1) as background:  # another process draws the film
+        film = background.submit(_film, run, standin)
+        curves = fidelity.curves(run.robot, batch, effects)
+        inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
+        drawings = pictures.of_run(run.folder, run.config, *inputs)
+    return {"pictures": drawings, "film": film.result()}
 
 
 def _film(run: _Run, walks: ScoredWalks) -> Picture | str:

@@ -27,6 +27,20 @@ class Command(NamedTuple):
     yaw_rate: Float[Any, "*batch S"]  # [rad/s]
 
 
+PIECES = 4  # of most commands, see `with_pieces`
+
+
+def with_pieces(command: Command) -> Command:
+    """Return the same command in at least PIECES pieces, so that programs and batches are shared.
+
+    Pieces without duration are added at its end.
+    """
+    added = max(PIECES - len(command.duration), 0)
+    duration, *rest = (np.concatenate([x, np.repeat(x[-1:], added, axis=0)]) for x in command)
+    duration[len(duration) - added :] = 0.0
+    return Command(duration, *rest)
+
+
 class Anchor(NamedTuple):
     """Start pose of the reference, and its start t = 0 at gait tick `tick`."""
 

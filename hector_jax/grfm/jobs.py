@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from hector_jax.control.reference import COMMANDS, Command, named_command
+from hector_jax.control.reference import COMMANDS, PIECES, Command, named_command, with_pieces
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
@@ -15,7 +15,6 @@ from hector_jax.sim.world import Push, hfs_drawn
 KINDS = (*COMMANDS, "random")  # of commands; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
 NEAR = 1.5  # and within x/NEAR of the weights of a tuning path
-PIECES = 4  # of every command, so that jobs can be stacked
 PUSHES = 2  # of every walk, so that jobs can be stacked; most have zero force
 PUSH_TIME = 0.1  # [s]
 
@@ -53,7 +52,7 @@ def draw_jobs(
     def draw(i: int) -> Job:
         rng = np.random.default_rng([seed, i])
         kind = KINDS[i % len(KINDS)]
-        command = _random_command(rng) if kind == "random" else _split_last(named_command(kind))
+        command = _random_command(rng) if kind == "random" else with_pieces(named_command(kind))
         centre = (i // len(KINDS)) % (3 if paths else 2)
         if centre == 2:
             path = paths[int(rng.integers(len(paths)))]
@@ -91,7 +90,7 @@ def draw_jobs_near(
 
     def draw(i: int) -> Job:
         rng = np.random.default_rng([seed, i])
-        job_command = _random_command(rng) if i % 2 else _split_last(command)
+        job_command = _random_command(rng) if i % 2 else with_pieces(command)
         point = -1 if i // 2 % 2 else int(rng.integers(len(path.Q.euler)))
         weights = _draw_weights(rng, _point(path, point), NEAR)
         return _draw_job(rng, i, job_command, weights, seconds=seconds, robot=robot)
@@ -137,11 +136,3 @@ def _random_command(rng: np.random.Generator) -> Command:
         velocity=rng.uniform([-0.2, -0.2], [0.6, 0.2], (PIECES, 2)),
         yaw_rate=rng.uniform(-0.5 * np.pi, 0.5 * np.pi, PIECES),
     )
-
-
-def _split_last(command: Command) -> Command:
-    """Return the same command in PIECES pieces, its last piece split into equal parts."""
-    parts = np.ones(len(command.duration), int)
-    parts[-1] += PIECES - len(parts)
-    whole = jax.tree.map(lambda x: np.repeat(x, parts, axis=0), command)
-    return whole._replace(duration=whole.duration / np.repeat(parts, parts))

@@ -140,11 +140,12 @@ def linearise(
     )
     moment_gain, force_gain = dt * inverse_inertia, dt / robot.mass * eye
     feet = len(lever)
+    arms = jax.vmap(skew)(lever)
     B = jnp.block(
         [
             [zero] * (2 * feet),
             [zero] * (2 * feet),
-            [moment_gain @ skew(arm) for arm in lever] + [moment_gain] * feet,
+            [moment_gain @ arm for arm in arms] + [moment_gain] * feet,
             [force_gain] * feet + [zero] * feet,
             [zero] * (2 * feet),
         ]

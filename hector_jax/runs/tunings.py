@@ -24,11 +24,8 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.folder import Journal
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
 from hector_jax.tuning import difftune, evaluate
-from hector_jax.tuning.curvature import Curvature, gauss_newton, main_directions
+from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import loss_of_robot
 from hector_jax.tuning.rollout import rollout_config
@@ -223,16 +220,6 @@ def gauss_newton_job(
     return np.mean([np.asarray(matrix) / float(loss) for loss, matrix in results], axis=0)
 
 
-def curvature(
-    pool: Executor, config: TuneConfig, robot: Robot, start: Weights, problem: Problem
-) -> Curvature:
-    """Return the curvature of the loss of the model in the weights at the start."""
-    with bar("directions of the weights that matter") as report_progress:
-        report_progress(0, 1, "compiling")
-        matrix = pool.submit(gauss_newton_job, config, robot, start, problem).result()
-    return main_directions(matrix, start)
-
-
 def tune_config(robot: Robot, **settings: Any) -> TuneConfig:
     """Return settings of a tuning, with the controller and the loss of the TOML of the robot.
 
@@ -256,20 +243,32 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
-def _compile_tuning(config: TuneConfig, robot: Robot, command: Command) -> None:
+def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: Command) -> None:
     (model,) = _models(config, robot, Problem(command, None))
-    difftune.tune_step(config, robot, nominal(robot), *model)
+    difftune.tune_step(config, robot, difftune.init(config, start).best, *model)
 
 
-def compile_programs(pool: Executor, robot: Robot) -> None:
-    """Compile the programs of tunings and walks in one process each; other processes load them."""
-    config = tune_config(robot)
-    controller, straight = config.rollout.walk, named_command("straight")
-    one_tick = Job(nominal(robot), straight, hfs(robot.description), controller.gait.tick)
+def compile_programs(
+    pool: Executor,
+    config: TuneConfig,
+    robot: Robot,
+    start: Weights,
+    command: Command,
+    *,
+    walking: Future[Any],
+) -> None:
+    """Compile the programs of a tuning in one process while another one walks.
+
+    The other processes load the programs of both from the cache.
+
+    Args:
+        pool: worker processes.
+        config, robot, start, command: of the tuning.
+        walking: a walk that was submitted to the pool.
+    """
+    tuning = pool.submit(_compile_tuning, config, robot, start, command)
     with bar("compiling, once on a machine") as report_progress:
-        tuning = pool.submit(_compile_tuning, config, robot, straight)
-        walking = pool.submit(walk, controller, robot, one_tick)
-        for done, future in enumerate((tuning, walking)):
+        for done, future in enumerate((walking, tuning)):
             report_progress(done, 2, "")
             future.result()
         report_progress(2, 2, "")

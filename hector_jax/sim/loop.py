@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
 from hector_jax.control.legs import LegParameters, Measurement
+from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
@@ -93,7 +94,7 @@ def measure(
 def plan_tick(
     config: WalkConfig,
     robot: Robot,
-    weights: Weights,
+    parameters: Parameters,
     command: Command,
     anchor: Anchor,
     tick: Int[Array, ""],
@@ -107,7 +108,7 @@ def plan_tick(
     """Measure and solve the MPC, once a tick.
 
     Args:
-        config, robot, weights: the controller.
+        config, robot, parameters: the controller.
         command, anchor: command, and where its reference starts.
         tick: current gait tick.
         memory: of the controller.
@@ -119,7 +120,7 @@ def plan_tick(
     return step_plan(
         config,
         robot,
-        config.parameters(weights),
+        parameters,
         command=command,
         anchor=anchor,
         tick=tick,

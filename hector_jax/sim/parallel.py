@@ -183,9 +183,10 @@ def _plan(
     program: _Program, walk: _Walk, tick: Int[Array, ""], carry: _Carry, *, max_contacts: int
 ) -> tuple[Memory, Plan]:
     job, reading = walk.job, _read(program, walk, carry.physics)
-    inputs = carry.anchor, tick, carry.memory, carry.yaw, reading, walk.error
+    inputs = job.command, carry.anchor, tick, carry.memory, carry.yaw, reading, walk.error
+    parameters = program.config.parameters(job.weights)
     return loop.plan_tick(
-        program.config, walk.robot, job.weights, job.command, *inputs, max_contacts=max_contacts
+        program.config, walk.robot, parameters, *inputs, max_contacts=max_contacts
     )
 
 
@@ -217,7 +218,8 @@ def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     anchor = standing_anchor(robot)._replace(tick=job.start_tick)
     memory = init_memory(robot, loop.measure(robot, reading, yaw, walk.error))
     inputs = anchor, tick, memory, yaw, reading, walk.error
-    plan = partial(loop.plan_tick, config, robot, job.weights, job.command, *inputs)
+    parameters = config.parameters(job.weights)
+    plan = partial(loop.plan_tick, config, robot, parameters, job.command, *inputs)
     shapes = jax.eval_shape(lambda: plan(max_contacts=len(robot.foot_point))[1])
     inputs = robot, job.command, anchor, 1.0 * tick, yaw, reading
     sample = loop.sample(config, *inputs, effect=effect, touches=Touches(false, false))

@@ -28,7 +28,9 @@ from hector_jax.control.controller import (
     contacts_needed,
     init_memory,
 )
-from hector_jax.control.reference import anchor_at, standing_anchor
+from hector_jax.control.parameters import Parameters
+from hector_jax.control.reference import anchor_at, standing_anchor, with_pieces
+from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.core.tree import Layout, layout, pack, stack, unpack
@@ -104,6 +106,12 @@ _LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""}  # products are loops, not
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
 
+def _parameters(config: WalkConfig, weights: Weights) -> Parameters:
+    """Return the controller's numbers as arrays: one compiled plan then serves all weights."""
+    numbers = jax.tree.map(partial(np.asarray, dtype=float), config.parameters(weights))
+    return jax.device_put(numbers)
+
+
 @quiet_mujoco()
 def walk(
     config: WalkConfig,
@@ -143,12 +151,13 @@ def _walk_ticks(
     """Yield plan and samples of each tick, until t = `ticks` or a fall."""
     programs, count, begin = _programs(config), substeps(config), first_tick(config)
     start, steps = job.start_tick, (job.start_tick - begin + ticks) * count
-    body, weights, command, imperfections = jax.device_put((robot, *job[:3]))
+    command, parameters = with_pieces(job.command), _parameters(config, job.weights)
+    body, command, imperfections = jax.device_put((robot, command, job.imperfections))
     joints, lead = len(robot.joint_lower), steps - ticks * count
     forces = np.asarray(_push_forces(job.push, np.arange(-lead, ticks * count)))
     errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
     anchor = jax.device_put(standing_anchor(robot, start))
-    constants = body, config.parameters(weights).legs, imperfections
+    constants = body, parameters.legs, imperfections
     readings = np.zeros((count + 1, 13 + 3 * joints))
     plant.read(readings[0])
     memory, yaw = programs.begin(body, readings[0]), np.zeros(())
@@ -170,9 +179,9 @@ def _walk_ticks(
         if retune is not None and plan is not None and tick >= start:
             measurement = programs.measure(body, readings[0], yaw, error[0])
             carry, weights = retune.step(carry, tick, anchor, measurement, plan.wrench)
-            weights = jax.device_put(weights)
+            parameters = _parameters(config, weights)
         memory, plan, packed_tick = programs.plan(
-            body, weights, command, anchor, *inputs, max_contacts=contacts_needed(config, tick)
+            body, parameters, command, anchor, *inputs, max_contacts=contacts_needed(config, tick)
         )
         if torques is None:
             trees = constants, (memory, plan), state, millisecond
