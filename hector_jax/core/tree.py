@@ -35,9 +35,14 @@ def pack(tree: Any) -> Float[Array, " n"]:
     return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(tree)])
 
 
-def unpack(layout: Layout, packed: Float[Array, " n"]) -> Any:
-    """Rebuild the tree of this layout from the array that `pack` returned."""
+def unpack(layout: Layout, packed: Float[Array | np.ndarray, "*batch n"]) -> Any:
+    """Rebuild the tree of this layout from arrays of `pack`; of NumPy's if they are."""
     structure, leaves = layout
-    parts = jnp.split(packed, np.cumsum([leaf.size for leaf in leaves])[:-1])
-    pairs = zip(parts, leaves, strict=True)
-    return structure.unflatten([x.reshape(leaf.shape).astype(leaf.dtype) for x, leaf in pairs])
+    split = np.split if isinstance(packed, np.ndarray) else jnp.split
+    parts = split(packed, np.cumsum([leaf.size for leaf in leaves])[:-1], axis=-1)
+    return structure.unflatten(
+        [
+            x.reshape((*packed.shape[:-1], *leaf.shape)).astype(leaf.dtype)
+            for x, leaf in zip(parts, leaves, strict=True)
+        ]
+    )

@@ -29,7 +29,7 @@ from hector_jax.control.controller import (
     init_memory,
 )
 from hector_jax.control.parameters import Parameters
-from hector_jax.control.reference import anchor_at, standing_anchor, with_pieces
+from hector_jax.control.reference import Anchor, anchor_at, standing_anchor, with_pieces
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import Trajectory
@@ -54,25 +54,49 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
         measurement = loop.measure(robot, reading, jnp.zeros(()), sensing.no_error(robot))
         return init_memory(robot, measurement)
 
-    def plan(*inputs: Any, max_contacts: int) -> tuple[Memory, Plan, Array]:
-        memory, plan = loop.plan_tick(config, *inputs, max_contacts=max_contacts)
-        return memory, plan, pack((memory, plan))
-
-    def samples(robot, command, anchor, tick, yaw, readings, contacts, *, ground_of) -> Sample:
-        def sample(time: Array, before: Array, after: Array, ground: Ground) -> Sample:
+    def samples(robot, command, anchors, ticks, yaws, readings, contacts, *, ground_of) -> Sample:
+        def sample(anchor, time, yaw, before, after, ground: Ground) -> Sample:
             effect = loop.effect_of(robot, before, ground)
             inputs = robot, command, anchor, time, yaw, after
             return loop.sample(config, *inputs, effect=effect, touches=ground.touches)
 
-        times = tick + (1 + jnp.arange(count)) / count
-        return jax.vmap(sample)(times, readings[:-1], readings[1:], ground_of(robot, contacts))
+        times = (ticks[:, None] + (1 + jnp.arange(count)) / count).ravel()
+        anchors, yaws = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), (anchors, yaws))
+        ground = ground_of(robot, contacts)
+        return jax.vmap(sample)(anchors, times, yaws, readings[:-1], readings[1:], ground)
+
+    def anchor(robot: Robot, reading: Array, yaw: Array, start_tick: int) -> Anchor:
+        state = sensing.base_state(robot, sensing.unpack_reading(reading), yaw)
+        return anchor_at(robot, state, start_tick)
 
     return SimpleNamespace(
         begin=jax.jit(begin),
+        anchor=jax.jit(anchor),
         measure=jax.jit(loop.measure),
-        plan=jax.jit(plan, static_argnames="max_contacts"),
         samples=jax.jit(samples, static_argnames="ground_of"),
     )
+
+
+class _Planner:
+    """The compiled plan of a tick, from packed trees to the packed memory and plan."""
+
+    layout: Layout  # of memory and plan, known after the first call
+
+    def __init__(
+        self, config: WalkConfig, constants: Layout, inputs: Layout, max_contacts: int
+    ) -> None:
+        def plan(*packed: Array) -> Array:
+            robot, parameters, command, _ = unpack(constants, packed[0])
+            now = unpack(inputs, packed[1])
+            numbers = config, robot, parameters, command
+            result = loop.plan_tick(*numbers, *now, max_contacts=max_contacts)
+            self.layout = layout(result)
+            return pack(result)
+
+        self.plan = jax.jit(plan)
+
+
+_planner = cache(_Planner)
 
 
 @cache
@@ -87,7 +111,8 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
 
     def torques(*packed: Array) -> Array:
         constants, tick, (_, yaw, motors), millisecond = map(unpack, layouts, packed)
-        inputs: Any = *constants, *tick, motors, yaw, *millisecond
+        robot, parameters, _, imperfections = constants
+        inputs: Any = robot, parameters.legs, imperfections, *tick, motors, yaw, *millisecond
         motors, yaw, torque = loop.motor_torques(config, *inputs)
         return pack((torque, yaw, motors))
 
@@ -95,21 +120,23 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
         with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
             return jax.jit(torques)(*packed)
 
-    shapes = [jax.eval_shape(pack, leaves) for _, leaves in layouts]
     if jax.default_backend() == "cpu":
+        compiled = jax.jit(small_call, compiler_options=_LOOPS)
         with suppress(jax.errors.JaxRuntimeError):
-            return jax.jit(small_call, compiler_options=_LOOPS).lower(*shapes).compile()
-    return jax.jit(torques).lower(*shapes).compile()
+            compiled(*(np.zeros(sum(leaf.size for leaf in leaves)) for _, leaves in layouts))
+            return compiled
+    return jax.jit(torques)
 
 
+_BLOCK = 10  # ticks that are sampled by one call, whose cost hardly grows with their number
 _LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""}  # products are loops, not library calls
+_pack = jax.jit(pack)
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
 
 def _parameters(config: WalkConfig, weights: Weights) -> Parameters:
     """Return the controller's numbers as arrays: one compiled plan then serves all weights."""
-    numbers = jax.tree.map(partial(np.asarray, dtype=float), config.parameters(weights))
-    return jax.device_put(numbers)
+    return jax.tree.map(partial(np.asarray, dtype=float), config.parameters(weights))
 
 
 @quiet_mujoco()
@@ -141,64 +168,66 @@ def walk(
     count, ticks = substeps(config), loop.walk_ticks(config, job.seconds, job.start_tick)
     lead, length = (job.start_tick - first_tick(config)) * count, ticks * count
     plant = build(job, job.body(robot), -lead, length)
-    plans, samples = zip(*_walk_ticks(config, robot, job, plant, ticks, retune), strict=True)
+    plans, samples = zip(*_walk_blocks(config, robot, job, plant, ticks, retune), strict=True)
     return _trajectory(plans, samples, count, lead, length, plant.broken)
 
 
-def _walk_ticks(
+def _walk_blocks(
     config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Retune | None
 ) -> Iterator[tuple[Plan, Sample]]:
-    """Yield plan and samples of each tick, until t = `ticks` or a fall."""
-    programs, count, begin = _programs(config), substeps(config), first_tick(config)
-    start, steps = job.start_tick, (job.start_tick - begin + ticks) * count
-    command, parameters = with_pieces(job.command), _parameters(config, job.weights)
-    body, command, imperfections = jax.device_put((robot, command, job.imperfections))
+    """Yield plans and samples of each block of ticks (numpy), until t = `ticks` or a fall."""
+    programs, count, first = _programs(config), substeps(config), first_tick(config)
+    start, steps = job.start_tick, (job.start_tick - first + ticks) * count
     joints, lead = len(robot.joint_lower), steps - ticks * count
     forces = np.asarray(_push_forces(job.push, np.arange(-lead, ticks * count)))
     errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
-    anchor = jax.device_put(standing_anchor(robot, start))
-    constants = body, parameters.legs, imperfections
-    readings = np.zeros((count + 1, 13 + 3 * joints))
+    readings, clock, yaw = np.zeros((steps + 1, 13 + 3 * joints)), np.int32(0), np.zeros(())
     plant.read(readings[0])
-    memory, yaw = programs.begin(body, readings[0]), np.zeros(())
-    state = np.zeros(joints), yaw, init_actuators(joints)
-    packed_constants, packed_state = pack(constants), pack(state)
-    millisecond = np.array(0, np.int32), readings[0], errors[0]
-    rows = np.zeros((count, pack(millisecond).size))
-    rows[:, 0] = np.arange(count)
-    carry = None if retune is None else retune.init
-    torques = plan = samples = None
-    for tick in range(begin, start + ticks):
-        if tick == start:
-            assert samples is not None  # `walk_ticks` refuses a walk that begins at t = 0
-            last = jax.tree.map(lambda x: x[-1], samples.state)
-            anchor = jax.device_put(anchor_at(robot, last, start))
-        step = (tick - begin) * count
-        error, yaw_before, tick_array = errors[step : step + count], yaw, np.array(tick, np.int32)
-        inputs = tick_array, memory, yaw, readings[0], error[0]
-        if retune is not None and plan is not None and tick >= start:
-            measurement = programs.measure(body, readings[0], yaw, error[0])
-            carry, weights = retune.step(carry, tick, anchor, measurement, plan.wrench)
-            parameters = _parameters(config, weights)
-        memory, plan, packed_tick = programs.plan(
-            body, parameters, command, anchor, *inputs, max_contacts=contacts_needed(config, tick)
-        )
-        if torques is None:
-            trees = constants, (memory, plan), state, millisecond
-            torques = _torques(config, *map(layout, trees))
-        rows[:, -error.shape[1] :] = error
-        for i in range(count):
-            rows[i, 1 : -error.shape[1]] = readings[i]
-            packed_state = torques(packed_constants, packed_tick, packed_state, rows[i])
-            plant.step(np.asarray(packed_state)[:joints], forces[step + i])
-            plant.read(readings[i + 1])
-        yaw = np.asarray(packed_state)[joints]
-        measured = tick_array, yaw_before, readings, plant.ground()
-        samples = programs.samples(body, command, anchor, *measured, ground_of=plant.ground_of)
-        yield plan, samples
-        if np.asarray(samples.fallen).any() or plant.broken:
+    body, command = jax.device_put((robot, with_pieces(job.command)))
+    constants = body, _parameters(config, job.weights), command, job.imperfections
+    anchor, memory = standing_anchor(robot, start), programs.begin(body, readings[0])
+    state, measured = (np.zeros(joints), yaw, init_actuators(joints)), (readings[0], errors[0])
+    of_constants, of_inputs = layout(constants), layout((anchor, clock, memory, yaw, *measured))
+    trees = anchor, constants, state, memory
+    packed_anchor, packed_constants, packed_state, packed = map(_pack, trees)
+    planner_for = cache(partial(_planner, config, of_constants, of_inputs))
+    memory_size, row = packed.size, np.zeros(1 + readings[0].size + errors[0].size)
+    carry, torques, planner, step = None if retune is None else retune.init, None, None, 0
+    while step < steps and not plant.broken:
+        begin, plans, at_start = step, [], []
+        for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
+            tick, reading, error = first + step // count, readings[step], errors[step]
+            if tick == start:
+                anchor = programs.anchor(body, reading, yaw, start)
+                packed_anchor = _pack(anchor)
+            if retune is not None and planner is not None and tick >= start:
+                measurement = programs.measure(body, reading, yaw, error)
+                wrench = unpack(planner.layout, np.asarray(packed))[1].wrench
+                carry, weights = retune.step(carry, tick, anchor, measurement, wrench)
+                packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
+            at_start.append((anchor, np.int32(tick), yaw))
+            planner = planner_for(contacts_needed(config, tick))
+            inputs = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], reading, error
+            packed = planner.plan(packed_constants, np.concatenate(inputs))
+            plans.append(np.asarray(packed))
+            if torques is None:
+                layouts = planner.layout, layout(state), layout((clock, *measured))
+                torques = _torques(config, of_constants, *layouts)
+            for row[0] in range(count):
+                row[1 : -error.size], row[-error.size :] = readings[step], errors[step]
+                packed_state = torques(packed_constants, packed, packed_state, row)
+                plant.step(np.asarray(packed_state)[:joints], forces[step])
+                step += 1
+                plant.read(readings[step])
+            yaw = np.asarray(packed_state)[joints]
+            if plant.broken:
+                break
+        inputs = *stack(at_start), readings[begin : step + 1], plant.ground()
+        samples = programs.samples(body, command, *inputs, ground_of=plant.ground_of)
+        assert planner is not None  # it has planned
+        yield unpack(planner.layout, np.stack(plans))[1], jax.tree.map(np.asarray, samples)
+        if np.asarray(samples.fallen).any():
             return
-        readings[0] = readings[-1]
 
 
 def _trajectory(
@@ -210,7 +239,7 @@ def _trajectory(
     broken: bool,
 ) -> Trajectory:
     """Return the samples from t = 0 on; from a fall on they repeat the last valid one."""
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), stack(samples))
+    plan, flat = (jax.tree.map(lambda *x: np.concatenate(x), *trees) for trees in (plans, samples))
     fell, good = np.flatnonzero(flat.fallen), len(flat.fallen) - 1
     if len(fell):
         good = max(fell[0] - 1, 0)
@@ -218,9 +247,12 @@ def _trajectory(
         good = max(len(flat.fallen) - count - 1, 0)
     steps = lead + np.arange(length)
     rows = np.minimum(steps, good)
-    plan = jax.tree.map(lambda x: x[rows // count], stack(plans))
     initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
-    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
+    plan, chosen = (
+        jax.tree.map(lambda x: x[rows // count], plan),
+        jax.tree.map(lambda x: x[rows], flat),
+    )
+    chosen = chosen._replace(fallen=steps > good)
     return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
