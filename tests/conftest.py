@@ -15,6 +15,8 @@ if version("jaxlib").startswith("0.10."):
     _QUICK.append("--xla_cpu_use_fusion_emitters=false")  # later ones do not know this flag
 _SET = os.environ.get("XLA_FLAGS", "").split()
 os.environ["XLA_FLAGS"] = " ".join(_SET + [flag for flag in _QUICK if flag not in _SET])
+# The matrices of the tests are small: threads of NumPy and SciPy would only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
