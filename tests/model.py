@@ -8,7 +8,7 @@ import numpy as np
 from synthetic import synthetic_walk
 
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import standing_anchor
+from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, effect_of
 from hector_jax.grfm.residual import init, with_statistics
@@ -25,6 +25,8 @@ ANCHOR = standing_anchor(ROBOT)
 SHORT = RolloutConfig(ticks=50)
 CONFIG = TuneConfig(rollout=SHORT)
 PLAIN = effect_of(None, GaitConfig())
+BRIEF = RolloutConfig(ticks=5)  # where a few ticks are enough, with one command
+AHEAD = Command(np.array([0.05]), np.array([[0.3, 0.0]]), np.zeros(1))
 
 
 def small_net(seed=0):

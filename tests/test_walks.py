@@ -1,7 +1,9 @@
 """Tuning on walks: the folder, the logs, and files against walks in process."""
 
 import json
-from concurrent.futures import Executor, ThreadPoolExecutor
+import pickle
+from concurrent.futures import Executor, Future
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,14 +11,14 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from model import AHEAD, BRIEF
 from pretend import pretend_history
 
 from hector_jax.cli import propose
 from hector_jax.cli import tune as command
 from hector_jax.cli.flags import Propose, Report, Tune
-from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import named_command
-from hector_jax.control.trajectories import NamedCommand, command_of
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
@@ -30,16 +32,26 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import loss_of
-from hector_jax.tuning.rollout import RolloutConfig
 
-COMMAND = {"s": named_command("s")}
+# all walks of this file are of these ticks and this command: one set of programs for all tests
+CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF), {"short": AHEAD}, 0.05
 SHORT = """
 name = "short"
 [[segment]]
 seconds = 0.05
 v_x = 0.3
 """
-CONFIG = TuneConfig(rollout=RolloutConfig(ticks=6))
+
+
+class HandsOver(Executor):
+    """Does each job at once in this process, on what pickling leaves of it."""
+
+    def submit(self, job, *inputs):
+        """Return the result, which was pickled too."""
+        job, inputs = pickle.loads(pickle.dumps((job, inputs)))
+        done = Future()
+        done.set_result(pickle.loads(pickle.dumps(job(*inputs))))
+        return done
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +61,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def pool():
-    with ThreadPoolExecutor(1) as pool:
-        yield pool
+    return HandsOver()
 
 
 def campaign(folder, robot, plants=(None,), seed=0):
@@ -65,7 +76,7 @@ def in_process(robot, pool, tmp_path_factory):
 
 
 def walked(robot, weights, path):
-    job = Job(weights, COMMAND["s"], hfs(), 0.06)
+    job = Job(weights, AHEAD, hfs(), SECONDS)
     save_tree(path, walk(CONFIG.rollout.walk, robot, job), kind="trajectory", robot=robot)
     return path
 
@@ -78,7 +89,7 @@ def test_ten_walks_through_files_equal_ten_in_process_to_the_last_bit(
     for number in range(10):
         again = walks.read_history(one)  # as a new process would
         proposal, weights = walks.next_proposal(pool, one, space, again)
-        log = walk_log.read_log(walked(robot, weights, tmp_path / f"{number}.npz"), robot, 0.06)
+        log = walk_log.read_log(walked(robot, weights, tmp_path / f"{number}.npz"), robot, SECONDS)
         again = walks.add_walk(one, again, proposal, walks.evaluate_logs(pool, one, [log]))
     assert len(again) == len(rows) == 10
     for mine, theirs in zip(again, rows, strict=True):
@@ -109,9 +120,9 @@ def test_a_start_that_falls_is_refused(robot, pool, in_process, tmp_path):
         walks.next_proposal(pool, one, space, [row])
 
 
-@pytest.fixture
-def arrays(robot, tmp_path):
-    path = walked(robot, nominal(robot), tmp_path / "whole.npz")
+@pytest.fixture(scope="module")
+def arrays(robot, tmp_path_factory):
+    path = walked(robot, nominal(robot), tmp_path_factory.mktemp("log") / "whole.npz")
     with np.load(path) as archive:
         return {name: archive[name] for name in archive.files if name != "card"}
 
@@ -119,33 +130,33 @@ def arrays(robot, tmp_path):
 def test_a_plain_archive_with_the_least_entries_is_a_log(robot, arrays, tmp_path):
     least = {n: x for n, x in arrays.items() if n.split(".")[0] in ("initial", "state", "command")}
     np.savez(tmp_path / "least.npz", joints=arrays["joints"], **least)
-    log = walk_log.read_log(tmp_path / "least.npz", robot, 0.06)
-    assert log.joints.shape == (60, 10)
+    log = walk_log.read_log(tmp_path / "least.npz", robot, SECONDS)
+    assert log.joints.shape == (50, 10)
     assert not log.fallen.any()
     # a log that ends early is that of a fall
     seen = walk_log.evaluate_log(
-        CONFIG, robot, COMMAND["s"], walk_log.read_log(tmp_path / "least.npz", robot, 0.06)
+        CONFIG, robot, AHEAD, walk_log.read_log(tmp_path / "least.npz", robot, SECONDS)
     )
     assert np.isfinite(seen[0].loss)
-    short = walk_log.read_log(tmp_path / "least.npz", robot, 0.08)
-    assert short.fallen.tolist() == [False] * 60 + [True] * 20
+    short = walk_log.read_log(tmp_path / "least.npz", robot, 0.07)
+    assert short.fallen.tolist() == [False] * 50 + [True] * 20
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"joints": np.zeros((60, 9))}, r"joints must have shape \(60, 10\), got \(60, 9\)"),
-        ({"state.euler": np.full((60, 3), np.nan)}, "state.euler must hold finite numbers"),
+        ({"joints": np.zeros((50, 9))}, r"joints must have shape \(50, 10\), got \(50, 9\)"),
+        ({"state.euler": np.full((50, 3), np.nan)}, "state.euler must hold finite numbers"),
         ({"period": np.array(0.01)}, "samples must be of 0.001 s, got 0.01"),
         ({"command.force": None}, "command.force is missing"),
-        ({"joints": np.zeros((61, 10))}, "expected 60 samples of joints, got 61"),
+        ({"joints": np.zeros((51, 10))}, "expected 50 samples of joints, got 51"),
     ],
 )
 def test_a_log_that_is_none_is_refused_in_one_line(robot, arrays, tmp_path, change, words):
     changed = {n: x for n, x in (arrays | change).items() if x is not None}
     np.savez(tmp_path / "log.npz", **changed)
     with pytest.raises(InputError, match=words):
-        walk_log.read_log(tmp_path / "log.npz", robot, 0.06)
+        walk_log.read_log(tmp_path / "log.npz", robot, SECONDS)
 
 
 def _cut(arrays, path):
@@ -164,23 +175,27 @@ def _cut(arrays, path):
 def test_what_is_no_whole_archive_is_refused(robot, arrays, tmp_path, write):
     write(arrays, tmp_path / "log.npz")
     with pytest.raises(InputError, match=r"not a log \(\.npz\)"):
-        walk_log.read_log(tmp_path / "log.npz", robot, 0.06)
+        walk_log.read_log(tmp_path / "log.npz", robot, SECONDS)
 
 
 def test_the_reference_of_a_log_is_that_of_its_walk(robot):
-    walked = walk(CONFIG.rollout.walk, robot, Job(nominal(robot), COMMAND["s"], hfs(), 0.06))
-    seen, _ = walk_log.evaluate_log(CONFIG, robot, COMMAND["s"], walk_log.log_of(walked))
+    walked = walk(CONFIG.rollout.walk, robot, Job(nominal(robot), AHEAD, hfs(), SECONDS))
+    seen, _ = walk_log.evaluate_log(CONFIG, robot, AHEAD, walk_log.log_of(walked))
     assert seen.loss == pytest.approx(float(loss_of(CONFIG.loss, walked)), rel=1e-9)
     assert 0.0 < seen.margin < 0.2
+
+
+def _fell(one, *_):
+    robot = one.robot
+    log = walk_log.log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
+    return walk_log.LogScore(np.inf, 1.0), log
 
 
 def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in_process, tmp_path):
     """As by a plant on which the answer of the tunings falls: the run goes on without it."""
     one = campaign(tmp_path, robot, [hfs()])
     (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
-    fell = walk_log.LogScore(np.inf, 1.0)
-    log = walk_log.log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
-    monkeypatch.setattr(walks, "_walk_job", lambda *_: (fell, log))
+    monkeypatch.setattr(walks, "_walk_job", _fell)
     rows = walks.tune_on_walks(pool, one, 10)
     assert [change.change for change in walks.changes(rows)] == [None]
     sets = walks.candidates(pool, one, rows)
@@ -210,7 +225,8 @@ def test_the_points_of_a_folder_stay_in_one_metric(monkeypatch, pool, in_process
     jax.tree.map(np.testing.assert_array_equal, again, kept)
 
 
-def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, tmp_path, capsys):
+def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, pool, tmp_path, capsys):
+    monkeypatch.setattr(propose, "workers", {1: nullcontext(pool)}.get)  # by --processes
     monkeypatch.chdir(tmp_path)
     (tmp_path / "short.toml").write_text(SHORT)
     wrong = nominal(robot)
@@ -224,12 +240,7 @@ def test_from_proposal_to_report_by_the_commands(monkeypatch, robot, tmp_path, c
     assert (first["walk"], first["proposed_by"]) == (0, "start")
     with pytest.raises(InputError, match="begun with --traj short.toml, got s"):
         propose.propose(Propose(folder, ("s",)))
-    weights = load_weights(Path(first["weights"]), robot)
-    job = Job(weights, command_of("short.toml").command, hfs(), 0.05)
-    save_tree(
-        tmp_path / "log.npz", walk(walk_config(robot), robot, job), kind="trajectory", robot=robot
-    )
-    log = tmp_path / "log.npz"
+    log = walked(robot, load_weights(Path(first["weights"]), robot), tmp_path / "log.npz")
     with pytest.raises(InputError, match="a log of each of short, got 2 files"):
         propose.report(Report(folder, (log, log)))
     propose.report(Report(folder, (log,), processes=1, json=True))
