@@ -1,10 +1,13 @@
 """Closed loop on the rigid body: physics, compilation, the gradient two ways."""
 
+from dataclasses import replace
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from model import LEARNS_TOUCHDOWNS, PLAIN, SHORT, small_effect
+from model import CONFIG, LEARNS_TOUCHDOWNS, PLAIN, SHORT, small_effect
 
 from hector_jax.control.reference import COMMANDS, named_command, standing_anchor
 from hector_jax.control.weights import expert, nominal, vector_to_weights, weights_to_vector
@@ -13,12 +16,20 @@ from hector_jax.grfm.dataset import make_dataset
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.tuning import sensitivity
-from hector_jax.tuning.difftune import TuneConfig, tune_step
-from hector_jax.tuning.evaluate import evaluate_jit
+from hector_jax.tuning.difftune import (
+    TuneConfig,
+    init,
+    rejection_reason,
+    tune,
+    tune_step,
+)
+from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 LONG = RolloutConfig(ticks=400)
+STRAIGHT = named_command("straight")
+OTHERS = ("footstep_feedback", "friction", "turn_lead")  # tuned beside Q and R
 walk = jax.jit(rollout, static_argnums=0)
 propagate = jax.jit(sensitivity.propagate, static_argnums=0)
 
@@ -33,10 +44,17 @@ def anchor(robot):
     return standing_anchor(robot)
 
 
+@cache
+def long_walk(weights, name):
+    """A walk of 4 s with named weights; several tests look at one."""
+    robot = load_robot()
+    return walk(LONG, robot, weights(), named_command(name), standing_anchor(robot), PLAIN)
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("weights", [nominal, expert])
-def test_named_weights_walk_every_trajectory(robot, anchor, name, weights):
-    trajectory = walk(LONG, robot, weights(), named_command(name), anchor, PLAIN)
+def test_named_weights_walk_every_trajectory(name, weights):
+    trajectory = long_walk(weights, name)
     assert not trajectory.fallen.any()
     assert trajectory.residual.max() < 1e-8
     assert total(PAPER_LOSS, losses(PAPER_LOSS, trajectory)) < 3e6
@@ -44,12 +62,14 @@ def test_named_weights_walk_every_trajectory(robot, anchor, name, weights):
 
 def test_a_foot_lands_where_phi_says_and_a_dataset_reads_it_back(robot, anchor):
     shift = np.array([[0.03, -0.02, 0.0], [0.01, 0.02, 0.001]])
-    moved = jax.tree_util.Partial(
-        lambda window: last_command(window)._replace(touchdown_error=jnp.asarray(shift))
-    )
+
+    def moved(shift, window):
+        return last_command(window)._replace(touchdown_error=shift)
+
     command = named_command("c")
     planned, walked = (
-        walk(SHORT, robot, nominal(), command, anchor, phi) for phi in (last_command, moved)
+        walk(SHORT, robot, nominal(), command, anchor, jax.tree_util.Partial(moved, by))
+        for by in (np.zeros((2, 3)), shift)
     )
     lands = np.flatnonzero(np.diff(planned.contact[:, 1].astype(int)) == 1)[0] + 1
     yaw = planned.state.euler[lands - 2, 2]
@@ -64,15 +84,15 @@ def test_a_foot_lands_where_phi_says_and_a_dataset_reads_it_back(robot, anchor):
     assert not make_dataset(robot, stacked)[0].lands.any()  # as its description asks
 
 
-def test_a_foot_in_the_air_gets_no_wrench(robot, anchor):
-    trajectory = walk(LONG, robot, expert(), named_command("s"), anchor, PLAIN)
+def test_a_foot_in_the_air_gets_no_wrench():
+    trajectory = long_walk(expert, "s")
     swing = ~np.asarray(trajectory.contact)
     assert not np.asarray(trajectory.command.force)[swing].any()
     assert not np.asarray(trajectory.command.moment)[swing].any()
 
 
-def test_commands_respect_friction_force_and_line_foot(robot, anchor):
-    trajectory = walk(LONG, robot, nominal(), named_command("s"), anchor, PLAIN)
+def test_commands_respect_friction_force_and_line_foot():
+    trajectory = long_walk(nominal, "s")
     force = np.asarray(trajectory.command.force)[np.asarray(trajectory.contact)]
     assert (np.abs(force[:, :2]) <= 0.5 * force[:, 2:] + 1e-4).all()
     assert (force[:, 2] >= -1e-6).all()
@@ -80,10 +100,8 @@ def test_commands_respect_friction_force_and_line_foot(robot, anchor):
     assert (np.abs(force[:, :2]).sum(axis=1) <= 0.6 * force[:, 2] + 1e-4).all()  # MuJoCo's diamond
 
 
-def test_a_line_foot_is_pressed_between_heel_and_toe_and_has_no_moment_about_its_length(
-    robot, anchor
-):
-    trajectory = walk(LONG, robot, nominal(), named_command("straight"), anchor, PLAIN)
+def test_a_line_foot_is_pressed_between_heel_and_toe_and_has_no_moment_about_its_length(robot):
+    trajectory = long_walk(nominal, "straight")
     stands = np.asarray(trajectory.contact)
     force = np.asarray(trajectory.command.force)[stands]
     moment = np.asarray(trajectory.command.moment)[stands]
@@ -109,15 +127,23 @@ def test_falling_is_seen_and_charged(robot, anchor):
 def test_starting_half_a_cycle_later_mirrors_the_walk(robot):
     mirror = jnp.array([1.0, -1.0, 1.0])
     half = RolloutConfig().walk.gait.cycle // 2
-    command = named_command("straight")
+    command, later = named_command("straight"), standing_anchor(robot, half)
     # A robot that is its own mirror image: the products of inertia that yaw couples to vanish.
-    one, other = (
-        walk(LONG, robot, nominal(), command, standing_anchor(robot, tick), PLAIN)
-        for tick in (0, half)
-    )
+    one = long_walk(nominal, "straight")
+    other = walk(LONG, robot, nominal(), command, later, PLAIN)
     position, force = other.state.position * mirror, other.command.force[:, ::-1] * mirror
     np.testing.assert_allclose(one.state.position[:50], position[:50], atol=1e-9)
     np.testing.assert_allclose(one.command.force[:50], force[:50], atol=1e-6)
+
+
+@cache
+def start():
+    """Nominal weights with other numbers, so that all gradients over 50 ticks share a program."""
+    return jax.tree.map(np.asarray, init(replace(CONFIG, others=OTHERS), nominal()).trial)
+
+
+def vector(weights):
+    return np.asarray(weights_to_vector(weights))
 
 
 def random_weights(seed):
@@ -135,7 +161,8 @@ def differences(config, robot, weights, *model, step, directions):
     theta, found = np.asarray(weights_to_vector(weights)), []
     for direction in step * directions:
         vectors = (jnp.asarray(theta * np.exp(side * direction)) for side in (1, -1))
-        up, down = (loss_of(config, robot, vector_to_weights(v, weights), *model) for v in vectors)
+        both = (vector_to_weights(v, weights)._replace(others=weights.others) for v in vectors)
+        up, down = (loss_of(config, robot, moved, *model) for moved in both)
         found.append((up - down) / (2 * step))
     return np.array(found)
 
@@ -184,8 +211,8 @@ def check_gradient(
 
 
 def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor):
-    command = named_command("s")
-    check_gradient(SHORT, robot, random_weights(0), command, anchor, PLAIN, 1e-6, OBLIQUE)
+    weights = random_weights(0)._replace(others=start().others)
+    check_gradient(SHORT, robot, weights, named_command("s"), anchor, PLAIN, 1e-6, OBLIQUE)
 
 
 @pytest.mark.slow
@@ -211,7 +238,7 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor)
         tune_step(
             TuneConfig(rollout=RolloutConfig(ticks=50, block=block)),
             robot,
-            nominal(),
+            start(),
             command,
             anchor,
             PLAIN,
@@ -225,9 +252,9 @@ def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor)
 
 def test_the_way_back_solves_no_qp_again(robot, anchor):
     lowered = jax.jit(tune_step, static_argnums=0).lower(
-        TuneConfig(rollout=SHORT),
+        CONFIG,
         robot,
-        nominal(),
+        start(),
         named_command("s"),
         anchor,
         PLAIN,
@@ -243,9 +270,65 @@ def test_a_block_has_at_least_one_tick():
 
 
 def test_new_weights_commands_and_effects_need_no_compilation(robot, anchor):
-    config = TuneConfig(rollout=SHORT)
-    tune_step(config, robot, nominal(), named_command("s"), anchor, PLAIN)
+    tune_step(CONFIG, robot, start(), named_command("s"), anchor, PLAIN)
     before = evaluate_jit._cache_size()
     other = TuneConfig(rollout=SHORT, loss=with_alphas({"L_Eul": 1.0}), beta_q=0.1, iterations=20)
-    tune_step(other, robot, expert(), named_command("c"), anchor, PLAIN)
+    weights = expert()._replace(others=start().others)
+    tune_step(other, robot, weights, named_command("c"), anchor, PLAIN)
     assert evaluate_jit._cache_size() == before
+
+
+# Numbers of the controller beside Q and R
+
+
+@pytest.fixture(scope="module")
+def recursion(robot, anchor):
+    """The walk from there and its sensitivities."""
+    return propagate(SHORT, robot, start(), STRAIGHT, anchor, PLAIN)
+
+
+def test_gradient_norms_are_those_of_the_parts(robot, anchor, recursion):
+    weights = start()
+    arguments = SHORT, robot, weights, STRAIGHT, anchor, PLAIN
+    norms = list(gradient_norms(*arguments, PAPER_LOSS).values())
+
+    def gradient(euler, position):
+        loss = with_alphas({"L_Eul": euler, "L_pos": position})
+        _, found = sensitivity.gradient(loss, *recursion, weights)
+        return vector(found) * vector(weights)
+
+    control = gradient(0.0, 0.0)
+    expected = gradient(1e6, 0.0) - control, gradient(0.0, 1e6) - control, 1e6 * control
+    np.testing.assert_allclose(norms, 1e-6 * np.linalg.norm(expected, axis=1), rtol=1e-6)
+
+
+def test_the_loss_is_that_of_its_parts(robot, anchor):
+    found = tune_step(CONFIG, robot, start(), STRAIGHT, anchor, PLAIN)
+    expected = 1e5 * found.terms["L_Eul"] + 2e5 * found.terms["L_pos"] + found.terms["L_ctrl"]
+    assert found.loss == pytest.approx(float(expected))
+    assert rejection_reason(CONFIG, jax.tree.map(np.asarray, found)) == ""
+
+
+def test_the_gradient_of_other_numbers_is_that_of_differences_and_of_the_recursion(
+    robot, anchor, recursion
+):
+    found = tune_step(CONFIG, robot, start(), STRAIGHT, anchor, PLAIN)
+
+    def loss(name, shift):
+        others = {**start().others, name: start().others[name] + shift}
+        moved = start()._replace(others=others)
+        return float(tune_step(CONFIG, robot, moved, STRAIGHT, anchor, PLAIN).loss)
+
+    for name in OTHERS:
+        expected = (loss(name, 1e-6) - loss(name, -1e-6)) / 2e-6
+        assert float(found.gradient.others[name]) == pytest.approx(expected, rel=1e-5, abs=1e-3)
+    _, forward = sensitivity.gradient(PAPER_LOSS, *recursion, start())
+    np.testing.assert_allclose(vector(forward), vector(found.gradient), rtol=1e-8)
+    for name in OTHERS:
+        np.testing.assert_allclose(
+            forward.others[name], found.gradient.others[name], rtol=1e-8, atol=1e-9
+        )
+    config = replace(CONFIG, others=OTHERS, iterations=5)
+    result = tune(config, robot, nominal(), STRAIGHT, anchor, PLAIN)
+    assert result.history[-1].evaluation.loss < found.loss
+    assert set(result.converged.others) == set(OTHERS)
