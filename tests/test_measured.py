@@ -1,11 +1,13 @@
-"""Tuning on along measured walks: gradient, guards, and that it goes down."""
+"""Tuning on along measured walks, and rollouts grounded on them."""
 
 import jax
 import numpy as np
 import pytest
+from model import AHEAD, BRIEF, PLAIN
 
-from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.reference import named_command
 from hector_jax.control.weights import nominal, weights_to_vector
+from hector_jax.core.trajectory import State, Wrench, no_samples
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
@@ -13,10 +15,12 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.grounded import evaluate_grounded, fit_grounding, grounded_rollout
+from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.measured import evaluate_walk, tune_measured
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig
 
-CONFIG = TuneConfig(rollout=RolloutConfig(ticks=6))
+CONFIG, WALKED = TuneConfig(rollout=BRIEF), (AHEAD, PLAIN)
 
 
 @pytest.fixture(scope="module")
@@ -24,35 +28,49 @@ def robot():
     return load_robot()
 
 
-def modelled(robot, ticks=6):
-    """The model's own walk, as if it had been measured."""
-    config = RolloutConfig(ticks=ticks)
-    found = jax.jit(rollout, static_argnums=0)(
-        config, robot, nominal(), named_command("s"), standing_anchor(robot), last_command
+def standing(robot, ticks=BRIEF.ticks):
+    """A walk of a robot that only stands, as if it had been measured."""
+    place = np.append(np.asarray(robot.com_offset)[:2], robot.standing_height)
+    zero, weight = np.zeros((ticks, 3)), np.asarray(robot.mass * robot.gravity)
+    state = State(zero, zero + place, zero, zero)
+    force = np.broadcast_to(weight / 2, (ticks, 2, 3))
+    return no_samples(10, 2)._replace(
+        period=np.array(0.01),
+        initial=jax.tree.map(lambda x: x[0], state),
+        state=state,
+        command=Wrench(force, np.zeros_like(force)),
+        joints=np.broadcast_to(robot.standing_joints, (ticks, 10)),
+        fallen=np.zeros(ticks, bool),
+        residual=np.zeros(ticks),
     )
-    return jax.tree.map(np.asarray, found)
+
+
+@pytest.fixture(scope="module")
+def measured(robot):
+    """A walk that the model does not explain: joints of a stance, and a shake."""
+    walk = standing(robot)
+    shake = 1e-3 * np.random.default_rng(0).standard_normal((BRIEF.ticks, 3))
+    return walk._replace(state=jax.tree.map(lambda x: x + shake, walk.state))
 
 
 def test_a_measured_walk_is_judged_by_its_own_errors(robot):
-    walked = modelled(robot)
-    # the model stands on joints that do not move; the feet that are measured follow from them
-    still = walked._replace(joints=np.broadcast_to(robot.standing_joints, (6, 10)))
-    found = evaluate_walk(CONFIG, robot, nominal(), named_command("s"), last_command, still)
+    still = standing(robot)
+    found = evaluate_walk(CONFIG, robot, nominal(), *WALKED, still)
     ahead = still.state.position + np.array([0.1, 0.0, 0.0])
     worse = still._replace(state=still.state._replace(position=ahead))
-    told = evaluate_walk(CONFIG, robot, nominal(), named_command("s"), last_command, worse)
+    told = evaluate_walk(CONFIG, robot, nominal(), *WALKED, worse)
     assert found.fallen == 0.0
     assert told.terms["L_pos"] > found.terms["L_pos"]
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(told.gradient))
-    fell = still._replace(fallen=np.arange(6) > 3)
-    told = evaluate_walk(CONFIG, robot, nominal(), named_command("s"), last_command, fell)
+    fell = still._replace(fallen=np.arange(BRIEF.ticks) > 3)
+    told = evaluate_walk(CONFIG, robot, nominal(), *WALKED, fell)
     assert told.fallen > 0.0
 
 
 def test_samples_that_do_not_fill_the_ticks_are_refused(robot):
-    walked = modelled(robot, ticks=7)
-    with pytest.raises(ValueError, match="each of its 6 ticks, got 7 samples"):
-        evaluate_walk(CONFIG, robot, nominal(), named_command("s"), last_command, walked)
+    walked = standing(robot, ticks=7)
+    with pytest.raises(ValueError, match="each of its 5 ticks, got 7 samples"):
+        evaluate_walk(CONFIG, robot, nominal(), *WALKED, walked)
 
 
 def pretend(weights, slope=1.0, fallen=0.0):
@@ -100,3 +118,30 @@ def test_a_walk_in_mujoco_gives_a_slope_that_leads_down(robot):
     assert len(losses) > 1
     assert losses[-1] < losses[0]
     assert np.any(weights_to_vector(found.converged) != weights_to_vector(nominal()))
+
+
+# Grounded rollouts
+
+
+def test_with_the_weights_that_were_walked_a_grounded_rollout_is_the_walk(robot, measured):
+    missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
+    again = jax.jit(grounded_rollout, static_argnums=0)(BRIEF, robot, nominal(), *WALKED, missed)
+    for found, there in zip(again.state, measured.state, strict=True):
+        np.testing.assert_allclose(found, there[1:], atol=1e-12)
+    assert not again.fallen.any()
+
+
+def test_its_gradient_is_that_along_the_walk_by_forward_recursion(robot, measured):
+    missed = fit_grounding(BRIEF, robot, nominal(), *WALKED, measured)
+    # that one prices the change from the command before its first tick too
+    tracking = tuple(t._replace(weight=t.weight * (t.name != "L_ctrl")) for t in PAPER_LOSS)
+    found = evaluate_grounded(BRIEF, robot, nominal(), *WALKED, missed, tracking)
+    config = TuneConfig(rollout=BRIEF, loss=tracking)
+    along = evaluate_walk(config, robot, nominal(), *WALKED, measured)
+    gradients = [weights_to_vector(one.gradient) for one in (found, along)]
+    np.testing.assert_allclose(*gradients, rtol=1e-7, atol=1e-7 * np.abs(gradients[1]).max())
+
+
+def test_a_walk_of_another_length_is_refused(robot, measured):
+    with pytest.raises(ValueError, match="a walk of 4 ticks has 5 samples"):
+        fit_grounding(RolloutConfig(ticks=4), robot, nominal(), *WALKED, measured)
