@@ -87,7 +87,7 @@ def test_steady_errors_go():
 
 
 def test_gradients_of_all_numbers_are_those_of_differences():
-    config = RolloutConfig(ticks=100)
+    config = RolloutConfig(ticks=50)
     names = GROUPS["all"]
     others = {"effort_reference": 0.3, **GAINS}
     start = config.walk.with_others(nominal()._replace(others=others), names)

@@ -27,9 +27,7 @@ from hector_jax.tuning.rollout import init_carry, step_carry
 
 ROBOT, TUNE, S = load_robot(), TuneConfig(), named_command("s")
 ANCHOR = standing_anchor(ROBOT)
-START, TICKS = 12, 20  # two windows of 10, with a change of stance in the first
-
-step = jax.jit(step_carry, static_argnums=0)
+TICKS = 16  # two windows of 8, with a change of stance in the first; begun as many ticks late
 
 
 def vector(weights):
@@ -43,20 +41,42 @@ def stack(trees):
 # The gradient, where what is measured is the rigid body itself
 
 
+@jax.jit
+def ahead(theta, carry, start):
+    """Carries at the start of each tick of a walk on the rigid body, the last one, and the loss.
+
+    The loss has the change from the command before the walk too.
+    """
+
+    def one(now, tick):
+        weights = vector_to_weights(theta)
+        after, sample = step_carry(TUNE.rollout, ROBOT, weights, S, last_command, now, tick)
+        return after, (now, sample)
+
+    last, (carries, samples) = jax.lax.scan(one, carry, start + jnp.arange(TICKS))
+    walk = samples._replace(period=samples.period[0], initial=carry.state)
+    change = jax.tree.map(lambda new, old: new[0] - old[0], samples.command, carry.commands)
+    change = sum(jnp.sum(x**2) for x in change)
+    return carries, last, total(TUNE.loss, losses(PAPER_LOSS, walk)) + change
+
+
 @pytest.fixture(scope="module")
-def carries():
-    """What the rigid body hands from tick to tick, over a change of stance."""
-    carry, found = init_carry(ROBOT, ANCHOR), []
-    for tick in range(START + TICKS + 1):
-        found.append(carry)
-        carry, _ = step(TUNE.rollout, ROBOT, nominal(), S, last_command, carry, jnp.asarray(tick))
-    return found[START:]
+def begin():
+    """What the rigid body hands on after as many ticks, before a change of stance."""
+    return ahead(vector(nominal()), init_carry(ROBOT, ANCHOR), 0)[1]
+
+
+@pytest.fixture(scope="module")
+def carries(begin):
+    """What it hands from tick to tick from then on."""
+    found, last, _ = jax.device_get(ahead(vector(nominal()), begin, TICKS))
+    return [*(jax.tree.map(lambda x, i=i: x[i], found) for i in range(TICKS)), last]
 
 
 def gradient(carries, trace, first, last, **how):
     told = stack([MeasuredState(carry.state, carry.feet) for carry in carries[first : last + 1]])
     weights = stack([nominal()] * (last - first))
-    tick = jnp.asarray(START + first)
+    tick = jnp.asarray(TICKS + first)
     return follow(TUNE, ROBOT, S, ANCHOR, last_command, trace, weights, tick, told, **how)
 
 
@@ -65,31 +85,17 @@ def begun(carry):
     return trace._replace(commands=carry.commands)
 
 
-@jax.jit
-def _loss(theta, carry):
-    """Loss of the walk from a carry on, the change from the command before it included."""
-
-    def one(now, tick):
-        return step_carry(TUNE.rollout, ROBOT, vector_to_weights(theta), S, last_command, now, tick)
-
-    _, samples = jax.lax.scan(one, carry, START + jnp.arange(TICKS))
-    walk = samples._replace(period=samples.period[0], initial=carry.state)
-    change = jax.tree.map(lambda new, old: new[0] - old[0], samples.command, carry.commands)
-    change = sum(jnp.sum(x**2) for x in change)
-    return total(TUNE.loss, losses(PAPER_LOSS, walk)) + change
-
-
-_losses = jax.jit(lambda thetas, carry: jax.lax.map(lambda theta: _loss(theta, carry), thetas))
-
-
-def test_along_the_models_own_states_two_windows_have_the_gradient_of_differences(carries):
+def test_along_the_models_own_states_two_windows_have_the_gradient_of_differences(begin, carries):
     trace, one = gradient(carries, begun(carries[0]), 0, TICKS // 2)
     _, other = gradient(carries, trace, TICKS // 2, TICKS)
     theta = vector(nominal())
     shift = np.exp(1e-5 * np.eye(24))
-    values = np.asarray(_losses(np.concatenate([theta * shift, theta / shift]), carries[0]))
-    expected = (values[:24] - values[24:]) / 2e-5
-    whole = float(_loss(theta, carries[0]))
+
+    def loss(theta):
+        return float(ahead(theta, begin, TICKS)[2])
+
+    expected = np.array([loss(theta * by) - loss(theta / by) for by in shift]) / 2e-5
+    whole = loss(theta)
     assert float(one.loss + other.loss) == pytest.approx(whole, rel=1e-9)
     error = (vector(one.gradient) + vector(other.gradient)) * theta - expected
     assert np.linalg.norm(error) <= 1e-6 * np.linalg.norm(expected)
