@@ -328,7 +328,8 @@ def test_what_is_no_dump_is_refused(monkeypatch, capsys, tmp_path, dump):
 
 def test_a_folder_that_cannot_be_written_does_not_end_the_tuning(tmp_path, capsys, params):
     (tmp_path / "wall").write_text("a file, where a folder is wanted")
-    _, lines = tune(tmp_path / "wall", told(Fault.FALL), params)
+    config = TuneConfig(rollout=CONFIG.rollout, iterations=4)
+    _, lines = tune(tmp_path / "wall", told(Fault.FALL), params, config)
     assert len(lines) > 3
     assert "a refused step was not recorded" in capsys.readouterr().err
 

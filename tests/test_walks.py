@@ -35,6 +35,7 @@ from hector_jax.tuning.loss import loss_of
 
 # all walks of this file are of these ticks and this command: one set of programs for all tests
 CONFIG, COMMAND, SECONDS = TuneConfig(rollout=BRIEF), {"short": AHEAD}, 0.05
+WALKS = 8  # so many that each of the methods proposes one
 SHORT = """
 name = "short"
 [[segment]]
@@ -71,7 +72,7 @@ def campaign(folder, robot, plants=(None,), seed=0):
 @pytest.fixture(scope="module")
 def in_process(robot, pool, tmp_path_factory):
     one = campaign(tmp_path_factory.mktemp("walked"), robot, [hfs()])
-    rows = walks.tune_on_walks(pool, one, 10)
+    rows = walks.tune_on_walks(pool, one, WALKS)
     return one, walks.answer(one, walks.space_of(pool, one), rows)[0], rows
 
 
@@ -81,28 +82,29 @@ def walked(robot, weights, path):
     return path
 
 
-def test_ten_walks_through_files_equal_ten_in_process_to_the_last_bit(
+def test_eight_walks_through_files_equal_eight_in_process_to_the_last_bit(
     robot, pool, in_process, tmp_path
 ):
     one, (_, _, rows) = campaign(tmp_path, robot), in_process
     space, again = walks.space_of(pool, one), []
-    for number in range(10):
+    for number in range(WALKS):
         again = walks.read_history(one)  # as a new process would
         proposal, weights = walks.next_proposal(pool, one, space, again)
         log = walk_log.read_log(walked(robot, weights, tmp_path / f"{number}.npz"), robot, SECONDS)
         again = walks.add_walk(one, again, proposal, walks.evaluate_logs(pool, one, [log]))
-    assert len(again) == len(rows) == 10
+    assert len(again) == len(rows) == WALKS
     for mine, theirs in zip(again, rows, strict=True):
         np.testing.assert_array_equal(mine.point, theirs.point)
         np.testing.assert_array_equal(mine.losses, theirs.losses)
         assert (mine.method, mine.predicted) == (theirs.method, theirs.predicted)
+    assert {row.method for row in rows} == {"start", "model", "surrogate", "evolution"}
     assert min(row.losses[0] for row in rows) < 0.9 * rows[0].losses[0]
 
 
 def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
     one, weights, _ = in_process
     monkeypatch.setattr(walks, "_walk_job", None)
-    again = walks.tune_on_walks(pool, one, 10)
+    again = walks.tune_on_walks(pool, one, WALKS)
     weights_again, _ = walks.answer(one, walks.space_of(pool, one), again)
     np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
 
@@ -196,7 +198,7 @@ def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in
     one = campaign(tmp_path, robot, [hfs()])
     (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
     monkeypatch.setattr(walks, "_walk_job", _fell)
-    rows = walks.tune_on_walks(pool, one, 10)
+    rows = walks.tune_on_walks(pool, one, WALKS)
     assert [change.change for change in walks.changes(rows)] == [None]
     sets = walks.candidates(pool, one, rows)
     assert list(sets) == ["set 0"]
@@ -209,7 +211,7 @@ def test_the_sets_to_choose_from_are_the_start_each_gain_and_the_answer(pool, in
     numbers = [int(name.removeprefix("set ")) for name in sets]
     assert numbers[0] == 0
     assert numbers == sorted(numbers)
-    gains = {n for n in range(1, 10) if losses[n] < 0.99 * min(losses[:n])}
+    gains = {n for n in range(1, WALKS) if losses[n] < 0.99 * min(losses[:n])}
     assert gains < set(numbers)
     assert len(set(numbers) - gains) <= 2  # the start and the answer
     assert any(np.array_equal(each.Q.euler, weights.Q.euler) for each in sets.values())
