@@ -127,7 +127,7 @@ def test_strider_needs_forty_lines_at_most_and_is_no_hector(strider):
 
 
 def test_strider_stands_with_both_soles_on_the_floor(strider):
-    feet = foot_poses(strider, jnp.asarray(strider.standing_joints))
+    feet = foot_poses_jit(strider, jnp.asarray(strider.standing_joints))
     np.testing.assert_allclose(feet.position[:, 2], -strider.trunk_height, atol=1e-5)
     assert -strider.heel < strider.com_offset[0] - feet.position[0, 0] < strider.toe
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hector_jax.core.geometry import rot_x, rot_y, rot_z
+from hector_jax.core.geometry import rot_x, rot_y
 from hector_jax.robot.kinematics import (
     _rotation_vector,
     _rotation_vector_rates,
@@ -101,6 +101,10 @@ def made(request, tmp_path_factory):
     return load_robot(path), compile_model(describe(path))
 
 
+poses, jacobians, gravity = map(jax.jit, (foot_poses, foot_jacobians, leg_gravity))
+levelled = jax.jit(jax.vmap(lambda roll, pitch: rot_y(pitch) @ rot_x(roll)))
+
+
 def posed(robot, model, joints):
     data = mujoco.MjData(model)
     data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0
@@ -118,7 +122,6 @@ def random_joints(robot, spread=0.4):
 
 def test_feet_and_jacobians_are_those_of_mujoco(made):
     robot, model = made
-    poses, jacobians = jax.jit(foot_poses), jax.jit(foot_jacobians)
     standing = posed(robot, model, robot.standing_joints)
     names = [foot.point for foot in robot.description.named_feet]
     bodies = [model.site(name).bodyid[0] for name in names]
@@ -144,7 +147,7 @@ def test_the_weight_of_the_legs_is_that_of_mujoco(made):
     for joints in random_joints(robot):
         data = posed(robot, model, joints)
         own = [model.joint(name).dofadr[0] for name in robot.description.joints]
-        found = leg_gravity(robot, jnp.asarray(joints), jnp.asarray(robot.gravity))
+        found = gravity(robot, jnp.asarray(joints), jnp.asarray(robot.gravity))
         np.testing.assert_allclose(found, data.qfrc_bias[own], atol=1e-10)
 
 
@@ -158,36 +161,34 @@ def test_joints_are_found_from_feet(made):
     rng, legs = np.random.default_rng(1), len(robot.foot_point)
     reach = np.array([0.0, 0.0, 0.05])  # less than standing: the quadruped's knees stay bent
     for _ in range(20):
-        feet = foot_poses(robot, start)
+        feet = poses(robot, start)
         position = feet.position + reach + rng.uniform(-0.04, 0.04, (legs, 3))
         roll, pitch, yaw = jnp.asarray(rng.uniform(-0.2, 0.2, (3, legs)))
-        level = [rot_y(p) @ rot_x(r) for r, p in zip(roll, pitch, strict=True)]
-        up = jnp.stack([R.T[:, 2] for R in level])
-        found = foot_poses(robot, inverse(robot, position, yaw, up, start))
+        level = np.asarray(levelled(roll, pitch))
+        up = level[:, 2]
+        found = poses(robot, inverse(robot, position, yaw, up, start))
         np.testing.assert_allclose(found.position, position, atol=1e-9)
         if count >= 6:
-            wanted = jnp.stack([R.T @ rot_z(y) for R, y in zip(level, yaw, strict=True)])
+            turned = Rotation.from_euler("z", np.asarray(yaw)[:, None]).as_matrix()
+            wanted = np.swapaxes(level, 1, 2) @ turned
             np.testing.assert_allclose(found.rotation, wanted, atol=1e-9)
 
 
 def test_rates_along_a_path_are_the_derivative_of_the_joints(made):
     robot, _ = made
     start, legs = jnp.asarray(robot.standing_joints), len(robot.foot_point)
-    position, up = (
-        foot_poses(robot, start).position,
-        jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1)),
-    )
+    position = poses(robot, start).position
+    up = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (legs, 1))
     moved = jnp.tile(jnp.array([[0.3, 0.1, 0.2], [-0.2, 0.1, 0.3]]), (legs // 2, 1))
     yaw = jnp.zeros(legs)
     at = jax.jit(lambda t: inverse_legs(robot, position + t * moved, yaw, up, start, 12))
-    rates = jax.jvp(at, (jnp.asarray(0.05),), (jnp.asarray(1.0),))[1]
+    here, rates = jax.jvp(at, (jnp.asarray(0.05),), (jnp.asarray(1.0),))
     difference = (at(jnp.asarray(0.05 + 1e-5)) - at(jnp.asarray(0.05 - 1e-5))) / 2e-5
     if robot.description.leg_joints <= 6:  # of a seventh joint the part that moves no foot is left
         np.testing.assert_allclose(rates, difference, atol=2e-4)
-    feet = lambda q: foot_poses(robot, q).position  # noqa: E731
-    np.testing.assert_allclose(
-        jax.jvp(feet, (at(jnp.asarray(0.05)),), (rates,))[1], moved, atol=1e-6
-    )
+    J_v, _ = jacobians(robot, here)
+    speeds = np.einsum("lij,lj->li", J_v, rates.reshape(legs, -1))
+    np.testing.assert_allclose(speeds, moved, atol=1e-6)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-6, 2e-4, 1.0, 3.0])

@@ -74,7 +74,7 @@ def test_a_walk_and_an_evaluation_take_another_engine(monkeypatch, capsys):
         return walk_rigid(pool, config, robot, them)
 
     monkeypatch.setitem(ENGINES, "mjx", MJX._replace(walk=walk))
-    flags = ["--engine", "mjx", "--seconds", "0.1", "--json"]
+    flags = ["--engine", "mjx", "--seconds", "0.5", "--json"]  # the program of the test above
     monkeypatch.setattr(sys, "argv", ["hector", "walk", "--world", "ideal", *flags])
     assert main() == 0
     assert json.loads(capsys.readouterr().out)["engine"] == "mjx"

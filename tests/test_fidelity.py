@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model import SHORT
 from synthetic import synthetic_walk
 
 from hector_jax.control.reference import named_command, standing_anchor
@@ -16,7 +17,7 @@ from hector_jax.grfm.training import errors, report
 from hector_jax.report import fidelity
 from hector_jax.report.report import Picture
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import rollout
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def samples(robot):
 def walks(robot):
     """A walk of the rigid body itself, on ground that returns what is commanded."""
     one = jax.jit(rollout, static_argnums=0)(
-        RolloutConfig(ticks=60),
+        SHORT,
         robot,
         nominal(),
         named_command("straight"),

@@ -59,6 +59,7 @@ def torques(config, state, joints, rates, contact, wrench, target, target_rates)
 
 
 poses = jax.jit(lambda joints: foot_poses(ROBOT, joints))
+carried = jax.jit(lambda joints, gravity: leg_gravity(ROBOT, joints, gravity))
 
 
 def base(euler=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0)):
@@ -66,6 +67,7 @@ def base(euler=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0)):
     return State(*(jnp.array(row, float) for row in (euler, height, (0, 0, 0), velocity)))
 
 
+@jax.jit
 def world_feet(state, joints):
     """Foot points and foot axes in the world."""
     R_wb, local = rotation_from_euler(state.euler), poses(joints)
@@ -119,7 +121,7 @@ def statics(share):
 @pytest.mark.parametrize("share", [0.5, 1.0])
 def test_stance_torques_and_leg_weight_are_the_statics_of_mujoco(share):
     need, wrench = statics(share)
-    weight = leg_gravity(ROBOT, STANDS, jnp.asarray(ROBOT.gravity))
+    weight = carried(STANDS, jnp.asarray(ROBOT.gravity))
     np.testing.assert_allclose(stance(base(), STANDS, wrench) + weight, need, atol=1e-8)
 
 
@@ -226,7 +228,7 @@ def test_stance_legs_push_and_swing_legs_follow():
         CONFIG, state, joints, rates, jnp.array([True, False]), wrench, target, target_rates
     )
     np.testing.assert_allclose(found[:5], stance(state, joints, wrench)[:5], atol=1e-9)
-    weight = leg_gravity(ROBOT, joints, jnp.asarray(ROBOT.gravity))
+    weight = carried(joints, jnp.asarray(ROBOT.gravity))
     pull = 0.05 * np.array(CONFIG.kp) + 0.2 * np.array(CONFIG.kd)
     np.testing.assert_allclose(found[5:], pull + weight[5:], atol=1e-9)
 
@@ -237,7 +239,7 @@ def test_a_swing_leg_on_its_target_carries_its_own_weight():
     hangs = jnp.zeros(2, bool)
     found = torques(CONFIG, state, joints, rates, hangs, zero_wrench(), joints, rates)
     up = jnp.asarray(ROBOT.gravity) @ rotation_from_euler(state.euler)
-    np.testing.assert_allclose(found, leg_gravity(ROBOT, joints, up), atol=1e-9)
+    np.testing.assert_allclose(found, carried(joints, up), atol=1e-9)
 
 
 def test_the_weight_of_a_stance_leg_is_added_on_request():
@@ -249,7 +251,7 @@ def test_the_weight_of_a_stance_leg_is_added_on_request():
         )
         for w in (False, True)
     )
-    weight = leg_gravity(ROBOT, STANDS, jnp.asarray(ROBOT.gravity))
+    weight = carried(STANDS, jnp.asarray(ROBOT.gravity))
     np.testing.assert_allclose(loaded - plain, weight, atol=1e-9)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pretend import pretend_history
 from test_humanoid import check_engines, check_export
-from test_rollout import OBLIQUE, check_gradient
+from test_rollout import OBLIQUE, check_gradient, propagate
 
 from hector_jax.cli.arguments import with_gait
 from hector_jax.cli.main import main
@@ -52,13 +52,14 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.rollout import RolloutConfig, rollout
+from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.status import StepStatus
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
 ROBOT = load_robot(FILE)
 CONFIG = walk_config(ROBOT)
 ANCHOR = standing_anchor(ROBOT)
+SHORT = RolloutConfig(walk=CONFIG, ticks=50)
 FAST = 0.25 * float(np.sqrt(ROBOT.gravity[2] * ROBOT.standing_height))  # [m/s]
 
 
@@ -138,16 +139,16 @@ def call(monkeypatch, *words):
     return main()
 
 
-def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
+def test_a_gait_is_chosen_by_name(monkeypatch, capsys, tmp_path):
     flags = ("--robot", FILE, "--world", "srbm", "--seconds", "0.3", "--json")
-    assert call(monkeypatch, "walk", *flags, "--gait", "crawl") == 0
-    crawl = capsys.readouterr().out
-    assert call(monkeypatch, "walk", *flags) == 0
-    assert capsys.readouterr().out != crawl
-    assert call(monkeypatch, "walk", *flags, "--gait", "stand") == 0
+    for name, stand in (("crawl", 3), ("stand", 4)):  # its own gait is a trot, of two
+        path = tmp_path / f"{name}.npz"
+        assert call(monkeypatch, "walk", *flags, "--gait", name, "--out", path) == 0
+        with np.load(path) as walked:
+            assert (walked["contact"].sum(axis=1) == stand).all()
     out, told = capsys.readouterr()
     assert "straight is not walked: all feet stand" in told
-    assert json.loads(out)["L"] < 1.0
+    assert json.loads(out.splitlines()[-1])["L"] < 1.0
     assert call(monkeypatch, "walk", "--gait", "trot") == 2
     assert "--gait: unknown gait 'trot'" in capsys.readouterr().err
 
@@ -155,10 +156,11 @@ def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
 # The MPC
 
 
-def planned(config, tick, command):
-    """What is planned about at a tick, a little off the reference."""
+@partial(jax.jit, static_argnums=0)
+def planned(config, command):
+    """What is planned about at tick 3, a little off the reference."""
     state = State(
-        *(np.asarray(x) + 0.01 for x in (np.zeros(3), ANCHOR.position, *np.zeros((2, 3))))
+        *(jnp.asarray(x) + 0.01 for x in (np.zeros(3), ANCHOR.position, *np.zeros((2, 3))))
     )
     feet = Feet(jnp.asarray(ROBOT.foot_ahead)[:, None] * jnp.eye(3)[0], jnp.zeros(4))
     return state, *plan_horizon(
@@ -167,21 +169,22 @@ def planned(config, tick, command):
         config.footstep.parameters,
         command=command,
         anchor=ANCHOR,
-        tick=jnp.asarray(tick),
-        state=jax.tree.map(jnp.asarray, state),
+        tick=jnp.asarray(3),
+        state=state,
         feet=feet,
     )
 
 
-def problem(config, tick):
-    """What is solved for at a tick."""
-    state, horizon, _ = planned(config, tick, named_command("s"))
-    return MpcProblem(ROBOT, config.mpc.parameters(nominal(ROBOT)), state, horizon)
+@partial(jax.jit, static_argnums=(0, 1))
+def solved(config, max_contacts):
+    """Wrench and solution at that tick, with room for so many feet."""
+    state, horizon, _ = planned(config, named_command("s"))
+    problem = MpcProblem(ROBOT, config.mpc.parameters(nominal(ROBOT)), state, horizon)
+    return solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)
 
 
 def test_room_for_more_feet_changes_nothing_while_two_stand():
-    solve = partial(solve_mpc, CONFIG.mpc, problem(CONFIG, 3), dt=CONFIG.mpc_step)
-    two, four = (solve(max_contacts=count)[0] for count in (2, 4))
+    two, four = (solved(CONFIG, count)[0] for count in (2, 4))
     np.testing.assert_allclose(four.force, two.force, atol=1e-6)
     assert np.asarray(two.force[:, 2] > 1.0).tolist() == [True, False, False, True]
     assert not np.asarray(two.moment).any()
@@ -190,7 +193,7 @@ def test_room_for_more_feet_changes_nothing_while_two_stand():
 def test_a_foot_of_each_pair_lands_beside_its_own_hips():
     """Two feet of a trot, of either pair and side, land at once: as far apart as they stand."""
     still = jax.tree.map(np.zeros_like, named_command("straight"))._replace(duration=np.ones(2))
-    *_, touchdown = planned(CONFIG, 3, still)
+    *_, touchdown = planned(CONFIG, still)
     front, hind = np.asarray(touchdown.position)[[0, 3]]
     ahead, aside = float(np.ptp(ROBOT.foot_ahead)), 2 * CONFIG.footstep.width
     assert ahead > 0.3
@@ -202,8 +205,8 @@ def test_a_qp_larger_than_the_gpu_s_kernel_is_told(monkeypatch):
     config, said = replace(CONFIG, mpc=replace(CONFIG.mpc, horizon=9)), []
     monkeypatch.setattr(active_set, "say", said.append)
     active_set._say_slower.cache_clear()
-    for _ in range(2):
-        solve_mpc(config.mpc, problem(config, 3), dt=config.mpc_step, max_contacts=4)
+    for count in (4, 4):
+        jax.eval_shape(partial(solved.__wrapped__, config, count))  # told where it is traced
     (line,) = said
     assert "a QP of 108 variables and 180 rows takes the slower path" in line
 
@@ -238,10 +241,8 @@ def test_point_feet_have_weights_of_forces_alone(tmp_path):
 @pytest.fixture(scope="module")
 def data():
     """Samples of two walks on the rigid body whose ground answers a little less than commanded."""
-    config = RolloutConfig(walk=CONFIG, ticks=60, lead=10)
-    walk_ = jax.jit(partial(rollout, config, ROBOT))
     walks = [
-        walk_(weights, named_command("s"), ANCHOR, last_command)
+        propagate(SHORT, ROBOT, weights, named_command("s"), ANCHOR, last_command)[0]
         for weights in (nominal(ROBOT), expert(ROBOT))
     ]
     walks = jax.tree.map(lambda *x: np.stack(x), *walks)
@@ -256,15 +257,25 @@ def flip(wrench):
     return Wrench(wrench.force[other] * ALONG, wrench.moment[other] * ACROSS)
 
 
+@pytest.fixture(scope="module")
+def gated(data):
+    return jax.tree.map(np.asarray, fit_gated(data))
+
+
+@pytest.fixture(scope="module")
+def residual(data):
+    return jax.tree.map(np.asarray, with_statistics(init(jax.random.key(0), 4), data))
+
+
+@pytest.fixture(scope="module")
+def paper(data):
+    made = with_paper_statistics(init_paper(jax.random.key(0), 4), data)
+    return jax.tree.map(np.asarray, made)
+
+
 @pytest.mark.parametrize("variant", ["residual", "gated", "paper"])
-def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant):
-    key = jax.random.key(0)
-    params = {
-        "residual": lambda: with_statistics(init(key, 4), data),
-        "gated": lambda: fit_gated(data),
-        "paper": lambda: with_paper_statistics(init_paper(key, 4), data),
-    }[variant]()
-    params = jax.tree.map(np.asarray, params)
+def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant, request):
+    params = request.getfixturevalue(variant)
     save_net(tmp_path / "net.npz", params, robot=ROBOT, about={})
     again, name, _ = load_net(tmp_path / "net.npz", ROBOT)
     assert name == variant
@@ -275,9 +286,9 @@ def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant):
         load_net(tmp_path / "net.npz", load_robot())
 
 
-def test_a_mirrored_window_of_four_feet_has_the_mirrored_effect(data):
+def test_a_mirrored_window_of_four_feet_has_the_mirrored_effect(data, residual):
     both, count = with_mirror(data), len(data.walk)
-    phi = jax.jit(as_effect(with_statistics(init(jax.random.key(0), 4), data)))
+    phi = jax.jit(as_effect(residual))
     for i in (0, 20, 37):
         here, there = (
             phi(jax.tree.map(lambda x, k=k: jnp.asarray(x[k]), both.window)) for k in (i, count + i)
@@ -288,16 +299,16 @@ def test_a_mirrored_window_of_four_feet_has_the_mirrored_effect(data):
         same(here.legs.torque * ACROSS, there.legs.torque)
 
 
-def test_the_push_of_each_pair_of_legs_is_found(data):
+def test_the_push_of_each_pair_of_legs_is_found(data, gated):
     """Legs that push the trunk as a map of each pair says, seen only as their sum."""
-    true = jax.tree.map(np.asarray, fit_gated(data))
     rng = np.random.default_rng(0)
-    true = true._replace(
-        legs_bias=rng.normal(size=true.legs_bias.shape), legs=np.zeros_like(true.legs)
+    true = gated._replace(
+        legs_bias=rng.normal(size=gated.legs_bias.shape), legs=np.zeros_like(gated.legs)
     )
-    told = jax.vmap(as_effect(true))(jax.tree.map(jnp.asarray, data.window))
+    every = jax.jit(lambda net: jax.vmap(as_effect(net))(jax.tree.map(jnp.asarray, data.window)))
+    told = every(true)
     known = data._replace(legs=jax.tree.map(np.asarray, told.legs))
-    found = jax.vmap(as_effect(fit_gated(known)))(jax.tree.map(jnp.asarray, data.window))
+    found = every(fit_gated(known))
     for found_, told_ in zip(found.legs, told.legs, strict=True):
         np.testing.assert_allclose(found_, told_, atol=0.1)
 
@@ -314,9 +325,8 @@ def test_the_plain_net_of_four_feet_returns_every_command(data):
 
 
 def test_gradient_of_the_quadruped_over_50_ticks_is_that_of_differences():
-    short = RolloutConfig(walk=CONFIG, ticks=50)
     model = named_command("s"), ANCHOR, last_command
-    check_gradient(short, ROBOT, nominal(ROBOT), *model, 1e-6, OBLIQUE)
+    check_gradient(SHORT, ROBOT, nominal(ROBOT), *model, 1e-6, OBLIQUE)
 
 
 @pytest.mark.slow

@@ -24,9 +24,16 @@ CONFIG, ROBOT = WalkConfig(), load_robot()
 
 
 @pytest.fixture(scope="module")
-def short():
-    """Half a second of the straight line in `ideal`."""
-    return walk(CONFIG, ROBOT, Job(expert(), named_command("straight"), ideal(), seconds=0.5))
+def watched():
+    """Half a second of the straight line in `ideal`, and the times of its steps."""
+    job, times = Job(expert(), named_command("straight"), ideal(), seconds=0.5), []
+    look = partial(MujocoPlant, on_step=lambda world, data: times.append(data.time))
+    return walk(CONFIG, ROBOT, job, build=look), times
+
+
+@pytest.fixture(scope="module")
+def short(watched):
+    return watched[0]
 
 
 def rms(error):
@@ -34,8 +41,10 @@ def rms(error):
 
 
 def test_the_numbers_of_the_weights_are_those_of_plan_and_legs(short):
+    names = ("kp", "foot_height", "footstep_width")
+
     def walked(**others):
-        weights = CONFIG.with_others(expert()._replace(others=others), ["kp"])
+        weights = CONFIG.with_others(expert()._replace(others=others), names)
         return walk(CONFIG, ROBOT, Job(weights, named_command("straight"), ideal(), seconds=0.2))
 
     for leaf, other in zip(jax.tree.leaves(walked()), jax.tree.leaves(short), strict=True):
@@ -129,17 +138,10 @@ def test_a_fall_is_held_and_marked():
         assert (leaf[first:] == leaf[max(first - 1, 0)]).all()
 
 
-def test_every_sample_can_be_watched():
-    times = []
-    job = Job(expert(), named_command("c"), ideal(), seconds=0.01)
-    walk(
-        CONFIG,
-        ROBOT,
-        job,
-        build=partial(MujocoPlant, on_step=lambda world, data: times.append(data.time)),
-    )
+def test_every_sample_can_be_watched(watched):
+    _, times = watched
     np.testing.assert_allclose(times, 0.001 * np.arange(1, len(times) + 1))
-    assert len(times) == 1100 + 10
+    assert len(times) == 1100 + 500
 
 
 def test_a_walk_may_start_at_another_phase():
@@ -196,7 +198,7 @@ def test_expert_weights_walk_on_the_standin(name):
         assert not trajectory.fallen.any(), seed
 
 
-def test_a_push_moves_the_robot_and_the_sensed_wrench_stays_the_grounds():
+def test_a_push_moves_the_robot_and_the_sensed_wrench_stays_the_grounds(short):
     """What the whole robot gains is from the ground, its weight and the push, in every sample."""
     push = Push(np.array([[0.0, 30.0, 0.0]]), start=np.array([0.02]), duration=np.array([0.05]))
     gained = []
@@ -209,8 +211,7 @@ def test_a_push_moves_the_robot_and_the_sensed_wrench_stays_the_grounds():
     pushed = walk(
         CONFIG, ROBOT, job._replace(push=push), build=partial(MujocoPlant, on_step=record)
     )
-    free = walk(CONFIG, ROBOT, job)
-    assert (pushed.state.velocity - free.state.velocity)[70, 1] > 0.05
+    assert (pushed.state.velocity[70] - short.state.velocity[70])[1] > 0.05
     # mj_step leaves the velocities of the step's start: sample j's own change is from j to j + 1.
     sideways = np.diff(np.array(gained), axis=0)[1100:, 1] / 0.001
     ground = pushed.effect.force.sum(axis=1)[:99, 1]
