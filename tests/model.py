@@ -24,6 +24,8 @@ LEARNS_TOUCHDOWNS = ROBOT._replace(
 ANCHOR = standing_anchor(ROBOT)
 SHORT = RolloutConfig(ticks=50)
 CONFIG = TuneConfig(rollout=SHORT)
+# the numbers beside Q and R in walks that have some: other names are another program
+OTHERS = ("footstep_width", "foot_height", "kp", "kd")
 PLAIN = effect_of(None, GaitConfig())
 BRIEF = RolloutConfig(ticks=5)  # where a few ticks are enough, with one command
 AHEAD = Command(np.array([0.05]), np.array([[0.3, 0.0]]), np.zeros(1))

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
+from model import OTHERS
 from oracles import exact_solution
 from scipy.spatial.transform import Rotation
 
@@ -275,7 +276,10 @@ def test_the_page_says_what_the_cpp_controller_lacks_and_the_header_our_numbers(
 
 
 # with numbers of the plan and of the legs
-TUNED = expert()._replace(others={"footstep_width": np.array(0.1), "foot_height": np.array(0.11)})
+TUNED = CONFIG.with_others(
+    expert()._replace(others={"footstep_width": np.array(0.1), "foot_height": np.array(0.11)}),
+    OTHERS,
+)
 
 
 def save_run(folder):
@@ -320,7 +324,7 @@ def test_the_loaded_controller_answers_as_the_live_one_did(loaded):
 @pytest.mark.parametrize(("weights", "part"), [(nominal, "force"), (expert, "torque")])
 def test_the_check_notices_other_weights(loaded, weights, part):
     """Also those that differ in the numbers of plan and legs alone."""
-    other = CONFIG.with_others(weights(), TUNED.others)
+    other = CONFIG.with_others(weights(), OTHERS)
     found = check(
         CONFIG, *loaded, record(CONFIG, ROBOT, other, command=named_command("s"), seconds=0.1)
     )

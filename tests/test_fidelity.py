@@ -45,6 +45,11 @@ def walks(robot):
     return jax.tree.map(lambda x: np.asarray(x)[None], one)
 
 
+@pytest.fixture(scope="module")
+def drifts(robot, walks):
+    return fidelity.drifts(robot, {"raw": last_command}, walks, np.zeros(1, int))
+
+
 def test_the_phases_make_up_the_whole(samples):
     told = fidelity.by_phase({"raw": last_command}, samples)["raw"]
     since, stands = samples.window.since_switch, samples.window.contact
@@ -57,9 +62,9 @@ def test_the_phases_make_up_the_whole(samples):
     np.testing.assert_allclose(stance, errors(last_command, samples).stance)
 
 
-def test_a_rigid_body_is_predicted_as_it_went(robot, walks):
-    for effect in (last_command, None):
-        found = fidelity.drift(robot, effect, walks, np.zeros(1, int))
+def test_a_rigid_body_is_predicted_as_it_went(drifts):
+    assert list(drifts) == ["raw", "measured"]
+    for found in drifts.values():
         assert found.time[-1] == pytest.approx(0.4)
         # the recorded foot is taken halfway through the tick, where it is set down at a switch
         assert found.position.max() < 0.01
@@ -77,27 +82,23 @@ def test_a_weaker_ground_lets_the_body_sag(robot, walks):
     assert 0.5 * fall < found.position[-1] < 2.0 * fall
 
 
-def test_what_follows_a_fall_is_not_predicted(robot, walks):
+def test_what_follows_a_fall_is_not_predicted(robot, walks, drifts):
     two = jax.tree.map(lambda x: np.concatenate([x, x]), walks)
     fallen = two.fallen.copy()
     fallen[1, 20:] = True
     broken = jax.tree.map(np.copy, two)._replace(fallen=fallen)
     broken.state.position[1, 20:] = 7.0
     here = fidelity.drift(robot, last_command, broken, np.zeros(2, int))
-    np.testing.assert_allclose(
-        here.position, fidelity.drift(robot, last_command, walks, np.zeros(1, int)).position
-    )
+    np.testing.assert_allclose(here.position, drifts["raw"].position)
     short = walks._replace(fallen=walks.fallen[:, :30])
     with pytest.raises(ValueError, match="30 ticks are too short to predict 40 ticks"):
         fidelity.drift(robot, last_command, short, np.zeros(1, int))
 
 
-def test_the_report_holds_every_world_and_phi(tmp_path, robot, samples, walks):
+def test_the_report_holds_every_world_and_phi(tmp_path, samples, drifts):
     effects = {"raw": last_command}
     found = fidelity.as_result(
-        report(effects, samples),
-        fidelity.by_phase(effects, samples),
-        fidelity.drifts(robot, effects, walks, np.zeros(1, int)),
+        report(effects, samples), fidelity.by_phase(effects, samples), drifts
     )
     worlds = {"hfs": found, "standin": found}
     text = fidelity.write_report(tmp_path, worlds, [Picture("a.png", "A picture.")]).read_text()

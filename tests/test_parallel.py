@@ -6,6 +6,7 @@ from functools import partial
 import jax
 import numpy as np
 import pytest
+from model import OTHERS
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.footstep import FootstepConfig
@@ -116,7 +117,7 @@ def job(weights, name="s", plant=None, seconds=0.1, start_tick=0, push=(0.0, 0.0
     return Job(weights, command, plant or hfs(), seconds, 0, start_tick, push)
 
 
-OTHERS = {"footstep_width": np.array(0.1), "foot_height": np.array(0.11), "kd": np.ones(5)}
+TUNED = {"footstep_width": np.array(0.1), "foot_height": np.array(0.11), "kd": np.ones(5)}
 ONE_PIECE = jax.tree.map(lambda x: x[:1], named_command("s"))
 
 
@@ -169,7 +170,7 @@ def three():
     """Three jobs that differ in all that may differ, and their walks two at once."""
     jobs = [
         job(expert(), push=(10.0, 20.0, 0.0)),
-        job(nominal()._replace(others=OTHERS), "c", hfs_drawn(1), start_tick=7),
+        job(nominal()._replace(others=TUNED), "c", hfs_drawn(1), start_tick=7),
         job(expert()),
     ]
     return jobs, list(walk_batch(CONFIG, ROBOT, jobs, chunk=2))

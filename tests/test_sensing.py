@@ -23,6 +23,17 @@ def sensed(robot, row, contacts, floor, foot_of_geom):
     return sensing.base_state(robot, reading, jnp.zeros(())), wrench, points, ground.touches
 
 
+@jax.jit
+def foot_points(robot, row):
+    reading = sensing.unpack_reading(row)
+    return reading, sensing.foot_points(robot, reading)
+
+
+@jax.jit
+def yaw_after(row, before):
+    return sensing.base_state(ROBOT, sensing.unpack_reading(row), before).euler[2]
+
+
 def flat_reading(world, data):
     return np.concatenate([data.qpos, data.qvel, [0.0]])[sensing.coordinates(world)]
 
@@ -126,8 +137,7 @@ def test_foot_points_and_joints_count_the_backlash():
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
     data.qpos[world.slack_qpos] = np.linspace(-0.005, 0.005, 10)
     mujoco.mj_kinematics(world.model, data)
-    reading = sensing.unpack_reading(jnp.asarray(flat_reading(world, data)))
-    points = sensing.foot_points(ROBOT, reading)
+    reading, points = foot_points(ROBOT, flat_reading(world, data))
     np.testing.assert_array_equal(reading.slack, np.linspace(-0.005, 0.005, 10))
     for foot, ankle in enumerate(world.joint_dof[[4, 9]]):
         body = world.model.dof_bodyid[ankle]
@@ -141,9 +151,7 @@ def test_yaw_goes_on_past_half_a_turn():
     before = jnp.zeros(())
     for yaw in yaws:
         row[3:7] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
-        before = sensing.base_state(ROBOT, sensing.unpack_reading(jnp.asarray(row)), before).euler[
-            2
-        ]
+        before = yaw_after(row, before)
         assert before == pytest.approx(yaw, abs=1e-9)
 
 

@@ -6,6 +6,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from model import OTHERS
 
 from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import COMMANDS, named_command
@@ -41,10 +42,8 @@ def rms(error):
 
 
 def test_the_numbers_of_the_weights_are_those_of_plan_and_legs(short):
-    names = ("kp", "foot_height", "footstep_width")
-
     def walked(**others):
-        weights = CONFIG.with_others(expert()._replace(others=others), names)
+        weights = CONFIG.with_others(expert()._replace(others=others), OTHERS)
         return walk(CONFIG, ROBOT, Job(weights, named_command("straight"), ideal(), seconds=0.2))
 
     for leaf, other in zip(jax.tree.leaves(walked()), jax.tree.leaves(short), strict=True):
