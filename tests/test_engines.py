@@ -44,7 +44,7 @@ def walked(build, plant):
 
 
 def gained(build):
-    """A walk with a push to the left, and how much faster to there it is than without."""
+    """A walk with a push to the left, and the velocity to the left that it gained by the push."""
     push = Push(np.array([[0.0, 40.0, 0.0]]), np.zeros(1), np.full(1, 0.1))
     pushed = walk(CONFIG, HECTOR, job(hfs(), 0.2, push=push), build=build)
     return pushed, (pushed.state.velocity[100] - walked(build, "hfs").state.velocity[100])[1]

@@ -145,9 +145,10 @@ def test_a_gait_is_chosen_by_name(monkeypatch, capsys):
     with monkeypatch.context() as patch:
         pretend = lambda robot, *known: walked.append(walk_config(robot)) or pretend_walk()  # noqa: E731
         patch.setattr(verdicts, "walk_rigid_body", pretend)
-        for name in ("crawl", "own"):
+        for name in ("own", "trot", "pace", "crawl"):
             assert call(monkeypatch, "walk", *flags, "--gait", name) == 0
-    assert [config.gait for config in walked] == [gait_named(CONFIG.gait, "crawl"), CONFIG.gait]
+    named = [gait_named(CONFIG.gait, name) for name in ("trot", "pace", "crawl")]
+    assert [config.gait for config in walked] == [CONFIG.gait, *named]
     capsys.readouterr()
     assert call(monkeypatch, "walk", *flags, "--gait", "stand") == 0
     out, told = capsys.readouterr()
