@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pretend import pretend_history, pretend_walk
 from test_humanoid import check_engines, check_export
-from test_rollout import OBLIQUE, check_gradient, propagate
+from test_rollout import OBLIQUE, check_gradient
 
 from hector_jax.cli.arguments import with_gait
 from hector_jax.cli.main import main
@@ -52,14 +52,13 @@ from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 from hector_jax.tuning.status import StepStatus
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
 ROBOT = load_robot(FILE)
 CONFIG = walk_config(ROBOT)
 ANCHOR = standing_anchor(ROBOT)
-SHORT = RolloutConfig(walk=CONFIG, ticks=50)
 FAST = 0.25 * float(np.sqrt(ROBOT.gravity[2] * ROBOT.standing_height))  # [m/s]
 
 
@@ -246,8 +245,10 @@ def test_point_feet_have_weights_of_forces_alone(tmp_path):
 @pytest.fixture(scope="module")
 def data():
     """Samples of two walks on the rigid body whose ground answers a little less than commanded."""
+    config = RolloutConfig(walk=CONFIG, ticks=60, lead=10)
+    walk_ = jax.jit(partial(rollout, config, ROBOT))
     walks = [
-        propagate(SHORT, ROBOT, weights, named_command("s"), ANCHOR, last_command)[0]
+        walk_(weights, named_command("s"), ANCHOR, last_command)
         for weights in (nominal(ROBOT), expert(ROBOT))
     ]
     walks = jax.tree.map(lambda *x: np.stack(x), *walks)
@@ -331,8 +332,9 @@ def test_the_plain_net_of_four_feet_returns_every_command(data):
 
 
 def test_gradient_of_the_quadruped_over_50_ticks_is_that_of_differences():
+    short = RolloutConfig(walk=CONFIG, ticks=50)
     model = named_command("s"), ANCHOR, last_command
-    check_gradient(SHORT, ROBOT, nominal(ROBOT), *model, 1e-6, OBLIQUE)
+    check_gradient(short, ROBOT, nominal(ROBOT), *model, 1e-6, OBLIQUE)
 
 
 @pytest.mark.slow
