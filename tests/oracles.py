@@ -6,7 +6,6 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import linprog
 
-from hector_jax.core.geometry import rot_z, skew
 from hector_jax.core.trajectory import State
 from hector_jax.qp import QP
 
@@ -31,7 +30,8 @@ def walking_qp(seed: int, horizon: int = 10) -> QP:
     usual = np.array([100, 100, 250, 200, 200, 300] + [1] * 6)
     Q = usual * 10 ** rng.uniform(-1, 1, 12)
     R = np.array([1e-4, 1e-4, 5e-4, 1e-2, 1e-2]) * 10 ** rng.uniform(-1, 1, 5)
-    turn = np.asarray(rot_z(jnp.asarray(rng.uniform(-1, 1))))
+    yaw = rng.uniform(-1, 1)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     spread = np.array([0.1, 0.1, 0.1, 0.03, 0.03, 0.03, 0.5, 0.5, 0.5, 0.3, 0.3, 0.2])
     state = rng.normal(size=12) * spread * (2.5 if seed % 4 == 0 else 1.0)
 
@@ -43,9 +43,9 @@ def walking_qp(seed: int, horizon: int = 10) -> QP:
     response = np.zeros((12, 5 * horizon))
     for k in range(horizon):
         side = 1.0 if ((k + seed) // 5) % 2 else -1.0
-        lever = turn @ np.array([0.05 * rng.normal(), 0.07 * side, -0.5])
+        x, y, z = turn @ np.array([0.05 * rng.normal(), 0.07 * side, -0.5])
         B = np.zeros((12, 5))
-        B[6:9, :3] = dt * inverse @ np.asarray(skew(jnp.asarray(lever)))
+        B[6:9, :3] = dt * inverse @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         B[6:9, 3:] = dt * inverse @ turn[:, 1:]
         B[9:, :3] = dt / mass * np.eye(3)
         response = A @ response

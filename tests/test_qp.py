@@ -1,6 +1,6 @@
 """The QP door against independent answers: solutions, statuses, derivatives."""
 
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import jax
@@ -26,27 +26,46 @@ from hector_jax.qp.method import JAXOPT
 from hector_jax.qp.problem import Point, normalise
 
 WALKING = 500
-SHAPES = [(1, 4), (2, 6), (5, 12), (12, 30), (30, 40), (60, 90), (120, 100)]
+SHAPES = [(1, 4), (2, 6), (5, 12), (12, 30), (30, 40), (50, 70), (120, 100)]
 EACH = 143  # of a shape: 1001 general QPs
 
 
-def stack(qps):
-    return QP(*(np.stack(parts) for parts in zip(*qps, strict=True)))
+def stack(found):
+    return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
 
-@partial(jax.jit, static_argnums=1)
-def solve_all(qps, config=QpConfig()):  # noqa: B008
-    return jax.lax.map(partial(solve_qp, config=config), qps)
+@jax.jit
+def _solve_batch(qps):
+    return jax.lax.map(solve_qp, qps)
+
+
+def solve_all(qps):
+    """Solve problems of one shape, EACH of them at a time: one program for each shape."""
+    batches = np.arange(len(qps) + -len(qps) % EACH).reshape(-1, EACH) % len(qps)
+    found = [jax.device_get(_solve_batch(stack([qps[i] for i in batch]))) for batch in batches]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(qps)], *found)
 
 
 solve = jax.jit(solve_qp, static_argnums=1)
 
 
-@jax.jit
-def along(qp, tangent):
+@partial(jax.jit, static_argnums=2)
+def along(qp, tangent, config=QpConfig()):  # noqa: B008
     """Solution's x moved along a tangent of the data, and its solution."""
-    solution, moved = jax.jvp(solve_qp, (qp,), (tangent,))
+    solution, moved = jax.jvp(partial(solve_qp, config=config), (qp,), (tangent,))
     return solution, moved.x
+
+
+def still(qp):
+    """Solution of a walking QP, from the program that also differentiates it."""
+    return along(qp, jax.tree.map(np.zeros_like, qp))[0]
+
+
+@cache
+def general(n, m):
+    """EACH general QPs with their minimisers and conditions, and what is found of them."""
+    made = [general_qp(seed, n, m) for seed in range(EACH)]
+    return made, solve_all([qp for qp, _, _ in made])
 
 
 @pytest.fixture(scope="module")
@@ -54,37 +73,41 @@ def walking():
     return [walking_qp(seed) for seed in range(WALKING)]
 
 
-def test_walking_qps_are_solved_to_the_first_newton(walking):
-    found = solve_all(stack(walking))
-    check_solved(found)
-    exact = np.stack([exact_solution(qp)[0] for qp in walking])
-    error = np.abs(np.asarray(found.x) - exact)[:, :5].max(axis=1)
+@pytest.fixture(scope="module")
+def walked(walking):
+    return stack([still(qp) for qp in walking])
+
+
+@pytest.fixture(scope="module")
+def exact(walking):
+    return np.stack([exact_solution(qp)[0] for qp in walking])
+
+
+def test_walking_qps_are_solved_to_the_first_newton(walked, exact):
+    check_solved(walked)
+    error = np.abs(walked.x - exact)[:, :5].max(axis=1)
     assert np.median(error) <= 1e-8
     assert error.max() <= 1e-4
-    assert found.iterations.max() <= 20
+    assert walked.iterations.max() <= 20
 
 
-def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking):
-    some = walking[::5]
-    found = solve_all(stack([QP(*(np.float32(part) for part in qp)) for qp in some]))
+def test_walking_qps_in_32_bits_are_near_and_never_wrong_in_silence(walking, exact):
+    found = stack([solve(QP(*(np.float32(part) for part in qp))) for qp in walking[::5]])
     assert found.x.dtype == jnp.float32
-    error = np.array(
-        [np.abs(x - exact_solution(qp)[0])[:5].max() for x, qp in zip(found.x, some, strict=True)]
-    )
-    solved = np.asarray(found.status) == Status.SOLVED
+    error = np.abs(found.x - exact[::5])[:, :5].max(axis=1)
+    solved = found.status == Status.SOLVED
     assert (error <= 0.1).mean() >= 0.99
     assert (error[solved] <= 0.1).all()
 
 
 @pytest.mark.parametrize(("n", "m"), SHAPES)
 def test_general_qps_are_right(n, m):
-    made = [general_qp(seed, n, m) for seed in range(EACH)]
-    found = solve_all(stack([qp for qp, _, _ in made]))
+    made, found = general(n, m)
     definite = np.isfinite([cond for *_, cond in made])
-    assert (np.asarray(found.status)[definite] == Status.SOLVED).all()
+    assert (found.status[definite] == Status.SOLVED).all()
     assert np.isin(found.status, (Status.SOLVED, Status.NOT_UNIQUE)).all()
     for i, (qp, x, cond) in enumerate(made):
-        residual = kkt_residual(qp, np.asarray(found.x[i]), np.asarray(found.y[i]))
+        residual = kkt_residual(qp, found.x[i], found.y[i])
         assert residual <= (1e-8 if cond <= 1e4 else 1e-6), (i, residual, cond)
         if cond <= 1e4:
             np.testing.assert_allclose(found.x[i], x, atol=1e-4 * np.abs(x).max())
@@ -92,25 +115,27 @@ def test_general_qps_are_right(n, m):
 
 @pytest.mark.parametrize(("n", "m"), SHAPES[1:3])
 def test_a_minimiser_is_not_unique_just_where_a_linear_program_finds_another(n, m):
-    made = [general_qp(seed, n, m) for seed in range(EACH)]
-    found = solve_all(stack([qp for qp, _, _ in made]))
+    made, found = general(n, m)
     flat = [i for i, (_, _, cond) in enumerate(made) if np.isinf(cond)]
-    unique = np.array([other_minimiser(made[i][0], np.asarray(found.x[i])) < 1e-3 for i in flat])
-    np.testing.assert_array_equal(np.asarray(found.status)[flat] == Status.SOLVED, unique)
+    unique = np.array([other_minimiser(made[i][0], found.x[i]) < 1e-3 for i in flat])
+    np.testing.assert_array_equal(found.status[flat] == Status.SOLVED, unique)
     assert 10 < unique.sum() < len(flat) - 10
 
 
 @pytest.mark.parametrize("far", [1e3, 1e6, 1e9, 1e12, 1e20, 1e30, 1e200])
 def test_a_loose_bound_of_any_size_changes_nothing(far):
-    for seed in range(6):
+    made = []
+    for seed in range(6):  # of SHAPES[2]
         rng = np.random.default_rng(seed)
-        M, A = rng.normal(size=(8, 8)), rng.normal(size=(11, 8))
-        bound = np.r_[np.ones(10), far]
-        P, q = M @ M.T + 0.1 * np.eye(8), 10.0 * rng.normal(size=8)
-        found = solve(QP(P, q, A, -bound, bound))
-        assert found.status == Status.SOLVED
-        without = solve(QP(P, q, A[:10], -bound[:10], bound[:10]))
-        np.testing.assert_allclose(found.x, without.x, atol=1e-8)
+        M, A = rng.normal(size=(5, 5)), rng.normal(size=(12, 5))
+        bound = np.r_[np.ones(11), far]
+        P, q = M @ M.T + 0.1 * np.eye(5), 10.0 * rng.normal(size=5)
+        made.append(QP(P, q, A, -bound, bound))
+    found = solve_all(made)
+    assert (found.status == Status.SOLVED).all()
+    for qp, x in zip(made, found.x, strict=True):
+        without = QP(qp.P, qp.q, qp.A[:11], qp.l[:11], qp.u[:11])
+        np.testing.assert_allclose(x, exact_solution(without)[0], atol=1e-8)
 
 
 INF = np.inf
@@ -289,9 +314,9 @@ def test_condensed_walks_are_solved_though_the_first_rows_are_zeros():
     first = np.array([qp.u[:2].min() for qp in walks])
     assert (first < 0).sum() >= 5
     assert np.abs(first).max() < 1e-16
-    found = solve_all(stack(walks))
+    found = solve_all(walks)
     check_solved(found)
-    for qp, x in zip(walks, np.asarray(found.x), strict=True):
+    for qp, x in zip(walks, found.x, strict=True):
         free = qp._replace(A=qp.A[2:], l=qp.l[2:], u=qp.u[2:])
         np.testing.assert_allclose(x, exact_solution(free)[0], atol=1e-9)
 
@@ -367,10 +392,7 @@ def test_units_redundant_rows_and_rounding_change_no_verdict():
             cases += [with_rows(qp, 0.0, [-INF, -bound, -INF], never[1])]
             unmet = bound == -1e-6 and status != Status.BAD_DATA
             expected += [Status.INFEASIBLE if unmet else status] * 2
-    short = -len(cases) % EACH  # as many as SHAPES[2] was compiled for
-    batches = np.arange(len(cases) + short).reshape(-1, EACH) % len(cases)
-    found = [solve_all(stack([cases[i] for i in batch])).status for batch in batches]
-    found = np.concatenate(found)[: len(cases)]
+    found = solve_all(cases).status  # of SHAPES[2]
     wrong = [
         (i, Status(int(found[i])).name, expected[i].name) for i in np.flatnonzero(found != expected)
     ]
@@ -391,22 +413,21 @@ def test_small_cases_by_hand():
     np.testing.assert_allclose(free.x, [1.0, 2.5], atol=1e-9)
     pressed = solve(small(u=(0.5,)))
     np.testing.assert_allclose(pressed.x, [0.5, 2.5], atol=1e-9)
-    np.testing.assert_allclose(
-        pressed.y, [1.0, 0.0, 0.0], atol=1e-8
-    )  # positive: the upper bound presses
+    # positive: the upper bound presses
+    np.testing.assert_allclose(pressed.y, [1.0, 0.0, 0.0], atol=1e-8)
     held = solve(small(A=((1.0, 1.0),), l=(1.0,), u=(1.0,)))
     np.testing.assert_allclose(held.x, [-0.25, 1.25], atol=1e-9)
-    line = solve(QP(*(np.array(v, float) for v in ([[3.0]], [-6.0], [[1.0]], [-1.0], [1.0]))))
-    np.testing.assert_allclose(line.x, [1.0], atol=1e-9)
+    one = np.ones(4)  # SHAPES[0]
+    line = solve_all([QP(np.array([[3.0]]), np.array([-6.0]), one[:, None], -one, one)])
+    np.testing.assert_allclose(line.x, [[1.0]], atol=1e-9)
     for found in (free, pressed, held, line):
         check_solved(found)
 
 
-def test_block_rows_are_those_of_the_dense_matrix(walking):
-    qp = walking[3]
-    block, dense = solve(qp), solve(qp._replace(A=dense_rows(qp.A)))
-    np.testing.assert_allclose(block.x, dense.x, atol=1e-8)
-    np.testing.assert_allclose(block.y, dense.y, atol=1e-8)
+def test_block_rows_are_those_of_the_dense_matrix(walking, walked):
+    dense = solve_all([qp._replace(A=dense_rows(qp.A)) for qp in walking[:EACH]])  # SHAPES[5]
+    np.testing.assert_allclose(walked.x[:EACH], dense.x, atol=1e-8)
+    np.testing.assert_allclose(walked.y[3], dense.y[3], atol=1e-8)  # unique, unlike some others
 
 
 def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
@@ -415,27 +436,25 @@ def test_a_batch_is_a_loop_whatever_becomes_of_its_problems(walking):
     falls = flat._replace(q=np.tile([0.0, 0.0, 0.0, 0.0, 1.0], 10))  # a moment without a bound
     crossed = first._replace(l=np.where(first.u == 500.0, 501.0, first.l))
     made = [*walking[:6], flat, falls, crossed, first._replace(q=np.nan * first.q)]
-    qps = stack(made)
-    batch, loop = jax.jit(jax.vmap(solve_qp))(qps), solve_all(qps)
+    batch, loop = jax.jit(jax.vmap(solve_qp))(stack(made)), stack([still(qp) for qp in made])
     np.testing.assert_allclose(batch.x, loop.x, atol=1e-8)
     np.testing.assert_array_equal(batch.status, loop.status)
     expected = ["SOLVED"] * 6 + ["NOT_UNIQUE", "UNBOUNDED", "INFEASIBLE", "BAD_DATA"]
     assert [Status(code).name for code in np.asarray(batch.status)] == expected
 
 
-def test_the_problem_may_be_measured_in_any_unit(walking):
+def test_the_problem_may_be_measured_in_any_unit(walking, walked):
     qp = walking[7]
-    plain = solve(qp)
     unit = np.logspace(-3, 3, qp.q.size)
     scaled = qp._replace(
         P=1e4 * qp.P * np.outer(unit, unit),
         q=1e4 * qp.q * unit,
         A=qp.A * unit.reshape(len(qp.A), 1, -1),
     )
-    np.testing.assert_allclose(unit * solve(scaled).x, plain.x, atol=1e-6)
+    np.testing.assert_allclose(unit * still(scaled).x, walked.x[7], atol=1e-6)
 
 
-def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking):
+def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking, walked):
     assert QpConfig(solver="jaxopt") == QpConfig(solver=JAXOPT)
     assert hash(QpConfig(solver="jaxopt")) == hash(QpConfig(solver=JAXOPT))
     called = []
@@ -446,22 +465,19 @@ def test_a_solver_is_a_value_and_one_of_ones_own_is_another(walking):
 
     cold = Solver("interior_point", approach=counted, guess=None)
     assert QpConfig(solver=cold) != QpConfig()  # of one name, but other functions: another program
-    some = stack(walking[:4])
-    found = solve_all(some, QpConfig(solver=cold, max_iterations=59))
+    found = [solve(qp, QpConfig(solver=cold, max_iterations=59)) for qp in walking[:4]]
     assert set(called) == {59}
-    np.testing.assert_allclose(found.x, solve_all(some).x, atol=1e-6)
+    np.testing.assert_allclose(stack(found).x, walked.x[:4], atol=1e-6)
 
 
 def test_jaxopt_is_a_second_solver_behind_the_door(walking):
-    config = QpConfig(solver="jaxopt")
-    some = stack(walking[:4])
-    ours, theirs = solve_all(some), solve_all(some, config)
-    check_solved(theirs)
-    np.testing.assert_allclose(theirs.x, ours.x, atol=1e-6)
-    tangent = jax.tree.map(jnp.zeros_like, walking[1])._replace(q=jnp.ones(50))
-    mine = jax.jvp(solve_qp, (walking[1],), (tangent,))[1].x
-    other = jax.jvp(partial(solve_qp, config=config), (walking[1],), (tangent,))[1].x
-    np.testing.assert_allclose(other, mine, atol=1e-6 * np.abs(mine).max())
+    for qp in walking[:4]:
+        tangent = jax.tree.map(np.zeros_like, qp)._replace(q=np.ones(50))
+        ours, mine = along(qp, tangent)
+        theirs, other = along(qp, tangent, QpConfig(solver="jaxopt"))
+        check_solved(theirs)
+        np.testing.assert_allclose(theirs.x, ours.x, atol=1e-6)
+        np.testing.assert_allclose(other, mine, atol=1e-6 * np.abs(mine).max())
 
 
 def tangents(seed, qp):
@@ -524,10 +540,9 @@ def test_the_interior_point_tries_again_in_the_sizes_that_it_found():
 
 @pytest.mark.parametrize("times", [1e3, 1e6])
 def test_a_q_that_is_too_large_makes_no_problem_infeasible_or_unbounded(times):
-    for begin in range(0, 400, EACH):  # as many as SHAPES[1] was compiled for
-        made = [general_qp(seed, 5, 12)[0] for seed in range(begin, begin + EACH)]
-        found = solve_all(stack([qp._replace(q=times * qp.q) for qp in made]))
-        assert np.isin(found.status, [Status.SOLVED, Status.NOT_UNIQUE]).all()
+    made = [general_qp(seed, 5, 12)[0] for seed in range(3 * EACH)]
+    found = solve_all([qp._replace(q=times * qp.q) for qp in made])
+    assert np.isin(found.status, [Status.SOLVED, Status.NOT_UNIQUE]).all()
 
 
 @pytest.fixture
@@ -568,9 +583,10 @@ def test_on_a_gpu_a_guess_that_did_not_settle_is_not_taken(walking, as_on_a_gpu,
         return gpu_kernel.Guess(jnp.full_like(q, jnp.nan), lower, side, jnp.int32(0))
 
     monkeypatch.setattr(gpu_kernel, "guess", lost)
-    found = first_guess(walking[3])
+    found = jax.jit(lambda qp: first_guess(qp))(walking[3])
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    for one, other in zip(*map(jax.tree.leaves, (found, first_guess(walking[3]))), strict=True):
+    usual = jax.jit(lambda qp: first_guess(qp))(walking[3])
+    for one, other in zip(*map(jax.tree.leaves, (found, usual)), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
