@@ -5,18 +5,23 @@ that nothing can predict.
 """
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 
 CYCLE, SUBSTEPS = 40, 10
 
 
+def turns(yaw) -> np.ndarray:
+    """Rotations about z; NumPy, which has no program to compile for each number of samples."""
+    c, s, one = np.cos(yaw), np.sin(yaw), np.ones_like(yaw)
+    rows = [[c, -s, 0 * one], [s, c, 0 * one], [0 * one, 0 * one, one]]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
 def turn_walk(walk: Trajectory, yaw: float) -> Trajectory:
     """The same walk in a world turned by `yaw`."""
-    R = np.asarray(rot_z(jnp.asarray(yaw)))
+    R = turns(yaw)
 
     def state(s: State) -> State:
         rows = State(s.euler, *(v @ R.T for v in s[1:]))
@@ -51,8 +56,7 @@ def synthetic_walk(seed: int, ticks: int = 400, noise: float = 1.0) -> Trajector
     yaw = 0.3 * np.sin(np.arange(ticks * SUBSTEPS + 1) / 1000) + rng.uniform(-1, 1)
 
     def to_world(w: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        R = np.asarray(jax.vmap(rot_z)(angle))
-        return np.einsum("tij,tfj->tfi", R, w)
+        return np.einsum("tij,tfj->tfi", turns(angle), w)
 
     held = np.repeat(yaw[:-1:SUBSTEPS], SUBSTEPS)
     fine = lambda w: to_world(np.repeat(w, SUBSTEPS, axis=0), held)  # noqa: E731
