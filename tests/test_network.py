@@ -25,6 +25,7 @@ from hector_jax.grfm.network import (
 )
 from hector_jax.grfm.paper import fit_linear, fit_scaling
 from hector_jax.grfm.residual import BOUND, member_params, plain_net
+from hector_jax.grfm.training import predict
 from hector_jax.robot.model import load_robot
 
 apply = jax.jit(lambda effect, window: effect(window))
@@ -47,9 +48,24 @@ def params(data):
     return untrained(data, "paper")
 
 
-@pytest.fixture(scope="module", params=["paper", "residual"])
-def either(request, data):
-    return untrained(data, request.param)
+@pytest.fixture(scope="module")
+def ensemble(data):
+    return untrained(data)
+
+
+@pytest.fixture(scope="module", params=["params", "ensemble"], ids=["paper", "residual"])
+def either(request):
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture(scope="module")
+def gated(data):
+    return fit_gated(data)
+
+
+@pytest.fixture(scope="module")
+def windows(data):
+    return jax.tree.map(jnp.asarray, data.window)
 
 
 @pytest.fixture(scope="module")
@@ -86,24 +102,22 @@ def test_the_effect_follows_the_dtype_of_the_window(either, window, dtype):
     assert effect.wrench.force.shape == (2, 3)
 
 
-def test_the_members_alone_are_on_average_the_ensemble(data, window):
-    params = untrained(data)
+def test_the_members_alone_are_on_average_the_ensemble(ensemble, window):
     members = jax.jit(jax.vmap(lambda effect: effect(window).wrench))(
-        as_effect(member_params(params))
+        as_effect(member_params(ensemble))
     )
-    whole = apply(as_effect(params), window).wrench
+    whole = apply(as_effect(ensemble), window).wrench
     for each, mean in zip(members, whole, strict=True):
         assert len(each) == 4
         assert np.ptp(each, axis=0).max() > 0
         np.testing.assert_allclose(each.mean(axis=0), mean, rtol=1e-5, atol=1e-9)
 
 
-def test_vmap_over_windows_equals_a_loop(either, data):
-    some = jax.tree.map(lambda x: jnp.asarray(x[:4]), data.window)
+def test_vmap_over_windows_equals_a_loop(either, data, windows):
     effect = as_effect(either)
-    batch = jax.jit(jax.vmap(effect))(some).wrench
+    batch = predict(effect, windows).wrench
     for i in range(4):
-        one = apply(effect, jax.tree.map(lambda x, i=i: x[i], some)).wrench
+        one = apply(effect, jax.tree.map(lambda x, i=i: x[i], data.window)).wrench
         np.testing.assert_allclose(batch.force[i], one.force, rtol=1e-12, atol=1e-12)
 
 
@@ -171,13 +185,13 @@ def test_an_axis_that_is_hardly_commanded_is_not_blown_up(data):
     assert np.all(still.scale.force == 1.0)
 
 
-def test_the_linear_map_finds_a_ground_that_is_linear(data):
+def test_the_linear_map_finds_a_ground_that_is_linear(data, windows):
     rng = np.random.default_rng(0)
     A, b = rng.normal(size=(18, 6)), rng.normal(size=6)
     force = data.window.commands.force.reshape(-1, 18) @ A + b
     known = data._replace(label=data.label._replace(force=force.reshape(-1, 2, 3)))
     effect = as_effect(fit_linear(known))
-    guess = jax.jit(jax.vmap(effect))(jax.tree.map(jnp.asarray, data.window)).wrench
+    guess = predict(effect, windows).wrench
     np.testing.assert_allclose(guess.force, known.label.force, atol=1e-6)
 
 
@@ -211,24 +225,24 @@ def test_a_net_of_another_size_comes_back(tmp_path, data, robot):
         jax.tree.map(np.testing.assert_array_equal, again, small)
 
 
-def test_a_net_from_a_file_of_the_old_names_comes_back(tmp_path, data, robot):
+def test_a_net_from_a_file_of_the_old_names_comes_back(tmp_path, ensemble, robot):
     """The statistics were called `usual` and the residual's RMS `left`."""
-    params, path = untrained(data), tmp_path / "net.npz"
-    save_net(path, params, robot=robot, about={})
+    path = tmp_path / "net.npz"
+    save_net(path, ensemble, robot=robot, about={})
     about = read_card(path)["about"]
-    fields = params._asdict()
+    fields = ensemble._asdict()
     old = {"usual": fields.pop("stats"), "left": fields.pop("residual_rms"), **fields}
     save_tree(path, old, kind="grfm-residual", robot=robot, about=about)
-    jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], params)
+    jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], ensemble)
 
 
-def test_a_net_of_a_file_without_touchdowns_lands_as_planned(tmp_path, data, robot):
-    params, path = untrained(data), tmp_path / "net.npz"
-    save_net(path, params, robot=robot, about={})
+def test_a_net_of_a_file_without_touchdowns_lands_as_planned(tmp_path, ensemble, robot):
+    path = tmp_path / "net.npz"
+    save_net(path, ensemble, robot=robot, about={})
     about = read_card(path)["about"]
     old, as_planned = (
-        params._replace(linear=params.linear._replace(touchdown=leaf))
-        for leaf in (None, jnp.zeros_like(params.linear.touchdown))
+        ensemble._replace(linear=ensemble.linear._replace(touchdown=leaf))
+        for leaf in (None, jnp.zeros_like(ensemble.linear.touchdown))
     )
     save_tree(path, old, kind="grfm-residual", robot=robot, about=about)
     jax.tree.map(np.testing.assert_array_equal, load_net(path, robot)[0], as_planned)
@@ -247,9 +261,9 @@ def _flip(wrench):
     return Wrench(wrench.force[::-1] * ALONG, wrench.moment[::-1] * ACROSS)
 
 
-def test_a_mirrored_window_has_the_mirrored_effect(data):
+def test_a_mirrored_window_has_the_mirrored_effect(data, ensemble):
     both = with_mirror(data)
-    phi = as_effect(untrained(data))
+    phi = as_effect(ensemble)
     count = len(data.walk)
     for i in (0, 17, 18, 40):
         here, there = (
@@ -266,8 +280,7 @@ def test_a_mirrored_window_has_the_mirrored_effect(data):
         np.testing.assert_allclose(error[::-1] * ALONG, there.touchdown_error, atol=1e-9)
 
 
-def test_a_command_that_stays_is_returned_as_it_is(data, window):
-    gated = fit_gated(data)
+def test_a_command_that_stays_is_returned_as_it_is(gated, window):
     held = jax.tree.map(lambda w: jnp.broadcast_to(w[:1], w.shape), window.commands)
     more = jax.tree.map(lambda w: w.at[:, 0].add(3.0), held)
     phi = as_effect(gated)
@@ -278,13 +291,12 @@ def test_a_command_that_stays_is_returned_as_it_is(data, window):
     np.testing.assert_allclose(after.moment - before.moment, [[3.0] * 3, [0.0] * 3], atol=1e-9)
 
 
-def test_what_the_nets_add_is_bounded_and_fades_far_from_the_data(data, window):
-    params = untrained(data)
-    loud = params._replace(
-        force=jax.tree.map(lambda p: 100.0 * p, params.force),
-        moment=jax.tree.map(lambda p: 100.0 * p, params.moment),
+def test_what_the_nets_add_is_bounded_and_fades_far_from_the_data(ensemble, window):
+    loud = ensemble._replace(
+        force=jax.tree.map(lambda p: 100.0 * p, ensemble.force),
+        moment=jax.tree.map(lambda p: 100.0 * p, ensemble.moment),
     )
-    linear = as_effect(params.linear)
+    linear = as_effect(ensemble.linear)
     added = []
     for size in (1.0, 30.0):
         far = window._replace(
@@ -292,23 +304,22 @@ def test_what_the_nets_add_is_bounded_and_fades_far_from_the_data(data, window):
         )
         nets, gated = (apply(phi, far).wrench.force for phi in (as_effect(loud), linear))
         difference = nets - gated
-        added.append(np.abs(difference / params.residual_rms[:3]))
+        added.append(np.abs(difference / ensemble.residual_rms[:3]))
     assert added[0].max() <= BOUND + 1e-6
     assert added[0].max() > 0.1 * BOUND
     assert added[1][0].max() < 1e-3
 
 
-def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data):
+def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data, windows, gated):
     rng = np.random.default_rng(0)
-    true = fit_gated(data)
-    true = true._replace(
-        bias=jnp.asarray(rng.normal(size=true.bias.shape)),
-        changes=jnp.asarray(0.2 * rng.normal(size=true.changes.shape)),
-        legs_bias=jnp.asarray(rng.normal(size=true.legs_bias.shape)),
-        legs=jnp.asarray(0.0 * true.legs),
-        touchdown=jnp.asarray(np.random.default_rng(1).normal(size=true.touchdown.shape)),
+    true = gated._replace(
+        bias=jnp.asarray(rng.normal(size=gated.bias.shape)),
+        changes=jnp.asarray(0.2 * rng.normal(size=gated.changes.shape)),
+        legs_bias=jnp.asarray(rng.normal(size=gated.legs_bias.shape)),
+        legs=jnp.asarray(0.0 * gated.legs),
+        touchdown=jnp.asarray(np.random.default_rng(1).normal(size=gated.touchdown.shape)),
     )
-    told = jax.jit(jax.vmap(as_effect(true)))(jax.tree.map(jnp.asarray, data.window))
+    told = predict(as_effect(true), windows)
     error = np.array(told.touchdown_error)
     error[::20] += 1e3  # robots that fall
     known = data._replace(
@@ -317,7 +328,7 @@ def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data):
         touchdown_error=error,
         lands=~data.window.contact,
     )
-    found = jax.jit(jax.vmap(as_effect(fit_gated(known))))(jax.tree.map(jnp.asarray, data.window))
+    found = predict(as_effect(fit_gated(known)), windows)
     for part in ("force", "moment"):
         error = getattr(found.wrench, part) - getattr(told.wrench, part)
         assert np.mean(error**2) < 0.05 * np.var(getattr(told.wrench, part))
@@ -327,8 +338,8 @@ def test_the_gated_map_finds_a_ground_that_is_gated_and_linear(data):
     assert np.abs(error).max() < 0.02 * np.asarray(told.touchdown_error)[lands].std()
 
 
-def test_a_leg_pushes_only_while_it_swings(data, window):
-    phi = as_effect(fit_gated(data))
+def test_a_leg_pushes_only_while_it_swings(gated, window):
+    phi = as_effect(gated)
     standing = window._replace(contact=jnp.array([True, True]))
     assert np.any(apply(phi, window).legs.force != 0.0)
     assert not np.any(apply(phi, standing).legs.force)
@@ -341,17 +352,15 @@ def test_hats_are_one_at_their_knot_and_sum_to_one():
     np.testing.assert_allclose(between.sum(axis=1), 1.0)
 
 
-def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one(data):
-    windows = jax.tree.map(jnp.asarray, data.window)
+def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one(windows, ensemble):
     told = windows.commands._replace(
         force=windows.commands.force * windows.contact[:, None, :, None],
         moment=windows.commands.moment * windows.contact[:, None, :, None],
     )
     windows = windows._replace(commands=told)  # a foot in the air is commanded nothing
     gait = GaitConfig()
-    plain, same = (jax.jit(jax.vmap(p))(windows) for p in (effect_of(None, gait), last_command))
+    plain, same = (predict(p, windows) for p in (effect_of(None, gait), last_command))
     jax.tree.map(np.testing.assert_array_equal, plain.wrench, same.wrench)
     assert not any(np.any(load) for load in plain.legs)
-    trained = untrained(data)
     shape = partial(jax.tree.map, lambda x: (x.shape, x.dtype))
-    assert shape(plain_net(gait)) == shape(trained)
+    assert shape(plain_net(gait)) == shape(ensemble)
