@@ -70,8 +70,11 @@ def asked(monkeypatch):
     return told
 
 
-def test_the_plants_of_the_verdict_are_asked_for_once_and_after_all_that_tunes(tmp_path, asked):
+def test_the_plants_of_the_verdict_are_asked_for_once_and_after_all_that_tunes(
+    tmp_path, asked, monkeypatch
+):
     seen = []
+    monkeypatch.setattr(study, "draw", lambda *args: [])
 
     def late(seeds):
         seen.append([names for _, *names in asked["tunings"]])

@@ -80,15 +80,22 @@ def code_hash(*modules: str) -> str:
         name = pending.pop()
         if name in trees or name in _NO_NUMBERS:
             continue
-        tree = ast.parse(_source(name).read_bytes())
-        pending += _imported(tree)
-        for node in ast.walk(tree):
-            body = getattr(node, "body", None)
-            if isinstance(body, list) and body and _is_text(body[0]):
-                body.pop(0)
-        trees[name] = ast.dump(tree)
+        trees[name], imported = _syntax(_source(name).read_bytes())
+        pending += imported
     numeric = {name: version(name) for name in NUMERIC}
     return hashlib.sha256(repr((sorted(trees.items()), numeric)).encode()).hexdigest()[:12]
+
+
+@cache  # most modules are in the hashes of several results
+def _syntax(source: bytes) -> tuple[str, list[str]]:
+    """Return the syntax tree of a module, without docstrings, and the modules that it imports."""
+    tree = ast.parse(source)
+    imported = _imported(tree)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and _is_text(body[0]):
+            body.pop(0)
+    return ast.dump(tree), imported
 
 
 def _source(module: str) -> Path:
