@@ -117,6 +117,9 @@ def views(window: Window) -> View:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(view_of, range(feet)))
 
 
+_views = jax.jit(jax.vmap(views))
+
+
 def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[Array, "... knots"]:
     """Return piecewise linear hat functions of the time [s], 1 at their knot, constant beyond."""
     before = jnp.concatenate([knots[:1] - 1.0, knots[:-1]])
@@ -182,7 +185,7 @@ def labels_in_view(dataset: Dataset) -> Float[np.ndarray, "n feet 6"]:
 def fit_gated(dataset: Dataset) -> GatedMap:
     """Fit the maps by ridge regression; every sample counts once in the view of each foot."""
     window = jax.tree.map(jnp.asarray, dataset.window)
-    view = jax.tree.map(np.asarray, jax.jit(jax.vmap(views))(window))
+    view = jax.tree.map(np.asarray, _views(window))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
     tick, gate = (np.asarray(jax.jit(hats)(window.since_switch, knots)) for knots in (ticks, gates))
     feet = view.stands.shape[1]

@@ -94,9 +94,13 @@ def init_nets(
     key: Key[Array, ""], hidden: tuple[int, ...], inputs: int, *, outputs: int, members: int
 ) -> Pair:
     """Draw parameters of force nets and moment nets, `members` of each stacked."""
-    net, x = Net(hidden, outputs), jnp.zeros(inputs)
-    draw = jax.jit(jax.vmap(lambda k: net.init(k, x)["params"]))
-    return Pair(*(draw(jax.random.split(k, members)) for k in jax.random.split(key)))
+    keys = (jax.random.split(k, members) for k in jax.random.split(key))
+    return Pair(*(_draw(Net(hidden, outputs), inputs, k) for k in keys))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _draw(net: Net, inputs: int, keys: Key[Array, " members"]) -> dict[str, Any]:
+    return jax.vmap(lambda k: net.init(k, jnp.zeros(inputs))["params"])(keys)
 
 
 def widths(net: dict[str, Any]) -> tuple[int, ...]:
