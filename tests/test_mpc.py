@@ -20,7 +20,7 @@ from hector_jax.control.contact import (
     Rows,
     StateConstraint,
 )
-from hector_jax.control.disturbance import Disturbance
+from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, build_qp, solve_mpc
 from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import (
@@ -46,16 +46,29 @@ WEIGHT = float(ROBOT.mass * ROBOT.gravity[2])
 FLIP, TURN = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of vectors, of axial ones
 
 
-@partial(jax.jit, static_argnums=(0, 5, 6))
-def solve(config, robot, weights, state, horizon, dt, contacts):
-    problem = MpcProblem(robot, config.parameters(weights), state, horizon)
-    return solve_mpc(config, problem, dt=dt, max_contacts=contacts)
+@partial(jax.jit, static_argnums=(0, 2))
+def _answer(config, problem, contacts):
+    what = {"dt": DT, "max_contacts": contacts}
+    return solve_mpc(config, problem, **what), build_qp(config, problem, **what)
 
 
-@partial(jax.jit, static_argnums=(0, 5, 6))
-def write(config, robot, weights, state, horizon, dt, contacts):
-    problem = MpcProblem(robot, config.parameters(weights), state, horizon)
-    return build_qp(config, problem, dt=dt, max_contacts=contacts)
+def answer(config, weights, state, horizon, contacts, lacking=NO_DISTURBANCE):
+    """Wrench and solution, and the QP and the map from its inputs to u_0.
+
+    Configurations that differ in traced numbers alone share a program.
+    """
+    problem = MpcProblem(ROBOT, config.parameters(weights), state, horizon, lacking)
+    numbers = ("friction", "max_force", "effort_reference")
+    shape = replace(config, **{name: getattr(CONFIG, name) for name in numbers})
+    return _answer(shape, jax.tree.map(jnp.asarray, problem), contacts)
+
+
+def solve(*args):
+    return answer(*args)[0]
+
+
+def write(*args):
+    return answer(*args)[1]
 
 
 linearise = jax.jit(jax.vmap(lambda e, r: srbm.linearise(ROBOT, e, r, DT)))
@@ -137,9 +150,7 @@ def test_what_the_model_lacks_is_predicted_to_stay():
     gained = DT * np.concatenate(
         [np.zeros(6), turned @ lacking.angular, turned @ lacking.linear, np.zeros(3)]
     )
-    parameters = CONFIG.parameters(expert())
-    asked = MpcProblem(ROBOT, parameters, state, horizon, lacking)
-    found, _ = build_qp(CONFIG, asked, dt=DT, max_contacts=1)
+    found, _ = answer(CONFIG, expert(), state, horizon, 1, lacking)[1]
     values = []
     for v in np.random.default_rng(0).normal(size=(3, N * 5)) * 20.0:
         written = cost(expert(), state, horizon, inputs(horizon, v), gained=gained)
@@ -207,7 +218,7 @@ def test_the_condensed_cost_is_that_of_the_rolled_out_states(max_contacts, about
         random_weights(1),
         problem(1, contact=BOTH if max_contacts == 2 else None),
     )
-    qp, _ = write(config, ROBOT, weights, state, horizon, DT, max_contacts)
+    qp, _ = write(config, weights, state, horizon, max_contacts)
     rng = np.random.default_rng(2)
     share = np.tile([0.0, 0.0, WEIGHT / 2], 4)
     share[6:] = 0.0
@@ -225,7 +236,7 @@ def test_the_condensed_cost_is_that_of_the_rolled_out_states(max_contacts, about
 @pytest.mark.parametrize("seed", range(4))
 def test_the_answer_is_that_of_the_sparse_problem(seed):
     weights, (state, horizon) = random_weights(seed), problem(seed, push=1.0 + seed)
-    wrench, solution = solve(CONFIG, ROBOT, weights, state, horizon, DT, 1)
+    wrench, solution = solve(CONFIG, weights, state, horizon, 1)
     assert solution.status == Status.SOLVED
     exact, _ = exact_solution(sparse_problem(weights, state, horizon))
     u = exact[12 * N :].reshape(N, 12)
@@ -241,7 +252,7 @@ def test_every_constraint_holds_and_each_kind_binds_somewhere():
         state, horizon = problem(seed, push=4.0)
         if seed == 0:  # a hard landing asks for more than the greatest force
             state = state._replace(velocity=state.velocity.at[2].set(-3.0))
-        _, solution = solve(CONFIG, ROBOT, random_weights(seed), state, horizon, DT, 1)
+        _, solution = solve(CONFIG, random_weights(seed), state, horizon, 1)
         assert solution.status == Status.SOLVED
         for k, u in enumerate(inputs(horizon, solution.x).reshape(N, 2, 2, 3)):
             foot = int(np.argmax(horizon.contact[k]))
@@ -285,8 +296,8 @@ def test_what_toe_and_heel_hold_across_a_foot_is_what_the_plants_hold(yaw):
 def test_line_friction_can_be_left_to_the_pyramid():
     config = MpcConfig(line_friction=False)
     state, horizon = problem(5, push=4.0)
-    qp, _ = write(config, ROBOT, nominal(), state, horizon, DT, 1)
-    full, _ = write(CONFIG, ROBOT, nominal(), state, horizon, DT, 1)
+    qp, _ = write(config, nominal(), state, horizon, 1)
+    full, _ = write(CONFIG, nominal(), state, horizon, 1)
     assert qp.A.shape == (N, 7, 5)
     assert full.A.shape == (N, 11, 5)
     np.testing.assert_array_equal(full.A[:, :7], qp.A)
@@ -307,7 +318,7 @@ def test_a_plan_obeys_an_input_and_a_state_constraint_of_ones_own():
     state = state._replace(velocity=state.velocity.at[2].set(-0.3))
 
     def planned(config):
-        _, solution = solve(config, ROBOT, expert(), state, horizon, DT, 1)
+        _, solution = solve(config, expert(), state, horizon, 1)
         assert solution.status == Status.SOLVED
         u = inputs(horizon, solution.x)
         twist = np.abs(u[:, 6:].reshape(N, 2, 3)[..., 2]).max()
@@ -341,7 +352,7 @@ def test_the_first_pose_which_no_input_moves_can_be_left_unbounded():
 
         constraints = (*CONFIG.constraints, StateConstraint(f"high {first}", of=high))
         config = MpcConfig(constraints=constraints, max_force=2000.0)
-        return solve(config, ROBOT, expert(), state, horizon, DT, 1)[1].status
+        return solve(config, expert(), state, horizon, 1)[1].status
 
     assert status(low) == Status.INFEASIBLE
     assert status(-np.inf) == Status.SOLVED
@@ -366,8 +377,8 @@ def test_constraints_are_chosen_by_name_in_files():
 
 def test_room_for_two_feet_changes_nothing_while_one_stands():
     state, horizon = problem(3, push=2.0)
-    one, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
-    two, solution = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 2)
+    one, _ = solve(CONFIG, expert(), state, horizon, 1)
+    two, solution = solve(CONFIG, expert(), state, horizon, 2)
     np.testing.assert_allclose(pack_wrench(two), pack_wrench(one), atol=1e-6)
     empty = np.asarray(solution.x).reshape(N, 2, 5)[~np.asarray(horizon.contact)]
     np.testing.assert_allclose(empty, 0.0, atol=1e-9)
@@ -389,14 +400,14 @@ def test_two_feet_in_the_corner_of_the_box_have_no_unique_wrench():
     weights = Weights(bounds()[1].Q, bounds()[0].R)
     for max_contacts, status in ((1, Status.SOLVED), (2, Status.NOT_UNIQUE)):
         state, horizon = problem(1, contact=BOTH if max_contacts == 2 else None)
-        _, solution = solve(CONFIG, ROBOT, weights, state, horizon, DT, max_contacts)
+        _, solution = solve(CONFIG, weights, state, horizon, max_contacts)
         assert solution.status == status
         assert max(solution.primal_residual, solution.dual_residual, solution.gap) <= 1e-8
 
 
 def test_standing_feet_share_the_weight():
     state, horizon = standing()
-    wrench, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 2)
+    wrench, _ = solve(CONFIG, expert(), state, horizon, 2)
     np.testing.assert_allclose(wrench.force[0], wrench.force[1], atol=1e-6)
     # effort is priced and the horizon ends: near the weight only
     assert wrench.force[:, 2].sum() == pytest.approx(WEIGHT, rel=0.15)
@@ -406,7 +417,7 @@ def test_standing_feet_share_the_weight():
 def test_effort_about_the_weight_stands_with_exactly_the_weight():
     state, horizon = standing()
     config = MpcConfig(effort_reference="gravity")
-    wrench, _ = solve(config, ROBOT, expert(), state, horizon, DT, 2)
+    wrench, _ = solve(config, expert(), state, horizon, 2)
     np.testing.assert_allclose(wrench.force, [[0.0, 0.0, WEIGHT / 2]] * 2, atol=1e-6)
     np.testing.assert_allclose(wrench.moment, 0.0, atol=1e-6)
 
@@ -415,15 +426,15 @@ def test_effort_about_the_weight_is_all_of_it_on_one_foot():
     state, horizon = standing()
     horizon = horizon._replace(contact=jnp.asarray(BOTH).at[:, 1].set(False))
     dear = expert()._replace(R=jax.tree.map(lambda r: 1e9 * r, expert().R))
-    wrench, _ = solve(MpcConfig(effort_reference="gravity"), ROBOT, dear, state, horizon, DT, 1)
+    wrench, _ = solve(MpcConfig(effort_reference="gravity"), dear, state, horizon, 1)
     np.testing.assert_allclose(wrench.force, [[0.0, 0.0, WEIGHT], [0.0] * 3], atol=1e-3)
 
 
 def test_only_the_ratio_of_weights_matters():
     state, horizon = problem(6, push=2.0)
-    one, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
+    one, _ = solve(CONFIG, expert(), state, horizon, 1)
     tenfold = jax.tree.map(lambda w: 10.0 * w, expert())
-    other, _ = solve(CONFIG, ROBOT, tenfold, state, horizon, DT, 1)
+    other, _ = solve(CONFIG, tenfold, state, horizon, 1)
     np.testing.assert_allclose(pack_wrench(other), pack_wrench(one), atol=1e-6)
 
 
@@ -442,8 +453,8 @@ def test_a_mirrored_problem_has_the_mirrored_answer(push):
         horizon.contact[:, ::-1],
     )
     swapped = weights._replace(R=Wrench(*(w[::-1] for w in weights.R)))
-    one, _ = solve(CONFIG, ROBOT, weights, state, horizon, DT, 1)
-    two, _ = solve(CONFIG, ROBOT, swapped, mirrored(state), other, DT, 1)
+    one, _ = solve(CONFIG, weights, state, horizon, 1)
+    two, _ = solve(CONFIG, swapped, mirrored(state), other, 1)
     np.testing.assert_allclose(two.force, one.force[::-1] * FLIP, atol=1e-6)
     np.testing.assert_allclose(two.moment, one.moment[::-1] * TURN, atol=1e-6)
 
@@ -464,8 +475,8 @@ def test_a_yawed_problem_has_the_yawed_answer():
         horizon.foot_yaw + 0.9,
         horizon.contact,
     )
-    one, _ = solve(config, ROBOT, nominal(), state, horizon, DT, 1)
-    two, _ = solve(config, ROBOT, nominal(), turned(state), other, DT, 1)
+    one, _ = solve(config, nominal(), state, horizon, 1)
+    two, _ = solve(config, nominal(), turned(state), other, 1)
     np.testing.assert_allclose(two.force, one.force @ R.T, atol=1e-6)
     np.testing.assert_allclose(two.moment, one.moment @ R.T, atol=1e-6)
 
@@ -473,15 +484,15 @@ def test_a_yawed_problem_has_the_yawed_answer():
 def test_a_batch_is_a_loop():
     cases = [problem(seed, push=2.0) for seed in range(3)]
     stacked = jax.tree.map(lambda *rows: jnp.stack(rows), *cases)
-    batch = jax.vmap(lambda s, h: solve(CONFIG, ROBOT, expert(), s, h, DT, 1)[0])(*stacked)
+    batch = jax.vmap(lambda s, h: solve(CONFIG, expert(), s, h, 1)[0])(*stacked)
     for i, (state, horizon) in enumerate(cases):
-        one, _ = solve(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
+        one, _ = solve(CONFIG, expert(), state, horizon, 1)
         np.testing.assert_allclose(batch.force[i], one.force, atol=1e-7)
 
 
 def test_u_is_packed_forces_first():
     state, horizon = problem(3)
-    _, first = write(CONFIG, ROBOT, expert(), state, horizon, DT, 1)
+    _, first = write(CONFIG, expert(), state, horizon, 1)
     wrench = unpack_wrench(first @ jnp.array([1.0, 2.0, 3.0, 0.0, 5.0]))
     np.testing.assert_allclose(wrench.force, [[1, 2, 3], [0, 0, 0]])
     np.testing.assert_allclose(wrench.moment, [[0, 0, 5], [0, 0, 0]])
