@@ -1,5 +1,6 @@
 """Films: poses are those that were walked, and no machine's missing back end ends a run."""
 
+import pickle
 import subprocess
 from pathlib import Path
 
@@ -125,7 +126,8 @@ def test_films_and_strips_are_written_with_the_promised_size(robot, tmp_path):
     # the plot below is pale where time has not come yet
     first, _, last = (np.sum(np.ptp(picture[324:], axis=-1) > 60) for picture in pictures)
     assert last > first + 20
-    write_film(tmp_path / "film.webp", robot, walks, config)
+    frames = (Image.fromarray(picture.astype(np.uint8)) for picture in pictures)
+    render._encode(str(tmp_path / "film.webp"), frames, (640, 432), 10)
     with Image.open(tmp_path / "film.webp") as picture:
         assert (picture.size, picture.n_frames, picture.info["loop"]) == ((640, 432), 3, 0)
     write_strip(tmp_path / "strip.png", robot, walks, config)
@@ -167,22 +169,26 @@ def test_a_back_end_that_fails_is_told_by_its_first_fault(tmp_path, monkeypatch)
     assert video._draw_in_child(tmp_path, "egl") == "KeyError: 'sky'"
 
 
-def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["film.mp4", "film.webp"])
+def test_back_ends_are_tried_in_turn_until_one_draws(robot, tmp_path, monkeypatch, name):
     tried = []
+    drawn = f"drawn{Path(name).suffix}"
 
     def draw(folder, back_end):
         tried.append(back_end)
         if back_end == "egl":
             return "no device"
-        (folder / "drawn.mp4").write_bytes(b"film")
+        scene = pickle.loads((folder / "scene.pickle").read_bytes())
+        assert str(scene.file) == drawn
+        (folder / drawn).write_bytes(b"film")
         return ""
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(video, "_draw_in_child", draw)
     walks = dict.fromkeys("ab", motion(robot, pretend_walk(seconds=0.1)))
-    assert write_film(tmp_path / "film.mp4", robot, walks) == "osmesa"
+    assert write_film(tmp_path / name, robot, walks) == "osmesa"
     assert tried == ["egl", "osmesa"]
-    assert (tmp_path / "film.mp4").read_bytes() == b"film"
+    assert (tmp_path / name).read_bytes() == b"film"
 
 
 def test_a_film_shows_two_walks(robot, tmp_path):
