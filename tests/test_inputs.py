@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import zipfile
+from functools import cache
 from typing import get_args, get_origin
 
 import jax
@@ -221,15 +222,21 @@ def refused_or(load, path):
     return None
 
 
+@pytest.fixture(scope="module")
+def sound_weights(folder):
+    path = folder / "sound.json"
+    save_weights(path, expert())
+    return path.read_bytes()
+
+
 @hundreds
 @given(st.data())
-def test_weights_files_are_taken_or_refused_in_one_line(folder, data):
+def test_weights_files_are_taken_or_refused_in_one_line(folder, sound_weights, data):
     path = folder / "weights.json"
-    save_weights(path, expert())
     if data.draw(st.booleans()):
-        path.write_text(json.dumps(changed(data, json.loads(path.read_text()))))
+        path.write_text(json.dumps(changed(data, json.loads(sound_weights))))
     else:
-        path.write_bytes(torn(data, path.read_bytes()))
+        path.write_bytes(torn(data, sound_weights))
     found = refused_or(load_weights, path)
     if found is not None:
         for leaf, like in zip(jax.tree.leaves(found), jax.tree.leaves(expert()), strict=True):
@@ -276,10 +283,16 @@ def test_trajectories_are_taken_or_refused_in_one_line(folder, data):
         assert 0.05 <= found.seconds <= 600.0
 
 
+@cache
+def entries(content):
+    """The arrays of an archive."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
 def forge(path, change_card=lambda card: card, arrays=None):
     """The archive with another card and other arrays, its hash made to fit."""
-    with np.load(path, allow_pickle=False) as archive:
-        held = {name: archive[name] for name in archive.files}
+    held = entries(path.read_bytes())
     card = change_card(json.loads(str(held["card"])))
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -306,9 +319,7 @@ ARRAYS = st.sampled_from(
 
 def spoilt(data, path):
     """A sound file of ours made unsound: its bytes, its card, its arrays, or an array's shape."""
-    with np.load(path, allow_pickle=False) as archive:
-        names = sorted(set(archive.files) - {"card"})
-        shapes = {name: archive[name].shape for name in names}
+    shapes = {name: x.shape for name, x in entries(path.read_bytes()).items() if name != "card"}
     how = data.draw(st.sampled_from(["bytes", "card", "card", "array", "longer"]))
     if how == "bytes":
         content = path.read_bytes()
@@ -318,7 +329,7 @@ def spoilt(data, path):
     elif how == "card":
         forge(path, lambda card: changed(data, card))
     else:
-        name = data.draw(st.sampled_from(names))
+        name = data.draw(st.sampled_from(sorted(shapes)))
         longer = np.ones([size + 1 for size in shapes[name]])
         forge(path, arrays={name: longer if how == "longer" else data.draw(ARRAYS)})
 

@@ -16,6 +16,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from multiprocessing import active_children, parent_process
 from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.managers import SyncManager
@@ -79,16 +80,9 @@ def check_jax(on_cpu: bool = False) -> None:
             f"the limit on virtual memory (ulimit -v) is {limit / 1e9:.1f} GB, expected at least "
             f"{_LEAST_MEMORY / 1e9:g} GB"
         )
-    if "XLA_FLAGS" in os.environ:  # an unknown flag ends the process
-        done = subprocess.run(
-            [sys.executable, "-c", "from jaxlib.xla_client import make_cpu_client as c; c()"],
-            capture_output=True,
-            text=True,
-            errors="replace",
-        )
-        if done.returncode:
-            reason = done.stderr.strip().rpartition("\n")[2].rpartition("] ")[2]
-            raise InputError(f"XLA_FLAGS={os.environ['XLA_FLAGS']}: {one_line(reason)}")
+    flags = os.environ.get("XLA_FLAGS", "")
+    if flags and (fault := _fault_of_xla(flags)):
+        raise InputError(f"XLA_FLAGS={flags}: {fault}")
     variables = [f"{name}={os.environ[name]}" for name in sorted(os.environ) if name[:4] == "JAX_"]
     try:
         import jax
@@ -99,6 +93,24 @@ def check_jax(on_cpu: bool = False) -> None:
     except Exception as error:  # of several types, some without a message
         what = f"JAX does not start{' with ' if variables else ''}{', '.join(variables)}"
         raise InputError(f"{what}: {one_line(error) or 'no such device here'}") from None
+
+
+@cache
+def _fault_of_xla(flags: str) -> str:
+    """Return why XLA does not start with these XLA_FLAGS, or "".
+
+    An unknown flag ends a process, so they are tried in a process of their own.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", "from jaxlib.xla_client import make_cpu_client as c; c()"],
+        env=os.environ | {"XLA_FLAGS": flags},
+        capture_output=True,
+        text=True,
+        errors="replace",
+    )
+    if not done.returncode:
+        return ""
+    return one_line(done.stderr.strip().rpartition("\n")[2].rpartition("] ")[2])
 
 
 def setup_jax() -> None:
