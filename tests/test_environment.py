@@ -12,6 +12,8 @@ import pytest
 from hector_jax.core import runtime
 from hector_jax.robot.model import load_robot
 
+# without the flags of the tests, which a command would try in one more process
+USUAL = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
 WRONG = [
     ({"JAX_PLATFORMS": "abacus"}, "JAX does not start with JAX_PLATFORMS=abacus: "),
     ({"JAX_PLATFORMS": "tpu"}, "JAX does not start with JAX_PLATFORMS=tpu: "),
@@ -31,7 +33,7 @@ def hector(*words, **options):
 
 @pytest.mark.parametrize(("wrong", "line"), WRONG, ids=[next(iter(w)) for w, _ in WRONG])
 def test_what_jax_cannot_start_with_is_one_line(wrong, line):
-    environment = os.environ | wrong
+    environment = USUAL | wrong
     done = hector("walk", env=environment)
     assert (done.returncode, done.stdout) == (2, "")
     said = [text for text in done.stderr.splitlines() if text != "loading JAX and MuJoCo"]
@@ -41,7 +43,7 @@ def test_what_jax_cannot_start_with_is_one_line(wrong, line):
 
 @pytest.mark.parametrize(("wrong", "line"), WRONG[2:], ids=["JAX", "XLA"])
 def test_the_doctor_names_what_jax_cannot_start_with(wrong, line):
-    done = hector("doctor", "--json", env=os.environ | wrong)
+    done = hector("doctor", "--json", env=USUAL | wrong)
     assert done.returncode == 1
     (fault,) = json.loads(done.stdout)["faults"]
     assert fault.startswith(line)
@@ -61,7 +63,7 @@ def test_too_little_memory_is_told_before_anything_hangs():
 
 def test_a_renderer_is_needed_for_a_film_alone(tmp_path):
     """And not for a report, as a home that cannot be written shows below."""
-    environment = os.environ | {"MUJOCO_GL": "crayon"}
+    environment = USUAL | {"MUJOCO_GL": "crayon"}
     done = hector("view", tmp_path, "--headless", env=environment)
     line = "hector: MUJOCO_GL must be 'egl', 'osmesa', 'glfw' or 'disable', got 'crayon'"
     assert (done.returncode, done.stderr.splitlines()[-1]) == (2, line)
@@ -95,7 +97,7 @@ def test_a_home_that_cannot_be_written_is_told_in_one_line(tmp_path):
     wall.write_text("a file, where a folder is wanted")
     places = {"XDG_CACHE_HOME": str(wall), "TMPDIR": str(tmp_path), "MPLCONFIGDIR": str(wall)}
     no_renderer = {"MUJOCO_GL": "crayon"}  # of which nothing is said, as there is no film
-    done = hector("compare", tmp_path, env=os.environ | places | no_renderer)
+    done = hector("compare", tmp_path, env=USUAL | places | no_renderer)
     told = f"{wall}/hector_jax/jax cannot be written: compiled programs are kept in {tmp_path}/"
     said = [line for line in done.stderr.splitlines() if line != "loading JAX and MuJoCo"]
     assert said[0].startswith(told)
