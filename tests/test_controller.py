@@ -106,8 +106,10 @@ def test_a_turned_hip_turns_its_foot():
 def test_a_tilted_robot_has_its_feet_where_kinematics_puts_them():
     state = standing().state._replace(euler=jnp.array([0.1, -0.2, 0.3]))
     measurement = standing()._replace(state=state)
-    local = foot_poses(ROBOT, measurement.joints).position
-    below = feet_of(measurement).position - trunk_position(ROBOT, state)
+    local, trunk = jax.jit(
+        lambda now: (foot_poses(ROBOT, now.joints).position, trunk_position(ROBOT, now.state))
+    )(measurement)
+    below = feet_of(measurement).position - trunk
     np.testing.assert_allclose(np.linalg.norm(below, axis=1), np.linalg.norm(local, axis=1))
 
 
@@ -242,16 +244,18 @@ def test_a_foot_that_lands_twice_within_the_horizon_lands_a_stride_further():
     assert config.touchdowns == 3
     walking = jax.tree.map(jnp.asarray, standing())
     state = walking.state._replace(velocity=jnp.array([0.5, 0.0, 0.0]))
-    horizon, touchdown = plan_horizon(
-        config,
-        ROBOT,
-        config.footstep.parameters,
-        command=STRAIGHT,
-        anchor=ANCHOR,
-        tick=jnp.array(0),
-        state=state,
-        feet=feet_of(walking),
-    )
+    horizon, touchdown = jax.jit(
+        lambda state, feet: plan_horizon(
+            config,
+            ROBOT,
+            config.footstep.parameters,
+            command=STRAIGHT,
+            anchor=ANCHOR,
+            tick=jnp.array(0),
+            state=state,
+            feet=feet,
+        )
+    )(state, feet_of(walking))
     stands = np.asarray(horizon.contact)
     assert stands.sum(axis=1).tolist() == [1] * 15
     # a foot stands 0.1 s: at 0.5 m/s it is hardly further than 3 cm from under the body
