@@ -99,7 +99,7 @@ def init_nets(
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _draw(net: Net, inputs: int, keys: Key[Array, " members"]) -> dict[str, Any]:
+def _draw(net: Net, inputs: int, keys: Key[Array, " members"]) -> Any:
     return jax.vmap(lambda k: net.init(k, jnp.zeros(inputs))["params"])(keys)
 
 
