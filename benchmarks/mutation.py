@@ -37,7 +37,7 @@ PARTS = {
         "qp gpu_kernel mpc",
     ),
     "tuning": (
-        "tuning/batch tuning/difftune tuning/loss tuning/measured tuning/online tuning/rollout"
+        "tuning/batch tuning/difftune tuning/loss tuning/grounded tuning/rollout"
         " tuning/sensitivity tuning/evaluate search/cmaes",
         "loss config rollout difftune faults measured online search batch",
     ),

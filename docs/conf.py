@@ -61,7 +61,7 @@ PUBLIC = {  # of packages without `__all__`, in whichever of their modules they 
     "sim": "Imperfections ideal hfs hfs_varied standin Job walk Engine choose_engine",
     "grfm": "Window Effect Phi as_effect load_net save_net load_walks TrainConfig train",
     "tuning": """RolloutConfig rollout LossTerm losses with_alphas TuneConfig Evaluation Tuning
-        tune descend tune_measured OnlineConfig""",
+        tune descend""",
     "search": "SearchConfig search",
     "runs": "Score score Verdict make_verdict load_run export",
     "report": "compare_runs write_film write_events",

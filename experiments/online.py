@@ -1,7 +1,7 @@
 """Does tuning while walking help on a plant that changes under the robot?
 
 A payload is put on the trunk in the middle of a walk. Weights that stay are compared with weights
-that take a step of DiffTune after every window of measured states (`tuning.online`), on the hfs
+that take a step of DiffTune after every window of measured states (`adaptation`), on the hfs
 and plants around it, from several start weights; and with weights that are tuned until the change
 only. What tuning all the way has over these is adapting to the payload and, not told apart from it,
 the ordinary tuning that goes on after the change. Other ways to the gradient are walked beside:
@@ -26,10 +26,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import adaptation
 import jax
 import numpy as np
 import plots
 import tyro
+from adaptation import Adaptation, OnlineConfig, retuner
 from lib import check_names, write_report
 from plots import ARMS
 
@@ -55,9 +57,10 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, named_world
 from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.online import Adaptation, OnlineConfig, retuner
 
-CODE = ("tuning.online", "grfm.network", "sim.walk")  # modules that decide the numbers
+# modules that decide the numbers
+CODE = ("tuning.grounded", "tuning.sensitivity", "grfm.network", "sim.walk")
+ADAPTATION = Path(adaptation.__file__).read_text()  # part of the cache keys, as CODE
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] of the losses along a walk
 
@@ -230,7 +233,7 @@ def walk_cases(
     def path(case: Case) -> Path:
         config, _, job, effect, moment, arm = inputs[case]
         name = "-".join(case).replace(" ", "")
-        ending = content_key(config, robot, job, (effect,), moment, arm, code=CODE)
+        ending = content_key(config, robot, job, (effect,), moment, arm, ADAPTATION, code=CODE)
         return flags.out / "walks" / f"{name}-{ending}.npz"
 
     def make(missing: Sequence[Case], _: Mapping[Case, Walked]) -> Iterator[tuple[Case, Walked]]:

@@ -11,6 +11,10 @@ from itertools import repeat
 from pathlib import Path
 from typing import NamedTuple
 
+import adaptation
+import measured
+from measured import evaluate_walk, tune_measured
+
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar, say
@@ -28,11 +32,12 @@ from hector_jax.sim.walk import walk
 from hector_jax.sim.world import Imperfections, hfs, hfs_drawn
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.measured import evaluate_walk, tune_measured
 
 # modules that decide the numbers, for `content_key`
 SEARCH_CODE = ("search.cmaes", "tuning.loss", "sim.walk", "sim.parallel")
-WALKS_CODE = (*tunings.TUNING_CODE, "tuning.measured", "sim.walk")
+WALKS_CODE = (*tunings.TUNING_CODE, "tuning.grounded", "tuning.sensitivity", "sim.walk")
+# part of the cache keys, as WALKS_CODE
+MEASURED = Path(adaptation.__file__).read_text() + Path(measured.__file__).read_text()
 
 
 class Bench(NamedTuple):
@@ -100,7 +105,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
     problem = Problem(named_command(name), bench.params)
     simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
     inputs = config, bench.robot, start, problem.command, problem.params
-    key = content_key(*inputs, *simulators, code=WALKS_CODE)
+    key = content_key(*inputs, *simulators, MEASURED, code=WALKS_CODE)
     job = partial(_walk_job, config, bench.robot, problem)
 
     def make(missing: list[str], _: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:

@@ -14,6 +14,7 @@ from typing import get_args, get_origin
 import jax
 import numpy as np
 import pytest
+from adaptation import OnlineConfig
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from scenes import SceneConfig
@@ -37,7 +38,6 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs.nets import CollectConfig
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.online import OnlineConfig
 from hector_jax.tuning.rollout import RolloutConfig
 
 ROBOT = load_robot()

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from measured import evaluate_walk, tune_measured
 from model import AHEAD, BRIEF, PLAIN
 
 from hector_jax.control.reference import named_command
@@ -17,7 +18,6 @@ from hector_jax.tuning.difftune import PAPER_ITERATIONS, TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import evaluate_grounded, fit_grounding, grounded_rollout
 from hector_jax.tuning.loss import PAPER_LOSS
-from hector_jax.tuning.measured import evaluate_walk, tune_measured
 from hector_jax.tuning.rollout import RolloutConfig
 
 CONFIG, WALKED = TuneConfig(rollout=BRIEF), (AHEAD, PLAIN)

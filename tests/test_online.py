@@ -2,10 +2,12 @@
 
 from dataclasses import replace
 
+import adaptation
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from adaptation import OnlineConfig, follow, init_trace, retuner
 
 from hector_jax.control.controller import Retune, WalkConfig
 from hector_jax.control.legs import Measurement
@@ -18,11 +20,10 @@ from hector_jax.robot.model import load_robot
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import ideal
-from hector_jax.tuning import online
 from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation
+from hector_jax.tuning.grounded import MeasuredState
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
-from hector_jax.tuning.online import MeasuredState, OnlineConfig, follow, init_trace, retuner
 from hector_jax.tuning.rollout import init_carry, step_carry
 
 ROBOT, TUNE, S = load_robot(), TuneConfig(), named_command("s")
@@ -144,7 +145,7 @@ MEASURED = Measurement(
 def course(monkeypatch, config, follows, windows, start=None):
     """Weights by tick, and the steps told; `follows` are used one after another."""
     start, steps, turn = start or nominal(), [], iter(follows)
-    monkeypatch.setattr(online, "follow", lambda *a, **how: next(turn)(*a, **how))
+    monkeypatch.setattr(adaptation, "follow", lambda *a, **how: next(turn)(*a, **how))
     retune = retuner(config, ROBOT, start, S, last_command, steps.append)
     carry, weights = retune.init, []
     for tick in range(config.window * windows + 2):
@@ -230,7 +231,7 @@ def same_bytes(one, other):
 
 def test_a_walk_with_steps_of_size_zero_is_the_plain_walk(monkeypatch):
     args = WalkConfig(), ROBOT, Job(nominal(), S, ideal(), 0.3)
-    monkeypatch.setattr(online, "follow", toy())
+    monkeypatch.setattr(adaptation, "follow", toy())
     still, moving = (
         retuner(OnlineConfig(window=10, step=size), ROBOT, nominal(), S, last_command)
         for size in (0.0, 1.0)

@@ -13,17 +13,48 @@ import jax.numpy as jnp
 from jaxtyping import Int
 
 from hector_jax import qp
+from hector_jax.control.controller import measured_feet
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance
 from hector_jax.control.footstep import Feet
-from hector_jax.control.reference import Command, anchor_at
+from hector_jax.control.legs import Measurement
+from hector_jax.control.reference import Anchor, Command, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.grfm.effect import HISTORY
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluation
 from hector_jax.tuning.loss import Loss
-from hector_jax.tuning.online import carry_from, command_history, measured_states
 from hector_jax.tuning.rollout import Carry, RolloutConfig, step_carry
+
+
+class MeasuredState(NamedTuple):
+    """Measurements at the start of a tick."""
+
+    state: State  # of the base
+    feet: Feet  # positions of the feet; those in the air are not used
+
+
+def measured_states(robot: Robot, state: State, joints: Array) -> MeasuredState:
+    """Compute the feet of measured states and joints; all with one leading axis."""
+
+    def measured_state(state: State, joints: Array) -> MeasuredState:
+        measurement = Measurement(state, joints, jnp.zeros_like(joints))
+        return MeasuredState(state, measured_feet(robot, measurement))
+
+    return jax.vmap(measured_state)(state, joints)
+
+
+def command_history(command: Wrench) -> Wrench:
+    """Return past commands (HISTORY, feet, 3) that all equal `command`."""
+    return jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), command)
+
+
+def carry_from(
+    measured: MeasuredState, anchor: Anchor, commands: Wrench, disturbance: Disturbance
+) -> Carry:
+    """Return the carry of a robot that has not fallen, from its measured state."""
+    return Carry(*measured, commands, anchor, disturbance, fallen=jnp.asarray(False))
 
 
 class ModelResidual(NamedTuple):

@@ -3,7 +3,7 @@
 The recursion needs no memory in T and no reverse mode; the columns of the sensitivity are tangents
 of one tick, so that each QP is solved and factorised once. With a network in the loop the past
 commands are part of the state. Reverse mode gives the same numbers faster (`evaluate.evaluate`);
-the recursion checks it and gives the gradient of online tuning.
+the recursion checks it and gives the gradient along measured walks.
 """
 
 from typing import NamedTuple

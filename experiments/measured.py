@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from adaptation import follow, init_trace
 
 from hector_jax.control.reference import Command, anchor_at
 from hector_jax.control.weights import Weights
@@ -20,7 +21,7 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, Tuning, descend
 from hector_jax.tuning.evaluate import Evaluation, mean_of
-from hector_jax.tuning.online import follow, init_trace, measured_states
+from hector_jax.tuning.grounded import measured_states
 
 _measured_states = jax.jit(measured_states)
 
