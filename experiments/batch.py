@@ -40,6 +40,7 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.metrics import Score
+from hector_jax.runs.setup import Setup
 from hector_jax.sim.standin import standin
 from hector_jax.sim.world import Imperfections, hfs, hfs_varied
 from hector_jax.tuning.batch import Problem, Scenario, Tunings, tail_weights, tune_batch
@@ -213,7 +214,8 @@ def scores_on(
 ) -> dict[str, Score]:
     """Return the scores of weight sets, stacked over the plants."""
     seeds = range(first_seed, first_seed + len(plants))
-    judgement = verdicts.judge(pool, TuneConfig(), robot, sets, command, plants, seeds, title=title)
+    setup = Setup(pool, TuneConfig(), robot)
+    judgement = verdicts.judge(setup, sets, command, plants, seeds, title=title)
     return {name: stack(scores) for name, scores in judgement.scores.items()}
 
 

@@ -46,6 +46,7 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import nets, searches
 from hector_jax.runs.cache import content_key, robot_hash
+from hector_jax.runs.setup import Setup
 from hector_jax.search.cmaes import Generation, SearchConfig
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
@@ -261,9 +262,8 @@ def race(
 
     def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
         commands = dict.fromkeys(sets, command)
-        return searches.losses_on_hfs(
-            pool, config, robot, sets, engine=engine, at_once=size, commands=commands
-        )
+        setup, options = Setup(pool, config, robot), {"engine": engine, "at_once": size}
+        return searches.losses_on_hfs(setup, sets, commands=commands, **options)
 
     with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as report_progress:
 

@@ -33,6 +33,7 @@ from hector_jax.report.report import print_table
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, nets
 from hector_jax.runs.metrics import Verdict
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
@@ -185,7 +186,7 @@ def _make_table(
         make_folder(path)
     with workers(flags.processes) as pool:
         params = nets.load_or_train(pool, robot, flags.data).params
-        bench = Bench(pool, config, robot, params, folder, about.get("commit", ""))
+        bench = Bench(Setup(pool, config, robot, about.get("commit", "")), params, folder)
         searches = steps.search(bench, budget, flags.trajectories)
         tunings = {
             name: steps.tune(bench, name, flags.steps, flags.step_plants)

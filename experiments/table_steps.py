@@ -4,7 +4,6 @@ Each stores its results and reads existing results.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from itertools import repeat
@@ -23,6 +22,7 @@ from hector_jax.grfm.network import Params, effect_of
 from hector_jax.robot.model import Robot
 from hector_jax.runs import searches, tunings, verdicts
 from hector_jax.runs.cache import content_key
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.search.cmaes import SearchConfig, SearchResult
@@ -43,27 +43,22 @@ MEASURED = Path(adaptation.__file__).read_text() + Path(measured.__file__).read_
 class Bench(NamedTuple):
     """Inputs of all steps."""
 
-    pool: Executor
-    tune: TuneConfig
-    robot: Robot
+    setup: Setup
     params: Params  # of the net
     folder: Path  # of the artefacts
-    commit: str  # noted in the results
 
 
 def search(
     bench: Bench, config: SearchConfig, trajectories: Sequence[str]
 ) -> dict[str, SearchResult]:
     """Search without derivatives from nominal, for all trajectories in lock-step."""
-    engine, tune = choose_engine("auto"), bench.tune
+    engine, (_, tune, robot, _) = choose_engine("auto"), bench.setup
     settings = replace(config, budget=config.population)  # a record continues to any budget
     model = engine.name, tune.rollout, repr(tune.loss)
-    key = content_key(*model, settings, bench.robot, hfs(), nominal(), code=SEARCH_CODE)
+    key = content_key(*model, settings, robot, hfs(), nominal(), code=SEARCH_CODE)
     return searches.search(
-        bench.pool,
+        bench.setup,
         config,
-        tune,
-        bench.robot,
         nominal(),
         commands={name: named_command(name) for name in trajectories},
         engine=engine,
@@ -73,11 +68,10 @@ def search(
 
 def tune(bench: Bench, name: str, steps: int, plants: int) -> dict[str, Tuned]:
     """Tune for one trajectory without and with the net; the latter on along walks, if any steps."""
-    pool, config, robot, params, folder, commit = bench
-    command, folder = named_command(name), folder / name
-    problems = {"without": Problem(command, None), "with": Problem(command, params)}
+    command = named_command(name)
+    problems = {"without": Problem(command, None), "with": Problem(command, bench.params)}
     title = f"tuning {name} without and with GRFM-Net"
-    results = tunings.tune(pool, config, robot, problems, folder, title=title, commit=commit)
+    results = tunings.tune(bench.setup, problems, bench.folder / name, title=title)
     if steps:
         start = results["with"].tuning.converged
         try:
@@ -101,29 +95,30 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
         InputError: a walk with the starting weights falls or is not solved; the folder cannot be
             written.
     """
-    config = TuneConfig(iterations=PAPER_ITERATIONS + steps)
+    setup = bench.setup._replace(config=TuneConfig(iterations=PAPER_ITERATIONS + steps))
+    pool, config, robot, commit = setup
     problem = Problem(named_command(name), bench.params)
     simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
-    inputs = config, bench.robot, start, problem.command, problem.params
+    inputs = config, robot, start, problem.command, problem.params
     key = content_key(*inputs, *simulators, MEASURED, code=WALKS_CODE)
-    job = partial(_walk_job, config, bench.robot, problem)
+    job = partial(_walk_job, config, robot, problem)
 
     def make(missing: list[str], _: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
         with bar(f"tuning {name} further, along walks on the simulator") as report_progress:
             report_progress(0, config.iterations, "compiling")
 
             def evaluate(trial: Weights) -> list[Evaluation]:
-                return list(bench.pool.map(job, repeat(trial), simulators))
+                return list(pool.map(job, repeat(trial), simulators))
 
             def on_iteration(iteration: Iteration) -> None:
                 message = f"L {float(iteration.evaluation.loss) / 1e6:.3f}e6"
                 report_progress(int(iteration.iteration), config.iterations, message)
 
             tuning = tune_measured(config, start, evaluate, on_iteration)
-        yield "walks", Tuned(tuning, bench.commit)
+        yield "walks", Tuned(tuning, commit)
 
     paths = {"walks": bench.folder / name / f"tuning-walks-{key}.npz"}
-    return tunings.load_or_tune(config, bench.robot, start, paths, make)["walks"]
+    return tunings.load_or_tune(setup, start, paths, make)["walks"]
 
 
 def _walk_job(
@@ -145,14 +140,11 @@ def judge(
 ) -> ScoredWalks:
     """Walk all sets on the plants, along one trajectory."""
     return verdicts.judge(
-        bench.pool,
-        bench.tune,
-        bench.robot,
+        bench.setup,
         sets,
         named_command(name),
         plants,
         seeds,
         title=f"evaluating {name} on {plural(len(plants), 'stand-in plant')}",
         folder=bench.folder / name,
-        commit=bench.commit,
     )

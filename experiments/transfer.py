@@ -56,6 +56,7 @@ from hector_jax.grfm.effect import Effect, Window, last_command
 from hector_jax.grfm.network import Params, as_effect
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import nets, tunings
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.loop import Job
@@ -167,9 +168,8 @@ def tuned_sets(
         for name in flags.trajectories
         if name not in loaded
     }
-    commit = environment().get("commit", "")
-    title = "tuning, ten iterations"
-    results = tunings.tune(pool, config, robot, problems, flags.out, title=title, commit=commit)
+    setup = Setup(pool, config, robot, environment().get("commit", ""))
+    results = tunings.tune(setup, problems, flags.out, title="tuning, ten iterations")
     return {**loaded, **{name: tuned.tuning.ten for name, tuned in results.items()}}
 
 

@@ -32,6 +32,7 @@ from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, tunings, verdicts
 from hector_jax.runs.folder import Journal
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig, descend
@@ -59,18 +60,16 @@ def look(folder: Path, weights) -> Evaluation:
     return Evaluation(loss, terms, gradient, none, none)
 
 
-def tune_toys(folder: Path, pool, config, robot, start, problems, title, on_iteration):
+def tune_toys(folder: Path, setup, start, problems, title, on_iteration):
     """In the place of `tunings._tunings`."""
     for name in problems:
-        yield name, descend(config, start, partial(look, folder), partial(on_iteration, name))
+        yield name, descend(setup.config, start, partial(look, folder), partial(on_iteration, name))
 
 
 def tuning(folder: Path) -> None:
     tunings._tunings = partial(tune_toys, folder)
     tunings.tune(
-        ThreadPoolExecutor(1),
-        TuneConfig(iterations=60),
-        ROBOT,
+        Setup(ThreadPoolExecutor(1), TuneConfig(iterations=60), ROBOT),
         {"toy": Problem(S, None)},
         folder,
         title="",
@@ -101,20 +100,20 @@ def training(folder: Path) -> None:
 
 
 def table(folder: Path) -> None:
-    def walks_of(pool, config, robot, jobs, title, engine):
+    def walks_of(setup, jobs, title, engine):
         for job in jobs:
             done(folder, f"{job.seed} {float(job.weights.Q.euler[0])}")
             yield pretend_walk(job.seed, float(job.weights.Q.euler[0]) / 1e4, 1.0)
 
     verdicts.walk_jobs, tunings._tunings = walks_of, partial(tune_toys, folder)
-    config, pool = TuneConfig(iterations=20), ThreadPoolExecutor(1)
+    setup = Setup(ThreadPoolExecutor(1), TuneConfig(iterations=20), ROBOT)
     problems = {"without": Problem(S, None)}
     with locked(folder):
-        tuned = tunings.tune(pool, config, ROBOT, problems, folder / "s", title="")["without"]
+        tuned = tunings.tune(setup, problems, folder / "s", title="")["without"]
         sets = {"nominal": nominal(), "expert": expert(), "without": tuned.tuning.converged}
         seeds = range(WALKS // 2)
         plants = [hfs()] * len(seeds)
-        verdicts.judge(pool, config, ROBOT, sets, S, plants, seeds, title="", folder=folder / "s")
+        verdicts.judge(setup, sets, S, plants, seeds, title="", folder=folder / "s")
 
 
 JOBS = {job.__name__: job for job in (tuning, collection, training, table)}

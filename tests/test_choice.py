@@ -16,6 +16,7 @@ from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.robot.description import TuningSettings
 from hector_jax.runs import choice, verdicts
 from hector_jax.runs.metrics import score_like
+from hector_jax.runs.setup import Setup
 from hector_jax.tuning.difftune import Iteration, Tuning
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.status import StepStatus
@@ -35,8 +36,8 @@ def _tuning(count):
 
 
 def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp_path, capsys):
-    def judge(pool, config, robot, sets, command, plants, seeds, **notes):
-        del pool, config, robot, notes
+    def judge(setup, sets, command, plants, seeds, **notes):
+        del setup, notes
         assert (len(plants), list(seeds)) == (3, [0, 1, 2])
         assert {"start", "with-16", "without-8"} <= set(sets)
         scale = 1.0 if command is commands[0] else 100.0  # of a command that costs more
@@ -58,20 +59,20 @@ def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp
     description = replace(ROBOT.description, tuning=TuningSettings(choice_plants=3))
     asks = ROBOT._replace(description=description)
     notes = {"seconds": 4.0, "folder": tmp_path}
-    chosen = choice.choose(Executor(), CONFIG, asks, tunings, commands, **notes)
+    chosen = choice.choose(Setup(Executor(), CONFIG, asks), tunings, commands, **notes)
     one = chosen["with"]
     assert (one.iteration, one.of) == (16, 32)
     np.testing.assert_array_equal(one.weights.Q.euler, 9 * nominal().Q.euler)
     assert chosen["without"].iteration == 0
     said = capsys.readouterr().err
     assert "with: iteration 16 of 32 walks best on plants drawn around the hfs: L -39 %" in said
-    assert choice.choose(Executor(), CONFIG, ROBOT, tunings, commands, **notes) == {}
+    assert choice.choose(Setup(Executor(), CONFIG, ROBOT), tunings, commands, **notes) == {}
 
 
 def _between(sets, config=CONFIG, robot=ROBOT):
     pair, notes = ("without", "with"), {"seconds": 4.0, "folder": None}
     commands = (named_command("straight"),)
-    return choice.answer(Executor(), config, robot, sets, pair, 0.25, commands, **notes)
+    return choice.answer(Setup(Executor(), config, robot), sets, pair, 0.25, commands, **notes)
 
 
 def test_the_answer_lies_between_two_tunings_and_plans_with_less_friction():
@@ -95,8 +96,8 @@ def test_the_answer_can_be_read_whatever_the_controllers_friction(tmp_path, fric
 
 @pytest.mark.parametrize("winner", ["with", "between"])
 def test_a_robot_with_drawn_plants_takes_what_walks_best_there(monkeypatch, capsys, winner):
-    def judge(pool, config, robot, sets, command, plants, seeds, **notes):
-        del pool, config, robot, command, notes
+    def judge(setup, sets, command, plants, seeds, **notes):
+        del setup, command, notes
         assert (len(plants), list(seeds)) == (2, [0, 1])
         assert list(sets) == ["nominal", "without", "with", "between"]
         cost = {name: np.array(0.5 if name == winner else 1.0) for name in sets}
@@ -127,8 +128,8 @@ def test_after_walks_the_earliest_set_as_good_as_the_best_is_taken(
         "set 3": 0.9,
     }  # set 3 fits its own plants
 
-    def judge(pool, config, robot, sets, command, plants, seeds, **notes):
-        del pool, config, robot, command, notes
+    def judge(setup, sets, command, plants, seeds, **notes):
+        del setup, command, notes
         assert len(plants) == choice.HELD_OUT
         tuned_on = choice.drawn_plants(ROBOT, 1000)  # the most of --walk-plants
         assert not {float(plant.mass) for plant in plants} & {float(p.mass) for p in tuned_on}
@@ -146,7 +147,7 @@ def test_after_walks_the_earliest_set_as_good_as_the_best_is_taken(
     monkeypatch.setattr(verdicts, "judge", judge)
     sets = dict.fromkeys(median, nominal())
     commands, notes = (named_command("s"),), {"seconds": 4.0, "folder": None}
-    assert choice.earliest(Executor(), CONFIG, ROBOT, sets, commands, **notes) == chosen
+    assert choice.earliest(Setup(Executor(), CONFIG, ROBOT), sets, commands, **notes) == chosen
     assert (
         f"best: {chosen}, the earliest as good as set 2 on 8 other plants"
         in capsys.readouterr().err

@@ -19,6 +19,7 @@ from hector_jax.control.weights import nominal
 from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, verdicts
+from hector_jax.runs.setup import Setup
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Record, StartupFall, likeliest_cause, not_the_weights
 from hector_jax.sim.loop import Job
@@ -197,7 +198,7 @@ def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
 ):
     made = []
 
-    def walks_of(pool, config, robot, jobs, title, engine):
+    def walks_of(setup, jobs, title, engine):
         for job in jobs:
             made.append(job.seed)
             yield pretend_walk(1, seconds=1.0) if job.seed == 1 else fallen_at_once(job.seed)
@@ -207,9 +208,7 @@ def test_an_evaluation_has_the_fall_before_t_0_and_tells_it_once_a_set(
     for _ in range(2):  # as walked, and from the folder
         with ThreadPoolExecutor(1) as pool:
             found = verdicts.judge(
-                pool,
-                TuneConfig(),
-                ROBOT,
+                Setup(pool, TuneConfig(), ROBOT),
                 {"mine": nominal()},
                 STRAIGHT,
                 [hfs()] * 3,

@@ -25,6 +25,7 @@ from hector_jax.report.run import tuning_section
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import replay, tunings
 from hector_jax.runs.folder import Journal
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
 from hector_jax.tuning import rollout
 from hector_jax.tuning.difftune import TuneConfig, descend
@@ -120,9 +121,7 @@ def tune(folder, command, params, config=CONFIG, robot=ROBOT):
     """The tuning as a run does it; with the lines that it left."""
     with ThreadPoolExecutor(1) as pool, TemporaryDirectory() as kept:
         found = tunings.tune(
-            pool,
-            config,
-            robot,
+            Setup(pool, config, robot),
             {"with": Problem(command, params)},
             Path(kept),
             title="tuning",
@@ -236,7 +235,7 @@ def test_a_dump_of_a_worker_is_reproduced_by_the_console_script(tmp_path, params
     with workers(2) as pool:
         problems = {"with": Problem(command, params)}
         kept, dumps = tmp_path / "kept", tmp_path / "dumps"
-        told = tunings.tune(pool, config, ROBOT, problems, kept, title="", dumps=dumps)
+        told = tunings.tune(Setup(pool, config, ROBOT), problems, kept, title="", dumps=dumps)
         found = told["with"].tuning
     path = min(dumps.iterdir())
     number = min(i.iteration for i in found.history if i.reason == "the robot fell")

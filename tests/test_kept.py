@@ -16,6 +16,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key
 from hector_jax.runs.folder import Journal, as_line
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
@@ -35,7 +36,7 @@ def tuned(monkeypatch):
     """Names of the problems that are really tuned."""
     names = []
 
-    def side_by_side(pool, config, robot, start, problems, title, on_iteration):
+    def side_by_side(setup, start, problems, title, on_iteration):
         for name in problems:
             names.append(name)
             for iteration in TUNING.history:
@@ -51,7 +52,7 @@ def walked(monkeypatch):
     """Seeds of the walks that are really walked; `cut` many walks at most."""
     seeds = []
 
-    def walks_of(pool, config, robot, jobs, title, engine):
+    def walks_of(setup, jobs, title, engine):
         for job in jobs:
             if len(seeds) == walks_of.cut:
                 raise KeyboardInterrupt
@@ -66,15 +67,14 @@ def walked(monkeypatch):
 
 def tune(folder, config=CONFIG, command=S, start=None):
     problems = {"without": Problem(command, None)}
-    return tunings.tune(POOL, config, ROBOT, problems, folder, title="", commit="abc", start=start)[
-        "without"
-    ]
+    setup = Setup(POOL, config, ROBOT, "abc")
+    return tunings.tune(setup, problems, folder, title="", start=start)["without"]
 
 
 def judge(folder, sets, seeds=(0, 1, 2), plant=None, commit="abc"):
     plants = [plant or hfs()] * len(seeds)
-    notes = {"title": "", "folder": folder, "commit": commit}
-    return verdicts.judge(POOL, CONFIG, ROBOT, sets, S, plants, seeds, **notes)
+    setup = Setup(POOL, CONFIG, ROBOT, commit)
+    return verdicts.judge(setup, sets, S, plants, seeds, title="", folder=folder)
 
 
 def test_a_tuning_comes_back_as_it_was(tmp_path, tuned):
@@ -100,7 +100,7 @@ def test_a_tuning_from_weights_with_other_numbers_comes_back(tmp_path, monkeypat
         for one in TUNING.history
     ]
 
-    def side_by_side(pool, config, robot, start, problems, title, on_iteration):
+    def side_by_side(setup, start, problems, title, on_iteration):
         made.append(title)
         yield "without", Tuning(history, start, start, "12 iterations")
 
@@ -117,7 +117,8 @@ def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)
         lines_of = Journal(folder / "metrics.jsonl")
-        tunings.tune(POOL, CONFIG, ROBOT, problems, folder, title="", journal=lines_of)
+        setup = Setup(POOL, CONFIG, ROBOT)
+        tunings.tune(setup, problems, folder, title="", journal=lines_of)
         return (folder / "metrics.jsonl").read_text()
 
     whole = lines(tmp_path / "whole", problems)
@@ -192,7 +193,7 @@ def test_a_fall_is_kept_with_its_time_and_last_state(tmp_path, walked):
 
 @pytest.mark.parametrize("residual", [1.0, np.nan])
 def test_a_walk_with_an_unsolved_qp_is_said(tmp_path, monkeypatch, capsys, residual):
-    def walks_of(pool, config, robot, jobs, title, engine):
+    def walks_of(setup, jobs, title, engine):
         for job in jobs:
             walk = pretend_walk(job.seed, 0.03, 1.0)
             yield walk._replace(residual=np.where(job.seed == 1, residual, walk.residual))

@@ -31,6 +31,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, searches, tunings
 from hector_jax.runs.metrics import score
 from hector_jax.runs.nets import CollectConfig
+from hector_jax.runs.setup import Setup
 from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -286,7 +287,7 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, r
     problems = dict.fromkeys(("without", "with"), tunings.Problem(named_command("s"), None))
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
-        tunings.tune(pool, TuneConfig(), robot, problems, tmp_path, title="tuning")
+        tunings.tune(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")
     assert time.monotonic() - begin < 15.0
     pool.shutdown(wait=False)
 
@@ -302,9 +303,8 @@ def test_a_search_says_which_walks_had_an_unsolved_qp(robot, capsys):
     commands = {name: named_command(name) for name in sets}
     engine = MUJOCO_C._replace(walk=toys)
     pool = ThreadPoolExecutor(1)
-    searches.losses_on_hfs(
-        pool, TuneConfig(), robot, sets, commands=commands, engine=engine, at_once=3
-    )
+    setup = Setup(pool, TuneConfig(), robot)
+    searches.losses_on_hfs(setup, sets, commands=commands, engine=engine, at_once=3)
     said = " ".join(capsys.readouterr().err.split())
     assert said == "c: a QP was not solved in 1 of 2 walks"
 
@@ -317,7 +317,7 @@ def test_what_a_search_is_told_is_the_loss_of_the_verdict_on_either_engine(robot
     pool = ThreadPoolExecutor(1)
     told = {
         name: searches.losses_on_hfs(
-            pool, config, robot, sets, commands=commands, engine=engine, at_once=3
+            Setup(pool, config, robot), sets, commands=commands, engine=engine, at_once=3
         )
         for name, engine in ENGINES.items()
         if name in ("c", "mjx")

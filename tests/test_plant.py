@@ -21,6 +21,7 @@ from hector_jax.core.tree_file import read_card
 from hector_jax.robot.description import PlantSizes
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import verdicts
+from hector_jax.runs.setup import Setup
 from hector_jax.sim import parallel
 from hector_jax.sim import walk as sim_walk
 from hector_jax.sim.loop import Job
@@ -118,23 +119,24 @@ def test_a_plant_of_other_joints_is_refused(engine):
 
 def test_scores_of_another_plant_are_others(monkeypatch, tmp_path, arms):
     monkeypatch.setattr(
-        verdicts, "walk_jobs", lambda *known: (pretend_walk(job.seed) for job in known[3])
+        verdicts, "walk_jobs", lambda *known: (pretend_walk(job.seed) for job in known[1])
     )
-    known = TuneConfig(), ROBOT, {"nominal": nominal()}, STRAIGHT, [hfs()], [0]
+    known = {"nominal": nominal()}, STRAIGHT, [hfs()], [0]
     # another file with the very same numbers
     renamed = arms._replace(description=replace(arms.description, name="other"))
     with ThreadPoolExecutor(1) as pool:
         for plant in (None, arms, arms, renamed):
-            verdicts.judge(pool, *known, title="", folder=tmp_path, plant=plant)
+            setup = Setup(pool, TuneConfig(), ROBOT)
+            verdicts.judge(setup, *known, title="", folder=tmp_path, plant=plant)
     assert len(list(tmp_path.glob("*.npz"))) == 3
 
 
 def test_the_command_line_takes_the_plant_and_names_it(monkeypatch, capsys, tmp_path):
     jobs = []
 
-    def walks_of(pool, config, robot, asked, title, engine):
+    def walks_of(setup, asked, title, engine):
         for job in asked:
-            jobs.append((robot, job))
+            jobs.append((setup.robot, job))
             yield pretend_walk(job.seed)
 
     def walk_one(config, robot, job, **others):

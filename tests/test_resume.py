@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import Executor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.cache import load_or_make
+from hector_jax.runs.setup import Setup
 from hector_jax.tuning.difftune import TuneConfig, descend
 
 ROBOT, CONFIG, HERE = load_robot(), TuneConfig(iterations=14), Path(__file__).parent
@@ -414,15 +416,13 @@ def test_a_run_folder_that_cannot_be_made_is_not_said_to_exist(tmp_path, monkeyp
 def test_a_run_is_not_resumed_from_another_start(tmp_path):
     def run(**others):
         return command._Run(
+            setup=Setup(Executor(), TuneConfig(), load_robot()),
             folder=tmp_path,
             args=flags.Tune(traj=("straight",)),
-            robot=load_robot(),
             start=nominal()._replace(others={name: np.array(x) for name, x in others.items()}),
             trajectories=(command_of("straight"),),
             seconds=4.0,
-            config=TuneConfig(),
             net=SimpleNamespace(params=None),
-            commit="0" * 40,
         )
 
     for begun, here in ((run(), run(turn_lead=0.8)), (run(turn_lead=0.8), run())):

@@ -21,6 +21,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.report.video import VideoUnavailable
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import nets, searches, tunings, verdicts
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
 from hector_jax.search.cmaes import Generation, SearchResult
 from hector_jax.sim.world import hfs
@@ -36,18 +37,18 @@ def asked(monkeypatch):
     """What the steps that take long were asked for; nothing is walked, tuned or drawn in 3D."""
     told = {"walks": 0, "tunings": []}
 
-    def search(pool, config, tune, robot, start, *, commands, engine, folder):
+    def search(setup, config, start, *, commands, engine, folder):
         told["search"] = config
         generation = Generation(np.zeros((10, 18)), np.full(10, 2e6))
         one = SearchResult(expert(), 2e6, 7, [generation] * 2, "2 generations")
         return dict.fromkeys(commands, one)
 
-    def side_by_side(pool, config, robot, start, problems, title, on_iteration):
-        told["tunings"].append((config.iterations, *problems))
+    def side_by_side(setup, start, problems, title, on_iteration):
+        told["tunings"].append((setup.config.iterations, *problems))
         for name in problems:
             yield name, Tuning(pretend_history(12), nominal(), expert(), "done")
 
-    def walks_of(pool, config, robot, jobs, title, engine):
+    def walks_of(setup, jobs, title, engine):
         for job in jobs:
             told["walks"] += 1
             yield pretend_walk(job.seed, 0.02, 1.0, fall_at=0.5 if job.seed == 3 else None)
@@ -172,7 +173,7 @@ def test_a_tuning_along_walks_is_stored_for_its_plants_and_steps(tmp_path, monke
         return Tuning(pretend_history(3), nominal(), expert(), "done")
 
     monkeypatch.setattr(table_steps, "tune_measured", tune_measured)
-    bench = table_steps.Bench(None, TuneConfig(), load_robot(), None, tmp_path, "abc")
+    bench = table_steps.Bench(Setup(None, TuneConfig(), load_robot(), "abc"), None, tmp_path)
     for steps, count in ((2, 3), (2, 3), (5, 3), (2, 4)):
         tuned = table_steps.tune_along_walks(bench, "s", nominal(), steps, count)
         assert tuned.commit == "abc"

@@ -23,6 +23,7 @@ from hector_jax.robot.model import load_robot
 from hector_jax.runs import matrix, verdicts
 from hector_jax.runs.matrix import Column
 from hector_jax.runs.metrics import Verdict, family_of
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.standin import FAMILIES, even, standin
@@ -198,7 +199,7 @@ def walked(monkeypatch):
     """Engine and job of each walk; no process is started."""
     state = SimpleNamespace(jobs=[], cut=None)
 
-    def walks_of(pool, config, robot, asked, title, engine):
+    def walks_of(setup, asked, title, engine):
         for job in asked:
             if len(state.jobs) == state.cut:
                 raise KeyboardInterrupt
@@ -317,7 +318,7 @@ def small(folder):
     sets = {name: nominal() for name in ("nominal", "expert", "without_ten", "best", "with")}
     course = NamedCommand("s", named_command("s"))
     with ThreadPoolExecutor(1) as pool:
-        inputs = pool, tune_config(robot), robot, sets, course
+        inputs = Setup(pool, tune_config(robot), robot), sets, course
         command.small_verdict(*inputs, seconds=1.0, folder=folder)()
 
 

@@ -26,6 +26,7 @@ from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import walk_log, walks
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
@@ -271,10 +272,9 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     monkeypatch.setattr(command.choice, "earliest", lambda *_, **__: "set 1")
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))
-    notes = {"seconds": 4.0, "config": CONFIG, "net": net, "commit": ""}
-    args = Tune(walks=12, walk_plants=3)
-    run = command._Run(tmp_path, args, robot, nominal(), (course,), **notes)
-    tuned = command._tune_sets(Executor(), run)
+    setup, args = Setup(Executor(), CONFIG, robot), Tune(walks=12, walk_plants=3)
+    run = command._Run(setup, tmp_path, args, nominal(), (course,), 4.0, net)
+    tuned = command._tune_sets(run)
     assert seen == {"plants": 3, "commands": ["straight"], "count": 12}
     np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)
     assert (tmp_path / "weights" / "before_walks.json").exists()

@@ -26,6 +26,7 @@ from hector_jax.robot.propose import propose as propose_robot
 from hector_jax.robot.table import changes, remarks, table_of, table_of_survey
 from hector_jax.runs import export, nets, replay, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
+from hector_jax.runs.setup import Setup
 from hector_jax.search.cmaes import SearchConfig
 from hector_jax.sim.engine import choose_engine
 from hector_jax.tuning.loss import alphas, loss_of_robot
@@ -86,12 +87,12 @@ def search(args: flags.Search) -> None:
     make_folder(out)
     shared: dict[str, Any] = {"commands": commands, "engine": engine}
     with workers(args.processes) as pool:
-        inputs = pool, config, tuning, robot, start
-        results = searches.search(*inputs, folder=args.record or out, **shared)
+        setup = Setup(pool, tuning, robot)
+        results = searches.search(setup, config, start, folder=args.record or out, **shared)
         say("walking with the start, expert and best weights")
         sets = {name: [start, expert(robot), result.weights] for name, result in results.items()}
         at_once = config.population * len(commands)
-        losses = searches.losses_on_hfs(pool, tuning, robot, sets, at_once=at_once, **shared)
+        losses = searches.losses_on_hfs(setup, sets, at_once=at_once, **shared)
     cards = {}
     for name, result in results.items():
         at_start, at_expert, again = losses[name].tolist()

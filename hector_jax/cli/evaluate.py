@@ -1,7 +1,6 @@
 """Evaluate weight sets on walks, and nets on the ground forces of held-out walks."""
 
 from collections.abc import Callable
-from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
+from hector_jax.runs.setup import Setup
 from hector_jax.sim.diagnosis import StartupFall, startup_fall
 from hector_jax.sim.engine import MUJOCO_C, choose_engine
 from hector_jax.sim.loop import Job
@@ -54,7 +54,7 @@ def evaluate(args: Evaluate) -> None:
     config, engine = tunings.tune_config(robot), choose_engine(args.engine)
     with workers(args.processes) as pool:
         title = f"evaluating on {plural(count, 'plant')} of {args.world}"
-        inputs = pool, config, robot, sets, trajectory.command, plants, seeds
+        inputs = Setup(pool, config, robot), sets, trajectory.command, plants, seeds
         walks = verdicts.judge(*inputs, title=title, seconds=seconds, plant=plant, engine=engine)
     verdict = metrics.make_verdict(config.loss, seeds, walks.scores)
     title = f"{trajectory.name}, {plural(count, 'plant')}"
@@ -173,7 +173,7 @@ def grfm(args: Grfm) -> None:
         with say_if_slow("reading the walks that no training saw"):
             worlds = {"hfs": nets.held_out_walks(robot, net)}
         if args.seeds:
-            worlds["standin"] = _on_stand_in(pool, config, robot, args.seeds)
+            worlds["standin"] = _on_stand_in(Setup(pool, config, robot), args.seeds)
     effects = {
         "raw": last_command,
         "linear": as_effect(net.linear),
@@ -205,8 +205,9 @@ def grfm(args: Grfm) -> None:
     say(f"the report is {report}")
 
 
-def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -> Walks:
+def _on_stand_in(setup: Setup, count: int) -> Walks:
     """Walk the three trajectories with nominal and expert weights, for information only."""
+    robot = setup.robot
     jobs = [
         Job(weights, named_command(name), plant, seed=seed)
         for weights in (nominal(robot), expert(robot))
@@ -214,6 +215,6 @@ def _on_stand_in(pool: Executor, config: TuneConfig, robot: Robot, count: int) -
         for seed, plant in enumerate(arguments.plants("standin", range(count), robot.description))
     ]
     title = f"walking on {plural(count, 'stand-in plant')}, for information"
-    walks = verdicts.walk_jobs(pool, config, robot, jobs, title)
-    tick = config.rollout.walk.gait.tick
+    walks = verdicts.walk_jobs(setup, jobs, title)
+    tick = setup.config.rollout.walk.gait.tick
     return Walks(stack(jobs), stack([at_interval(walk, tick) for walk in walks]))

@@ -36,6 +36,7 @@ from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
 from hector_jax.sim.diagnosis import not_the_weights
@@ -102,15 +103,13 @@ def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
 class _Run(NamedTuple):
     """Shared inputs of the steps of a run."""
 
+    setup: Setup
     folder: Path
     args: Tune
-    robot: Robot
     start: Weights
     trajectories: tuple[NamedCommand, ...]
     seconds: float  # of each walk
-    config: TuneConfig
     net: nets.TrainedNet
-    commit: str
 
     @property
     def artefacts(self) -> Path:
@@ -152,33 +151,32 @@ def _tune_in(folder: Path, args: Tune) -> None:
     robot = load_robot(args.robot)
     trajectories = _trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
+    config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         _say_what_no_weights_mend(pool, config, robot, start, trajectories[0])
         run = _Run(
+            setup=Setup(pool, config, robot, made_with.get("commit", "")),
             folder=folder,
             args=args,
-            robot=robot,
             start=start,
             trajectories=trajectories,
             seconds=trajectories[0].seconds or Walk.seconds,
-            config=arguments.with_length(config, trajectories[0]),
             net=_net(pool, args, robot),
-            commit=made_with.get("commit", ""),
         )
-        norms = tunings.gradient_norms(pool, run.config, robot, run.problems)
+        norms = tunings.gradient_norms(run.setup, run.problems)
         if args.alpha == "auto":
-            loss = aligned(run.config.loss, norms["with"])
+            loss = aligned(config.loss, norms["with"])
             say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
-            run = run._replace(config=replace(run.config, loss=loss))
+            run = run._replace(setup=run.setup._replace(config=replace(config, loss=loss)))
         settings = _note_settings(run)
-        inputs = run.config, robot, run.start, run.problems["with"]
+        inputs = run.setup.config, robot, run.start, run.problems["with"]
         matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the tunings
-        tuned = _tune_sets(pool, run)
-        walks = _walk_sets(pool, run, tuned.sets)
+        tuned = _tune_sets(run)
+        walks = _walk_sets(run, tuned.sets)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
-        show = small_verdict(pool, run.config, robot, tuned.sets, *case) if args.verdict else None
+        show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
     result, by_name = _result(run, tuned, walks)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     report = write_report(
@@ -241,12 +239,12 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     as_lists = partial(jax.tree.map, lambda x: np.asarray(x).tolist())
     commands = [as_lists(command)._asdict() for command in run.commands.values()]
     settings = {
-        "tune": run.config.as_table(),
+        "tune": run.setup.config.as_table(),
         "net": tree_hash(run.net.params),
         "command": commands[0] if len(commands) == 1 else commands,
         "seconds": run.seconds,
         "start": weights_tree(run.start),
-        "choice_plants": run.robot.description.tuning.choice_plants,
+        "choice_plants": run.setup.robot.description.tuning.choice_plants,
     }
     as_read = json.loads(as_json(settings))
     run_folder.check_agreement(run.folder, recorded, as_read)
@@ -257,15 +255,15 @@ def _note_settings(run: _Run) -> dict[str, Any]:
 
 
 def _refresh(
-    pool: Executor, run: _Run, done: dict[str, tunings.Tuned], tune_problems: Callable
+    run: _Run, done: dict[str, tunings.Tuned], tune_problems: Callable
 ) -> list[dict[str, Any]]:
     """Train the net again at the tuned weights and tune with it, into `done`; return the shifts."""
     net, name, shifts = run.net, "with", []
     for count in range(1, run.args.refresh + 1):
         config = replace(nets.REFRESH, seed=count, seconds=run.seconds)
         folder = run.folder / f"refresh-{count}"
-        inputs = pool, config, run.robot, run.trajectories[0].command, done[name].tuning
-        net, shift = nets.refresh(*inputs, net=net, folder=folder)
+        inputs = run.setup.pool, config, run.setup.robot, run.trajectories[0].command
+        net, shift = nets.refresh(*inputs, done[name].tuning, net=net, folder=folder)
         shifts.append(shift)
         name = "with_refreshed" + (str(count) if count > 1 else "")
         problem = {name: run.problems["with"]._replace(params=net.params)}
@@ -273,42 +271,39 @@ def _refresh(
     return shifts
 
 
-def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
+def _tune_sets(run: _Run) -> _Tuned:
     """Tune without and with the net, and with each refreshed net; write the weights."""
     tune_problems = partial(
         tunings.tune,
-        pool,
-        run.config,
-        run.robot,
+        run.setup,
         folder=run.artefacts,
         start=run.start,
-        commit=run.commit,
         journal=Journal(run.folder / METRICS),
         dumps=run.folder / "dumps",
     )
     done = tune_problems(run.problems, title=f"tuning {run.name} without and with GRFM-Net")
-    shifts, name = _refresh(pool, run, done, tune_problems), list(done)[-1]
+    shifts, name = _refresh(run, done, tune_problems), list(done)[-1]
     results = {name: entry.tuning for name, entry in done.items()}
-    inputs, commands = (pool, run.config, run.robot), list(run.commands.values())
-    options = {"seconds": run.seconds, "folder": run.artefacts / "choice", "commit": run.commit}
-    choices = choice.choose(*inputs, results, commands, **options)
+    setup, commands = run.setup, list(run.commands.values())
+    options = {"seconds": run.seconds, "folder": run.artefacts / "choice"}
+    choices = choice.choose(setup, results, commands, **options)
     sets = {
-        "nominal": nominal(run.robot),
-        "expert": expert(run.robot),
+        "nominal": nominal(setup.robot),
+        "expert": expert(setup.robot),
         **({} if run.args.start in BASELINES else {"start": run.start}),
         **{f"{name}_ten": results[name].ten for name in run.problems},
         **{name: tuning.converged for name, tuning in results.items()},
         **{name: chosen.weights for name, chosen in choices.items()},
     }
     compared, pair = {name: sets[name] for name in ("nominal", *results)}, ("without", name)
-    sets["best"] = choice.answer(*inputs, compared, pair, run.args.share, commands, **options)
+    sets["best"] = choice.answer(setup, compared, pair, run.args.share, commands, **options)
     proposals, best = [], ""
     if run.args.walks:
         sets["before_walks"] = sets.pop("best")
         campaign = _campaign(run, sets["before_walks"])
-        proposals = tune_on_walks(pool, campaign, run.args.walks)
-        stages = candidates(pool, campaign, proposals)
-        best = choice.earliest(*inputs, stages, commands, **options)
+        proposals = tune_on_walks(setup.pool, campaign, run.args.walks)
+        stages = candidates(setup.pool, campaign, proposals)
+        best = choice.earliest(setup, stages, commands, **options)
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
@@ -317,19 +312,19 @@ def _tune_sets(pool: Executor, run: _Run) -> _Tuned:
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
-    plants = choice.drawn_plants(run.robot, run.args.walk_plants) or [hfs(run.robot.description)]
-    return Campaign(run.folder / "walks", run.config, run.robot, start, run.commands, plants)
+    _, config, robot, _ = run.setup
+    plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
+    return Campaign(run.folder / "walks", config, robot, start, run.commands, plants)
 
 
 def _walk_sets(
-    pool: Executor, run: _Run, sets: Mapping[str, Weights]
+    run: _Run, sets: Mapping[str, Weights]
 ) -> dict[str, tuple[ScoredWalks, ScoredWalks]]:
     """Walk all sets on the stand-in plants and on the hfs; return the walks by trajectory."""
-    seeds = range(run.args.seeds)
-    plants = arguments.plants("standin", seeds, run.robot.description)
-    options: dict[str, Any] = {"seconds": run.seconds, "commit": run.commit}
-    judge = partial(verdicts.judge, pool, run.config, run.robot, sets, **options)
-    simulator, walks = hfs(run.robot.description), {}
+    seeds, description = range(run.args.seeds), run.setup.robot.description
+    plants = arguments.plants("standin", seeds, description)
+    judge = partial(verdicts.judge, run.setup, sets, seconds=run.seconds)
+    simulator, walks = hfs(description), {}
     for name, command in run.commands.items():
         suffix = f" {name}" if len(run.trajectories) > 1 else ""
         title = f"evaluating{suffix} on {plural(len(seeds), 'stand-in plant')}"
@@ -362,7 +357,7 @@ def _result(
         scored = [walks[name][world].scores for name in names]
         scores = {key: [score for by_set in scored for score in by_set[key]] for key in tuned.sets}
         seeds = ([*range(run.args.seeds)], [0])[world] * len(names)
-        return metrics.make_verdict(run.config.loss, seeds, scores)
+        return metrics.make_verdict(run.setup.config.loss, seeds, scores)
 
     def content(names: Sequence[str], standin: metrics.Verdict) -> dict[str, Any]:
         result = metrics.as_result(standin)
@@ -394,9 +389,9 @@ def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -
     batch = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
-        curves = fidelity.curves(run.robot, batch, effects)
+        curves = fidelity.curves(run.setup.robot, batch, effects)
         inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
-        drawings = pictures.of_run(run.folder, run.config, *inputs)
+        drawings = pictures.of_run(run.folder, run.setup.config, *inputs)
     return {"pictures": drawings, "film": film.result()}
 
 
@@ -406,5 +401,5 @@ def _film(run: _Run, walks: ScoredWalks) -> Picture | str:
         return "left out (--no-video)"
     pair = {name: walks.first[name] for name in ("nominal", "best")}
     film = run.folder / "film.mp4"
-    reason = pictures.film(film, run.robot, pair, run.folder / "film.png")
+    reason = pictures.film(film, run.setup.robot, pair, run.folder / "film.png")
     return reason or Picture(film.name, "Nominal and tuned weights on the first stand-in plant.")

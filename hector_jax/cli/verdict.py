@@ -2,10 +2,9 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 from hector_jax.cli import arguments
 from hector_jax.cli.arguments import print_result
@@ -23,9 +22,9 @@ from hector_jax.report import matrix as report
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.matrix import HEAVY, LIGHT, OWN, Cells, Column
+from hector_jax.runs.setup import Setup
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
-from hector_jax.tuning.difftune import TuneConfig
 
 _ENGINES = get_args(JudgingEngine)[:-1]  # without `all`
 
@@ -64,7 +63,8 @@ def verdict(args: Verdict) -> None:
     make_folder(args.out)
     made_with, config = environment(), tunings.tune_config(plan.robot)
     with workers(args.processes) as pool:
-        cells = walk_cells(pool, config, plan, args.out / "scores", made_with.get("commit", ""))
+        setup = Setup(pool, config, plan.robot, made_with.get("commit", ""))
+        cells = walk_cells(setup, plan, args.out / "scores")
     result = report.write_report(
         args.out,
         cells,
@@ -172,16 +172,13 @@ def _plan_text(plan: Plan) -> str:
     return "; ".join(parts)
 
 
-def walk_cells(
-    pool: Executor, config: TuneConfig, plan: Plan, folder: Path, commit: str = ""
-) -> Cells:
+def walk_cells(setup: Setup, plan: Plan, folder: Path) -> Cells:
     """Do all walks, engine by engine; walks whose scores are in the folder are not repeated."""
     scored: dict[tuple[Column, str, str, int], verdicts.ScoredWalk] = {}
-    options: dict[str, Any] = {"folder": folder, "commit": commit}
     for name, engine in plan.engines.items():
         jobs, title = _jobs(plan, name), f"walking in {report.TITLES[name]}"
-        inputs = pool, config, plan.robot, {case: job for case, job in jobs.values()}
-        by_case = verdicts.score_jobs(*inputs, title=title, engine=engine, **options)
+        options = {"title": title, "folder": folder, "engine": engine}
+        by_case = verdicts.score_jobs(setup, dict(jobs.values()), **options)
         scored |= {key: by_case[case][0] for key, (case, _) in jobs.items()}
     cells = {}
     for column, seeds in plan.columns.items():
@@ -191,7 +188,7 @@ def walk_cells(
             where = report.cell_text(cell)
             verdicts.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
             scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
-            cells[cell] = metrics.make_verdict(config.loss, seeds, scores)
+            cells[cell] = metrics.make_verdict(setup.config.loss, seeds, scores)
     return cells
 
 
@@ -214,9 +211,7 @@ def _jobs(plan: Plan, engine: str) -> dict[tuple[Column, str, str, int], tuple[v
 
 
 def small_verdict(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     sets: Mapping[str, Weights],
     trajectory: NamedCommand,
     seconds: float,
@@ -235,6 +230,6 @@ def small_verdict(
     columns = {Column(engine, model): range(1) for engine in engines for model in models}
     walks = {trajectory.name: (trajectory, seconds)}
     few = {trajectory.name: {name: sets[name] for name in ("nominal", "expert", "with", "best")}}
-    plan = Plan(robot, "standin", walks, few, models, columns, engines)
-    cells = walk_cells(pool, config, plan, folder)
+    plan = Plan(setup.robot, "standin", walks, few, models, columns, engines)
+    cells = walk_cells(setup, plan, folder)
     return partial(report.print_verdict, cells, plan.differs, plan.family)

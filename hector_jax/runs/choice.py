@@ -10,7 +10,6 @@ state exactly, so nothing keeps a tuning from gains that amplify noise.
 """
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,8 +24,9 @@ from hector_jax.core.console import say
 from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
 from hector_jax.runs import verdicts
+from hector_jax.runs.setup import Setup
 from hector_jax.sim.world import Imperfections, hfs_drawn, truth
-from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.difftune import Tuning
 
 # fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
@@ -65,9 +65,7 @@ def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> lis
 
 
 def _ratios(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     sets: Mapping[str, Weights],
     commands: Sequence[Command],
     plants: Sequence[Imperfections],
@@ -76,7 +74,7 @@ def _ratios(
 ) -> dict[str, Float[np.ndarray, " walks"]]:
     """Return L of each set relative to the first set, by command and plant."""
     title = f"{title} on {plural(len(plants), 'plant')} drawn around the hfs"
-    judge = partial(verdicts.judge, pool, config, robot, sets, title=title, **notes)
+    judge = partial(verdicts.judge, setup, sets, title=title, **notes)
     results = [judge(command, plants, range(len(plants))).scores for command in commands]
     losses = {name: np.array([[s.L for s in scores[name]] for scores in results]) for name in sets}
     first = losses[next(iter(sets))]
@@ -84,27 +82,23 @@ def _ratios(
 
 
 def choose(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     tunings: Mapping[str, Tuning],
     commands: Sequence[Command],
     *,
     seconds: float,
     folder: Path,
-    commit: str = "",
 ) -> dict[str, Choice]:
     """Walk the paths of tunings and return the best point of each; empty if no plants are required.
 
     Args:
-        pool: worker processes.
-        config, robot: controller and loss, nominal body with the number of plants.
+        setup: workers, controller and loss, nominal body with the number of plants.
         tunings: tunings by name, all from the same start.
         commands, seconds: commands to walk, which count alike, and their length.
         folder: folder of the scores; walks whose scores are in it are not repeated.
-        commit: commit to record with new walks.
     """
-    if not robot.description.tuning.choice_plants:
+    plants = drawn_plants(setup.robot, setup.robot.description.tuning.choice_plants)
+    if not plants:
         return {}
     points = {}  # of each path, by their labels
     for name, tuning in tunings.items():
@@ -113,10 +107,9 @@ def choose(
         points[name] = {f"{name}-{i}" if i else "start": path[i] for i in indices}
     sets = {label: i.weights for labels in points.values() for label, i in labels.items()}
     sets = {"start": sets["start"], **sets}
-    notes = {"seconds": seconds, "folder": folder, "commit": commit}
-    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
-    inputs, title = (pool, config, robot, sets, commands, plants), "choosing an iteration"
-    ratio = {name: float(r.mean()) for name, r in _ratios(*inputs, title, **notes).items()}
+    inputs, title = (setup, sets, commands, plants), "choosing an iteration"
+    ratios = _ratios(*inputs, title, seconds=seconds, folder=folder)
+    ratio = {name: float(r.mean()) for name, r in ratios.items()}
     choices = {}
     for name, labels in points.items():
         *_, last = labels
@@ -132,9 +125,7 @@ def choose(
 
 
 def answer(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     sets: Mapping[str, Weights],
     pair: tuple[str, str],
     share: float,
@@ -149,30 +140,27 @@ def answer(
     where it walks better on them, because the models are less exact for such robots.
 
     Args:
-        pool, config, robot, commands, notes: see `choose`.
+        setup, commands, notes: see `choose`.
         sets: sets by name: nominal and all tuned sets.
         pair: names of the two tunings.
         share: share of the second tuning.
     """
-    lower, upper = TUNABLES["friction"].lower, TUNABLES["friction"].upper
-    friction = float(np.clip(_FRICTION * config.rollout.walk.mpc.friction, lower, upper))
+    _, lower, upper, _ = TUNABLES["friction"]
+    friction = float(np.clip(_FRICTION * setup.config.rollout.walk.mpc.friction, lower, upper))
     mixture = between(sets[pair[0]], sets[pair[1]], share)
     mixture = mixture._replace(others={"friction": friction, **mixture.others})
-    if not robot.description.tuning.choice_plants:
+    plants = drawn_plants(setup.robot, setup.robot.description.tuning.choice_plants)
+    if not plants:
         return mixture
     candidates = {**sets, "between": mixture}
-    plants = drawn_plants(robot, robot.description.tuning.choice_plants)
-    inputs, title = (pool, config, robot, candidates, commands, plants), "choosing the answer"
-    ratio = _ratios(*inputs, title, **notes)
+    ratio = _ratios(setup, candidates, commands, plants, "choosing the answer", **notes)
     best = min((n for n in candidates if n != "nominal"), key=lambda name: ratio[name].mean())
     say(f"best: {best} walks best on plants drawn around the hfs")
     return candidates[best]
 
 
 def earliest(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     sets: Mapping[str, Weights],
     commands: Sequence[Command],
     **notes: Any,
@@ -185,15 +173,15 @@ def earliest(
     log L) the earliest is taken.
 
     Args:
-        pool, config, robot, commands, notes: see `choose`.
+        setup, commands, notes: see `choose`.
         sets: sets by name in the order in which they were made, the start first.
 
     Source: the one-standard-error rule of Breiman, Friedman, Olshen and Stone, "Classification and
     Regression Trees", 1984.
     """
-    plants = drawn_plants(robot, HELD_OUT, _FIRST_SEED - HELD_OUT)
-    inputs, title = (pool, config, robot, sets, commands, plants), "comparing the tuned sets"
-    losses = {name: np.log(r) for name, r in _ratios(*inputs, title, **notes).items()}
+    plants = drawn_plants(setup.robot, HELD_OUT, _FIRST_SEED - HELD_OUT)
+    ratios = _ratios(setup, sets, commands, plants, "comparing the tuned sets", **notes)
+    losses = {name: np.log(r) for name, r in ratios.items()}
     best = min(losses, key=lambda name: losses[name].mean())
 
     def as_good(name: str) -> bool:

@@ -1,7 +1,6 @@
 """The step `search`: CMA-ES on walks of the high-fidelity simulator."""
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
 
@@ -15,21 +14,18 @@ from hector_jax.core.files import locked
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree_file import tree_hash
-from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import robot_hash
+from hector_jax.runs.setup import Setup
 from hector_jax.search import cmaes
 from hector_jax.search.cmaes import Generation, SearchConfig, SearchResult, best
 from hector_jax.sim.engine import Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.loss import loss_of
 
 
 def losses_on_hfs(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     sets: Mapping[str, Sequence[Weights]],
     *,
     commands: Mapping[str, Command],
@@ -39,14 +35,13 @@ def losses_on_hfs(
     """Return L of weight sets, one walk each on the hfs of the same length as rollouts.
 
     Args:
-        pool: worker processes.
-        config: controller, length and loss.
-        robot: robot that walks.
+        setup: workers; controller, length and loss; robot that walks.
         sets: weight sets by the trajectory that they walk.
         commands: commands by trajectory.
         engine: engine of the walks.
         at_once: number of walks for which a program is compiled; fewer walks are padded to it.
     """
+    pool, config, robot, _ = setup
     walk, plant = config.rollout.walk, hfs(robot.description)
     seconds = config.rollout.ticks * walk.gait.tick
     cases = [(weights, commands[name]) for name, group in sets.items() for weights in group]
@@ -62,10 +57,8 @@ def losses_on_hfs(
 
 
 def search(
-    pool: Executor,
+    setup: Setup,
     config: SearchConfig,
-    tune: TuneConfig,
-    robot: Robot,
     start: Weights,
     *,
     commands: Mapping[str, Command],
@@ -75,10 +68,8 @@ def search(
     """Search with CMA-ES on the high-fidelity simulator, continuing the records under `folder`.
 
     Args:
-        pool: worker processes.
+        setup: workers; controller, length of the walks and loss as those of tunings; robot.
         config: settings of the search.
-        tune: controller, length of the walks and loss, the same as those of tunings.
-        robot: robot that walks.
         start: weights at the start.
         commands: commands by trajectory; the searches run in lock-step.
         engine: engine of the walks.
@@ -87,7 +78,7 @@ def search(
     Raises:
         InputError: before any walk: the folder cannot be written, or see `search.cmaes.search`.
     """
-    size = config.population * len(commands)
+    size, tune, robot = config.population * len(commands), setup.config, setup.robot
     all_commands = {name: named_command(name) for name in COMMANDS} | dict(commands)
     about = {  # without the engine: the losses of both agree to seven digits
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
@@ -99,7 +90,7 @@ def search(
     }
 
     options = {"commands": commands, "engine": engine, "at_once": size}
-    walk = partial(losses_on_hfs, pool, tune, robot, **options)
+    walk = partial(losses_on_hfs, setup, **options)
     title = f"searching on the high-fidelity simulator, engine {engine.name}"
     with locked(folder), bar(title) as report_progress:
 

@@ -24,6 +24,7 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs import replay
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.folder import Journal
+from hector_jax.runs.setup import Setup
 from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
@@ -62,14 +63,13 @@ def _restored(stored: Any) -> Tuned:
 
 
 def load_or_tune(
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     start: Weights,
     paths: Mapping[str, Path],
     make: Callable[[list[str], Mapping[str, Tuned]], Iterator[tuple[str, Tuned]]],
 ) -> dict[str, Tuned]:
     """Return tunings by name; `paths` and `make` are arguments of `load_or_make`."""
-    empty, text = np.zeros(0), np.array("")
+    config, empty, text = setup.config, np.zeros(0), np.array("")
     weights = difftune.init(config, start).best  # with the other numbers that are tuned
     rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
     terms = {term.name: empty for term in config.loss}
@@ -84,7 +84,7 @@ def load_or_tune(
         for name, (tuning, commit) in make(missing, restored(stored)):
             yield name, Tuned(tuning._replace(history=stack(tuning.history)), commit)
 
-    options = {"like": lambda _: like, "kind": "tuning", "robot": robot}
+    options = {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
     return restored(load_or_make(paths, make_stored, **options))
 
 
@@ -106,19 +106,18 @@ def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[tuple[An
 
 
 def _tunings(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     start: Weights,
     problems: Mapping[str, Problem],
     title: str,
     on_iteration: Callable[[str, Iteration], None],
 ) -> Iterator[tuple[str, Tuning]]:
     """Tune several problems in parallel and yield each tuning with its name when it ends."""
-    done, total = 0, config.iterations * len(problems)
+    done, total = 0, setup.config.iterations * len(problems)
+    inputs = setup.config, setup.robot, start
     with message_queue() as messages, bar(title) as report_progress:
         running: dict[Future[Tuning], str] = {
-            pool.submit(_tune_job, config, robot, start, problem, name, messages): name
+            setup.pool.submit(_tune_job, *inputs, problem, name, messages): name
             for name, problem in problems.items()
         }
         report_progress(done, total, "compiling")
@@ -135,15 +134,12 @@ def _tunings(
 
 
 def tune(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     problems: Mapping[str, Problem],
     folder: Path,
     *,
     title: str,
     start: Weights | None = None,
-    commit: str = "",
     journal: Journal | None = None,
     dumps: Path | None = None,
 ) -> dict[str, Tuned]:
@@ -153,14 +149,11 @@ def tune(
     share of the losses at the start, so that all count alike.
 
     Args:
-        pool: worker processes.
-        config: settings of the tunings.
-        robot: robot of the model.
+        setup: workers, settings and robot of the tunings.
         problems: problems by name.
         folder: folder of the tunings, a file for each; tunings in it are not repeated.
         start: weights at the start; the nominal weights by default.
         title: title of the progress bar.
-        commit: commit to record with new tunings.
         journal: journal of the iterations.
         dumps: folder for rejected evaluations, see `replay.keep`; None: no dumps. A problem with
             several commands has no dumps, because a dump is of one rollout.
@@ -169,8 +162,8 @@ def tune(
         InputError: with the weights at the start the model falls or a QP is not solved; or the
             folder cannot be written.
     """
-    start = nominal(robot) if start is None else start
-    key = partial(content_key, config, robot, start, code=TUNING_CODE)
+    start = nominal(setup.robot) if start is None else start
+    key = partial(content_key, setup.config, setup.robot, start, code=TUNING_CODE)
     paths = {n: folder / f"tuning-{n}-{key(*problem)}.npz" for n, problem in problems.items()}
 
     def on_iteration(name: str, iteration: Iteration) -> None:
@@ -178,17 +171,17 @@ def tune(
             journal.add(name, iteration)
         command, net, others = problems[name]
         if dumps is not None and not others:
-            inputs = {"config": config, "robot": robot, "command": command, "net": net}
-            replay.keep(dumps, name, iteration, **inputs)
+            inputs = {"config": setup.config, "robot": setup.robot, "command": command}
+            replay.keep(dumps, name, iteration, net=net, **inputs)
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
         if journal is not None:  # in the order of the problems
             journal.write({n: stored[n].tuning.history if n in stored else () for n in problems})
         remaining = {name: problems[name] for name in missing}
-        for name, tuning in _tunings(pool, config, robot, start, remaining, title, on_iteration):
-            yield name, Tuned(tuning, commit)
+        for name, tuning in _tunings(setup, start, remaining, title, on_iteration):
+            yield name, Tuned(tuning, setup.commit)
 
-    tuned = load_or_tune(config, robot, start, paths, make)
+    tuned = load_or_tune(setup, start, paths, make)
     if journal is not None:
         journal.write({name: result.tuning.history for name, result in tuned.items()})
     return tuned
@@ -201,11 +194,10 @@ def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, 
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
 
 
-def gradient_norms(
-    pool: Executor, config: TuneConfig, robot: Robot, problems: Mapping[str, Problem]
-) -> dict[str, dict[str, float]]:
+def gradient_norms(setup: Setup, problems: Mapping[str, Problem]) -> dict[str, dict[str, float]]:
     """Return norms of the gradients of the loss terms at nominal weights, means over commands."""
     with bar("norms of the gradients") as report_progress:
+        pool, config, robot, _ = setup
         running = {n: pool.submit(_norms_job, config, robot, p) for n, p in problems.items()}
         report_progress(0, len(problems), "compiling")
         return {name: future.result() for name, future in running.items()}
@@ -235,10 +227,9 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
 
     The tunings are saved in `folder`; their settings do not depend on later tunings.
     """
-    config = tune_config(robot)
     problems = {name: Problem(named_command(name), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
-    tuned = tune(pool, config, robot, problems, folder, title=title)
+    tuned = tune(Setup(pool, tune_config(robot), robot), problems, folder, title=title)
     histories = [tuned[name].tuning.history for name in COMMANDS]
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 

@@ -1,7 +1,6 @@
 """The step `judge`: walks of weight sets on plants, each score an artefact (cache.py)."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,13 +20,12 @@ from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
 from hector_jax.runs import metrics
 from hector_jax.runs.cache import content_key, load_or_make
+from hector_jax.runs.setup import Setup
 from hector_jax.sim.diagnosis import startup_fall
 from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import Imperfections
-from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.loss import Loss
 from hector_jax.tuning.rollout import rollout, rollout_config
 
 # modules that determine the numbers, for `content_key`
@@ -60,14 +58,10 @@ class ScoredWalks(NamedTuple):
 
 
 def walk_jobs(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
-    jobs: Sequence[Job],
-    title: str,
-    engine: Engine = MUJOCO_C,
+    setup: Setup, jobs: Sequence[Job], title: str, engine: Engine = MUJOCO_C
 ) -> Iterator[Trajectory]:
     """Yield the walks of jobs in order, each when it is available."""
+    pool, config, robot, _ = setup
     with bar(title) as report_progress:
         report_progress(0, len(jobs), "compiling")
         for done, walk in enumerate(engine.walk(pool, config.rollout.walk, robot, jobs), 1):
@@ -82,16 +76,9 @@ def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: f
     return jax.device_get(jax.jit(rollout, static_argnums=0)(*inputs))
 
 
-def _score_walk(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
-    job: Job,
-    walk: Trajectory,
-    commit: str,
-    engine: Engine,
-) -> ScoredWalk:
+def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> ScoredWalk:
     """Score a walk; simulate it again in MuJoCo C if it fell in the start-up."""
+    pool, config, robot, commit = setup
     samples, text = int(np.sum(~np.asarray(walk.fallen))), ""  # upright samples
     upright = samples * float(walk.period)
     if not samples and not engine.differs:
@@ -103,17 +90,16 @@ def _score_walk(
     return ScoredWalk(score, np.asarray(upright), last, commit, text)
 
 
-def _like(robot: Robot, loss: Loss, with_walk: bool) -> Any:
+def _like(setup: Setup, with_walk: bool) -> Any:
     """Return the structure of the artefact of one walk, with or without its trajectory."""
-    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(robot).trajectory)
+    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(setup.robot).trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
-    score, text = metrics.score_like(loss=loss), np.array("")
+    score, text = metrics.score_like(loss=setup.config.loss), np.array("")
     return ScoredWalk(score, np.zeros(()), last, text, text), walk if with_walk else None  # pyright: ignore
 
 
-def _file_name(
-    config: TuneConfig, robot: Robot, case: Case, job: Job, with_walk: bool, engine: Engine
-) -> str:
+def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engine) -> str:
+    _, config, robot, _ = setup
     inputs = engine.name, engine.version, config.rollout.walk, repr(config.loss), robot, job
     key = content_key(*inputs, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
     name, seed = case
@@ -136,58 +122,50 @@ def _restored(walk: ScoredWalk) -> ScoredWalk:
 
 
 def score_jobs(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     jobs: Mapping[Case, Job],
     *,
     title: str,
     folder: Path | None = None,
-    commit: str = "",
     engine: Engine = MUJOCO_C,
     with_walk: Callable[[Case], bool] = lambda case: False,
 ) -> dict[Case, tuple[ScoredWalk, Trajectory | None]]:
     """Walk jobs and score the walks; walks whose scores are in the folder are not repeated.
 
     Args:
-        pool: worker processes.
-        config, robot: controller and loss, nominal body.
+        setup: workers, controller and loss, nominal body.
         jobs: jobs by case; the names of cases are parts of the names of files.
         title: title of the progress bar.
         folder: folder of the scores; None: nothing is saved.
-        commit: commit to record with new walks.
         engine: engine of the walks.
         with_walk: tells whether the walk of a case is saved beside its score.
 
     Raises:
         InputError: the folder cannot be written, or the engine cannot walk a job.
     """
-    tick = config.rollout.walk.gait.tick
+    tick = setup.config.rollout.walk.gait.tick
 
     def make(missing: list[Case], stored: Mapping[Case, Any]) -> Iterator[tuple[Case, Any]]:
         remark = f"; {len(stored)} of {plural(len(jobs), 'walk')} are there" if stored else ""
         new_jobs = [jobs[case] for case in missing]
-        walks = walk_jobs(pool, config, robot, new_jobs, title + remark, engine)
+        walks = walk_jobs(setup, new_jobs, title + remark, engine)
         for case, walk in zip(missing, walks, strict=True):
             samples = at_interval(walk, tick) if with_walk(case) else None
-            score = _score_walk(pool, config, robot, jobs[case], walk, commit, engine)
-            yield case, (score, samples)
+            yield case, (_score_walk(setup, jobs[case], walk, engine), samples)
 
     if folder is None:
         return dict(make(list(jobs), {}))
     paths = {
-        case: folder / _file_name(config, robot, case, job, with_walk(case), engine)
+        case: folder / _file_name(setup, case, job, with_walk(case), engine)
         for case, job in jobs.items()
     }
-    like = lambda case: _like(robot, config.loss, with_walk(case))  # noqa: E731
-    results = load_or_make(paths, make, like=like, kind="walk", robot=robot)
+    like = lambda case: _like(setup, with_walk(case))  # noqa: E731
+    results = load_or_make(paths, make, like=like, kind="walk", robot=setup.robot)
     return {case: (_restored(scored), walk) for case, (scored, walk) in results.items()}
 
 
 def judge(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
+    setup: Setup,
     sets: Mapping[str, Weights],
     command: Command,
     plants: Sequence[Imperfections],
@@ -196,22 +174,19 @@ def judge(
     title: str,
     seconds: float = 4.0,
     folder: Path | None = None,
-    commit: str = "",
     plant: Robot | None = None,
     engine: Engine = MUJOCO_C,
 ) -> ScoredWalks:
     """Walk every weight set on every plant and score the walks.
 
     Args:
-        pool: worker processes.
-        config, robot: controller and loss, nominal body.
+        setup: workers, controller and loss, nominal body.
         sets: weights by name.
         command, seconds: command to walk, and length of the walks.
         plants, seeds: plants, and the seeds of their estimators.
         title: title of the progress bar.
         folder: folder of the scores; walks whose scores are in it are not repeated; None: nothing
             is saved.
-        commit: commit to record with new walks.
         plant: another model of the robot, to which the plants belong.
         engine: engine of the walks.
 
@@ -224,8 +199,8 @@ def judge(
         for name, weights in sets.items()
     }
     with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
-    notes: dict[str, Any] = {"title": title, "folder": folder, "commit": commit}
-    results = score_jobs(pool, config, robot, jobs, engine=engine, with_walk=with_walk, **notes)
+    options: dict[str, Any] = {"engine": engine, "with_walk": with_walk}
+    results = score_jobs(setup, jobs, title=title, folder=folder, **options)
     by_set = {name: [results[name, seed][0] for seed in seeds] for name in sets}
     say_faults(by_set)
     first = {name: results[name, seeds[0]][1] for name in sets}
