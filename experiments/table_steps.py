@@ -21,7 +21,7 @@ from hector_jax.core.inputs import InputError, plural
 from hector_jax.grfm.network import Params, effect_of
 from hector_jax.robot.model import Robot
 from hector_jax.runs import searches, tunings, verdicts
-from hector_jax.runs.cache import content_key
+from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.runs.verdicts import ScoredWalks
@@ -118,7 +118,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
         yield "walks", Tuned(tuning, commit)
 
     paths = {"walks": bench.folder / name / f"tuning-walks-{key}.npz"}
-    return tunings.load_or_tune(setup, start, paths, make)["walks"]
+    return load_or_make(paths, make, **tunings.artefact(setup, start))["walks"]
 
 
 def _walk_job(

@@ -86,12 +86,12 @@ def load_tree(
     Args:
         path: the file.
         like: a tree of the expected structure. Shapes must match its leaves, in which an axis of
-            length 0 matches any length; dtypes are those of the file.
+            length 0 matches any length; dtypes are those of the file. A leaf "" is for a text.
         kind: the kind passed to `save_tree`.
         robot: the `Robot` in use, or None to accept any.
 
     Returns:
-        The tree, with numpy arrays, and its card.
+        The tree, with numpy arrays and texts, and its card.
 
     Raises:
         InputError: one line naming the file that is missing, truncated, modified, or of another
@@ -115,7 +115,8 @@ def load_tree(
         if len(shape) != len(got) or any(s not in (0, g) for s, g in zip(shape, got, strict=True)):
             text = ", ".join("any" if s == 0 else str(s) for s in shape)
             raise InputError(f"{path}: {name} has shape {got}, expected ({text})")
-    return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in leaves]), card
+    values = [str(arrays[n]) if isinstance(x, str) else arrays[n] for n, x in leaves.items()]
+    return jax.tree.unflatten(jax.tree.structure(like), values), card
 
 
 def read_card(path: Path, kind: str | None = None) -> dict[str, Any]:

@@ -53,10 +53,12 @@ def load_or_make(
     paths: Mapping[Key, Path],
     make: Callable[[list[Key], Mapping[Key, Tree]], Iterable[tuple[Key, Tree]]],
     *,
-    like: Callable[[Key], Tree],
+    like: Callable[[Key], Any],
     kind: str,
     robot: Robot,
     about: Mapping[str, Any] | None = None,
+    pack: Callable[[Tree], Any] = lambda tree: tree,
+    unpack: Callable[[Any], Tree] = lambda stored: stored,
 ) -> dict[Key, Tree]:
     """Return artefacts by key: read those on disk, make the others and save them as they come.
 
@@ -64,10 +66,11 @@ def load_or_make(
         paths: file of each artefact, all in one folder, which is locked during the call.
         make: function of the missing keys and the artefacts that were read, which yields each
             missing key with its artefact, in any order; not called if nothing is missing.
-        like: returns a tree with the structure of the artefact of a key, see `load_tree`.
+        like: returns a tree with the structure of the file of a key, see `load_tree`.
         kind: kind of the files.
         robot: robot of the artefacts.
         about: JSON values for the cards.
+        pack, unpack: convert an artefact to the tree in its file, and back.
 
     Raises:
         InputError: the folder cannot be written.
@@ -79,11 +82,12 @@ def load_or_make(
         for key, path in paths.items():
             try:
                 if path.exists():
-                    trees[key] = load_tree(path, like(key), kind=kind, robot=robot)[0]
+                    stored, _ = load_tree(path, like(key), kind=kind, robot=robot)
+                    trees[key] = unpack(stored)
             except InputError as error:
                 say(f"made anew: {error}")
         missing = [key for key in paths if key not in trees]
         for key, tree in make(missing, dict(trees)) if missing else ():
-            save_tree(paths[key], tree, kind=kind, robot=robot, about=about)
+            save_tree(paths[key], pack(tree), kind=kind, robot=robot, about=about)
             trees[key] = tree
     return {key: trees[key] for key in paths}

@@ -55,37 +55,26 @@ class Tuned(NamedTuple):
     commit: str  # of the code that made it; empty if unknown
 
 
-def _restored(stored: Any) -> Tuned:
-    """Convert a tuning from a file, in which iterations are stacked and strings are arrays."""
-    tuning, count = stored.tuning, len(stored.tuning.history.iteration)
-    history = [jax.tree.map(lambda x, i=i: np.asarray(x[i]), tuning.history) for i in range(count)]
-    return Tuned(tuning._replace(history=history, stop=str(tuning.stop)), str(stored.commit))
-
-
-def load_or_tune(
-    setup: Setup,
-    start: Weights,
-    paths: Mapping[str, Path],
-    make: Callable[[list[str], Mapping[str, Tuned]], Iterator[tuple[str, Tuned]]],
-) -> dict[str, Tuned]:
-    """Return tunings by name; `paths` and `make` are arguments of `load_or_make`."""
-    config, empty, text = setup.config, np.zeros(0), np.array("")
+def artefact(setup: Setup, start: Weights) -> dict[str, Any]:
+    """Return the options of `load_or_make` for tunings, whose iterations are stacked in files."""
+    config, empty = setup.config, np.zeros(0)
     weights = difftune.init(config, start).best  # with the other numbers that are tuned
     rows = jax.tree.map(lambda w: np.zeros((0, *w.shape)), weights)
     terms = {term.name: empty for term in config.loss}
     evaluation = evaluate.Evaluation(empty, terms, rows, empty, empty)
-    history: Any = Iteration(empty, rows, evaluation, empty, empty)  # as stacked in the file
-    like: Any = Tuned(Tuning(history, weights, weights, text), text)  # pyright: ignore
+    history: Any = Iteration(empty, rows, evaluation, empty, empty)
+    like = Tuned(Tuning(history, weights, weights, ""), "")
 
-    def restored(stored: Mapping[str, Any]) -> dict[str, Tuned]:
-        return {name: _restored(tuned) for name, tuned in stored.items()}
+    def pack(tuned: Tuned) -> Any:
+        return tuned._replace(tuning=tuned.tuning._replace(history=stack(tuned.tuning.history)))
 
-    def make_stored(missing: list[str], stored: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-        for name, (tuning, commit) in make(missing, restored(stored)):
-            yield name, Tuned(tuning._replace(history=stack(tuning.history)), commit)
+    def unpack(stored: Any) -> Tuned:
+        stacked, count = stored.tuning.history, len(stored.tuning.history.iteration)
+        history = [jax.tree.map(lambda x, i=i: np.asarray(x[i]), stacked) for i in range(count)]
+        return stored._replace(tuning=stored.tuning._replace(history=history))
 
     options = {"like": lambda _: like, "kind": "tuning", "robot": setup.robot}
-    return restored(load_or_make(paths, make_stored, **options))
+    return {**options, "pack": pack, "unpack": unpack}
 
 
 def _tune_job(
@@ -181,7 +170,7 @@ def tune(
         for name, tuning in _tunings(setup, start, remaining, title, on_iteration):
             yield name, Tuned(tuning, setup.commit)
 
-    tuned = load_or_tune(setup, start, paths, make)
+    tuned = load_or_make(paths, make, **artefact(setup, start))
     if journal is not None:
         journal.write({name: result.tuning.history for name, result in tuned.items()})
     return tuned

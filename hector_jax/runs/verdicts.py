@@ -94,8 +94,8 @@ def _like(setup: Setup, with_walk: bool) -> Any:
     """Return the structure of the artefact of one walk, with or without its trajectory."""
     walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(setup.robot).trajectory)
     last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
-    score, text = metrics.score_like(loss=setup.config.loss), np.array("")
-    return ScoredWalk(score, np.zeros(()), last, text, text), walk if with_walk else None  # pyright: ignore
+    score = metrics.score_like(loss=setup.config.loss)
+    return ScoredWalk(score, np.zeros(()), last, "", ""), walk if with_walk else None
 
 
 def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engine) -> str:
@@ -114,11 +114,6 @@ def say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
             say(f"{name}: at least one QP of its walks was not solved (residual {worst:.0e})")
         if falls := [walk.startup for walk in group if walk.startup]:
             say(f"{name}: {len(falls)} of {plural(len(group), 'walk')} {falls[0]}")
-
-
-def _restored(walk: ScoredWalk) -> ScoredWalk:
-    """Convert a walk from a file, in which strings are arrays."""
-    return walk._replace(commit=str(walk.commit), startup=str(walk.startup))
 
 
 def score_jobs(
@@ -160,8 +155,7 @@ def score_jobs(
         for case, job in jobs.items()
     }
     like = lambda case: _like(setup, with_walk(case))  # noqa: E731
-    results = load_or_make(paths, make, like=like, kind="walk", robot=setup.robot)
-    return {case: (_restored(scored), walk) for case, (scored, walk) in results.items()}
+    return load_or_make(paths, make, like=like, kind="walk", robot=setup.robot)
 
 
 def judge(
