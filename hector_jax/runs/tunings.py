@@ -82,16 +82,17 @@ def _tune_job(
 ) -> Tuning:
     """Run one tuning in a worker and put each iteration into the queue `messages`."""
     step, models = partial(difftune.tune_step, config, robot), _models(config, robot, problem)
-    evaluations = [lambda weights, m=model: step(weights, *m) for model in models]
+    evaluations = [partial(step, **model) for model in models]
     start = difftune.init(config, start).best  # with the other numbers that are tuned
     mean = evaluate.mean_over_commands(evaluations, start)
     return difftune.descend(config, start, mean, lambda i: messages.put((name, i)))
 
 
-def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[tuple[Any, ...]]:
+def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[dict[str, Any]]:
     """Return command, anchor and effect of the rollout for each command of a problem."""
     effect = network.effect_of(problem.params, config.rollout.walk.gait)
-    return [(command, standing_anchor(robot), effect) for command in problem.commands]
+    model = {"anchor": standing_anchor(robot), "effect": effect}
+    return [{"command": command, **model} for command in problem.commands]
 
 
 def _tunings(
@@ -178,8 +179,7 @@ def tune(
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:
     norms = partial(evaluate.gradient_norms, config.rollout, robot, nominal(robot))
-    models = _models(config, robot, problem)
-    results = [norms(command, anchor, effect, config.loss) for command, anchor, effect in models]
+    results = [norms(**model, loss=config.loss) for model in _models(config, robot, problem)]
     return jax.tree.map(lambda *x: float(np.mean(x)), *results)
 
 
@@ -197,7 +197,8 @@ def gauss_newton_job(
 ) -> Float[np.ndarray, "n n"]:
     """Return the Gauss-Newton matrix divided by the loss, mean over the commands, in a worker."""
     matrix_of = partial(gauss_newton, config.rollout, robot, start)
-    results = [matrix_of(*model, config.loss) for model in _models(config, robot, problem)]
+    models = _models(config, robot, problem)
+    results = [matrix_of(*model.values(), config.loss) for model in models]
     return np.mean([np.asarray(matrix) / float(loss) for loss, matrix in results], axis=0)
 
 
@@ -225,7 +226,7 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
 
 def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: Command) -> None:
     (model,) = _models(config, robot, Problem(command, None))
-    difftune.tune_step(config, robot, difftune.init(config, start).best, *model)
+    difftune.tune_step(config, robot, difftune.init(config, start).best, **model)
 
 
 def compile_programs(

@@ -1,6 +1,7 @@
 """Loss of a weight set on the model and its gradient, by reverse mode (Eq. 9, 11)."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -60,9 +61,8 @@ def evaluate(
 
     Source: Eq. 9, 11.
     """
-    return evaluation(
-        lambda w: rollout(config, robot, w, command, anchor, effect, variation), weights, loss
-    )
+    inputs = {"command": command, "anchor": anchor, "effect": effect, "variation": variation}
+    return evaluation(partial(rollout, config, robot, **inputs), weights, loss)
 
 
 evaluate_jit = jax.jit(evaluate, static_argnums=0)

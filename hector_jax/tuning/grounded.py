@@ -174,6 +174,5 @@ def evaluate_grounded(
 
     Source: Eq. 9, 11.
     """
-    return evaluation(
-        lambda w: grounded_rollout(config, robot, w, command, effect, grounding), weights, loss
-    )
+    inputs = {"command": command, "effect": effect, "grounding": grounding}
+    return evaluation(partial(grounded_rollout, config, robot, **inputs), weights, loss)

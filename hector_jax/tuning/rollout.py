@@ -306,14 +306,9 @@ def rollout(
 
     Source: Eq. 12, 13.
     """
-
-    @partial(jax.checkpoint, policy=jax.checkpoint_policies.save_only_these_names(qp.SAVED))
-    def tick(carry: Carry, j: Int[Array, ""]) -> tuple[Carry, Trajectory]:
-        return step_carry(config, robot, weights, command, effect, carry, j, variation)
-
-    def walk(carry: Carry, ticks: Int[Array, " block"]) -> tuple[Carry, Trajectory]:
-        return jax.lax.scan(tick, carry, ticks)
-
+    policy = jax.checkpoint_policies.save_only_these_names(qp.SAVED)
+    tick = partial(step_carry, config, robot, weights, command, effect, variation=variation)
+    walk = partial(jax.lax.scan, jax.checkpoint(tick, policy=policy))
     start, ticks = init_carry(robot, anchor), walked_ticks(config, anchor)
     if variation is not None:
         standing = jax.tree.map(lambda w: w[0], start.commands)
