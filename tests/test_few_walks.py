@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from hector_jax.core import inputs
 from hector_jax.core.inputs import InputError
-from hector_jax.search import few_walks
 from hector_jax.search.few_walks import WalkResult, incumbent, needs_model, propose, space_of
 
 SIZE = 5
@@ -138,11 +138,9 @@ def test_the_luckiest_walk_is_not_believed(history):
 
 @pytest.mark.parametrize("package", ["tinygp", "cmaes"])
 def test_a_missing_package_is_named_with_its_extra(monkeypatch, history, package):
-    there = few_walks.find_spec
-    monkeypatch.setattr(
-        few_walks, "find_spec", lambda name: None if name == package else there(name)
-    )
+    there = inputs.find_spec
+    monkeypatch.setattr(inputs, "find_spec", lambda name: None if name == package else there(name))
     methods = [row.method for row in history]
     count = methods.index({"tinygp": "surrogate", "cmaes": "evolution"}[package])
-    with pytest.raises(InputError, match=rf'{package}: pip install "hector-jax\[search\]"'):
+    with pytest.raises(InputError, match=rf"{package}: pip install 'hector-jax\[search\]'"):
         propose(SPACE, history[:count], model)

@@ -228,6 +228,6 @@ def test_wrong_settings_are_named(wrong, says):
 
 
 def test_a_search_without_its_package_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr("hector_jax.search.cmaes.find_spec", lambda name: None)
+    monkeypatch.setattr("hector_jax.core.inputs.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"hector-jax\[search\]"):
         run(tmp_path)

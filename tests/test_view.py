@@ -17,6 +17,7 @@ from hector_jax.cli.main import main
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import save_weights
+from hector_jax.core import inputs
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.report import pictures, view
@@ -194,7 +195,7 @@ def test_two_different_sets_are_asked_for(monkeypatch, capsys, tmp_path):
 
 
 def test_a_missing_viser_is_told_with_the_extra_that_has_it(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(view, "find_spec", lambda name: None)
+    monkeypatch.setattr(inputs, "find_spec", lambda name: None)
     line = refused(monkeypatch, capsys, pretend_run(tmp_path))
     assert "pip install 'hector-jax[view]'" in line
 
@@ -204,7 +205,7 @@ def test_headless_writes_film_and_pictures_instead(monkeypatch, capsys, tmp_path
     for write in ("write_film", "write_strip"):
         monkeypatch.setattr(pictures, write, lambda *film: filmed.append(film))
     monkeypatch.setattr(arguments, "walk_once", lambda *_: pretend_walk(seconds=0.3))
-    monkeypatch.setattr(view, "find_spec", lambda name: None)  # needs no viser
+    monkeypatch.setattr(inputs, "find_spec", lambda name: None)  # needs no viser
     run, out = pretend_run(tmp_path / "run"), tmp_path / "out"
     flags = ["--world", "srbm", "--sets", "nominal", "expert"]
     monkeypatch.setattr(sys, "argv", ["hector", "view", *map(str, [run, "--out", out, *flags])])

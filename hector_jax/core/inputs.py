@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,12 @@ class InputError(ValueError):
     The programs end with exit code 2 and that line. Every other exception is a bug and keeps its
     traceback.
     """
+
+
+def require_package(package: str, extra: str, what: str, hint: str = "") -> None:
+    """Raise an InputError unless the package of an extra, which `what` needs, is installed."""
+    if find_spec(package) is None:
+        raise InputError(f"{what} needs {package}: pip install 'hector-jax[{extra}]'{hint}")
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:

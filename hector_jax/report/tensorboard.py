@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hector_jax.core.files import make_folder
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import require_package
 from hector_jax.runs.folder import read_metrics
 
 
@@ -26,12 +26,9 @@ def write_events(folder: Path, out: Path) -> list[Path]:
     Raises:
         InputError: there is no run, tensorboardX is not installed, or a folder cannot be written.
     """
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        raise InputError(
-            "TensorBoard's files need tensorboardX: pip install 'hector-jax[tensorboard]'"
-        ) from None
+    require_package("tensorboardX", "tensorboard", "TensorBoard")
+    from tensorboardX import SummaryWriter
+
     lines = read_metrics(folder)
     folders = {name: out / name for name in dict.fromkeys(line["set"] for line in lines)}
     for name, set_folder in folders.items():

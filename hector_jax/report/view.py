@@ -12,7 +12,6 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
-from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.report.motion import COLOURS, INK, Motion
 from hector_jax.report.report import render
@@ -90,11 +89,7 @@ def check_viser() -> None:
     Raises:
         InputError: viser is not installed.
     """
-    if find_spec("viser") is None:
-        raise InputError(
-            "the page needs the package viser: pip install 'hector-jax[view]' "
-            "(--headless writes a film without it)"
-        )
+    require_package("viser", "view", "the page", " (--headless writes a film without it)")
 
 
 def serve(

@@ -19,7 +19,6 @@ timing a recorded walk.
 import time
 from collections.abc import Callable
 from functools import partial
-from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import jax
@@ -43,7 +42,7 @@ from hector_jax.control.legs import Measurement
 from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.qp import Status
 from hector_jax.robot.model import Robot
@@ -190,8 +189,7 @@ def export_controller(
     Raises:
         InputError: flatbuffers is not installed, or JAX runs with 32 bits or not on the CPU.
     """
-    if find_spec("flatbuffers") is None:
-        raise InputError("exporting needs flatbuffers: pip install 'hector-jax[export]'")
+    require_package("flatbuffers", "export", "exporting")
     if jax.default_backend() != "cpu" or not jax.config.read("jax_enable_x64"):
         raise InputError("exporting needs JAX on the CPU (JAX_PLATFORMS=cpu) and with 64 bits")
     control, example = controller(config, robot, weights)

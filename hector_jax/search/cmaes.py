@@ -15,7 +15,6 @@ import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -33,7 +32,7 @@ from hector_jax.control.weights import (
 )
 from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.files import append_file, as_json, write_file
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 
 FORMAT = 1
@@ -154,8 +153,7 @@ class CmaSearch:
     """
 
     def __init__(self, config: SearchConfig, start: Weights) -> None:
-        if find_spec("cmaes") is None:
-            raise InputError('a search needs the package cmaes: pip install "hector-jax[search]"')
+        require_package("cmaes", "search", "a search")
         from cmaes import CMA
 
         self.config, self.start = config, start

@@ -18,7 +18,6 @@ Conn, Gould, Toint, "Trust region methods", 2000). A proposal is a function of t
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib.util import find_spec
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -29,7 +28,7 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 
 from hector_jax.core.arrays import Array
-from hector_jax.core.inputs import InputError
+from hector_jax.core.inputs import require_package
 
 # added to the eigenvalues of the metric: a flat direction has a unit step of two e-folds
 _FLAT = 0.25
@@ -316,10 +315,7 @@ def _acquisition(
 
 def _fit_losses(space: Space, history: Sequence[WalkResult]) -> tuple[_Fit, int, float]:
     """Fit the losses; returns the process, the walk of least posterior mean and that mean."""
-    if find_spec("tinygp") is None:
-        raise InputError(
-            'walks beyond the model need the package tinygp: pip install "hector-jax[search]"'
-        )
+    require_package("tinygp", "search", "tuning on walks beyond the model")
     finite = [i for i, row in enumerate(history) if np.isfinite(row.loss)]
     points = np.array([history[i].point for i in finite])
     fit = _fit(points, np.array([history[i].loss for i in finite]), space.curvature)
@@ -353,8 +349,7 @@ def _improve(
 
 def _evolution(history: Sequence[WalkResult], since: int, seed: int) -> Float[np.ndarray, " n"]:
     """Draw the next sample of CMA-ES, updated with all walks since the model stalled."""
-    if find_spec("cmaes") is None:
-        raise InputError('walks need the package cmaes: pip install "hector-jax[search]"')
+    require_package("cmaes", "search", "tuning on walks")
     from cmaes import CMA
 
     first = history[best_walk(history[:since])]
