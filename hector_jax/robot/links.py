@@ -50,11 +50,16 @@ class Link(NamedTuple):
     bodies: dict[int, Pose]  # by index in the model
 
 
-def pose_of(pos: Float[np.ndarray, "3"], quat: Float[np.ndarray, "4"]) -> Pose:
-    """Return the pose of a position [m] and a quaternion."""
+def rotation_of(quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation matrix of a quaternion (w, x, y, z)."""
     R = np.zeros(9)
     mujoco.mju_quat2Mat(R, quat)
-    return Pose(R.reshape(3, 3), np.array(pos))
+    return R.reshape(3, 3)
+
+
+def pose_of(pos: Float[np.ndarray, "3"], quat: Float[np.ndarray, "4"]) -> Pose:
+    """Return the pose of a position [m] and a quaternion."""
+    return Pose(rotation_of(quat), np.array(pos))
 
 
 def links_of(

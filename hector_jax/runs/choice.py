@@ -160,10 +160,7 @@ def answer(
 
 
 def earliest(
-    setup: Setup,
-    sets: Mapping[str, Weights],
-    commands: Sequence[Command],
-    **notes: Any,
+    setup: Setup, sets: Mapping[str, Weights], commands: Sequence[Command], **notes: Any
 ) -> str:
     """Return the name of the first set that is as good as the best one on plants of its own.
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
+from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.sim.world import World
 
@@ -56,13 +57,6 @@ class Shape(NamedTuple):
     size: Float[np.ndarray, "3"]  # [m] as MuJoCo's: radius, half length; half edges
     position: Float[np.ndarray, "3"]  # [m] body frame
     rotation: Float[np.ndarray, "3 3"]
-
-
-def rotation_of(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation matrix of a quaternion (w, x, y, z)."""
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, quaternion)
-    return R.reshape(3, 3)
 
 
 def bodies(world: World) -> list[Body]:

@@ -18,8 +18,8 @@ import numpy as np
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError
+from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
-from hector_jax.sim.bodies import rotation_of
 from hector_jax.sim.world import World
 
 TRUNK_TOP = (0.0, 0.0, 0.124)  # [m] in the trunk's frame

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from hector_jax.control.controller import WalkConfig
 from hector_jax.core.headless import mujoco
 from hector_jax.core.trajectory import SOLVED, Trajectory
+from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
-from hector_jax.sim.bodies import rotation_of
 from hector_jax.sim.loop import Job, first_tick, substeps
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.walk import walk

@@ -20,6 +20,7 @@ from pydrake.multibody import tree
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.sim import bodies
@@ -105,7 +106,7 @@ class DrakePlant(Plant):
 
     def stand(self, qpos: Float[np.ndarray, " nq"]) -> None:
         """Take up the coordinates of a MuJoCo model of this world, at rest."""
-        pose = RigidTransform(RotationMatrix(bodies.rotation_of(qpos[3:7])), qpos[:3])
+        pose = RigidTransform(RotationMatrix(rotation_of(qpos[3:7])), qpos[:3])
         self.plant.SetFreeBodyPose(self.context, self._trunk, pose)
         for dof, joint in self.joints.items():
             joint.set_angle(self.context, qpos[dof + 1])  # the trunk's quaternion has one more
@@ -130,7 +131,7 @@ class DrakePlant(Plant):
         force[self._hinges] = -self._friction * np.tanh(rates[self._hinges] / self._stiction)
         force[self._motors] += torque
         if push.any():
-            lever = bodies.rotation_of(self._state[self._reading_index[3:7]]) @ self._com
+            lever = rotation_of(self._state[self._reading_index[3:7]]) @ self._com
             force[self._base_rates : self._base_rates + 6] = *np.cross(lever, push), *push
         self._input.set_value(force)
         self._time += 1
@@ -157,7 +158,7 @@ class DrakePlant(Plant):
         """See `Plant`."""
         self._state.take(self._reading_index, out=row)
         row[3:7] /= np.linalg.norm(row[3:7])  # Drake lets the quaternion's norm drift
-        row[10:13] = row[10:13] @ bodies.rotation_of(row[3:7])  # into the trunk's frame
+        row[10:13] = row[10:13] @ rotation_of(row[3:7])  # into the trunk's frame
 
     def ground(self) -> Ground:
         """See `Plant`."""

@@ -348,10 +348,7 @@ def tune(
 
     Source: problem P and the paper's set-up (ten iterations, beta_Q 0.05, beta_R 0.08).
     """
-
-    def evaluate(trial: Weights) -> Evaluation:
-        return tune_step(config, robot, trial, command, anchor, effect)
-
+    evaluate = partial(tune_step, config, robot, command=command, anchor=anchor, effect=effect)
     return descend(config, weights, evaluate, on_iteration)
 
 
