@@ -18,7 +18,7 @@ from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.report.report import render
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import metrics, verdicts
+from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.setup import Setup
 from hector_jax.sim import diagnosis
 from hector_jax.sim.diagnosis import Record, StartupFall, likeliest_cause, not_the_weights
@@ -152,10 +152,9 @@ def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
 def test_a_fall_in_the_start_up_is_told_before_any_tuning(monkeypatch, capsys):
     monkeypatch.setattr(diagnosis, "record_walk", lambda *args: recorded())
     monkeypatch.setattr(diagnosis, "startup_fall", lambda *args: FALL)
-    monkeypatch.setattr(tuning.tunings, "compile_programs", lambda *args, walking: None)
+    monkeypatch.setattr(tunings, "_compile_tuning", lambda *args: None)
     with ThreadPoolExecutor(1) as pool:
-        inputs = TuneConfig(), ROBOT, nominal(), command_of("straight")
-        tuning._say_what_no_weights_mend(pool, *inputs)
+        tunings.compile_programs(pool, TuneConfig(), ROBOT, nominal(), command_of("straight"))
     said = capsys.readouterr().err
     assert f"before any tuning, straight on hfs with nominal weights: {TEXT}\n" in said
 

@@ -39,12 +39,9 @@ from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, r
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
-from hector_jax.sim.diagnosis import not_the_weights
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import on_host
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import main_directions
-from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.evaluate import aligned
 
 _FOLDERS = ("out", "run", "resume")  # flags that name the run folder
@@ -108,13 +105,17 @@ class _Run(NamedTuple):
     args: Tune
     start: Weights
     trajectories: tuple[NamedCommand, ...]
-    seconds: float  # of each walk
     net: nets.TrainedNet
 
     @property
     def artefacts(self) -> Path:
         """Folder of the artefacts."""
         return self.folder / "kept"
+
+    @property
+    def seconds(self) -> float:
+        """Length of each walk [s]."""
+        return self.trajectories[0].seconds or Walk.seconds
 
     @property
     def name(self) -> str:
@@ -155,14 +156,13 @@ def _tune_in(folder: Path, args: Tune) -> None:
     start = arguments.weights(args.start, robot)
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
-        _say_what_no_weights_mend(pool, config, robot, start, trajectories[0])
+        tunings.compile_programs(pool, config, robot, start, trajectories[0])
         run = _Run(
             setup=Setup(pool, config, robot, made_with.get("commit", "")),
             folder=folder,
             args=args,
             start=start,
             trajectories=trajectories,
-            seconds=trajectories[0].seconds or Walk.seconds,
             net=_net(pool, args, robot),
         )
         norms = tunings.gradient_norms(run.setup, run.problems)
@@ -171,7 +171,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
             run = run._replace(setup=run.setup._replace(config=replace(config, loss=loss)))
         settings = _note_settings(run)
-        inputs = run.setup.config, robot, run.start, run.problems["with"]
+        inputs = run.setup.config, robot, start, run.problems["with"]
         matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the tunings
         tuned = _tune_sets(run)
         walks = _walk_sets(run, tuned.sets)
@@ -184,7 +184,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,
-        curvature=main_directions(matrix.result(), run.start),
+        curvature=main_directions(matrix.result(), start),
         errors=run.net.errors,
         tunings=tuned.tunings,
         shifts=tuned.shifts,
@@ -213,23 +213,6 @@ def _net(pool: Executor, args: Tune, robot: Robot) -> nets.TrainedNet:
         return nets.load_net(args.net, robot, args.variant)[0]
     data = arguments.robot_folder(args.data, args.robot, robot)
     return nets.load_or_train(pool, robot, data, args.variant)
-
-
-def _say_what_no_weights_mend(
-    pool: Executor, config: TuneConfig, robot: Robot, start: Weights, trajectory: NamedCommand
-) -> None:
-    """Walk once with nominal weights on the simulator; report faults that no weights can cure.
-
-    The programs of the tuning are compiled at the same time.
-    """
-    seconds = trajectory.seconds or Walk.seconds
-    job = Job(nominal(robot), trajectory.command, hfs(robot.description), seconds)
-    inputs = config.rollout.walk, jax.tree.map(np.asarray, robot), on_host(job)
-    walking = pool.submit(not_the_weights, *inputs)
-    command = trajectory.command
-    tunings.compile_programs(pool, config, robot, start, command, walking=walking)
-    for line in walking.result():
-        say(f"before any tuning, {trajectory.name} on hfs with nominal weights: {line}")
 
 
 def _note_settings(run: _Run) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import Command, named_command
+from hector_jax.control.reference import Command
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import bar, say, say_if_slow
 from hector_jax.core.environment import code_hash
@@ -29,11 +29,9 @@ from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
+from hector_jax.runs.tunings import TUNING_CODE, tune_config, tuning_paths
 from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
 
 # modules that determine the numbers, for `code_hash`
@@ -97,10 +95,6 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
             walks of other settings.
     """
     with locked(folder):
-        tuning, straight = tune_config(robot), named_command("straight")
-        one_tick = Job(nominal(robot), straight, hfs(robot.description), GaitConfig.tick)
-        walking = pool.submit(walk, tuning.rollout.walk, robot, one_tick)
-        compile_programs(pool, tuning, robot, nominal(robot), straight, walking=walking)
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
         _collect(pool, config, robot, jobs, folder, collection_settings(config, robot))

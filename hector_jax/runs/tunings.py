@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.core.console import bar
+from hector_jax.core.console import bar, say
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
@@ -25,6 +26,10 @@ from hector_jax.runs import replay
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.folder import Journal
 from hector_jax.runs.setup import Setup
+from hector_jax.sim.diagnosis import not_the_weights
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import on_host
+from hector_jax.sim.world import hfs
 from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
@@ -230,26 +235,26 @@ def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: C
 
 
 def compile_programs(
-    pool: Executor,
-    config: TuneConfig,
-    robot: Robot,
-    start: Weights,
-    command: Command,
-    *,
-    walking: Future[Any],
+    pool: Executor, config: TuneConfig, robot: Robot, start: Weights, trajectory: NamedCommand
 ) -> None:
-    """Compile the programs of a tuning in one process while another one walks.
+    """Compile the programs of a tuning in one process and walk once in another one.
 
-    The other processes load the programs of both from the cache.
+    The other processes load the programs of both from the cache. The walk is with nominal weights
+    on the hfs; its faults that no weights can cure are printed.
 
     Args:
         pool: worker processes.
-        config, robot, start, command: of the tuning.
-        walking: a walk that was submitted to the pool.
+        config, robot, start, trajectory: of the tuning.
     """
-    tuning = pool.submit(_compile_tuning, config, robot, start, command)
+    command, seconds = trajectory.command, trajectory.seconds or Job._field_defaults["seconds"]
+    job = on_host(Job(nominal(robot), command, hfs(robot.description), seconds))
+    on_hfs = config.rollout.walk, jax.tree.map(np.asarray, robot), job
     with bar("compiling, once on a machine") as report_progress:
+        walking = pool.submit(not_the_weights, *on_hfs)
+        tuning = pool.submit(_compile_tuning, config, robot, start, command)
         for done, future in enumerate((walking, tuning)):
             report_progress(done, 2, "")
             future.result()
         report_progress(2, 2, "")
+    for line in walking.result():
+        say(f"before any tuning, {trajectory.name} on hfs with nominal weights: {line}")
