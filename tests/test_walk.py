@@ -9,7 +9,7 @@ import pytest
 from model import OTHERS
 
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.reference import COMMANDS, named_command
+from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.runtime import workers
 from hector_jax.core.tree import layout, pack, unpack
@@ -52,6 +52,22 @@ def test_the_numbers_of_the_weights_are_those_of_plan_and_legs(short):
     assert 0.02 < higher[..., 2].max() < 0.05
     wider = walked(footstep_width=0.1).feet - short.feet[:200]
     assert np.abs(wider[..., 1]).max() > 0.005
+
+
+def test_all_weights_and_commands_are_walked_by_the_same_programs(short):
+    compiled = []
+
+    def hear(event, seconds, fun_name="", **more):
+        compiled.append(fun_name)
+
+    three = Command(np.full(3, 0.2), np.full((3, 2), 0.1), np.zeros(3))
+    weights = CONFIG.with_others(nominal(), ["friction", "foot_height"])
+    jax.monitoring.register_event_duration_secs_listener(hear)
+    try:
+        walk(CONFIG, ROBOT, Job(weights, three, hfs(), seconds=0.1))
+    finally:
+        jax.monitoring.unregister_event_duration_listener(hear)
+    assert not {"plan", "torques", "small_call", "samples", "begin", "anchor"} & set(compiled)
 
 
 def test_a_walk_has_a_sample_each_millisecond(short):
