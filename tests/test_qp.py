@@ -187,13 +187,18 @@ def correlated(off, q):
     return rows(P=((1.0, off), (off, 1.0)), q=q)
 
 
-FIRST, SECOND, BOTH = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)
+FIRST, SECOND, BOTH, HALF = (1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (0.5, 0.5)
 FLAT = ((1.0, 0.0), (0.0, 0.0))
 EDGES = {
     "a row of zeros past zero": (
         lambda t: rows((ZERO, -INF, -t)),
-        (0.0, 1e-17, 2e-8, Status.SOLVED),
-        (3e-8, 1.0, Status.INFEASIBLE),
+        (0.0, 1e-17, 4.9e-8, Status.SOLVED),
+        (5.1e-8, 1.0, Status.INFEASIBLE),
+    ),
+    "a row of zeros past zero, beside shorter rows": (
+        lambda t: rows((ZERO, -INF, -t), (HALF, -9.0, 9.0), (HALF, -9.0, 9.0)),
+        (0.0, 1e-17, 2.4e-8, Status.SOLVED),
+        (2.6e-8, 1.0, Status.INFEASIBLE),
     ),
     "the only row, all else at rest": (
         lambda t: small(q=ZERO, A=(ZERO, ZERO, ZERO), l=(t, -INF, -1.0), u=(INF, -t, 1.0)),
@@ -252,8 +257,13 @@ EDGES = {
     ),
     "force of the row that holds": (
         lambda t: rows((SECOND, 1.0, 2.0), P=FLAT, q=(-1.0, t)),
+        (0.0, 1e-12, 9.9e-9, Status.NOT_UNIQUE),
+        (1.1e-8, 1e-3, Status.SOLVED),
+    ),
+    "force of the row that holds, beside a shorter row": (
+        lambda t: rows((SECOND, 1.0, 2.0), (HALF, -9.0, 9.0), P=FLAT, q=(-1.0, t)),
         (0.0, 1e-12, 2e-8, Status.NOT_UNIQUE),
-        (3e-8, 1e-3, Status.SOLVED),
+        (2.1e-8, 1e-3, Status.SOLVED),
     ),
     "price of two forces that share a load": (
         lambda t: rows((BOTH, 1.0, 1.0), (FIRST, 0.0, 2.0), (SECOND, 0.0, 2.0), P=t * EYE, q=ZERO),
@@ -397,6 +407,71 @@ def test_units_redundant_rows_and_rounding_change_no_verdict():
         (i, Status(int(found[i])).name, expected[i].name) for i in np.flatnonzero(found != expected)
     ]
     assert not wrong
+
+
+@jax.jit
+def _solve_and_pull_batch(qps, cotangent):
+    """Solutions of a batch, and the gradients of cotangent'x by all data."""
+
+    def x_and_solution(qp):
+        solution = solve_qp(qp)
+        return solution.x, solution
+
+    def solve_and_pull(qp):
+        _, pull, solution = jax.vjp(x_and_solution, qp, has_aux=True)
+        return solution, pull(cotangent)[0]
+
+    return jax.lax.map(solve_and_pull, qps)
+
+
+def past_zero(t):
+    """At rest on a bound t past zero, beside a row of zeros that is as far past it; nine rows."""
+    A, lower, upper = np.zeros((9, 5)), np.full(9, -INF), np.full(9, INF)
+    A[1, 0] = A[2, 0] = A[2, 1] = 1.0
+    lower[2], upper[:3] = -0.1, (-t, -t, 0.1)
+    return QP(np.eye(5), np.zeros(5), A, lower, upper)
+
+
+def test_rows_without_bounds_change_nothing():
+    cases = [of_kind(seed) for seed in range(24)]
+    cases += [(past_zero(t), Status.SOLVED) for t in (0.0, 1e-17, 1e-16)]
+    expected = np.array([status for _, status in cases])
+    made, never = [], ([-INF] * 3, [INF] * 3)
+    for i, (qp, _) in enumerate(cases):
+        rng = np.random.default_rng(200 + i)
+        sizes = 1.0, 1e-17, 1e-3, 1e3, 1e17, 1e200, 10 ** rng.uniform(-3, 3, (3, 1))
+        drawn = [size * rng.normal(size=(3, 5)) for size in sizes]
+        made += [with_rows(qp, added, *never) for added in (0.0, 0.5 * np.eye(3, 5), *drawn)]
+    cotangent = np.random.default_rng(0).normal(size=5)
+    found, gradient = jax.device_get(_solve_and_pull_batch(stack(made), cotangent))
+    each = len(made) // len(cases)
+    np.testing.assert_array_equal(found.status, np.repeat(expected, each))
+    for part in (found.x, found.y, *gradient):
+        np.testing.assert_array_equal(part, np.repeat(part[::each], each, axis=0))
+
+    # without the rows sums have fewer terms, which may be rounded differently
+    qps = stack([qp for qp, _ in cases])
+    alone, alone_gradient = jax.device_get(_solve_and_pull_batch(qps, cotangent))
+    np.testing.assert_array_equal(alone.status, expected)
+    pairs = zip((found.x, found.y, *gradient), (alone.x, alone.y, *alone_gradient), strict=True)
+    for more, part in pairs:
+        more, part = more[::each][expected == Status.SOLVED], part[expected == Status.SOLVED]
+        rows = part.shape[1]  # nine, or as many as variables
+        np.testing.assert_allclose(more[:, :rows], part, rtol=0.0, atol=1e-12)
+        assert not more[:, rows:].any()
+
+
+def test_block_rows_without_bounds_change_nothing(walking):
+    for i, qp in enumerate(walking[:3]):
+        free = np.zeros(qp.A.shape[:2], bool)
+        free[i::3, 4 + i] = True
+        l, u = np.where(free.ravel(), [[-INF], [INF]], [qp.l, qp.u])  # noqa: E741
+        tangent = jax.tree.map(np.ones_like, qp)
+        entries = [np.where(free[..., None], size * qp.A, qp.A) for size in (0.0, 1.0, 1e17)]
+        found = [along(qp._replace(A=A, l=l, u=u), tangent) for A in entries]
+        check_solved(found[0][0])
+        for other in found[1:]:
+            jax.tree.map(np.testing.assert_array_equal, other, found[0])
 
 
 def test_each_status_has_its_meaning_and_is_documented():

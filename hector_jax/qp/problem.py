@@ -10,7 +10,7 @@ A violation is relative to the larger of x and the row's bound. A row of zeros (
 1e-15 of the longest row's, 1e-7 in 32 bits) has no length and its bound sets no scale: its
 violation is relative to x, its length is the geometric mean of the others, and a violation below
 the rounding of the largest bound is zero. Bounds that cross within the tolerance are an equality
-at their middle.
+at their middle. A row without bounds has no part in any scale: its entries count as zeros.
 """
 
 from enum import IntEnum
@@ -214,11 +214,14 @@ def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
 
 def normalise(tolerances: Tolerances, qp: QP) -> Normal:
     """Normalise a QP of finite numbers."""
+    bound = jnp.stack([qp.u, qp.l])
+    finite = jnp.abs(bound) < INFINITE
+    # a row without bounds is one of zeros: its entries must not scale variables and other rows
+    bounded = jnp.any(finite, axis=0).reshape(qp.A.shape[:-1])
+    qp = qp._replace(A=jnp.where(bounded[..., None], qp.A, 0.0))
     column, row, zeros = _scales(tolerances, qp)
     A = _scale_rows_and_columns(qp.A, row, column)
     sign = jnp.asarray(SIGN, A.dtype)
-    bound = jnp.stack([qp.u, qp.l])
-    finite = jnp.abs(bound) < INFINITE
     bound = jnp.where(finite, row * bound, 0.0)
     rounding = _ROUNDING * jnp.finfo(A.dtype).eps
     # no x satisfies a violated row of zeros, nor comes nearer to crossed bounds than their middle
