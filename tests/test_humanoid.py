@@ -88,6 +88,21 @@ def test_what_corner_friction_allows_the_corners_hold(yaw):
         assert held(wrench * [1, 1, 1, 0.999, 0.999, 0.999], yaw)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.4, np.pi / 4, -1.2])
+def test_corner_friction_allows_all_that_the_corners_hold_within_their_squares(yaw):
+    """The edges of that cone: one corner loaded, its force at a corner of its square."""
+    side = 0.5 * MU / max(abs(np.cos(yaw)), abs(np.sin(yaw)))
+    foot = np.array([(side * a, side * b, 1.0) for a, b in product((1, -1), (1, -1))])
+    forces = foot @ Rotation.from_euler("z", yaw).as_matrix().T
+    edges = np.concatenate(
+        [corner_forces(yaw)[:, 3 * i : 3 * i + 3] @ forces.T for i in range(4)], 1
+    )
+    eye = jnp.eye(6)
+    A, lower, upper = rows(CORNER_FRICTION, Contact(eye[:3], eye[3:], yaw, ROBOT, MU, MOST), eye)
+    room = np.minimum(A @ edges - lower[:, None], upper[:, None] - A @ edges)
+    np.testing.assert_allclose(room.min(axis=1), 0.0, atol=1e-12)
+
+
 def test_the_bounds_of_a_flat_foot_are_its_edges():
     A, lower, upper = flat_rows(0.3)
     inside = lambda w: np.all(lower - 1e-9 <= A @ w) and np.all(A @ w <= upper + 1e-9)  # noqa: E731

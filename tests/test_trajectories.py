@@ -117,6 +117,11 @@ def test_the_limits_are_those_that_the_robot_was_seen_to_have():
     np.testing.assert_allclose(slower, np.array(LIMITS) / 2)
 
 
+def test_who_stands_on_points_walks_back_as_fast_as_ahead():
+    found = limits(ROBOT._replace(toe=np.zeros(()), heel=np.zeros(())), GaitConfig())
+    assert found == LIMITS._replace(back=LIMITS.ahead)
+
+
 @pytest.mark.parametrize("name", [*COMMANDS, *UNSEEN])
 def test_built_in_trajectories_are_within_the_limits(name):
     assert beyond(LIMITS, named_command(name)) is None

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hector_jax.control.parameters import bounds
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import TUNABLES, bounds
 from hector_jax.control.weights import (
     Weights,
     between,
@@ -13,6 +14,7 @@ from hector_jax.control.weights import (
     directions,
     expert,
     nominal,
+    sample_weights,
     scale_weights,
     vector_to_weights,
     weight_names,
@@ -89,3 +91,37 @@ def test_between_two_sets_weights_are_geometric_means_and_other_numbers_lie_on_a
     np.testing.assert_allclose(weights_to_vector(third) ** 3, cubes, rtol=1e-12)
     points = Weights(nominal().Q, nominal().R._replace(moment=np.zeros((2, 0))))
     assert between(points, points).R.moment.shape == (2, 0)
+
+
+BOXES = {
+    "footstep_feedback": (0.0, 0.5),  # [s]
+    "footstep_width": (0.0, 0.2),  # [m]
+    "turn_lead": (0.0, 2.0),
+    "effort_reference": (0.0, 1.0),
+    "horizontal_gain": (0.0, 50.0),  # [1/s^3], as the next three
+    "height_gain": (0.0, 200.0),
+    "tilt_gain": (0.0, 1000.0),
+    "yaw_gain": (0.0, 1000.0),
+    "friction": (0.1, 1.0),
+    "gravity_compensation": (0.0, 1.0),
+    "foot_height": (0.02, 0.2),  # [m]
+    "kp": (1.0, 300.0),  # [N m/rad]
+    "kd": (0.05, 10.0),  # [N m s/rad]
+}
+
+
+def test_each_number_beside_the_weights_has_its_box_and_its_default_inside():
+    parameters = WalkConfig().parameters(nominal())
+    for name, (low, high) in BOXES.items():
+        assert (TUNABLES[name].lower, TUNABLES[name].upper) == (low, high), name
+        default = np.asarray(TUNABLES[name].read(parameters))
+        assert ((low <= default) & (default <= high)).all(), name
+
+
+def test_drawn_weights_are_spread_evenly_up_and_down_within_the_factor():
+    middle = weights_to_vector(nominal())
+    drawn = [weights_to_vector(w) / middle for w in sample_weights(nominal(), 2.0, 10)]
+    shares = np.log2(np.asarray(drawn))
+    assert -1.0 <= shares.min() < -0.9
+    assert 0.9 < shares.max() <= 1.0
+    assert abs(shares.mean()) < 0.1
