@@ -38,5 +38,6 @@ def test_the_guess_is_the_active_set_of_the_solution(dtype):
 
 def test_only_small_problems_fit():
     assert gpu_kernel.fits(50, 110)
+    assert gpu_kernel.fits(gpu_kernel.VARIABLES, gpu_kernel.ROWS)
     assert not gpu_kernel.fits(100, 110)
     assert not gpu_kernel.fits(50, 220)

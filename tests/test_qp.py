@@ -690,6 +690,17 @@ def test_derivative_is_finite_where_it_is_one_sided():
     assert np.isfinite(moved).all()
 
 
+def test_residuals_have_no_slope():
+    """They are evidence; a loss that holds them is not pulled by their rounding."""
+
+    @jax.jit
+    def slopes(qp):
+        moved = jax.jvp(solve_qp, (qp,), (qp,))[1]
+        return moved.primal_residual, moved.dual_residual, moved.gap
+
+    assert slopes(small()) == (0.0, 0.0, 0.0)
+
+
 @pytest.mark.parametrize(
     "change",
     [{"q": np.zeros(3)}, {"A": np.zeros((1, 3))}, {"u": np.zeros(2)}, {"P": np.zeros((3, 3))}],
