@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -120,6 +121,26 @@ def test_how_many_walk_side_by_side_does_not_matter(on_toy):
     one, *others = (tune_batch(TOY, ROBOT, asked, last_command, lanes=lanes) for lanes in (1, 2, 0))
     for other in others:
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-9), one, other)
+
+
+def test_as_many_walk_side_by_side_as_are_asked_for(on_toy, monkeypatch):
+    asked, seen = stack([problem(w, [scenario("c")]) for w in STARTS]), []
+
+    def advance(config, lanes, *rest):
+        seen.append(lanes)
+        raise InterruptedError
+
+    monkeypatch.setattr(batch, "_advance", advance)
+    for lanes in (3, 0, None):
+        with pytest.raises(InterruptedError):
+            tune_batch(TOY, ROBOT, asked, last_command, lanes=lanes, devices=jax.devices("cpu")[:1])
+    assert seen == [3, 0, 1]
+
+
+@pytest.mark.parametrize(("lanes", "loops"), [(1, True), (2, True), (5, False), (0, False)])
+def test_all_at_once_is_no_loop(lanes, loops):
+    program = jax.make_jaxpr(partial(batch._map, lanes, jnp.sin))(jnp.ones(5))
+    assert ("scan" in str(program)) == loops
 
 
 def test_a_start_that_falls_keeps_itself_and_says_so(on_toy):

@@ -28,7 +28,7 @@ from hector_jax.tuning.difftune import (
     step_weights,
     tune,
 )
-from hector_jax.tuning.evaluate import Evaluation, aligned
+from hector_jax.tuning.evaluate import Evaluation, aligned, mean_over_commands
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -213,6 +213,13 @@ def test_the_papers_ten_steps_are_taken_uphill_too_and_later_ones_are_not(monkey
     assert (np.diff(kept) < 0).all()
 
 
+def test_a_late_step_to_the_same_loss_gains_nothing(monkeypatch):
+    level = lambda *model, **inputs: evaluation(1e5)  # noqa: E731
+    found = tune_toy(monkeypatch, level, TuneConfig(iterations=12))
+    assert [i.accepted for i in found.history] == [True] * 11 + [False]
+    assert found.history[-1].reason == "the loss rose"
+
+
 @pytest.mark.parametrize(("patience", "last"), [(5, 11), (15, 15)])
 def test_it_stops_where_nothing_is_gained(monkeypatch, patience, last):
     config = TuneConfig(patience=patience, gain=5e-3)
@@ -302,6 +309,21 @@ def test_aligned_loss_weights_are_powers_of_ten_that_level_the_gradients():
     for gradient, term in zip((0.3, 4e-3), config, strict=False):
         alpha = term.weight
         assert 10**-0.5 <= alpha * gradient / 2e4 <= 10**0.5
+
+
+def test_a_loss_without_control_is_aligned_to_its_last_term():
+    loss = (PAPER_LOSS[1]._replace(weight=7.0), PAPER_LOSS[0]._replace(weight=3.0))
+    first, last = (term.name for term in loss)
+    found = aligned(loss, {first: 1.0, last: 100.0})
+    assert {term.name: term.weight for term in found} == {first: 300.0, last: 3.0}
+
+
+def test_the_mean_over_commands_begins_at_the_mean_of_their_losses_with_equal_parts():
+    each = [lambda weights, loss=loss: evaluation(loss) for loss in (1.0, 3.0, 8.0)]
+    found = mean_over_commands(each, nominal())(nominal())
+    assert found.loss == pytest.approx(4.0)
+    parts = [vector(random_tree(0)) * 4.0 / loss for loss in (1.0, 3.0, 8.0)]
+    np.testing.assert_allclose(vector(found.gradient), np.mean(parts, axis=0))
 
 
 @pytest.mark.slow

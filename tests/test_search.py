@@ -101,6 +101,13 @@ def test_a_record_is_carried_on_to_a_larger_budget_and_read_for_a_smaller_one(tm
     same(small, run(tmp_path, SearchConfig(30, 10, seed=3), walk=unasked)["s"])
 
 
+def test_a_record_says_its_format_first(tmp_path):
+    """Another number makes all that was written before unreadable."""
+    run(tmp_path)
+    head = json.loads((tmp_path / "s.jsonl").read_text().splitlines()[0])
+    assert next(iter(head.items())) == ("format", 1)
+
+
 def test_searches_in_lock_step_are_those_that_go_alone(tmp_path):
     together = run(tmp_path / "both", names=("c", "s"))
     alone = run(tmp_path / "one", names=("s",))["s"]

@@ -11,7 +11,13 @@ from hector_jax.core.trajectory import State, Wrench
 from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.rollout import RolloutConfig, _moved_by, _within_friction, rollout
+from hector_jax.tuning.rollout import (
+    RolloutConfig,
+    _estimate_error,
+    _moved_by,
+    _within_friction,
+    rollout,
+)
 from hector_jax.tuning.rollout import no_variation as as_believed
 
 ROBOT = load_robot()
@@ -84,6 +90,15 @@ def test_a_foot_that_slips_keeps_its_direction_and_load():
     force = jnp.array([[30.0, -20.0, 50.0], [15.0, 8.0, 50.0]])
     found = _within_friction(Wrench(force, force), jnp.asarray(0.5)).force
     np.testing.assert_allclose(found, [[15.0, -10.0, 50.0], [15.0, 8.0, 50.0]])
+
+
+def test_the_error_of_the_estimate_has_its_stated_sizes():
+    sizes = State(*(jnp.asarray(rows) for rows in np.linspace(0.01, 0.12, 12).reshape(4, 3)))
+    noisy = no_variation()._replace(noise=sizes)
+    draw = jax.jit(jax.vmap(lambda tick: _estimate_error(noisy, tilted(), tick)))
+    for found, size in zip(draw(jnp.arange(2000)), sizes, strict=True):
+        np.testing.assert_allclose(found.std(axis=0), size, rtol=0.1)
+        assert (np.abs(found.mean(axis=0)) < 0.1 * size).all()
 
 
 def test_friction_has_a_slope_where_no_foot_carries_anything():
