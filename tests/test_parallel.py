@@ -163,6 +163,9 @@ def test_a_robot_of_feet_alone_has_nothing_that_may_not_touch_the_floor():
 
 def test_no_jobs_are_no_walks():
     assert list(walk_batch(CONFIG, ROBOT, [])) == []
+    assert list(walk_batch(CONFIG, ROBOT, [], chunk=1)) == []
+    with pytest.raises(ValueError, match="at least one walk, got 0"):
+        walk_batch(CONFIG, ROBOT, [], chunk=0)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """What is sensed: base state, ground wrench, falls and the estimator's errors, against MuJoCo."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -198,3 +200,29 @@ def test_a_seed_gives_the_same_errors():
     first, same, other = (sensing.draw_errors(estimator, 10, s, 10, 50) for s in (1, 1, 2))
     np.testing.assert_array_equal(first, same)
     assert (first != other).any()
+
+
+def test_the_controller_is_told_the_truth_plus_the_error():
+    world = build_world(ideal())
+    data = mujoco.MjData(world.model)
+    data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
+    reading, _ = foot_points(ROBOT, flat_reading(world, data))
+    true, _ = sensing.measure(ROBOT, reading, jnp.zeros(()), sensing.no_error(ROBOT))
+    error = np.linspace(0.01, 0.22, 22)
+    told, yaw = sensing.measure(ROBOT, reading, jnp.zeros(()), error)
+    off = jax.tree.map(jnp.subtract, told, true)
+    np.testing.assert_allclose(np.concatenate(off.state), error[:12], atol=1e-12)
+    np.testing.assert_allclose(off.joints, error[12:], atol=1e-12)
+    assert not np.any(off.joint_rates)
+    assert yaw == 0.0  # the true one
+
+
+def test_more_contacts_than_there_is_room_for_are_a_part_on_the_floor():
+    world, contacts = build_world(ideal()), sensing.empty_contacts(1)
+    crowd = SimpleNamespace(ncon=sensing.CONTACTS + 1, contact=None)
+    sensing.read_contacts(world, crowd, contacts, 0)
+    one = jax.tree.map(lambda x: x[0], contacts)
+    row = flat_reading(world, mujoco.MjData(world.model))
+    _, wrench, _, touches = sensed(ROBOT, row, one, world.floor, world.foot_of_geom)
+    assert touches.floor
+    assert not np.any(wrench.force)

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from model import OTHERS
 
-from hector_jax.control.controller import WalkConfig
+from hector_jax.control.controller import Plan, WalkConfig
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.runtime import workers
+from hector_jax.core.trajectory import State, Wrench
 from hector_jax.core.tree import layout, pack, unpack
 from hector_jax.robot.model import load_robot
-from hector_jax.sim.loop import Job
+from hector_jax.sim.loop import Job, Sample
 from hector_jax.sim.mujoco_plant import MujocoPlant
 from hector_jax.sim.standin import standin
-from hector_jax.sim.walk import walk, walk_many
+from hector_jax.sim.walk import _trajectory, walk, walk_many
 from hector_jax.sim.world import Push, build_world, hfs, ideal
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
@@ -151,6 +152,17 @@ def test_a_fall_is_held_and_marked():
     for leaf in jax.tree.leaves(fall._replace(period=None, initial=None, fallen=None)):
         assert np.isfinite(leaf).all()
         assert (leaf[first:] == leaf[max(first - 1, 0)]).all()
+
+
+@pytest.mark.parametrize(("fell", "good"), [(1, 0), (2, 1), (5, 4)])
+def test_from_a_fall_on_the_sample_before_it_is_repeated(fell, good):
+    at, zero = np.arange(6.0), np.zeros(6)
+    state = State(*(at[:, None] * np.ones(3) for _ in range(4)))
+    sample = Sample(state, state, Wrench(zero, zero), zero, at, at >= fell, at >= fell)
+    plan = Plan(Wrench(zero, zero), zero, None, None, zero, None)
+    walked = _trajectory([plan], [sample], 1, 1, 5, False)
+    np.testing.assert_array_equal(walked.joints, np.minimum(at[1:], good))
+    np.testing.assert_array_equal(walked.fallen, at[1:] >= fell)
 
 
 def test_every_sample_can_be_watched(watched):

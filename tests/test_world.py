@@ -102,6 +102,14 @@ def test_backlash_adds_a_free_play_that_the_encoder_does_not_see():
     assert np.abs(slack).max() < 1.2 * width
 
 
+def test_the_play_of_a_joint_is_free_of_all_but_a_little_damping():
+    world = build_world(hfs())
+    joints = [world.model.joint(f"{name}_backlash") for name in ROBOT.description.joints]
+    for joint in joints:
+        assert (joint.stiffness[0], joint.frictionloss[0], joint.armature[0]) == (0.0, 0.0, 0.0)
+        assert joint.damping[0] == 0.01
+
+
 def test_joint_friction_holds_against_a_small_torque():
     free = knee_after(ideal(), torque=0.2)[0]
     held = knee_after(ideal()._replace(joint_friction=np.array(0.3)), torque=0.2)[0]

@@ -171,9 +171,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
             say("loss weights: " + ", ".join(f"{term.name} {term.weight:g}" for term in loss))
             run = run._replace(setup=run.setup._replace(config=replace(config, loss=loss)))
         settings = _note_settings(run)
-        inputs = run.setup.config, robot, start, run.problems["with"]
-        matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the tunings
         tuned = _tune_sets(run)
+        inputs = run.setup.config, robot, start, run.problems["with"]
+        matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the walks
         walks = _walk_sets(run, tuned.sets)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
