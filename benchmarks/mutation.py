@@ -29,7 +29,8 @@ PARTS = {
         "control/footstep control/gait control/legs control/mpc control/reference"
         " control/trajectories control/controller control/weights control/contact"
         " control/parameters",
-        "gait footstep legs reference trajectories weights config mpc controller rollout export",
+        "gait footstep legs reference trajectories weights config mpc controller rollout humanoid"
+        " quadruped export",
     ),
     "qp": (
         "qp/problem qp/active_set qp/interior_point qp/certificates qp/method qp/derivative"
@@ -39,12 +40,12 @@ PARTS = {
     "tuning": (
         "tuning/batch tuning/difftune tuning/loss tuning/grounded tuning/rollout"
         " tuning/sensitivity tuning/evaluate search/cmaes",
-        "loss config rollout difftune faults measured online search batch",
+        "loss variation config rollout difftune faults measured online search batch",
     ),
     "sim": (
         "sim/actuators sim/changes sim/loop sim/mjx_model sim/parallel sim/sensing sim/walk"
         " sim/world",
-        "changes sensing world walk engine variation parallel fidelity",
+        "changes sensing world sizes walk engine parallel fidelity",
     ),
 }
 COMPARISONS = {"<": "<=", "<=": "<", ">": ">=", ">=": ">", "==": "!=", "!=": "=="}
