@@ -23,6 +23,7 @@ from hector_jax.control.footstep import Feet
 from hector_jax.control.gait import GaitConfig, gait_named
 from hector_jax.control.mpc import MpcProblem, solve_mpc
 from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.trajectories import limits
 from hector_jax.control.weights import (
     direction_names,
     expert,
@@ -329,6 +330,13 @@ def test_the_plain_net_of_four_feet_returns_every_command(data):
 
 
 # Gradients, engines, export
+
+
+def test_its_limits_allow_the_speeds_that_it_trots_at():
+    found = limits(ROBOT, walk_config(ROBOT).gait)
+    assert 0.45 < found.ahead == found.back < 1.0
+    assert 0.3 < found.aside <= found.ahead
+    assert 0.5 < found.turn  # without a joint that turns the leg
 
 
 def test_gradient_of_the_quadruped_over_50_ticks_is_that_of_differences():

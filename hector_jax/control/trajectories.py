@@ -132,20 +132,22 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
 
     A rule of thumb: during a stance the body moves by half of the leg's reach at standing height;
     the other half remains for balance. Sideways the hip's roll limits the reach, backwards the
-    foot's shorter lever behind the ankle, in a turn the hip's yaw. For HECTOR in MuJoCo (`hfs`,
+    foot's shorter lever behind the ankle, in a turn the hip's yaw, or without such a joint the way
+    that the feet go sideways. A leg without an ankle ends at its foot point. For HECTOR in MuJoCo (`hfs`,
     expert weights, 6 s from standing) the estimate is 1.55, 1.04, 1.20 m/s and 3.5 rad/s; it walked
     at 1.6, 1.0, 1.2 m/s and 4 rad/s, and fell at 1.8, 1.2, 1.5 m/s and 5 rad/s.
     """
     hip, knee, ankle = knee_joints(robot)
-    axis = robot.joint_axis[0]
+    axis, foot = robot.joint_axis[0], np.asarray(robot.foot_point[0])
     hip_yaw, hip_roll = (np.argmax(np.abs(axis[:, direction])) for direction in (2, 0))
 
-    def distance(first: int, last: int) -> float:
-        """Return the distance [m] of two joints in the knee's plane, the leg straight at zero."""
-        offset = robot.joint_origin[0, first + 1 : last + 1].sum(axis=0)
+    def length(offset: np.ndarray) -> float:
+        """Return the length [m] of an offset in the knee's plane, the leg straight at zero."""
         return float(np.linalg.norm(offset - (offset @ axis[knee]) * axis[knee]))
 
-    thigh, shin = distance(hip, knee), distance(knee, ankle)
+    origin = np.asarray(robot.joint_origin[0])
+    thigh = length(origin[hip + 1 : knee + 1].sum(axis=0))
+    shin = length(origin[knee + 1 : ankle + 1].sum(axis=0) if ankle > knee else foot)
 
     def leg_length(bend: float) -> float:
         return np.sqrt(thigh**2 + shin**2 + 2 * thigh * shin * np.cos(bend))
@@ -156,15 +158,17 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
 
     standing_length = leg_length(robot.standing_joints[knee])
     reach = np.sqrt(max(leg_length(smallest_limit(knee)) ** 2 - standing_length**2, 0.0))
-    yaw, roll = smallest_limit(hip_yaw), smallest_limit(hip_roll)
-    height = standing_length + abs(robot.foot_point[0, 2])
+    height = standing_length + (abs(foot[2]) if ankle > knee else 0.0)
+    sideways = min(reach, height * np.tan(smallest_limit(hip_roll)))
+    has_yaw = np.abs(axis[hip_yaw, 2]) > 0.5
+    turn = smallest_limit(hip_yaw) if has_yaw else sideways / np.linalg.norm(origin[0, :2])
     stance = gait.stance * gait.tick
     back = min(robot.heel / robot.toe, 1.0) if robot.toe > 0.0 else 1.0
     return Limits(
         ahead=float(reach / stance),
         back=float(reach / stance * back),
-        aside=float(min(reach, height * np.tan(roll)) / stance),
-        turn=float(yaw / stance),
+        aside=float(sideways / stance),
+        turn=float(turn / stance),
     )
 
 
