@@ -59,7 +59,7 @@ from hector_jax.tuning.difftune import Iteration, TuneConfig
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total
 
 # modules that decide the numbers
-CODE = ("tuning.grounded", "tuning.sensitivity", "grfm.network", "sim.walk")
+CODE = ("tuning.difftune", "tuning.grounded", "tuning.sensitivity", "grfm.network", "sim.walk")
 ADAPTATION = Path(adaptation.__file__).read_text()  # part of the cache keys, as CODE
 SETS = ("nominal", "expert", "tuned")
 WINDOW = 0.4  # [s] of the losses along a walk

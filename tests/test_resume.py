@@ -421,7 +421,6 @@ def test_a_run_is_not_resumed_from_another_start(tmp_path):
             args=flags.Tune(traj=("straight",)),
             start=nominal()._replace(others={name: np.array(x) for name, x in others.items()}),
             trajectories=(command_of("straight"),),
-            seconds=4.0,
             net=SimpleNamespace(params=None),
         )
 

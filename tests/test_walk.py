@@ -165,6 +165,22 @@ def test_from_a_fall_on_the_sample_before_it_is_repeated(fell, good):
     np.testing.assert_array_equal(walked.fallen, at[1:] >= fell)
 
 
+class Breaks(MujocoPlant):
+    """A plant whose engine warns 33 ms after t = 0."""
+
+    @property
+    def broken(self):
+        return self._time > 33
+
+
+def test_a_plant_that_breaks_ends_the_walk_a_tick_before(short):
+    job = Job(expert(), named_command("straight"), ideal(), seconds=0.2)
+    walked = walk(CONFIG, ROBOT, job, build=Breaks)
+    np.testing.assert_array_equal(walked.fallen, np.arange(200) >= 30)
+    np.testing.assert_array_equal(walked.joints[:30], short.joints[:30])
+    assert (walked.joints[30:] == short.joints[29]).all()
+
+
 def test_every_sample_can_be_watched(watched):
     _, times = watched
     np.testing.assert_allclose(times, 0.001 * np.arange(1, len(times) + 1))

@@ -273,7 +273,7 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))
     setup, args = Setup(Executor(), CONFIG, robot), Tune(walks=12, walk_plants=3)
-    run = command._Run(setup, tmp_path, args, nominal(), (course,), 4.0, net)
+    run = command._Run(setup, tmp_path, args, nominal(), (course,), net)
     tuned = command._tune_sets(run)
     assert seen == {"plants": 3, "commands": ["straight"], "count": 12}
     np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)

@@ -9,7 +9,7 @@ from typing import Any
 from hector_jax.cli import arguments, doctor, evaluate, flags, propose, tune, verdict, view
 from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.console import Broken, say
 from hector_jax.core.environment import versions
@@ -55,9 +55,6 @@ def collect(args: flags.Collect) -> None:
     robot = load_robot(args.robot)
     out = arguments.flag_folder(args.out, flags.Collect.out, args.robot, robot)
     with workers(args.processes) as pool:
-        straight = arguments.load_trajectory("straight", robot)
-        tuning = tunings.tune_config(robot)
-        tunings.compile_programs(pool, tuning, robot, nominal(robot), straight)
         nets.collect(pool, config, robot, out)
     say(f"the walks are in {out}")
 

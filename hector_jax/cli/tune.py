@@ -154,16 +154,19 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
+    net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
-        tunings.compile_programs(pool, config, robot, start, trajectories[0])
+        for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
+            name = trajectories[0].name
+            say(f"before any tuning, {name} on hfs with nominal weights: {line}")
         run = _Run(
             setup=Setup(pool, config, robot, made_with.get("commit", "")),
             folder=folder,
             args=args,
             start=start,
             trajectories=trajectories,
-            net=_net(pool, args, robot),
+            net=net or _net(pool, args, robot),
         )
         norms = tunings.gradient_norms(run.setup, run.problems)
         if args.alpha == "auto":
@@ -175,6 +178,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         inputs = run.setup.config, robot, start, run.problems["with"]
         matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the walks
         walks = _walk_sets(run, tuned.sets)
+        curvature = main_directions(matrix.result(), start)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
     result, by_name = _result(run, tuned, walks)
@@ -184,7 +188,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,
-        curvature=main_directions(matrix.result(), start),
+        curvature=curvature,
         errors=run.net.errors,
         tunings=tuned.tunings,
         shifts=tuned.shifts,
@@ -197,20 +201,21 @@ def _tune_in(folder: Path, args: Tune) -> None:
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-
-    def print_text() -> None:
-        for name, verdict in by_name.items():
-            print_table(verdict, f"{name}, {plural(args.seeds, 'plant')}")
-        if show:
-            show()
-
+    print_text = partial(_print_tables, by_name, args.seeds, show)
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
 
 
+def _print_tables(
+    verdicts: Mapping[str, metrics.Verdict], seeds: int, show: Callable[[], None] | None
+) -> None:
+    for name, verdict in verdicts.items():
+        print_table(verdict, f"{name}, {plural(seeds, 'plant')}")
+    if show:
+        show()
+
+
 def _net(pool: Executor, args: Tune, robot: Robot) -> nets.TrainedNet:
-    if args.net is not None:
-        return nets.load_net(args.net, robot, args.variant)[0]
     data = arguments.robot_folder(args.data, args.robot, robot)
     return nets.load_or_train(pool, robot, data, args.variant)
 

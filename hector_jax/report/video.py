@@ -10,6 +10,7 @@ and the run goes on without a film.
 import os
 import pickle
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -191,6 +192,8 @@ def _draw_in_child(folder: Path, back_end: str) -> str:
         return f"not done after {_TIMEOUT:.0f} s"
     if child.returncode == 0:
         return ""
+    if child.returncode == -signal.SIGINT:  # Ctrl-C reaches the child too
+        raise KeyboardInterrupt
     # the error of the first traceback; later ones come from resources that it left open
     first = child.stderr.split("Traceback (most recent call last):")[:2][-1]
     errors = [line for line in first.splitlines() if line.strip() and line[0] != " "]

@@ -12,6 +12,7 @@ import numpy as np
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.reference import Command
+from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import bar, say, say_if_slow
 from hector_jax.core.environment import code_hash
@@ -29,7 +30,7 @@ from hector_jax.grfm.paper import LinearMap, fit_linear
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.tunings import TUNING_CODE, tune_config, tuning_paths
+from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
@@ -95,6 +96,7 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
             walks of other settings.
     """
     with locked(folder):
+        compile_programs(pool, tune_config(robot), robot, nominal(robot), command_of("straight"))
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
         _collect(pool, config, robot, jobs, folder, collection_settings(config, robot))

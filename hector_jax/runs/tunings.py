@@ -17,7 +17,7 @@ from jaxtyping import Float
 from hector_jax.control.reference import COMMANDS, Command, named_command, standing_anchor
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, nominal
-from hector_jax.core.console import bar, say
+from hector_jax.core.console import bar
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
@@ -236,11 +236,11 @@ def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: C
 
 def compile_programs(
     pool: Executor, config: TuneConfig, robot: Robot, start: Weights, trajectory: NamedCommand
-) -> None:
+) -> list[str]:
     """Compile the programs of a tuning in one process and walk once in another one.
 
     The other processes load the programs of both from the cache. The walk is with nominal weights
-    on the hfs; its faults that no weights can cure are printed.
+    on the hfs; its faults that no weights can cure are returned, a line each.
 
     Args:
         pool: worker processes.
@@ -256,5 +256,4 @@ def compile_programs(
             report_progress(done, 2, "")
             future.result()
         report_progress(2, 2, "")
-    for line in walking.result():
-        say(f"before any tuning, {trajectory.name} on hfs with nominal weights: {line}")
+    return walking.result()

@@ -74,7 +74,7 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
 
     def append(world: World, data: mujoco.MjData) -> None:
         if rows and rows[-1][-1]:
-            return  # the rest of the tick in which it fell
+            return  # the rest of the ten ticks in which it fell
         up = rotation_of(data.qpos[3:7])[2]  # z of the trunk's axes in the world
         roll, pitch = np.arctan2(up[1], up[2]), -np.arcsin(np.clip(up[0], -1.0, 1.0))
         height = data.qpos[2] + up @ robot.com_offset

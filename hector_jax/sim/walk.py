@@ -1,10 +1,10 @@
 """The closed loop in an engine that steps one plant: one walk, or many on several processes.
 
 Controller and sensing are compiled once per process and serve every walk, whatever its weights,
-command, plant and engine: per tick one program plans and one samples, per millisecond one turns the
-plan into torques, and the engine steps in between. Inputs and outputs of the torques are packed
-into a few flat arrays, because the cost of a call grows with their number. A fall ends the walk:
-later samples repeat the last valid one and are marked as fallen.
+command (of up to PIECES pieces), plant and engine: per tick one program plans, per millisecond one
+turns the plan into torques and the engine steps, and one program samples ten ticks. Inputs and
+outputs are packed into a few flat arrays, because the cost of a call grows with their number. A
+fall ends the walk: later samples repeat the last valid one and are marked as fallen.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -155,7 +155,8 @@ def walk(
         robot: its nominal robot; the plant is its MJCF, or that of the job.
         job: the walk.
         build: builds the plant in an engine.
-        retune: returns the weights to plan with at each tick from t = 0 on, instead of the job's.
+        retune: returns the weights of plans and legs at each tick from t = 0 on, instead of the
+            job's.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they repeat the last valid sample and are
@@ -193,9 +194,11 @@ def _walk_blocks(
     planner_for = cache(partial(_planner, config, of_constants, of_inputs))
     memory_size, row = packed.size, np.zeros(1 + readings[0].size + errors[0].size)
     carry, torques, planner, step = None if retune is None else retune.init, None, None, 0
-    while step < steps and not plant.broken:
+    while step < steps:
         begin, plans, at_start = step, [], []
-        for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
+        # nothing is to be retuned after a fall, which is looked for after each block
+        whole = retune is None and steps - step >= _BLOCK * count
+        for _ in range(_BLOCK if whole else 1):
             tick, reading, error = first + step // count, readings[step], errors[step]
             if tick == start:
                 anchor = programs.anchor(body, reading, yaw, start)
@@ -213,7 +216,7 @@ def _walk_blocks(
             if torques is None:
                 layouts = planner.layout, layout(state), layout((clock, *measured))
                 torques = _torques(config, of_constants, *layouts)
-            for row[0] in range(count):
+            for row[0] in range(count):  # the first number of `row` is the millisecond
                 row[1 : -error.size], row[-error.size :] = readings[step], errors[step]
                 packed_state = torques(packed_constants, packed, packed_state, row)
                 plant.step(np.asarray(packed_state)[:joints], forces[step])
@@ -221,12 +224,12 @@ def _walk_blocks(
                 plant.read(readings[step])
             yaw = np.asarray(packed_state)[joints]
             if plant.broken:
-                break
+                break  # rare: the samples of less than a block are another program
         inputs = *stack(at_start), readings[begin : step + 1], plant.ground()
         samples = programs.samples(body, command, *inputs, ground_of=plant.ground_of)
         assert planner is not None  # it has planned
         yield unpack(planner.layout, np.stack(plans))[1], jax.tree.map(np.asarray, samples)
-        if np.asarray(samples.fallen).any():
+        if plant.broken or np.asarray(samples.fallen).any():
             return
 
 
@@ -248,11 +251,8 @@ def _trajectory(
     steps = lead + np.arange(length)
     rows = np.minimum(steps, good)
     initial = jax.tree.map(lambda x: x[min(lead - 1, good)], flat.state)
-    plan, chosen = (
-        jax.tree.map(lambda x: x[rows // count], plan),
-        jax.tree.map(lambda x: x[rows], flat),
-    )
-    chosen = chosen._replace(fallen=steps > good)
+    plan = jax.tree.map(lambda x: x[rows // count], plan)
+    chosen = jax.tree.map(lambda x: x[rows], flat)._replace(fallen=steps > good)
     return loop.as_trajectory(np.array(TIME_STEP), initial, plan, chosen)
 
 
