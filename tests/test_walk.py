@@ -169,7 +169,7 @@ class Breaks(MujocoPlant):
     """A plant whose engine warns 33 ms after t = 0."""
 
     @property
-    def broken(self):
+    def broken(self):  # noqa: D102
         return self._time > 33
 
 
