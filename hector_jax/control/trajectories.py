@@ -161,9 +161,8 @@ def limits(robot: Robot, gait: GaitConfig) -> Limits:
     height = standing_length + (abs(foot[2]) if ankle > knee else 0.0)
     sideways = min(reach, height * np.tan(smallest_limit(hip_roll)))
     has_yaw = np.abs(axis[hip_yaw, 2]) > 0.5
-    turn = (
-        smallest_limit(hip_yaw) if has_yaw else sideways / max(np.linalg.norm(origin[0, :2]), 1e-9)
-    )
+    radius = max(np.linalg.norm(origin[0, :2]), 1e-9)  # [m] of the hips about the trunk's origin
+    turn = smallest_limit(hip_yaw) if has_yaw else sideways / radius
     stance = gait.stance * gait.tick
     back = min(robot.heel / robot.toe, 1.0) if robot.toe > 0.0 else 1.0
     return Limits(

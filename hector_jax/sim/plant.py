@@ -42,7 +42,8 @@ class Plant(ABC):
     def ground_of(robot: Robot, contacts: Any) -> Ground:
         """Sum the contacts that `ground` returned, in JAX, to a Ground with a leading axis n.
 
-        The closed loop calls it within its compiled program of samples. By default `ground` has summed them already.
+        The closed loop calls it within its compiled program of samples. By default `ground` has
+        summed them already.
         """
         return contacts
 
