@@ -39,7 +39,7 @@ from hector_jax.tuning.difftune import TuneConfig, descend
 from hector_jax.tuning.evaluate import Evaluation
 
 ROBOT, S = load_robot(), named_command("s")
-WALKS = 60  # so many that 25 kills come before the last one is saved
+WALKS = 160  # so many that 25 kills come before the last one is saved
 
 
 def done(folder: Path, what) -> None:

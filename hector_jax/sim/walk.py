@@ -65,7 +65,7 @@ def _programs(config: WalkConfig) -> SimpleNamespace:
         ground = ground_of(robot, contacts)
         return jax.vmap(sample)(anchors, times, yaws, readings[:-1], readings[1:], ground)
 
-    def anchor(robot: Robot, reading: Array, yaw: Array, start_tick: int) -> Anchor:
+    def anchor(robot: Robot, reading: Array, yaw: Array, start_tick: Array) -> Anchor:
         state = sensing.base_state(robot, sensing.unpack_reading(reading), yaw)
         return anchor_at(robot, state, start_tick)
 
@@ -156,7 +156,7 @@ def walk(
         job: the walk.
         build: builds the plant in an engine.
         retune: returns the weights of plans and legs at each tick from t = 0 on, instead of the
-            job's.
+            job's; called for up to nine ticks after a fall too.
 
     Returns:
         Samples of 1 ms from t = 0 (numpy). After a fall they repeat the last valid sample and are
@@ -196,9 +196,7 @@ def _walk_blocks(
     carry, torques, planner, step = None if retune is None else retune.init, None, None, 0
     while step < steps:
         begin, plans, at_start = step, [], []
-        # nothing is to be retuned after a fall, which is looked for after each block
-        whole = retune is None and steps - step >= _BLOCK * count
-        for _ in range(_BLOCK if whole else 1):
+        for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
             tick, reading, error = first + step // count, readings[step], errors[step]
             if tick == start:
                 anchor = programs.anchor(body, reading, yaw, start)
