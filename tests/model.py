@@ -24,7 +24,7 @@ LEARNS_TOUCHDOWNS = ROBOT._replace(
 ANCHOR = standing_anchor(ROBOT)
 SHORT = RolloutConfig(ticks=50)
 CONFIG = TuneConfig(rollout=SHORT)
-# the numbers beside Q and R in walks that have some: other names are another program
+# the numbers beside Q and R of tests that have some: in MJX other names are another program
 OTHERS = ("footstep_width", "foot_height", "kp", "kd")
 PLAIN = effect_of(None, GaitConfig())
 BRIEF = RolloutConfig(ticks=5)  # where a few ticks are enough, with one command

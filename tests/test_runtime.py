@@ -8,7 +8,19 @@ from pathlib import Path
 import jax.numpy as jnp
 import pytest
 
+from hector_jax.control.reference import named_command
+from hector_jax.control.trajectories import command_of
+from hector_jax.control.weights import nominal
 from hector_jax.core import runtime
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import tunings
+from hector_jax.runs.setup import Setup
+from hector_jax.runs.tunings import Problem
+from hector_jax.sim.loop import Job
+from hector_jax.sim.walk import walk_many
+from hector_jax.sim.world import hfs
+from hector_jax.tuning.difftune import TuneConfig
+from hector_jax.tuning.rollout import RolloutConfig
 
 
 def test_the_cache_lies_in_the_users_cache_folder(monkeypatch, tmp_path):
@@ -71,3 +83,20 @@ def test_a_failing_caller_ends_the_workers():
 def test_fewer_than_one_worker_is_refused():
     with pytest.raises(ValueError, match="at least 1, got 0"), runtime.workers(0):
         pass
+
+
+@pytest.mark.slow
+def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    robot, config = load_robot(), TuneConfig(rollout=RolloutConfig(ticks=10), iterations=1)
+    straight = command_of("straight")._replace(seconds=0.1)
+    problems = {name: Problem(named_command(name), None) for name in ("straight", "c")}
+    with runtime.workers(2) as pool:
+        tunings.compile_programs(pool, config, robot, nominal(), straight)
+        tunings.tune(Setup(pool, config, robot), problems, tmp_path / "tunings", title="")
+        weights = config.rollout.walk.with_others(nominal(), ["friction"])
+        jobs = [Job(weights, command, hfs(), 0.1) for command, *_ in problems.values()]
+        list(walk_many(pool, config.rollout.walk, robot, jobs))
+    programs = [path.name.split("-")[0] for path in (tmp_path / "hector_jax" / "jax").iterdir()]
+    assert programs.count("jit_plan") == 2  # for all feet on the ground, and for one
+    assert programs.count("jit_evaluate") == 1

@@ -27,7 +27,7 @@ class Command(NamedTuple):
     yaw_rate: Float[Any, "*batch S"]  # [rad/s]
 
 
-PIECES = 4  # of most commands, see `with_pieces`
+PIECES = 4  # least number in walks and collections, see `with_pieces`
 
 
 def with_pieces(command: Command) -> Command:

@@ -36,7 +36,7 @@ def pack(tree: Any) -> Float[Array, " n"]:
 
 
 def unpack(layout: Layout, packed: Float[Array | np.ndarray, "*batch n"]) -> Any:
-    """Rebuild the tree of this layout from what `pack` returned; with NumPy if that is NumPy's."""
+    """Rebuild the tree of this layout from packed numbers; leaves are NumPy's if they are."""
     structure, leaves = layout
     split = np.split if isinstance(packed, np.ndarray) else jnp.split
     parts = split(packed, np.cumsum([leaf.size for leaf in leaves])[:-1], axis=-1)

@@ -145,8 +145,8 @@ def answer(
         pair: names of the two tunings.
         share: share of the second tuning.
     """
-    _, lower, upper, _ = TUNABLES["friction"]
-    friction = float(np.clip(_FRICTION * setup.config.rollout.walk.mpc.friction, lower, upper))
+    box, planned = TUNABLES["friction"], setup.config.rollout.walk.mpc.friction
+    friction = float(np.clip(_FRICTION * planned, box.lower, box.upper))
     mixture = between(sets[pair[0]], sets[pair[1]], share)
     mixture = mixture._replace(others={"friction": friction, **mixture.others})
     plants = drawn_plants(setup.robot, setup.robot.description.tuning.choice_plants)

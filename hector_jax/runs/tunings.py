@@ -202,8 +202,7 @@ def gauss_newton_job(
 ) -> Float[np.ndarray, "n n"]:
     """Return the Gauss-Newton matrix divided by the loss, mean over the commands, in a worker."""
     matrix_of = partial(gauss_newton, config.rollout, robot, start)
-    models = _models(config, robot, problem)
-    results = [matrix_of(*model.values(), config.loss) for model in models]
+    results = [matrix_of(**m, loss=config.loss) for m in _models(config, robot, problem)]
     return np.mean([np.asarray(matrix) / float(loss) for loss, matrix in results], axis=0)
 
 
@@ -246,12 +245,12 @@ def compile_programs(
         pool: worker processes.
         config, robot, start, trajectory: of the tuning.
     """
-    command, seconds = trajectory.command, trajectory.seconds or Job._field_defaults["seconds"]
-    job = on_host(Job(nominal(robot), command, hfs(robot.description), seconds))
+    job = Job(nominal(robot), trajectory.command, hfs(robot.description))
+    job = on_host(job._replace(seconds=trajectory.seconds or job.seconds))
     on_hfs = config.rollout.walk, jax.tree.map(np.asarray, robot), job
     with bar("compiling, once on a machine") as report_progress:
         walking = pool.submit(not_the_weights, *on_hfs)
-        tuning = pool.submit(_compile_tuning, config, robot, start, command)
+        tuning = pool.submit(_compile_tuning, config, robot, start, trajectory.command)
         for done, future in enumerate((walking, tuning)):
             report_progress(done, 2, "")
             future.result()
