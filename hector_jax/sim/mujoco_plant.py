@@ -1,7 +1,6 @@
 """A plant in MuJoCo C."""
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import numpy as np
@@ -14,7 +13,7 @@ from hector_jax.sim import sensing
 from hector_jax.sim.changes import worlds_by_step
 from hector_jax.sim.loop import Job
 from hector_jax.sim.plant import Plant
-from hector_jax.sim.sensing import Contacts, Ground
+from hector_jax.sim.sensing import Ground, RawContacts
 from hector_jax.sim.world import World, build_world, standing_qpos
 
 
@@ -57,7 +56,7 @@ class MujocoPlant(Plant):
         self._ctrl[world.actuator] = torque
         self._push[:] = push
         mujoco.mj_step(world.model, self.data)
-        sensing.read_contacts(world, self.data, self._contacts, self._steps)
+        sensing.read_contacts(self.data, self._contacts, self._steps)
         self._time, self._steps = self._time + 1, self._steps + 1
         if self._on_step is not None:
             self._on_step(world, self.data)
@@ -68,14 +67,18 @@ class MujocoPlant(Plant):
         self._flat[:split], self._flat[split:-1] = self._qpos, self._qvel
         self._flat.take(self._reading_index, out=row, mode="clip")
 
-    def ground(self) -> tuple[Contacts, Array, Array]:
+    def ground(self) -> tuple[RawContacts, Array, Array]:
         """See `Plant`."""
-        contacts = Contacts(*(x[: self._steps] for x in self._contacts))
+        contacts = RawContacts(*(x[: self._steps] for x in self._contacts))
         self._steps = 0
         return contacts, *self._place
 
     @staticmethod
-    def ground_of(robot: Robot, contacts: tuple[Contacts, Array, Array]) -> Ground:
+    def ground_of(robot: Robot, contacts: tuple[RawContacts, Array, Array]) -> Ground:
         """See `Plant`."""
-        ground_of = partial(sensing.ground_of, feet=len(robot.foot_point))
+
+        def ground_of(raw: RawContacts, floor: Array, foot_of_geom: Array) -> Ground:
+            feet = len(robot.foot_point)
+            return sensing.ground_of(sensing.contacts_of(raw, floor), floor, foot_of_geom, feet)
+
         return jax.vmap(ground_of, in_axes=(0, None, None))(*contacts)

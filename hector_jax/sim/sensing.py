@@ -63,6 +63,19 @@ class Contacts(NamedTuple):
     friction: Float[Array, "*batch n 2"]  # along the tangents
 
 
+class RawContacts(NamedTuple):
+    """Contacts of one step as they lie in MuJoCo C; `contacts_of` makes sense of them."""
+
+    count: Int[Array, "*batch"]  # rows in use; more than there are if there is no room
+    geoms: Int[Array, "*batch n 2"]
+    position: Float[Array, "*batch n 3"]  # [m]
+    frame: Float[Array, "*batch n 9"]
+    friction: Float[Array, "*batch n 5"]
+    address: Int[Array, "*batch n"]  # first constraint; -1: left out of the constraints
+    first: Int[Array, "*batch"]  # constraint that `force` begins with
+    force: Float[Array, "*batch m"]  # [N] of the last constraints, which are those of contacts
+
+
 def coordinates(world: World) -> Int[np.ndarray, " reading"]:
     """Return the indices of a flat reading in (qpos, qvel, 0); without backlash slack is the 0."""
     model = world.model
@@ -129,29 +142,48 @@ def ground_of(
     return Ground(foot_force.sum(axis=1), moment, touches)
 
 
-def read_contacts(world: World, data: mujoco.MjData, out: Contacts, row: int) -> None:
+def read_contacts(data: mujoco.MjData, out: RawContacts, row: int) -> None:
     """Copy the contacts of the last step of MuJoCo C into a row of `out` (numpy)."""
-    count, contact = data.ncon, data.contact
-    out.geoms[row] = -1
-    if count > CONTACTS:  # more than in any walk: reported as a part on the floor that is no foot
-        out.geoms[row] = world.floor
-    elif count:
-        address = contact.efc_address  # -1: left out of the constraints
-        edges = address[:, None] + _EDGES
+    # few operations: what a millisecond runs does not fit the cache of a core
+    count = out.count[row] = data.ncon
+    if 0 < count <= CONTACTS:
+        contact, force = data.contact, data.efc_force
         out.geoms[row, :count] = contact.geom
         out.position[row, :count] = contact.pos
-        out.frame[row, :count] = contact.frame.reshape(-1, 3, 3)
-        out.friction[row, :count] = contact.friction[:, :2]
-        out.pyramid[row, :count] = data.efc_force.take(edges, mode="clip")
-        if address.min() < 0:
-            out.pyramid[row, :count][address < 0] = 0.0
+        out.frame[row, :count] = contact.frame
+        out.friction[row, :count] = contact.friction
+        out.address[row, :count] = contact.efc_address
+        first = out.first[row] = max(len(force) - out.force.shape[1], 0)
+        out.force[row, : len(force) - first] = force[first:]
 
 
-def empty_contacts(rows: int) -> Contacts:
-    """Return empty contacts (numpy) for `rows` steps of MuJoCo C."""
-    shapes = {"position": (3,), "frame": (3, 3), "pyramid": (4,), "friction": (2,)}
+def empty_contacts(rows: int) -> RawContacts:
+    """Return room for the contacts of `rows` steps of MuJoCo C (numpy)."""
+    shapes = {"position": (3,), "frame": (9,), "friction": (5,)}
     zeros = {name: np.zeros((rows, CONTACTS, *shape)) for name, shape in shapes.items()}
-    return Contacts(geoms=np.full((rows, CONTACTS, 2), -1), **zeros)
+    count, first = np.zeros((2, rows), int)
+    geoms, address = (np.zeros((rows, CONTACTS, *shape), np.int32) for shape in ((2,), ()))
+    force = np.zeros((rows, CONTACTS * len(_EDGES)))
+    return RawContacts(count=count, geoms=geoms, address=address, first=first, force=force, **zeros)
+
+
+def contacts_of(raw: RawContacts, floor: Int[Array, ""]) -> Contacts:
+    """Return the contacts of a step of MuJoCo C.
+
+    More than there is room for, which no walk has, are reported as a part on the floor that is no
+    foot.
+    """
+    present = jnp.arange(len(raw.address)) < raw.count
+    crowded = raw.count > len(raw.address)
+    edges = raw.address[:, None] - raw.first + _EDGES
+    loaded = present & (raw.address >= 0)
+    return Contacts(
+        geoms=jnp.where(crowded, floor, jnp.where(present[:, None], raw.geoms, -1)),
+        position=raw.position,
+        frame=raw.frame.reshape(-1, 3, 3),
+        pyramid=jnp.where(loaded[:, None], raw.force[edges], 0.0),
+        friction=raw.friction[:, :2],
+    )
 
 
 def measure(

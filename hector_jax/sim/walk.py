@@ -182,7 +182,10 @@ def _walk_blocks(
     joints, lead = len(robot.joint_lower), steps - ticks * count
     forces = np.asarray(_push_forces(job.push, np.arange(-lead, ticks * count)))
     errors = sensing.draw_errors(job.imperfections.estimator, joints, job.seed, lead, ticks * count)
-    readings, clock, yaw = np.zeros((steps + 1, 13 + 3 * joints)), np.int32(0), np.zeros(())
+    # inputs of each millisecond: milliseconds since the plan, reading, error
+    rows = np.zeros((steps + 1, 1 + 13 + 3 * joints + errors.shape[1]))
+    rows[:, 0], rows[:-1, -errors.shape[1] :] = np.arange(steps + 1) % count, errors
+    readings, clock, yaw = rows[:, 1 : -errors.shape[1]], np.int32(0), np.zeros(())
     plant.read(readings[0])
     body, command = jax.device_put((robot, with_pieces(job.command)))
     constants = body, _parameters(config, job.weights), command, job.imperfections
@@ -192,7 +195,7 @@ def _walk_blocks(
     trees = anchor, constants, state, memory
     packed_anchor, packed_constants, packed_state, packed = map(_pack, trees)
     planner_for = cache(partial(_planner, config, of_constants, of_inputs))
-    memory_size, row = packed.size, np.zeros(1 + readings[0].size + errors[0].size)
+    memory_size = packed.size
     carry, torques, planner, step = None if retune is None else retune.init, None, None, 0
     while step < steps:
         begin, plans, at_start = step, [], []
@@ -208,15 +211,14 @@ def _walk_blocks(
                 packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
             at_start.append((anchor, np.int32(tick), yaw))
             planner = planner_for(contacts_needed(config, tick))
-            inputs = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], reading, error
+            inputs = packed_anchor, [tick], np.asarray(packed)[:memory_size], [yaw], rows[step, 1:]
             packed = planner.plan(packed_constants, np.concatenate(inputs))
             plans.append(np.asarray(packed))
             if torques is None:
                 layouts = planner.layout, layout(state), layout((clock, *measured))
                 torques = _torques(config, of_constants, *layouts)
-            for row[0] in range(count):  # the first number of `row` is the millisecond
-                row[1 : -error.size], row[-error.size :] = readings[step], errors[step]
-                packed_state = torques(packed_constants, packed, packed_state, row)
+            for _ in range(count):
+                packed_state = torques(packed_constants, packed, packed_state, rows[step])
                 plant.step(np.asarray(packed_state)[:joints], forces[step])
                 step += 1
                 plant.read(readings[step])
