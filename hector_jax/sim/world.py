@@ -264,7 +264,9 @@ def _with_numbers(world: World, imperfections: Imperfections) -> World:
     model.opt.timestep = TIME_STEP
     model.opt.ls_iterations = LINE_SEARCH
     # A diverged state must stay so: a reset to the initial pose would look like a new start.
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    # The robot is one tree: a search for separate islands of constraints finds one.
+    flags = mujoco.mjtDisableBit
+    model.opt.disableflags |= flags.mjDSBL_AUTORESET | flags.mjDSBL_ISLAND
     model.dof_frictionloss[dof] = imperfections.joint_friction
     model.dof_damping[dof] = imperfections.joint_damping
     model.dof_armature[dof] *= imperfections.armature
