@@ -66,7 +66,7 @@ class Contacts(NamedTuple):
 class RawContacts(NamedTuple):
     """Contacts of one step as they lie in MuJoCo C; `contacts_of` makes sense of them."""
 
-    count: Int[Array, "*batch"]  # rows in use; more than there are if there is no room
+    size: Int[Array, "*batch"]  # number of contacts; n or less, else there is no room
     geoms: Int[Array, "*batch n 2"]
     position: Float[Array, "*batch n 3"]  # [m]
     frame: Float[Array, "*batch n 9"]
@@ -145,7 +145,7 @@ def ground_of(
 def read_contacts(data: mujoco.MjData, out: RawContacts, row: int) -> None:
     """Copy the contacts of the last step of MuJoCo C into a row of `out` (numpy)."""
     # few operations: what a millisecond runs does not fit the cache of a core
-    count = out.count[row] = data.ncon
+    count = out.size[row] = data.ncon
     if 0 < count <= CONTACTS:
         contact, force = data.contact, data.efc_force
         out.geoms[row, :count] = contact.geom
@@ -161,10 +161,10 @@ def empty_contacts(rows: int) -> RawContacts:
     """Return room for the contacts of `rows` steps of MuJoCo C (numpy)."""
     shapes = {"position": (3,), "frame": (9,), "friction": (5,)}
     zeros = {name: np.zeros((rows, CONTACTS, *shape)) for name, shape in shapes.items()}
-    count, first = np.zeros((2, rows), int)
+    size, first = np.zeros((2, rows), int)
     geoms, address = (np.zeros((rows, CONTACTS, *shape), np.int32) for shape in ((2,), ()))
     force = np.zeros((rows, CONTACTS * len(_EDGES)))
-    return RawContacts(count=count, geoms=geoms, address=address, first=first, force=force, **zeros)
+    return RawContacts(size=size, geoms=geoms, address=address, first=first, force=force, **zeros)
 
 
 def contacts_of(raw: RawContacts, floor: Int[Array, ""]) -> Contacts:
@@ -173,8 +173,8 @@ def contacts_of(raw: RawContacts, floor: Int[Array, ""]) -> Contacts:
     More than there is room for, which no walk has, are reported as a part on the floor that is no
     foot.
     """
-    present = jnp.arange(len(raw.address)) < raw.count
-    crowded = raw.count > len(raw.address)
+    present = jnp.arange(len(raw.address)) < raw.size
+    crowded = raw.size > len(raw.address)
     edges = raw.address[:, None] - raw.first + _EDGES
     loaded = present & (raw.address >= 0)
     return Contacts(
