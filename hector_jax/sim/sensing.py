@@ -144,7 +144,7 @@ def ground_of(
 
 def read_contacts(data: mujoco.MjData, out: RawContacts, row: int) -> None:
     """Copy the contacts of the last step of MuJoCo C into a row of `out` (numpy)."""
-    # few operations: what a millisecond runs does not fit the cache of a core
+    # few operations: after other code each costs several times what it does alone
     count = out.size[row] = data.ncon
     if 0 < count <= CONTACTS:
         contact, force = data.contact, data.efc_force
