@@ -190,6 +190,7 @@ def check_gradient(
     effect,
     bar,
     directions=np.eye(24),  # noqa: B008
+    case="",
 ):
     tuning, model = TuneConfig(rollout=config), (command, anchor, effect)
     evaluation = tune_step(tuning, robot, weights, *model)
@@ -202,12 +203,12 @@ def check_gradient(
         if errors[-1] <= bar:
             break
     print(f"error against differences {errors}", end=" ")
-    assert errors[-1] <= bar, errors
+    assert errors[-1] <= bar, (case, errors)
     trajectory, columns = propagate(config, robot, weights, command, anchor, effect)
     _, forward = sensitivity.gradient(PAPER_LOSS, trajectory, columns, weights)
     forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
     print(f"forward against reverse {relative(forward, reverse):.1e}")
-    assert relative(forward, reverse) <= 1e-8
+    assert relative(forward, reverse) <= 1e-8, case
 
 
 def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor):
@@ -215,21 +216,27 @@ def test_gradient_over_50_ticks_is_that_of_differences(robot, anchor):
     check_gradient(SHORT, robot, weights, named_command("s"), anchor, PLAIN, 1e-6, OBLIQUE)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_gradient_over_50_ticks_is_that_of_differences_from_anywhere(robot, anchor, net, seed):
-    command = named_command(COMMANDS[seed])
-    for effect in (PLAIN, net):
-        check_gradient(SHORT, robot, random_weights(seed), command, anchor, effect, 1e-6)
+@pytest.fixture
+def cases(net):
+    """Random weights for each trajectory, with phi the identity and the net."""
+    return [
+        ((name, said), random_weights(seed), named_command(name), effect)
+        for seed, name in enumerate(COMMANDS)
+        for said, effect in (("plain", PLAIN), ("net", net))
+    ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, net, seed):
-    weights, command = random_weights(seed), named_command(COMMANDS[seed])
-    for effect in (PLAIN, net):
-        assert not walk(LONG, robot, weights, command, anchor, effect).fallen.any()
-        check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4)
+def test_gradient_over_50_ticks_is_that_of_differences_from_anywhere(robot, anchor, cases):
+    for case, weights, command, effect in cases:
+        check_gradient(SHORT, robot, weights, command, anchor, effect, 1e-6, case=case)
+
+
+@pytest.mark.slow
+def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, cases):
+    for case, weights, command, effect in cases:
+        assert not walk(LONG, robot, weights, command, anchor, effect).fallen.any(), case
+        check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4, case=case)
 
 
 def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor):
