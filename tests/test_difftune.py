@@ -327,18 +327,19 @@ def test_the_mean_over_commands_begins_at_the_mean_of_their_losses_with_equal_pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "least"), [("straight", 0.15), ("c", 0.2), ("s", 0.2)])
-def test_ten_iterations_from_nominal_go_down_inside_the_box(name, least):
+def test_ten_iterations_from_nominal_go_down_inside_the_box():
     """By a fifth at least was asked for; on straight 16 % is measured (docs/decisions.md)."""
-    command = named_command(name)
-    found = tune(TuneConfig(iterations=10), ROBOT, nominal(), command, ANCHOR, last_command)
-    losses = [float(i.evaluation.loss) for i in found.history]
-    assert len(losses) == 11
-    assert losses[-1] <= (1.0 - least) * losses[0]
     lower, upper = map(vector, bounds())
-    for iteration in found.history:
-        assert iteration.accepted
-        assert ((lower <= vector(iteration.weights)) & (vector(iteration.weights) <= upper)).all()
+    for name, least in (("straight", 0.15), ("c", 0.2), ("s", 0.2)):
+        command = named_command(name)
+        found = tune(TuneConfig(iterations=10), ROBOT, nominal(), command, ANCHOR, last_command)
+        losses = [float(i.evaluation.loss) for i in found.history]
+        assert len(losses) == 11, name
+        assert losses[-1] <= (1.0 - least) * losses[0], name
+        for iteration in found.history:
+            at = vector(iteration.weights)
+            assert iteration.accepted, (name, iteration.reason)
+            assert ((lower <= at) & (at <= upper)).all(), (name, at)
 
 
 # Numbers of the controller beside Q and R
