@@ -347,26 +347,26 @@ def test_a_searched_leg_is_differentiable_and_finite_out_of_reach(tmp_path):
 # It walks
 
 
-def walked(robot, plant, seconds):
-    job = Job(nominal(robot), named_command("straight"), plant, seconds)
+def walked(robot, world, seconds):
+    job = Job(nominal(robot), named_command("straight"), world(), seconds)
     found = walk(walk_config(robot), robot, job)
-    assert not found.fallen.any()
-    assert not found.legs_touch.any()
+    assert not found.fallen.any(), world
+    assert not found.legs_touch.any(), world
     return found.state.position[-1] - found.initial.position
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plant", [ideal(), hfs()], ids=["ideal", "hfs"])
-def test_strider_walks_five_metres_untuned(strider, plant):
-    ahead, aside, up = walked(strider, plant, 10.5)
-    assert ahead > 5.0
-    assert abs(aside) < 0.5
-    assert abs(up) < 0.1
+def test_strider_walks_five_metres_untuned(strider):
+    for world in (ideal, hfs):
+        ahead, aside, up = walked(strider, world, 10.5)
+        assert ahead > 5.0, world
+        assert abs(aside) < 0.5, world
+        assert abs(up) < 0.1, world
 
 
 @pytest.mark.slow
 def test_strider_walks_with_its_joints_in_another_order(tmp_path):
-    ahead, aside, _ = walked(load_robot(reordered("xzyyy", tmp_path)), hfs(), 4.0)
+    ahead, aside, _ = walked(load_robot(reordered("xzyyy", tmp_path)), hfs, 4.0)
     assert ahead > 1.8
     assert abs(aside) < 0.3
 
