@@ -1,6 +1,7 @@
 """The pictures and the film of each command, drawn by plots and video.py."""
 
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -129,10 +130,11 @@ def film(
     """
     say("making the film")
     pair = motions(robot, walks)
+    files = ((write_film, path), *([(write_strip, strip)] if strip is not None else []))
     try:
-        write_film(path, robot, pair)
-        if strip is not None:
-            write_strip(strip, robot, pair)
+        with ThreadPoolExecutor(len(files)) as background:  # other processes draw
+            for drawn in [background.submit(write, file, robot, pair) for write, file in files]:
+                drawn.result()
     except VideoUnavailable as error:
         say(str(error))
         return str(error)

@@ -233,6 +233,13 @@ def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: C
     difftune.tune_step(config, robot, difftune.init(config, start).best, **model)
 
 
+def _trace_tuning(config: TuneConfig, robot: Robot, start: Weights, command: Command) -> None:
+    """Trace the program of a tuning, which its first call in this process then need not do."""
+    (model,) = _models(config, robot, Problem(command, None))
+    weights, inputs = difftune.init(config, start).best, tuple(model.values())
+    evaluate.evaluate_jit.lower(config.rollout, robot, weights, *inputs, config.loss)
+
+
 def compile_programs(
     pool: Executor, config: TuneConfig, robot: Robot, start: Weights, trajectory: NamedCommand
 ) -> list[str]:
@@ -248,9 +255,11 @@ def compile_programs(
     job = Job(nominal(robot), trajectory.command, hfs(robot.description))
     job = on_host(job._replace(seconds=trajectory.seconds or job.seconds))
     on_hfs = config.rollout.walk, jax.tree.map(np.asarray, robot), job
+    inputs = config, robot, start, trajectory.command
     with bar("compiling, once on a machine") as report_progress:
         walking = pool.submit(not_the_weights, *on_hfs)
-        tuning = pool.submit(_compile_tuning, config, robot, start, trajectory.command)
+        tuning = pool.submit(_compile_tuning, *inputs)
+        pool.submit(_trace_tuning, *inputs)  # by the process that has walked
         for done, future in enumerate((walking, tuning)):
             report_progress(done, 2, "")
             future.result()
