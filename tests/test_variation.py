@@ -1,5 +1,7 @@
 """What the controller does not know: a body, a ground and an estimate that are not as believed."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,16 +9,23 @@ import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
 from hector_jax.control.weights import nominal
+from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
+from hector_jax.robot.description import TuningSettings
 from hector_jax.robot.model import load_robot
+from hector_jax.tuning.difftune import TuneConfig, tune_step
+from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
+from hector_jax.tuning.loss import PAPER_LOSS
 from hector_jax.tuning.rollout import (
     RolloutConfig,
     _estimate_error,
     _moved_by,
     _within_friction,
     rollout,
+    rollout_config,
+    variation_of,
 )
 from hector_jax.tuning.rollout import no_variation as as_believed
 
@@ -122,3 +131,33 @@ def test_a_walk_in_a_world_that_is_as_believed_is_the_plain_one():
     apart = [np.abs(w.state.position - plain.state.position).max() for w in noisy[1:]]
     assert all(1e-4 < a < 0.05 for a in apart)
     assert apart[0] != apart[1]
+
+
+def robot_with(**settings):
+    description = replace(ROBOT.description, tuning=TuningSettings(**settings))
+    return ROBOT._replace(description=description)
+
+
+def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tunings():
+    assert variation_of(ROBOT) is None
+    variation = variation_of(robot_with(estimate_noise=2.0, delay=0.005))
+    np.testing.assert_allclose(variation.noise.velocity, 0.04)
+    np.testing.assert_allclose(variation.noise.euler, 0.002)
+    assert_same(variation._replace(noise=as_believed().noise, delay=0.0), as_believed())
+    assert variation.delay == 0.005
+
+
+def test_a_delay_of_more_than_a_tick_is_refused():
+    with pytest.raises(InputError, match=r"tuning.delay must be at most 0.01 s, got 0.02"):
+        rollout_config(robot_with(delay=0.02))
+
+
+def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
+    robot, config = robot_with(estimate_noise=1.0, delay=0.005), RolloutConfig(ticks=10)
+    inputs = nominal(), named_command("straight"), standing_anchor(ROBOT), last_command
+    seen = tune_step(TuneConfig(rollout=config), robot, *inputs)
+    expected = evaluate_jit(config, robot, *inputs, PAPER_LOSS, variation_of(robot))
+    assert_same(seen, expected)
+    plain = evaluate_jit(config, robot, *inputs, PAPER_LOSS, None)
+    assert abs(seen.loss / plain.loss - 1.0) > 1e-3
+    assert gradient_norms(config, robot, *inputs, PAPER_LOSS)["L_ctrl"] > 0.0

@@ -92,6 +92,8 @@ class TuningSettings:
 
     lead: Annotated[int, NOT_NEGATIVE] = 0  # gait ticks of stepping in place before the command
     touchdown_error: bool = False  # the net learns the distance from planned to actual touchdown
+    estimate_noise: Annotated[float, NOT_NEGATIVE] = 0.0  # factor on that of a real robot's sensors
+    delay: Annotated[float, NOT_NEGATIVE] = 0.0  # [s] of the ground's reaction, at most a tick
     choice_plants: Annotated[int, NOT_NEGATIVE] = 0  # plants to choose the iteration; 0: the last
 
     def __post_init__(self) -> None:

@@ -25,7 +25,7 @@ from hector_jax.core.inputs import plural
 from hector_jax.robot.model import Robot
 from hector_jax.runs import verdicts
 from hector_jax.runs.setup import Setup
-from hector_jax.sim.world import Imperfections, hfs_drawn, truth
+from hector_jax.sim.world import ESTIMATE_NOISE, Imperfections, hfs_drawn, truth
 from hector_jax.tuning.difftune import Tuning
 
 # fractions of the accepted iterations at which a path is walked
@@ -36,15 +36,6 @@ HELD_OUT = 8
 # first seed of the plants for choice and tuning, drawn like `hfs-varied` but with other seeds; the
 # plants of `earliest` have the seeds before it, so that none is among them however many there are
 _FIRST_SEED = 7000
-# Standard deviations of white noise: encoders of 14 bits; a gyroscope on a vibrating trunk;
-# velocity and position follow from both over a leg of about 0.7 m.
-_SIGMAS = {
-    "position": 0.001,  # [m]
-    "velocity": 0.02,  # [m/s]
-    "angle": 0.001,  # [rad]
-    "ang_velocity": 0.02,  # [rad/s]
-    "joint": 0.0004,  # [rad]
-}
 
 
 class Choice(NamedTuple):
@@ -57,7 +48,7 @@ class Choice(NamedTuple):
 
 def drawn_plants(robot: Robot, count: int, first_seed: int = _FIRST_SEED) -> list[Imperfections]:
     """Return plants drawn around the hfs; by default the first of those for choice and tuning."""
-    noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in _SIGMAS.items()})
+    noisy = truth()._replace(**{name: np.asarray(sigma) for name, sigma in ESTIMATE_NOISE.items()})
     return [
         hfs_drawn(seed, 0.4, robot.description)._replace(estimator=noisy)
         for seed in range(first_seed, first_seed + count)

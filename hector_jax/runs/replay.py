@@ -32,7 +32,7 @@ from hector_jax.tuning.difftune import (
     tune_step,
 )
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.rollout import rollout
+from hector_jax.tuning.rollout import rollout, variation_of
 from hector_jax.tuning.status import StepStatus
 
 MOST = 3
@@ -174,7 +174,8 @@ def replay(path: Path) -> Replay:
     is_cpu = jax.default_backend() == "cpu"
     with jax.default_device(None if is_cpu else jax.local_devices(backend="cpu")[0]):
         evaluation = jax.device_get(tune_step(config, *inputs))
-        trajectory = jax.device_get(jax.jit(rollout, static_argnums=0)(config.rollout, *inputs))
+        inputs = config.rollout, *inputs, variation_of(dump.robot)
+        trajectory = jax.device_get(jax.jit(rollout, static_argnums=0)(*inputs))
     same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, evaluation)
     then, now = about["environment"], environment()
     machines = {name: [then.get(name), now.get(name)] for name in sorted(then.keys() | now.keys())}

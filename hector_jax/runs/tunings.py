@@ -34,7 +34,7 @@ from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import rollout_config
+from hector_jax.tuning.rollout import rollout_config, variation_of
 
 # modules that determine the numbers, for `content_key`
 TUNING_CODE = ("tuning.difftune", "grfm.network")
@@ -236,8 +236,8 @@ def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: C
 def _trace_tuning(config: TuneConfig, robot: Robot, start: Weights, command: Command) -> None:
     """Trace the program of a tuning, which its first call in this process then need not do."""
     (model,) = _models(config, robot, Problem(command, None))
-    weights, inputs = difftune.init(config, start).best, tuple(model.values())
-    evaluate.evaluate_jit.lower(config.rollout, robot, weights, *inputs, config.loss)
+    inputs = robot, difftune.init(config, start).best, *model.values(), config.loss
+    evaluate.evaluate_jit.lower(config.rollout, *inputs, variation_of(robot))
 
 
 def compile_programs(

@@ -33,7 +33,7 @@ from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, TuneState
 from hector_jax.tuning.evaluate import Evaluation, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
-from hector_jax.tuning.rollout import Variation
+from hector_jax.tuning.rollout import Variation, variation_of
 from hector_jax.tuning.status import Stop
 
 AXIS = "problems"
@@ -131,6 +131,7 @@ def _evaluate(
     def walk(scenario: Scenario) -> Evaluation:
         command, anchor, index, loss, scale, variation = scenario
         effect = jax.tree.map(lambda leaf: leaf[0 if single else index], effects)
+        variation = variation_of(robot) if variation is None else variation
         result = evaluate(config.rollout, robot, weights, command, anchor, effect, loss, variation)
         value, terms, gradient = jax.tree.map(lambda x: x / scale, result[:3])
         return result._replace(loss=value, terms=terms, gradient=gradient)

@@ -34,6 +34,7 @@ from hector_jax.grfm.effect import HISTORY, Effect, Window, from_yaw_frame, grou
 from hector_jax.robot import srbm
 from hector_jax.robot.kinematics import foot_poses
 from hector_jax.robot.model import Robot
+from hector_jax.sim.world import ESTIMATE_NOISE
 
 
 @dataclass(frozen=True)
@@ -60,11 +61,14 @@ def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutCon
     Raises:
         InputError: one line naming the file, the key and what was expected.
     """
-    walk, lead = walk_config(robot), robot.description.tuning.lead
+    walk, tuning = walk_config(robot), robot.description.tuning
+    path, tick = robot.description.path, walk.gait.tick
+    if tuning.delay > tick:
+        raise InputError(f"{path}: tuning.delay must be at most {tick} s, got {tuning.delay}")
     try:
-        return RolloutConfig(walk=walk, ticks=ticks, lead=lead)
+        return RolloutConfig(walk=walk, ticks=ticks, lead=tuning.lead)
     except InputError as error:
-        raise InputError(f"{robot.description.path}: tuning: {error}") from None
+        raise InputError(f"{path}: tuning: {error}") from None
 
 
 class Variation(NamedTuple):
@@ -84,6 +88,16 @@ def no_variation() -> Variation:
     one, zero, zeros = np.asarray(1.0), np.asarray(0.0), np.zeros(3)
     noise = State(zeros, zeros, zeros, zeros)
     return Variation(one, one, zeros, np.asarray(1e3), zero, noise, np.asarray(0))
+
+
+def variation_of(robot: Robot) -> Variation | None:
+    """Return the variation of a robot's tunings from its description; None if it has none."""
+    tuning = robot.description.tuning
+    if not tuning.estimate_noise and not tuning.delay:
+        return None
+    names = ("angle", "position", "ang_velocity", "velocity")
+    noise = State(*(np.full(3, tuning.estimate_noise * ESTIMATE_NOISE[name]) for name in names))
+    return no_variation()._replace(noise=noise, delay=np.asarray(tuning.delay))
 
 
 class Carry(NamedTuple):
