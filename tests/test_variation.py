@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from hector_jax.control.reference import named_command, standing_anchor
-from hector_jax.control.weights import nominal
+from hector_jax.control.weights import nominal, weights_to_vector
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.grfm.effect import ground_effect, last_command
 from hector_jax.robot import srbm
 from hector_jax.robot.description import TuningSettings
 from hector_jax.robot.model import load_robot
+from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import TuneConfig, tune_step
 from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS
@@ -160,4 +161,10 @@ def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
     assert_same(seen, expected)
     plain = evaluate_jit(config, robot, *inputs, PAPER_LOSS, None)
     assert abs(seen.loss / plain.loss - 1.0) > 1e-3
-    assert gradient_norms(config, robot, *inputs, PAPER_LOSS)["L_ctrl"] > 0.0
+    single = tuple(t._replace(weight=float(t.name == "L_ctrl")) for t in PAPER_LOSS)
+    slope = evaluate_jit(config, robot, *inputs, single, variation_of(robot)).gradient
+    logs = weights_to_vector(jax.tree.map(jnp.multiply, slope, nominal()))
+    norms = gradient_norms(config, robot, *inputs, PAPER_LOSS)
+    assert norms["L_ctrl"] == pytest.approx(np.linalg.norm(logs))
+    loss, _ = gauss_newton(config, robot, *inputs, PAPER_LOSS)
+    assert loss == pytest.approx(seen.loss)

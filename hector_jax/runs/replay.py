@@ -174,8 +174,8 @@ def replay(path: Path) -> Replay:
     is_cpu = jax.default_backend() == "cpu"
     with jax.default_device(None if is_cpu else jax.local_devices(backend="cpu")[0]):
         evaluation = jax.device_get(tune_step(config, *inputs))
-        inputs = config.rollout, *inputs, variation_of(dump.robot)
-        trajectory = jax.device_get(jax.jit(rollout, static_argnums=0)(*inputs))
+        walk = partial(jax.jit(rollout, static_argnums=0), config.rollout)
+        trajectory = jax.device_get(walk(*inputs, variation_of(dump.robot)))
     same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, evaluation)
     then, now = about["environment"], environment()
     machines = {name: [then.get(name), now.get(name)] for name in sorted(then.keys() | now.keys())}

@@ -236,14 +236,15 @@ def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: C
 def _trace_tuning(config: TuneConfig, robot: Robot, start: Weights, command: Command) -> None:
     """Trace the program of a tuning, which its first call in this process then need not do."""
     (model,) = _models(config, robot, Problem(command, None))
-    inputs = robot, difftune.init(config, start).best, *model.values(), config.loss
-    evaluate.evaluate_jit.lower(config.rollout, *inputs, variation_of(robot))
+    weights, variation = difftune.init(config, start).best, variation_of(robot)
+    inputs = model["command"], model["anchor"], model["effect"], config.loss, variation
+    evaluate.evaluate_jit.lower(config.rollout, robot, weights, *inputs)
 
 
 def compile_programs(
     pool: Executor, config: TuneConfig, robot: Robot, start: Weights, trajectory: NamedCommand
 ) -> list[str]:
-    """Compile the programs of a tuning in one process and walk once in another one.
+    """Compile the programs of a tuning in one process; walk once and trace them in another one.
 
     The other processes load the programs of both from the cache. The walk is with nominal weights
     on the hfs; its faults that no weights can cure are returned, a line each.
@@ -259,7 +260,7 @@ def compile_programs(
     with bar("compiling, once on a machine") as report_progress:
         walking = pool.submit(not_the_weights, *on_hfs)
         tuning = pool.submit(_compile_tuning, *inputs)
-        pool.submit(_trace_tuning, *inputs)  # by the process that has walked
+        pool.submit(_trace_tuning, *inputs)  # by a free process; `tuning` raises its errors
         for done, future in enumerate((walking, tuning)):
             report_progress(done, 2, "")
             future.result()

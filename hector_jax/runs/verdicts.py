@@ -70,7 +70,7 @@ def walk_jobs(
 
 
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
-    """Return a walk of `seconds` on the plain single rigid body, which starts as in a tuning."""
+    """Return a walk of `seconds` on the plain rigid body, without a tuning's noise and delay."""
     config = rollout_config(robot, round(seconds / walk_config(robot).gait.tick))
     inputs = config, robot, weights, command, standing_anchor(robot), last_command
     return jax.device_get(jax.jit(rollout, static_argnums=0)(*inputs))

@@ -64,7 +64,7 @@ class Contacts(NamedTuple):
 
 
 class RawContacts(NamedTuple):
-    """Contacts of one step as they lie in MuJoCo C; `contacts_of` makes sense of them."""
+    """Contacts of one step as they lie in MuJoCo C; `contacts_of` decodes them."""
 
     size: Int[Array, "*batch"]  # number of contacts; n or less, else there is no room
     geoms: Int[Array, "*batch n 2"]
@@ -144,7 +144,7 @@ def ground_of(
 
 def read_contacts(data: mujoco.MjData, out: RawContacts, row: int) -> None:
     """Copy the contacts of the last step of MuJoCo C into a row of `out` (numpy)."""
-    # few operations: after other code each costs several times what it does alone
+    # few calls: within a walk each takes several times as long as when it is repeated alone
     count = out.size[row] = data.ncon
     if 0 < count <= CONTACTS:
         contact, force = data.contact, data.efc_force

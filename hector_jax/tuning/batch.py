@@ -48,7 +48,7 @@ class Scenario(NamedTuple):
     effect: Int[Array, "*batch"]  # index of a phi of the batch
     loss: Loss  # its weights have the same leading axes
     scale: Float[Array, "*batch"]  # divisor of the loss
-    variation: Variation | None = None
+    variation: Variation | None = None  # None: that of the robot's tunings, see `variation_of`
 
 
 class Problem(NamedTuple):

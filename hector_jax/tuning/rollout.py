@@ -112,7 +112,7 @@ class Carry(NamedTuple):
     before: Effect | None = None  # of the last tick, world frame; None without a variation
 
 
-def init_carry(robot: Robot, anchor: Anchor) -> Carry:
+def init_carry(robot: Robot, anchor: Anchor, variation: Variation | None = None) -> Carry:
     """Return the carry of a robot standing at its anchor, its weight shared by all feet."""
     zero = jnp.zeros(3)
     trunk = anchor.position - robot.com_offset
@@ -122,7 +122,9 @@ def init_carry(robot: Robot, anchor: Anchor) -> Carry:
     state = State(zero, anchor.position, zero, zero)
     feet = Feet(trunk + local, jnp.zeros(len(local)))
     commands = Wrench(force, jnp.zeros_like(force))
-    return Carry(state, feet, commands, anchor, NO_DISTURBANCE, jnp.asarray(False))
+    standing = jax.tree.map(lambda w: w[0], commands)
+    before = None if variation is None else ground_effect(standing)
+    return Carry(state, feet, commands, anchor, NO_DISTURBANCE, jnp.asarray(False), before)
 
 
 def _estimate_error(variation: Variation, state: State, tick: Int[Array, ""]) -> State:
@@ -272,7 +274,7 @@ def step_carry(
     if variation is None:
         state = srbm.step(robot, carry.state, response.wrench, feet.position, dt, response.legs)
     else:
-        assert carry.before is not None  # `rollout` starts with the effect of standing
+        assert carry.before is not None  # `init_carry` starts with the effect of standing
         last = carry.before, carry.feet.position
         state = _moved_by(variation, robot, carry.state, response, feet.position, *last, dt)
     fallen = carry.fallen | has_fallen(state, *robot.description.limits)
@@ -323,10 +325,7 @@ def rollout(
     policy = jax.checkpoint_policies.save_only_these_names(qp.SAVED)
     tick = partial(step_carry, config, robot, weights, command, effect, variation=variation)
     walk = partial(jax.lax.scan, jax.checkpoint(tick, policy=policy))
-    start, ticks = init_carry(robot, anchor), walked_ticks(config, anchor)
-    if variation is not None:
-        standing = jax.tree.map(lambda w: w[0], start.commands)
-        start = start._replace(before=ground_effect(standing))
+    start, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
     blocks = -(-len(ticks) // config.block)
     if blocks == 1:
         _, samples = walk(start, ticks)

@@ -19,11 +19,13 @@ from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
+from hector_jax.grfm.effect import Effect
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
 from hector_jax.tuning.rollout import (
     Carry,
     RolloutConfig,
+    Variation,
     from_start,
     init_carry,
     step_carry,
@@ -47,12 +49,13 @@ class Varied(NamedTuple):
     disturbance: Disturbance
     position: Float[Array, "*batch 3"]  # of the anchor
     yaw: Float[Array, "*batch"]
+    before: Effect | None  # None without a variation
 
 
 def varied(carry: Carry) -> Varied:
     """Return the parts of a carry that depend on the weights."""
-    state, feet, commands, anchor, disturbance, *_ = carry
-    return Varied(state, feet, commands, disturbance, anchor.position, anchor.yaw)
+    state, feet, commands, anchor, disturbance, _, before = carry
+    return Varied(state, feet, commands, disturbance, anchor.position, anchor.yaw, before)
 
 
 def no_tangents(carry: Carry, weights: Weights) -> Varied:
@@ -70,11 +73,12 @@ def step_sensitivities(
     carry: Carry,
     tangents: Varied,
     tick: Int[Array, ""],
+    variation: Variation | None = None,
 ) -> tuple[Carry, Varied, Trajectory, Sensitivities]:
     """Walk one tick of the closed loop with its n tangents.
 
     Args:
-        config, robot, weights, command, effect, carry, tick: see `step_carry`.
+        config, robot, weights, command, effect, carry, tick, variation: see `step_carry`.
         tangents: of the carry; the weights are the first axis.
 
     Returns:
@@ -85,10 +89,11 @@ def step_sensitivities(
     theta, to_weights = ravel_pytree(weights)
 
     def step(parts: Varied, theta: Float[jax.Array, " n"]) -> tuple:
-        state, feet, commands, disturbance, position, yaw = parts
+        state, feet, commands, disturbance, position, yaw, last = parts
         anchor = Anchor(position, yaw, carry.anchor.tick)
-        before = Carry(state, feet, commands, anchor, disturbance, carry.fallen)
-        after, sample = step_carry(config, robot, to_weights(theta), command, effect, before, tick)
+        before = Carry(state, feet, commands, anchor, disturbance, carry.fallen, last)
+        inputs = to_weights(theta), command, effect, before, tick, variation
+        after, sample = step_carry(config, robot, *inputs)
         return (varied(after), sample.state, sample.command), (after, sample)
 
     def tangent_of(tangent: Varied, direction: Float[Array, " n"]) -> tuple:
@@ -108,16 +113,17 @@ def propagate(
     command: Command,
     anchor: Anchor,
     effect: jax.tree_util.Partial,
+    variation: Variation | None = None,
 ) -> tuple[Trajectory, Sensitivities]:
     """Compute a rollout and its sensitivities by forward recursion. Source: Eq. 10."""
 
     def tick(carried: tuple[Carry, Varied], j: Int[Array, ""]):
         carry, tangents, sample, columns = step_sensitivities(
-            config, robot, weights, command, effect, *carried, j
+            config, robot, weights, command, effect, *carried, j, variation
         )
         return (carry, tangents), (sample, columns)
 
-    carry, ticks = init_carry(robot, anchor), walked_ticks(config, anchor)
+    carry, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
     _, (samples, columns) = jax.lax.scan(tick, (carry, no_tangents(carry, weights)), ticks)
     columns = jax.tree.map(lambda s: jnp.swapaxes(s[config.lead :], 0, 1), columns)
     return from_start(config, samples), columns
