@@ -97,7 +97,8 @@ def variation_of(robot: Robot) -> Variation | None:
         return None
     names = ("angle", "position", "ang_velocity", "velocity")
     noise = State(*(np.full(3, tuning.estimate_noise * ESTIMATE_NOISE[name]) for name in names))
-    return no_variation()._replace(noise=noise, delay=np.asarray(tuning.delay))
+    variation = no_variation()._replace(noise=noise, delay=np.asarray(tuning.delay))
+    return jax.tree.map(jnp.asarray, variation)
 
 
 class Carry(NamedTuple):
