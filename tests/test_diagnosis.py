@@ -152,8 +152,7 @@ def test_what_leads_to_a_fall_is_not_told_as_steady(monkeypatch):
 def test_a_fall_in_the_start_up_is_found_before_any_tuning(monkeypatch):
     monkeypatch.setattr(diagnosis, "record_walk", lambda *args: recorded())
     monkeypatch.setattr(diagnosis, "startup_fall", lambda *args: FALL)
-    for name in ("_compile_tuning", "_trace_tuning"):
-        monkeypatch.setattr(tunings, name, lambda *args: None)
+    monkeypatch.setattr(tunings, "_prepare_tuning", lambda *args: None)
     with ThreadPoolExecutor(1) as pool:
         inputs = TuneConfig(), ROBOT, nominal(), command_of("straight")
         assert tunings.compile_programs(pool, *inputs) == [TEXT]

@@ -12,7 +12,7 @@ from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.grfm.nets import History
 from hector_jax.report import plots
 from hector_jax.report.fidelity import Drift
-from hector_jax.report.motion import motions
+from hector_jax.report.motion import Motion, motions
 from hector_jax.report.report import WORLDS, Picture
 from hector_jax.report.video import VideoUnavailable, write_film, write_strip
 from hector_jax.report.view import ViewedWalk
@@ -117,8 +117,15 @@ def of_view(
         plots.losses(folder / "losses.png", loss, tunings)
     say("making the film")
     pair = motions(robot, plots.style.titled(walks))
-    write_film(folder / "film.mp4", robot, pair)
-    write_strip(folder / "film.png", robot, pair)
+    _write(folder / "film.mp4", robot, pair, folder / "film.png")
+
+
+def _write(path: Path, robot: Robot, pair: Mapping[str, Motion], strip: Path | None) -> None:
+    with ThreadPoolExecutor(1) as background:  # two other processes draw side by side
+        film = background.submit(write_film, path, robot, pair)
+        if strip is not None:
+            write_strip(strip, robot, pair)
+        film.result()
 
 
 def film(
@@ -130,11 +137,8 @@ def film(
     """
     say("making the film")
     pair = motions(robot, walks)
-    files = ((write_film, path), *([(write_strip, strip)] if strip is not None else []))
     try:
-        with ThreadPoolExecutor(len(files)) as background:  # other processes draw
-            for drawn in [background.submit(write, file, robot, pair) for write, file in files]:
-                drawn.result()
+        _write(path, robot, pair, strip)
     except VideoUnavailable as error:
         say(str(error))
         return str(error)

@@ -34,7 +34,7 @@ from hector_jax.tuning import difftune, evaluate
 from hector_jax.tuning.curvature import gauss_newton
 from hector_jax.tuning.difftune import Iteration, TuneConfig, Tuning
 from hector_jax.tuning.loss import loss_of_robot
-from hector_jax.tuning.rollout import rollout_config, variation_of
+from hector_jax.tuning.rollout import rollout_config
 
 # modules that determine the numbers, for `content_key`
 TUNING_CODE = ("tuning.difftune", "grfm.network")
@@ -228,17 +228,13 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
     return [stack([i.weights for i in history if i.accepted]) for history in histories]
 
 
-def _compile_tuning(config: TuneConfig, robot: Robot, start: Weights, command: Command) -> None:
+def _prepare_tuning(
+    config: TuneConfig, robot: Robot, start: Weights, command: Command, trace_only: bool
+) -> None:
+    """Compile the program of a tuning, or only trace it, so that its first call need not."""
     (model,) = _models(config, robot, Problem(command, None))
-    difftune.tune_step(config, robot, difftune.init(config, start).best, **model)
-
-
-def _trace_tuning(config: TuneConfig, robot: Robot, start: Weights, command: Command) -> None:
-    """Trace the program of a tuning, which its first call in this process then need not do."""
-    (model,) = _models(config, robot, Problem(command, None))
-    weights, variation = difftune.init(config, start).best, variation_of(robot)
-    inputs = model["command"], model["anchor"], model["effect"], config.loss, variation
-    evaluate.evaluate_jit.lower(config.rollout, robot, weights, *inputs)
+    step, weights = partial(difftune.tune_step, config, robot), difftune.init(config, start).best
+    jax.eval_shape(step, weights, **model) if trace_only else step(weights, **model)
 
 
 def compile_programs(
@@ -259,8 +255,8 @@ def compile_programs(
     inputs = config, robot, start, trajectory.command
     with bar("compiling, once on a machine") as report_progress:
         walking = pool.submit(not_the_weights, *on_hfs)
-        tuning = pool.submit(_compile_tuning, *inputs)
-        pool.submit(_trace_tuning, *inputs)  # by a free process; `tuning` raises its errors
+        tuning = pool.submit(_prepare_tuning, *inputs, False)
+        pool.submit(_prepare_tuning, *inputs, True)  # by a free process; `tuning` raises its errors
         for done, future in enumerate((walking, tuning)):
             report_progress(done, 2, "")
             future.result()

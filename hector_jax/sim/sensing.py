@@ -73,7 +73,7 @@ class RawContacts(NamedTuple):
     friction: Float[Array, "*batch n 5"]
     address: Int[Array, "*batch n"]  # first constraint; -1: left out of the constraints
     first: Int[Array, "*batch"]  # constraint that `force` begins with
-    force: Float[Array, "*batch m"]  # [N] of the last constraints, which are those of contacts
+    force: Float[Array, "*batch m"]  # [N] of the last constraints; contacts come last
 
 
 def coordinates(world: World) -> Int[np.ndarray, " reading"]:
