@@ -7,7 +7,7 @@ Four of each kind are trained side by side and their mean is added. The statisti
 samples are part of the parameters: a net cannot be used with another net's.
 """
 
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -169,6 +169,7 @@ def apply(params: ResidualParams, window: Window) -> Effect:
 RESIDUAL = Phi("residual", ResidualParams, init, fit, apply, lambda p: nets.widths(p.force))
 
 
+@cache  # every rollout on the plain rigid body asks for it
 def plain_net(gait: GaitConfig) -> ResidualParams:
     """Return a net that returns every command unchanged: the rigid body, in the net's program.
 
