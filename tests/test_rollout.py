@@ -240,6 +240,7 @@ def test_gradient_over_400_ticks_is_that_of_differences(robot, anchor, cases):
         check_gradient(LONG, robot, weights, command, anchor, effect, 1e-4, case=case)
 
 
+@pytest.mark.slow
 def test_a_walk_in_blocks_is_the_same_walk_with_the_same_gradient(robot, anchor):
     command = named_command("s")
     whole, parts = (

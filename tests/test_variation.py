@@ -161,19 +161,17 @@ def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
     seen = tune_step(TuneConfig(rollout=config), robot, *inputs)
     expected = evaluate_jit(config, robot, *inputs, PAPER_LOSS, variation_of(robot))
     assert_same(seen, expected)
-    plain = evaluate_jit(config, robot, *inputs, PAPER_LOSS, None)
+    plain = evaluate_jit(config, robot, *inputs, PAPER_LOSS, no_variation())
     assert abs(seen.loss / plain.loss - 1.0) > 1e-3
     single = tuple(t._replace(weight=float(t.name == "L_ctrl")) for t in PAPER_LOSS)
     slope = evaluate_jit(config, robot, *inputs, single, variation_of(robot)).gradient
     logs = weights_to_vector(jax.tree.map(jnp.multiply, slope, nominal()))
     norms = gradient_norms(config, robot, *inputs, PAPER_LOSS)
     assert norms["L_ctrl"] == pytest.approx(np.linalg.norm(logs))
-    loss, _ = gauss_newton(config, robot, *inputs, PAPER_LOSS)
-    assert loss == pytest.approx(seen.loss)
 
 
 @pytest.mark.slow
-def test_a_dump_of_a_tuning_with_noise_is_reproduced(tmp_path):
+def test_dump_and_curvature_of_a_tuning_have_its_noise(tmp_path):
     robot = robot_with(estimate_noise=1.0, delay=0.005)
     config = TuneConfig(rollout=RolloutConfig(ticks=10), residual=1e-300)  # refuses every step
     command, effect = named_command("straight"), effect_of(None, config.rollout.walk.gait)
@@ -184,3 +182,6 @@ def test_a_dump_of_a_tuning_with_noise_is_reproduced(tmp_path):
     inputs = {"config": config, "robot": robot, "command": command, "net": None}
     path = replay.keep(tmp_path, "without", iteration, **inputs)
     assert replay.replay(path).same
+    model = command, standing_anchor(robot), effect
+    loss, _ = gauss_newton(config.rollout, robot, nominal(), *model, PAPER_LOSS)
+    assert loss == pytest.approx(seen.loss)
