@@ -345,8 +345,10 @@ def test_gradient_of_the_quadruped_is_that_of_differences():
     """Over 50 ticks to 1e-6, over 4 s to 1e-4."""
     short, long = (RolloutConfig(walk=CONFIG, ticks=ticks) for ticks in (50, 400))
     model = ANCHOR, last_command
-    check_gradient(short, ROBOT, nominal(ROBOT), named_command("s"), *model, 1e-6, OBLIQUE)
-    check_gradient(long, ROBOT, nominal(ROBOT), named_command("c"), *model, 1e-4)
+    check_gradient(
+        short, ROBOT, nominal(ROBOT), named_command("s"), *model, 1e-6, OBLIQUE, "50 ticks"
+    )
+    check_gradient(long, ROBOT, nominal(ROBOT), named_command("c"), *model, 1e-4, case="4 s")
 
 
 @pytest.mark.slow
