@@ -139,15 +139,19 @@ def test_gains_in_a_weights_file_are_one_for_each_joint(tmp_path):
     jsonschema.validate(weights_tree(weights), weights_schema(ROBOT))
 
 
+def check_gradients(robot):
+    """The gradient is that of differences: over 50 ticks to 1e-6, over 4 s to 1e-4."""
+    short, long = (RolloutConfig(walk=walk_config(robot), ticks=ticks) for ticks in (50, 400))
+    model, weights = (standing_anchor(robot), last_command), nominal(robot)
+    check_gradient(
+        short, robot, weights, named_command("s"), *model, 1e-6, OBLIQUE, case="50 ticks"
+    )
+    check_gradient(long, robot, weights, named_command("c"), *model, 1e-4, case="4 s")
+
+
 @pytest.mark.slow
 def test_gradient_of_the_humanoid_is_that_of_differences():
-    """Over 50 ticks to 1e-6, over 4 s to 1e-4."""
-    model = standing_anchor(ROBOT), last_command
-    short, long = (RolloutConfig(walk=CONFIG, ticks=ticks) for ticks in (50, 400))
-    check_gradient(
-        short, ROBOT, nominal(ROBOT), named_command("s"), *model, 1e-6, OBLIQUE, "50 ticks"
-    )
-    check_gradient(long, ROBOT, nominal(ROBOT), named_command("c"), *model, 1e-4, case="4 s")
+    check_gradients(ROBOT)
 
 
 def check_engines(robot):

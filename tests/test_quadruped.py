@@ -13,8 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 from pretend import pretend_history, pretend_walk
-from test_humanoid import check_engines, check_export
-from test_rollout import OBLIQUE, check_gradient
+from test_humanoid import check_engines, check_export, check_gradients
 
 from hector_jax.cli.arguments import with_gait
 from hector_jax.cli.main import main
@@ -342,13 +341,7 @@ def test_its_limits_allow_the_speeds_that_it_trots_at():
 
 @pytest.mark.slow
 def test_gradient_of_the_quadruped_is_that_of_differences():
-    """Over 50 ticks to 1e-6, over 4 s to 1e-4."""
-    short, long = (RolloutConfig(walk=CONFIG, ticks=ticks) for ticks in (50, 400))
-    model = ANCHOR, last_command
-    check_gradient(
-        short, ROBOT, nominal(ROBOT), named_command("s"), *model, 1e-6, OBLIQUE, "50 ticks"
-    )
-    check_gradient(long, ROBOT, nominal(ROBOT), named_command("c"), *model, 1e-4, case="4 s")
+    check_gradients(ROBOT)
 
 
 @pytest.mark.slow
