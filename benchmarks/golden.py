@@ -163,7 +163,7 @@ def rollouts() -> Arrays:
     """Loss and gradient over 400 ticks, on each model, by each way."""
     robot, found = load_robot(), {}
     models = {name: as_effect(params) for name, params in _nets(robot).items()}
-    models["plain"] = effect_of(None, GaitConfig())
+    models["plain"] = effect_of(None, WalkConfig())
     config = TuneConfig()
     for model, effect in models.items():
         for command in COMMANDS if model == "plain" else ("s",):
@@ -208,7 +208,7 @@ def tunings() -> Arrays:
         "untied": TuneConfig(iterations=10, tie_feet=False),
     }
     for name, config in rules.items():
-        ended = tune(config, *known, effect_of(None, GaitConfig()))
+        ended = tune(config, *known, effect_of(None, WalkConfig()))
         found[f"{name}, L"] = [float(one.evaluation.loss) for one in ended.history]
         found[f"{name}, weights"] = np.asarray(weights_to_vector(ended.ten))
     return found

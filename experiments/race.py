@@ -126,7 +126,7 @@ class Results(NamedTuple):
 def _model_job(
     method: str, config: TuneConfig, robot: Robot, command: Command, params: Params | None
 ) -> ModelRun:
-    effect = effect_of(params, config.rollout.walk.gait)
+    effect = effect_of(params, config.rollout.walk)
     start, anchor, begin = nominal(), standing_anchor(robot), time.monotonic()
     first = difftune.tune_step(config, robot, start, command, anchor, effect)
     jax.block_until_ready(first)

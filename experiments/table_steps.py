@@ -127,7 +127,7 @@ def _walk_job(
     controller, command = config.rollout.walk, problem.command
     seconds = config.rollout.ticks * controller.gait.tick
     trajectory = walk(controller, robot, Job(weights, command, plant, seconds))
-    effect = effect_of(problem.params, controller.gait)
+    effect = effect_of(problem.params, controller)
     return evaluate_walk(config, robot, weights, command, effect, trajectory)
 
 

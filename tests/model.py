@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from synthetic import synthetic_walk
 
-from hector_jax.control.gait import GaitConfig
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.grfm.dataset import at_interval, make_dataset
 from hector_jax.grfm.network import as_effect, effect_of
@@ -26,7 +26,7 @@ SHORT = RolloutConfig(ticks=50)
 CONFIG = TuneConfig(rollout=SHORT)
 # the numbers beside Q and R of tests that have some: in MJX other names are another program
 OTHERS = ("footstep_width", "foot_height", "kp", "kd")
-PLAIN = effect_of(None, GaitConfig())
+PLAIN = effect_of(None, WalkConfig())
 BRIEF = RolloutConfig(ticks=5)  # where a few ticks are enough, with one command
 AHEAD = Command(np.array([0.05]), np.array([[0.3, 0.0]]), np.zeros(1))
 

@@ -9,6 +9,7 @@ import pytest
 from model import LEARNS_TOUCHDOWNS
 from synthetic import synthetic_walk
 
+from hector_jax.control.controller import WalkConfig
 from hector_jax.control.gait import GaitConfig
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree_file import read_card, save_tree
@@ -358,9 +359,8 @@ def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one
         moment=windows.commands.moment * windows.contact[:, None, :, None],
     )
     windows = windows._replace(commands=told)  # a foot in the air is commanded nothing
-    gait = GaitConfig()
-    plain, same = (predict(p, windows) for p in (effect_of(None, gait), last_command))
+    plain, same = (predict(p, windows) for p in (effect_of(None, WalkConfig()), last_command))
     jax.tree.map(np.testing.assert_array_equal, plain.wrench, same.wrench)
     assert not any(np.any(load) for load in plain.legs)
     shape = partial(jax.tree.map, lambda x: (x.shape, x.dtype))
-    assert shape(plain_net(gait)) == shape(ensemble)
+    assert shape(plain_net(GaitConfig(), 6)) == shape(ensemble)

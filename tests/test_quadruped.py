@@ -43,6 +43,7 @@ from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net
 from hector_jax.grfm.paper import init as init_paper
 from hector_jax.grfm.paper import with_statistics as with_paper_statistics
 from hector_jax.grfm.residual import init, plain_net, with_statistics
+from hector_jax.grfm.training import TrainConfig, train
 from hector_jax.qp import active_set
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import replay, verdicts
@@ -271,12 +272,12 @@ def gated(data):
 
 @pytest.fixture(scope="module")
 def residual(data):
-    return jax.tree.map(np.asarray, with_statistics(init(jax.random.key(0), 4), data))
+    return jax.tree.map(np.asarray, with_statistics(init(jax.random.key(0), 4, 3), data))
 
 
 @pytest.fixture(scope="module")
 def paper(data):
-    made = with_paper_statistics(init_paper(jax.random.key(0), 4), data)
+    made = with_paper_statistics(init_paper(jax.random.key(0), 4, 3), data)
     return jax.tree.map(np.asarray, made)
 
 
@@ -288,9 +289,21 @@ def test_a_net_of_four_feet_is_fitted_stored_and_read(tmp_path, data, variant, r
     assert name == variant
     jax.tree.map(np.testing.assert_array_equal, again, params)
     window = jax.tree.map(lambda x: jnp.asarray(x[7]), data.window)
-    assert jax.eval_shape(as_effect(params), window).wrench.force.shape == (4, 3)
+    effect = as_effect(params)(window)
+    assert effect.wrench.force.shape == effect.wrench.moment.shape == (4, 3)
+    assert np.any(effect.wrench.force)
+    assert not np.any(effect.wrench.moment)
+    assert variant == "gated" or not params.moment  # point feet have no moment, so no net for it
     with pytest.raises(InputError):
         load_net(tmp_path / "net.npz", load_robot())
+
+
+def test_nets_of_point_feet_are_trained_without_moments(data):
+    for variant in ("residual", "paper"):
+        params, history = train(TrainConfig(epochs=1, variant=variant), data, data)
+        assert not params.moment
+        assert history.valid_force.all()
+        assert not history.valid_moment.any()
 
 
 def test_a_mirrored_window_of_four_feet_has_the_mirrored_effect(data, residual):
@@ -323,8 +336,7 @@ def test_the_push_of_each_pair_of_legs_is_found(data, gated):
 def test_the_plain_net_of_four_feet_returns_every_command(data):
     windows = jax.tree.map(jnp.asarray, data.window)
     plain, same = (
-        jax.jit(jax.vmap(phi))(windows).wrench
-        for phi in (effect_of(None, CONFIG.gait), last_command)
+        jax.jit(jax.vmap(phi))(windows).wrench for phi in (effect_of(None, CONFIG), last_command)
     )
     jax.tree.map(np.testing.assert_array_equal, plain, same)
 
@@ -359,7 +371,7 @@ def test_a_dump_knows_four_feet(tmp_path):
     evaluation = one.evaluation._replace(fallen=np.array(1.0), gradient=weights)
     fell = one._replace(weights=weights, evaluation=evaluation, status=np.array(StepStatus.FELL))
     what = {"config": TuneConfig(rollout=RolloutConfig(walk=CONFIG)), "robot": ROBOT}
-    what |= {"command": named_command("straight"), "net": plain_net(CONFIG.gait)}
+    what |= {"command": named_command("straight"), "net": plain_net(CONFIG.gait, 3)}
     found, _, _ = replay.load(replay.keep(tmp_path / "dumps", "with", fell, **what))
     assert found.robot.structure == ROBOT.structure
     jax.tree.map(np.testing.assert_array_equal, found.robot, ROBOT)

@@ -182,7 +182,7 @@ class Share(NamedTuple):
     share: jax.Array  # (2,) of the force and of the moment
 
 
-def init_share(key, feet=2, hidden=()):
+def init_share(key, feet=2, axes=6, hidden=()):
     return Share(jnp.ones(2))
 
 

@@ -174,7 +174,7 @@ def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
 def test_dump_and_curvature_of_a_tuning_have_its_noise(tmp_path):
     robot = robot_with(estimate_noise=1.0, delay=0.005)
     config = TuneConfig(rollout=RolloutConfig(ticks=10), residual=1e-300)  # refuses every step
-    command, effect = named_command("straight"), effect_of(None, config.rollout.walk.gait)
+    command, effect = named_command("straight"), effect_of(None, config.rollout.walk)
     seen = tune_step(config, robot, nominal(), command, standing_anchor(robot), effect)
     iteration = Iteration(
         np.asarray(1), nominal(), seen, step_status(config, seen), np.asarray(1.0)

@@ -67,6 +67,11 @@ class ContactModel(Part):
         return len(self.components)
 
     @property
+    def axes(self) -> int:
+        """Number of wrench axes that GRFM-Net learns: 6, or 3 for a foot without moments."""
+        return 6 if max(self.components) > 2 else 3
+
+    @property
     def selection(self) -> Float[np.ndarray, "6 inputs"]:
         """Matrix from the inputs to the six wrench components."""
         return np.eye(6)[:, list(self.components)]

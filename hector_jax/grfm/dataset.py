@@ -49,6 +49,16 @@ class Dataset(NamedTuple):
     walk: Int[Array, " n"]  # index of the walk
     tick: Int[Array, " n"]  # tick within the walk
 
+    @property
+    def feet(self) -> int:
+        """Number of feet."""
+        return self.lands.shape[1]
+
+    @property
+    def axes(self) -> int:
+        """Number of axes of a foot's wrench: 6, or 3 for feet without moments."""
+        return 6 if np.any(self.label.moment) else 3
+
 
 def at_interval(walk: Trajectory, interval: float) -> Trajectory:
     """Return the walk sampled every `interval` [s]: mean wrenches, states at the end.
@@ -140,9 +150,12 @@ def _samples(
         return jnp.concatenate([x[1:], x[-1:]])
 
     commands = to_yaw_frame(jax.tree.map(newest_first, walk.command))
-    label = to_yaw_frame(current.effect)
+    effect = current.effect
+    if config.mpc.contact_model.axes == 3:  # what a rolling ball adds belongs to the legs' load
+        effect = effect._replace(moment=jnp.zeros_like(effect.moment))
+    label = to_yaw_frame(effect)
     legs = jax.vmap(partial(srbm.unexplained, robot, dt=config.gait.tick))(
-        previous, current.state, current.effect, 0.5 * (previous_feet + current.feet)
+        previous, current.state, effect, 0.5 * (previous_feet + current.feet)
     )
     legs = to_yaw_frame(legs)
     tick = jnp.arange(first, ticks)
@@ -189,7 +202,7 @@ def with_mirror(dataset: Dataset) -> Dataset:
     The image of a sample belongs to the same walk, so that a split by walk remains one. A property
     of one side of a plant, such as the gain of a motor, moves to the other side in the image.
     """
-    other = partners(dataset.lands.shape[1])
+    other = partners(dataset.feet)
 
     def flip(wrench: Wrench) -> Wrench:
         force, moment = (part[..., other, :] for part in wrench)

@@ -46,7 +46,7 @@ class Phi(NamedTuple):
 
     name: str  # in flags; a file of its parameters is of the kind `grfm-<name>`
     params: type  # of the parameters, a NamedTuple that no other variant uses
-    init: Callable[..., Any]  # (key, feet, hidden=widths of the layers) -> params
+    init: Callable[..., Any]  # (key, feet, axes=3 or 6, hidden=widths of the layers) -> params
     # (nets.FitConfig, training, validation Dataset, progress) -> (params, nets.History)
     fit: Callable[..., tuple[Any, Any]]
     apply: Callable[[Any, Window], Effect]

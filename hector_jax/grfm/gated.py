@@ -21,6 +21,7 @@ Each foot sees the walk as if it were a left one, so a mirrored window has the m
 pair of feet has maps of its own.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -42,9 +43,9 @@ HUBER, HUBER_ROUNDS = 2.0, 20  # threshold of the linear loss, in medians of the
 _FLOOR = 0.05  # least scale of a change, relative to the largest of its kind
 
 
-def num_changes(feet: int) -> int:
+def num_changes(feet: int, axes: int) -> int:
     """Return the number of tick-to-tick changes in a window's commands, over all feet."""
-    return 6 * feet * (HISTORY - 1)
+    return axes * feet * (HISTORY - 1)
 
 
 def signs(feet: int) -> Float[np.ndarray, "feet 6"]:
@@ -55,7 +56,7 @@ def signs(feet: int) -> Float[np.ndarray, "feet 6"]:
 class View(NamedTuple):
     """A window as one foot sees it; a right foot sees the mirror image."""
 
-    command: Float[Array, "*batch 6"]  # newest force and moment on the foot
+    command: Float[Array, "*batch axes"]  # newest force and moment on the foot
     others: Float[Array, "*batch 2"]  # total force on the other feet, forward and sideways
     changes: Float[Array, "*batch changes"]  # of commands, newest first: own foot, partner, others
     motion: Float[Array, "*batch 3"]  # of the base
@@ -65,43 +66,53 @@ class View(NamedTuple):
 
 
 class GatedMap(NamedTuple):
-    """The three maps; kinds are those of a `View`, an axis of 6 is force and moment (torque)."""
+    """The three maps; kinds are those of a `View`.
+
+    Axes are those of a foot's wrench: force and moment, or the force alone if it has no moment.
+    """
 
     ticks: Float[Array, " ticks"]  # [s] after a switch, knots of the biases
     gates: Float[Array, " gates"]  # [s] after a switch, knots of the terms of the legs
-    bias: Float[Array, "kinds ticks 6"]
-    changes: Float[Array, "kinds changes 6"]
-    legs_bias: Float[Array, "ticks pushes"]  # 6 pushes per pair
+    bias: Float[Array, "kinds ticks axes"]
+    changes: Float[Array, "kinds changes axes"]
+    legs_bias: Float[Array, "ticks pushes"]  # force and torque, 6 pushes per pair
     legs: Float[Array, "gates terms pushes"]  # terms: motion, then changes; 6 pushes per pair
     touchdown: Float[Array, "terms shifts"]  # terms: 1, motion, force on others; 3 [m] per pair
 
+    @property
+    def axes(self) -> int:
+        """Number of axes of a foot's wrench, 3 or 6."""
+        return self.bias.shape[-1]
 
-def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()) -> GatedMap:
+
+def init(
+    key: Key[Array, ""], feet: int = 2, axes: int = 6, hidden: tuple[int, ...] = ()
+) -> GatedMap:
     """Return maps of zeros; the axis of ticks has length 0."""
     del key, hidden
-    pairs, changes = feet // 2, num_changes(feet)
+    pairs, changes = feet // 2, num_changes(feet, axes)
     return GatedMap(
         ticks=jnp.zeros(0),
         gates=jnp.zeros(len(GATES)),
-        bias=jnp.zeros((feet, 0, 6)),
-        changes=jnp.zeros((feet, changes, 6)),
+        bias=jnp.zeros((feet, 0, axes)),
+        changes=jnp.zeros((feet, changes, axes)),
         legs_bias=jnp.zeros((0, pairs * 6)),
         legs=jnp.zeros((len(GATES), changes + MOTION, pairs * 6)),
         touchdown=jnp.zeros((TOUCHDOWN, pairs * 3)),
     )
 
 
-def views(window: Window) -> View:
-    """Return each foot's view of one window; the feet are the leading axis."""
+def views(window: Window, axes: int) -> View:
+    """Return each foot's view of one window, of 3 or 6 axes; the feet are the leading axis."""
     dtype, feet = window.commands.force.dtype, len(window.contact)
-    commands = jnp.concatenate(window.commands, axis=-1)  # (HISTORY, feet, 6)
+    commands = jnp.concatenate(window.commands, axis=-1)[..., :axes]  # (HISTORY, feet, axes)
 
     def view_of(foot: int) -> View:
         sign = jnp.asarray(signs(feet)[foot], dtype)
         # the foot's own pair first, and in each pair first the foot on its own side
         order = (np.arange(feet) ^ foot % 2).reshape(-1, 2)
         order = np.roll(order, -(foot // 2), axis=0).ravel()
-        wrenches, base = commands[:, order] * sign, window.base
+        wrenches, base = commands[:, order] * sign[:axes], window.base
         motion = (base.ang_velocity * sign[3:])[2:], (base.velocity * sign[:3])[:2]
         stands = window.contact[foot]
         return View(
@@ -117,7 +128,9 @@ def views(window: Window) -> View:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(view_of, range(feet)))
 
 
-_views = jax.jit(jax.vmap(views))
+@partial(jax.jit, static_argnums=1)
+def _views(windows: Window, axes: int) -> View:
+    return jax.vmap(partial(views, axes=axes))(windows)
 
 
 def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[Array, "... knots"]:
@@ -129,15 +142,16 @@ def hats(time: Float[Array, "*batch"], knots: Float[Array, " knots"]) -> Float[A
     return jnp.clip(jnp.minimum(*sides), 0.0, 1.0)
 
 
-def from_views(values: Float[Array, "feet 6"]) -> Wrench:
-    """Return forces and moments of the feet's views in the yaw frame."""
+def from_views(values: Float[Array, "feet axes"]) -> Wrench:
+    """Return forces and moments of the feet's views in the yaw frame; of 3 axes, no moments."""
+    values = jnp.pad(values, ((0, 0), (0, 6 - values.shape[-1])))
     wrench = values * jnp.asarray(signs(len(values)), values.dtype)
     return Wrench(wrench[:, :3], wrench[:, 3:])
 
 
 def apply_gated(
     gated: GatedMap, window: Window, view: View
-) -> tuple[Float[Array, "feet 6"], Load, Float[Array, "feet 3"]]:
+) -> tuple[Float[Array, "feet axes"], Load, Float[Array, "feet 3"]]:
     """Return the ground wrench in each foot's view, and legs' load and touchdown error [m].
 
     Load and touchdown error are in the yaw frame.
@@ -145,7 +159,7 @@ def apply_gated(
     Args:
         gated: fitted maps.
         window: one window.
-        view: views of that window, `views(window)`.
+        view: views of that window, `views(window, gated.axes)`.
     """
     feet = len(view.stands)
     pairs = feet // 2
@@ -172,25 +186,26 @@ def apply_gated(
 def apply(gated: GatedMap, window: Window) -> Effect:
     """Return the effect of the linear part alone for one window."""
     gated, window = in_dtype_of(window, gated), in_dtype_of(window, window)
-    ground, legs, shift = apply_gated(gated, window, views(window))
+    ground, legs, shift = apply_gated(gated, window, views(window, gated.axes))
     return Effect(from_views(ground), legs, shift)
 
 
-def labels_in_view(dataset: Dataset) -> Float[np.ndarray, "n feet 6"]:
+def labels_in_view(dataset: Dataset) -> Float[np.ndarray, "n feet axes"]:
     """Return the labels, wrenches of the ground, in each foot's view."""
     ground = np.concatenate([dataset.label.force, dataset.label.moment], axis=-1)
-    return ground * signs(ground.shape[1])
+    return (ground * signs(dataset.feet))[..., : dataset.axes]
 
 
 def fit_gated(dataset: Dataset) -> GatedMap:
     """Fit the maps by ridge regression; every sample counts once in the view of each foot."""
     window = jax.tree.map(jnp.asarray, dataset.window)
-    view = jax.tree.map(np.asarray, _views(window))
+    axes = dataset.axes
+    view = jax.tree.map(np.asarray, _views(window, axes))
     ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
     tick, gate = (np.asarray(jax.jit(hats)(window.since_switch, knots)) for knots in (ticks, gates))
     feet = view.stands.shape[1]
     residual = labels_in_view(dataset) - view.stands[..., None] * view.command
-    scale = _scale(view.changes)
+    scale = _scale(view.changes.reshape(-1, view.changes.shape[-1] // axes, axes // 3, 3))
     changes = view.changes / scale
     tick_by_foot = np.repeat(tick[:, None], feet, axis=1)
 
@@ -250,10 +265,9 @@ def _touchdown_terms(view: View) -> Float[Array, "*batch terms"]:
 
 def _fit_touchdown(view: View, dataset: Dataset) -> Float[np.ndarray, "terms shifts"]:
     """Fit the map of touchdown errors on the samples in which a foot lands."""
-    feet = dataset.lands.shape[1]
     all_terms, error = np.asarray(_touchdown_terms(view)), dataset.touchdown_error
     maps = []
-    for first in range(0, feet, 2):
+    for first in range(0, dataset.feet, 2):
         pair = slice(first, first + 2)
         lands = dataset.lands[:, pair]
         if not lands.any():
@@ -292,9 +306,9 @@ def _spread(x: np.ndarray) -> np.ndarray:
     return np.where(spread > 0.0, spread, 1.0)
 
 
-def _scale(changes: np.ndarray) -> np.ndarray:
+def _scale(changes: Float[np.ndarray, "n changes parts 3"]) -> Float[np.ndarray, " terms"]:
     """Return the spread of each change, at least `_FLOOR` of the largest of its kind."""
-    spread = changes.reshape(-1, changes.shape[-1] // 6, 2, 3).std(axis=0)
+    spread = changes.std(axis=0)
     largest = spread.max(axis=(0, 2), keepdims=True)
     largest = np.where(largest > 0.0, largest, 1.0)
     return np.maximum(spread, _FLOOR * largest).ravel()

@@ -9,7 +9,7 @@ keeps the epoch with its least mean square error (N^2, (N m)^2) on validation wa
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import flax.linen as nn
 import jax
@@ -42,7 +42,8 @@ class FitConfig:
 class History(NamedTuple):
     """Mean square errors in physical units by epoch, mean over the members of an ensemble.
 
-    Training errors are means over the epoch. A fit in closed form has no epochs.
+    Training errors are means over the epoch. A fit in closed form has no epochs. Moments of feet
+    that have none are zero.
     """
 
     train_force: Float[np.ndarray, " epochs"]  # [N^2]
@@ -60,18 +61,18 @@ def closed_form(fit: Callable[[Any], Any]) -> Callable[..., tuple[Any, History]]
     return lambda config, training, validation, progress: (fit(training), NO_EPOCHS)
 
 
-class Pair(NamedTuple):
-    """A value of the force nets and one of the moment nets: parameters, samples or errors."""
+ByKind = tuple[Any, ...]
+"""A value of the force nets and, unless feet have no moments, one of the moment nets."""
 
-    force: Any
-    moment: Any
+
+_Params = TypeVar("_Params", bound=Any)
 
 
 class Samples(NamedTuple):
     """Training samples of the nets, n of them."""
 
-    x: Pair  # inputs (n, ..., inputs)
-    y: Pair  # standardised labels (n, ..., outputs)
+    x: ByKind  # inputs (n, ..., inputs)
+    y: ByKind  # standardised labels (n, ..., outputs)
     trust: Any  # (n, ..., 1) factor on the nets' outputs
 
 
@@ -91,11 +92,31 @@ class Net(nn.Module):
 
 
 def init_nets(
-    key: Key[Array, ""], hidden: tuple[int, ...], inputs: int, *, outputs: int, members: int
-) -> Pair:
-    """Draw parameters of force nets and moment nets, `members` of each stacked."""
-    keys = (jax.random.split(k, members) for k in jax.random.split(key))
-    return Pair(*(_draw(Net(hidden, outputs), inputs, k) for k in keys))
+    key: Key[Array, ""],
+    hidden: tuple[int, ...],
+    inputs: int,
+    *,
+    outputs: int,
+    members: int,
+    axes: int,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Draw parameters of force nets and moment nets, `members` of each stacked.
+
+    There are no moment nets, an empty dictionary, if a foot's wrench has 3 `axes` and not 6.
+    """
+    keys = (jax.random.split(k, members) for k in jax.random.split(key)[: axes // 3])
+    force, *moment = (_draw(Net(hidden, outputs), inputs, k) for k in keys)
+    return force, moment[0] if moment else {}
+
+
+def by_kind(params: Any) -> ByKind:
+    """Return the nets that the parameters of a variant have, see `init_nets`."""
+    return tuple(net for net in (params.force, params.moment) if net)
+
+
+def with_nets(params: _Params, nets: ByKind) -> _Params:
+    """Return parameters of a variant with other nets of the kinds that they have."""
+    return params._replace(**dict(zip(("force", "moment"), nets, strict=False)))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -124,23 +145,23 @@ class _Rates(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    nets: Pair  # parameters of force and moment nets, members stacked
+    nets: ByKind  # parameters, members stacked
     optimiser: Any  # its state
-    best: Pair  # parameters of each member's epoch with the least validation error
-    best_error: Pair  # that error, by member
+    best: ByKind  # parameters of each member's epoch with the least validation error
+    best_error: ByKind  # that error, by member
 
 
 def fit_nets(
     config: FitConfig,
     key: Key[Array, ""],
-    nets: Pair,
+    nets: ByKind,
     *,
     training: Samples,
     validation: Samples,
-    scale: Pair,
+    scale: ByKind,
     output: Callable[[Array, Array], Array],
     progress: Progress,
-) -> tuple[Pair, History]:
+) -> tuple[ByKind, History]:
     """Train force nets and moment nets in 32 bits.
 
     Args:
@@ -162,7 +183,7 @@ def fit_nets(
     members = len(jax.tree.leaves(nets)[0])
     infinite = jnp.full(members, jnp.inf, jnp.float32)
     rates, rows = _Rates(config.learning_rate, config.l2), []
-    carry = _Carry(nets, _optimiser(rates).init(nets), nets, Pair(infinite, infinite))
+    carry = _Carry(nets, _optimiser(rates).init(nets), nets, (infinite,) * len(nets))
     for epoch, key_epoch in enumerate(jax.random.split(key, config.epochs), start=1):
         carry, row = _train_epoch(
             output, config.batch, rates, scale, training, validation, carry, key_epoch
@@ -183,7 +204,7 @@ def _optimiser(rates: _Rates) -> optax.GradientTransformation:
     )
 
 
-def _squares(output: Callable[[Array, Array], Array], nets: Pair, samples: Samples) -> Pair:
+def _squares(output: Callable[[Array, Array], Array], nets: ByKind, samples: Samples) -> ByKind:
     """Return the mean square of the standardised error per member and output."""
 
     def square(net: Any, x: Array, y: Array) -> Array:
@@ -191,7 +212,7 @@ def _squares(output: Callable[[Array, Array], Array], nets: Pair, samples: Sampl
         return jnp.mean(error**2, axis=tuple(range(y.ndim - 1)))
 
     by_member = jax.vmap(square, in_axes=(0, None, None))
-    return Pair(*map(by_member, nets, samples.x, samples.y))
+    return tuple(map(by_member, nets, samples.x, samples.y))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -199,22 +220,22 @@ def _train_epoch(
     output: Callable[[Array, Array], Array],
     size: int,
     rates: _Rates,
-    scale: Pair,
+    scale: ByKind,
     training: Samples,
     validation: Samples,
     carry: _Carry,
     key: Key[Array, ""],
 ) -> tuple[_Carry, Float[Array, "4"]]:
-    count = len(training.x.force)
+    count = len(training.x[0])
     batch = min(size, count)
     order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
     optimiser = _optimiser(rates)
 
-    def loss(nets: Pair, samples: Samples) -> tuple[Float[Array, ""], Pair]:
+    def loss(nets: ByKind, samples: Samples) -> tuple[Float[Array, ""], ByKind]:
         squares = _squares(output, nets, samples)
-        return squares.force.mean(axis=1).sum() + squares.moment.mean(axis=1).sum(), squares
+        return jax.tree.reduce(jnp.add, [s.mean(axis=1).sum() for s in squares]), squares
 
-    def step(state: tuple[Any, Any], rows: Int[Array, " batch"]) -> tuple[tuple[Any, Any], Pair]:
+    def step(state: tuple[Any, Any], rows: Int[Array, " batch"]) -> tuple[tuple[Any, Any], ByKind]:
         nets, opt_state = state
         samples = jax.tree.map(lambda a: a[rows], training)
         gradient, squares = jax.grad(loss, has_aux=True)(nets, samples)
@@ -228,8 +249,9 @@ def _train_epoch(
     variance = jax.tree.map(jnp.square, scale)
     physical = partial(jax.tree.map, lambda square, v: jnp.mean(square * v, axis=-1))
     error = physical(_squares(output, nets, validation), variance)
-    best = Pair(*map(keep_best, error, carry.best_error, nets, carry.best))
+    best = tuple(map(keep_best, error, carry.best_error, nets, carry.best))
     best_error = jax.tree.map(jnp.fmin, error, carry.best_error)
     train_error = physical(jax.tree.map(lambda s: s.mean(axis=0), squares), variance)
-    row = jnp.stack([x.mean() for x in (*train_error, *error)])
+    means = jnp.array([[x.mean() for x in errors] for errors in (train_error, error)])
+    row = jnp.pad(means, ((0, 0), (0, 2 - len(nets)))).ravel()
     return _Carry(nets, opt_state, best, best_error), row

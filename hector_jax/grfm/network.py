@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hector_jax.control.gait import GaitConfig
+from hector_jax.control.controller import WalkConfig, walk_config
 from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import Range, validation_error
 from hector_jax.core.tree_file import load_tree, read_card, save_tree
@@ -40,9 +40,10 @@ def as_effect(params: Params) -> jax.tree_util.Partial:
     return jax.tree_util.Partial(variant_of(params).apply, params)
 
 
-def effect_of(params: Params | None, gait: GaitConfig) -> jax.tree_util.Partial:
+def effect_of(params: Params | None, config: WalkConfig) -> jax.tree_util.Partial:
     """Return the phi of a net, or of the plain rigid body (None), in one and the same program."""
-    return as_effect(plain_net(gait) if params is None else params)
+    axes = config.mpc.contact_model.axes
+    return as_effect(plain_net(config.gait, axes) if params is None else params)
 
 
 def save_net(path: Path, params: Params, *, robot: Robot, about: dict[str, Any]) -> None:
@@ -96,7 +97,7 @@ def load_net(
             with a number that is not finite.
     """
     name, card = read_net_card(path, variant)
-    zeros = layout(name, tuple(card["about"]["hidden"]), len(robot.foot_point))
+    zeros = layout(name, tuple(card["about"]["hidden"]), walk_config(robot))
     arrays = card.get("arrays")
     arrays = arrays if isinstance(arrays, dict) else {}
     like = jax.tree_util.tree_map_with_path(
@@ -119,14 +120,17 @@ def _is_in_file(path: Any, arrays: Any) -> bool:
     return not name.endswith("touchdown") or name in arrays
 
 
-def layout(variant: str, hidden: tuple[int, ...], feet: int = 2) -> Params:
+def layout(variant: str, hidden: tuple[int, ...], config: WalkConfig) -> Params:
     """Return zeros in the parameters' shapes, as `load_tree` takes them; an axis of 0 is ticks."""
-    shapes = _shapes(VARIANTS[variant], hidden, feet, jnp.result_type(float))
+    sizes = len(config.gait.offsets), config.mpc.contact_model.axes
+    shapes = _shapes(VARIANTS[variant], hidden, *sizes, jnp.result_type(float))
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 @lru_cache(maxsize=64)
-def _shapes(variant: Phi, hidden: tuple[int, ...], feet: int, dtype: Any) -> Any:
+def _shapes(variant: Phi, hidden: tuple[int, ...], feet: int, axes: int, dtype: Any) -> Any:
     """Return the parameters' shapes under JAX's default `dtype`; cached, as it is slow."""
     del dtype  # a part of the cache's key only
-    return jax.eval_shape(partial(variant.init, feet=feet, hidden=hidden), jax.random.key(0))
+    return jax.eval_shape(
+        partial(variant.init, feet=feet, axes=axes, hidden=hidden), jax.random.key(0)
+    )

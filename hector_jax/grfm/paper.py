@@ -22,7 +22,7 @@ from hector_jax.core.trajectory import Wrench, zero_wrench
 from hector_jax.grfm import nets
 from hector_jax.grfm.dataset import Dataset, with_mirror
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, ground_effect, in_dtype_of
-from hector_jax.grfm.nets import FitConfig, History, Pair, Progress, Samples
+from hector_jax.grfm.nets import FitConfig, History, Progress, Samples
 
 _FLOOR = 0.01  # least scale of an axis, relative to the largest of its kind
 
@@ -38,7 +38,7 @@ class PaperParams(NamedTuple):
     """Parameters of a GRFM-Net of the paper's variant."""
 
     force: dict[str, Any]  # of a `Net`
-    moment: dict[str, Any]
+    moment: dict[str, Any]  # the same; empty for feet without moments
     inputs: Scaling  # commands; the same for each age
     outputs: Scaling  # effects
 
@@ -83,9 +83,12 @@ def _effect(scaling: Scaling, flat: Wrench) -> Effect:
     return ground_effect(jax.tree.map(physical, flat, scaling.mean, scaling.scale))
 
 
-def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = (64, 64, 64)) -> PaperParams:
+def init(
+    key: Key[Array, ""], feet: int = 2, axes: int = 6, hidden: tuple[int, ...] = (64, 64, 64)
+) -> PaperParams:
     """Draw the parameters of networks without statistics, in 32 bits."""
-    drawn = nets.init_nets(key, hidden, 3 * feet * HISTORY, outputs=3 * feet, members=1)
+    inputs, outputs = 3 * feet * HISTORY, 3 * feet
+    drawn = nets.init_nets(key, hidden, inputs, outputs=outputs, members=1, axes=axes)
     scaling = Scaling(zero_wrench(feet), zero_wrench(feet))
     force, moment = jax.tree.map(lambda p: p[0], drawn)
     params = PaperParams(force, moment, scaling, scaling)
@@ -102,11 +105,16 @@ def with_statistics(params: PaperParams, dataset: Dataset) -> PaperParams:
 def _samples(params: PaperParams, dataset: Dataset) -> Samples:
     label = _standardised(params.outputs, dataset.label)
     samples = Samples(
-        x=Pair(*_features(params.inputs, dataset.window.commands)),
-        y=Pair(*(w.reshape(len(w), -1) for w in label)),
+        x=_by_kind(params, _features(params.inputs, dataset.window.commands)),
+        y=_by_kind(params, jax.tree.map(lambda w: w.reshape(len(w), -1), label)),
         trust=np.ones((len(dataset.walk), 1)),
     )
     return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
+
+
+def _by_kind(params: PaperParams, wrench: Wrench) -> nets.ByKind:
+    """Return the parts of a wrench for which there are nets."""
+    return tuple(wrench)[: len(nets.by_kind(params))]
 
 
 def _output(raw: Array, trust: Array) -> Array:
@@ -120,35 +128,38 @@ def fit(
     """Train both nets; see `nets.fit_nets`."""
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
     training = with_mirror(training) if config.mirror else training
-    params = with_statistics(init(key_init, training.lands.shape[1]), training)
+    params = with_statistics(init(key_init, training.feet, training.axes), training)
     best, history = nets.fit_nets(
         config,
         key_shuffle,
-        jax.tree.map(lambda p: p[None], Pair(params.force, params.moment)),
+        jax.tree.map(lambda p: p[None], nets.by_kind(params)),
         training=_samples(params, training),
         validation=_samples(params, validation),
-        scale=Pair(*(w.reshape(-1) for w in params.outputs.scale)),
+        scale=_by_kind(params, jax.tree.map(jnp.ravel, params.outputs.scale)),
         output=_output,
         progress=progress,
     )
-    force, moment = jax.tree.map(lambda p: p[0], best)
-    return params._replace(force=force, moment=moment), history
+    return nets.with_nets(params, jax.tree.map(lambda p: p[0], best)), history
 
 
 def apply(params: PaperParams, window: Window) -> Effect:
     """Return the effect of a trained net for one window."""
     params = in_dtype_of(window, params)
     x = _features(params.inputs, window.commands)
-    flat = Wrench(nets.apply_net(params.force, x.force), nets.apply_net(params.moment, x.moment))
-    return _effect(params.outputs, flat)
+    outputs = map(nets.apply_net, nets.by_kind(params), x)
+    zero = jnp.zeros(x.force.shape[-1] // HISTORY, x.force.dtype)
+    force, *moment = outputs
+    return _effect(params.outputs, Wrench(force, *moment or [zero]))
 
 
 PAPER = Phi("paper", PaperParams, init, fit, apply, lambda p: nets.widths(p.force))
 
 
-def init_linear(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = ()) -> LinearMap:
+def init_linear(
+    key: Key[Array, ""], feet: int = 2, axes: int = 6, hidden: tuple[int, ...] = ()
+) -> LinearMap:
     """Return a map to zero."""
-    del key, hidden
+    del key, axes, hidden
     zeros = jnp.zeros((3 * feet * HISTORY + 1, 3 * feet))
     scaling = Scaling(zero_wrench(feet), zero_wrench(feet))
     return LinearMap(zeros, zeros, scaling, scaling)

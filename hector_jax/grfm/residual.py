@@ -21,7 +21,7 @@ from hector_jax.grfm import gated, nets
 from hector_jax.grfm.dataset import Dataset
 from hector_jax.grfm.effect import Effect, Phi, Window, in_dtype_of
 from hector_jax.grfm.gated import GATES, MOTION, GatedMap, View, hats, num_changes, views
-from hector_jax.grfm.nets import FitConfig, History, Pair, Progress, Samples
+from hector_jax.grfm.nets import FitConfig, History, Progress, Samples
 
 HIDDEN = (32, 32)
 MEMBERS = 4  # nets of each kind
@@ -42,19 +42,21 @@ class ResidualParams(NamedTuple):
 
     linear: GatedMap
     force: dict[str, Any]  # of MEMBERS `Net`s, stacked, for one foot
-    moment: dict[str, Any]
+    moment: dict[str, Any]  # the same; empty for feet without moments
     stats: FeatureStats
-    residual_rms: Float[Array, "6"]  # [N], [N m] of the linear part's residual
+    residual_rms: Float[Array, " axes"]  # [N], [N m] of the linear part's residual
 
 
-def init(key: Key[Array, ""], feet: int = 2, hidden: tuple[int, ...] = HIDDEN) -> ResidualParams:
+def init(
+    key: Key[Array, ""], feet: int = 2, axes: int = 6, hidden: tuple[int, ...] = HIDDEN
+) -> ResidualParams:
     """Draw networks without statistics, in 32 bits; the axis of ticks has length 0."""
-    terms = num_changes(feet) + MOTION
+    terms = num_changes(feet, axes) + MOTION
     inputs = terms + len(GATES) + feet - 1
-    force, moment = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS)
+    drawn = nets.init_nets(key, hidden, inputs, outputs=3, members=MEMBERS, axes=axes)
     table = jnp.zeros((feet, 0, terms))
     stats = FeatureStats(table, table, jnp.zeros(()))
-    params = ResidualParams(gated.init(key, feet), force, moment, stats, jnp.zeros(6))
+    params = ResidualParams(gated.init(key, feet, axes), *drawn, stats, jnp.zeros(axes))
     return jax.tree.map(lambda p: jnp.asarray(p, jnp.float32), params)
 
 
@@ -70,7 +72,7 @@ def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.nda
     """Return statistics of the features, and the RMS of the linear part's residual."""
 
     def evaluate(window: Window) -> tuple[View, Array, Array]:
-        view = views(window)
+        view = views(window, linear.axes)
         ground, *_ = gated.apply_gated(linear, window, view)
         return view, hats(window.since_switch, linear.ticks), ground
 
@@ -123,15 +125,15 @@ def _output(raw: Array, trust: Array) -> Array:
 
 def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
     def evaluate(window: Window) -> tuple[Array, Array, Array]:
-        view = views(window)
+        view = views(window, params.linear.axes)
         ground, *_ = gated.apply_gated(params.linear, window, view)
         return ground, *_inputs(params, window, view)
 
     window = jax.tree.map(jnp.asarray, dataset.window)
     ground, z, trust = jax.jit(jax.vmap(evaluate))(window)
     residual = (gated.labels_in_view(dataset) - ground) / params.residual_rms
-    y = Pair(residual[..., :3], residual[..., 3:])
-    samples = Samples(Pair(z, z), y, trust[..., None])
+    y = tuple(np.split(residual, residual.shape[-1] // 3, axis=-1))
+    samples = Samples((z,) * len(y), y, trust[..., None])
     return jax.tree.map(lambda w: jnp.asarray(w, jnp.float32), samples)
 
 
@@ -140,28 +142,28 @@ def fit(
 ) -> tuple[ResidualParams, History]:
     """Fit the linear part, then train the nets on its residual; see `nets.fit_nets`."""
     key_init, key_shuffle = jax.random.split(jax.random.key(config.seed))
-    params = with_statistics(init(key_init, training.lands.shape[1]), training)
+    params = with_statistics(init(key_init, training.feet, training.axes), training)
     best, history = nets.fit_nets(
         config,
         key_shuffle,
-        Pair(params.force, params.moment),
+        nets.by_kind(params),
         training=_samples(params, training),
         validation=_samples(params, validation),
-        scale=Pair(params.residual_rms[:3], params.residual_rms[3:]),
+        scale=tuple(params.residual_rms.reshape(-1, 3)),
         output=_output,
         progress=progress,
     )
-    return params._replace(force=best.force, moment=best.moment), history
+    return nets.with_nets(params, best), history
 
 
 def apply(params: ResidualParams, window: Window) -> Effect:
     """Return the effect of a trained net for one window."""
     params, window = in_dtype_of(window, params), in_dtype_of(window, window)
-    view = views(window)
+    view = views(window, params.linear.axes)
     ground, legs, shift = gated.apply_gated(params.linear, window, view)
     x, trust = _inputs(params, window, view)
     members = jax.vmap(lambda net: _bounded(nets.apply_net(net, x)))
-    added = jnp.concatenate([members(params.force), members(params.moment)], axis=-1)
+    added = jnp.concatenate([*map(members, nets.by_kind(params))], axis=-1)
     added = trust[:, None] * params.residual_rms * added
     return Effect(gated.from_views(ground + added.mean(axis=0)), legs, shift)
 
@@ -170,10 +172,11 @@ RESIDUAL = Phi("residual", ResidualParams, init, fit, apply, lambda p: nets.widt
 
 
 @cache  # every rollout on the plain rigid body asks for it
-def plain_net(gait: GaitConfig) -> ResidualParams:
+def plain_net(gait: GaitConfig, axes: int) -> ResidualParams:
     """Return a net that returns every command unchanged: the rigid body, in the net's program.
 
-    Its parameters have the shapes of a net that was trained on walks of `gait`.
+    Its parameters have the shapes of a net that was trained on walks of `gait` with feet whose
+    wrench has 3 or 6 `axes`.
     """
     ticks = np.unique(np.asarray(since_switch(gait, jnp.arange(gait.cycle))))
     feet = len(gait.offsets)
@@ -181,7 +184,9 @@ def plain_net(gait: GaitConfig) -> ResidualParams:
     def zeros(x: Any) -> np.ndarray:
         return np.zeros([len(ticks) if n == 0 else n for n in x.shape], np.float32)
 
-    net = jax.tree.map(zeros, jax.eval_shape(partial(init, feet=feet), jax.random.key(0)))
+    net = jax.tree.map(
+        zeros, jax.eval_shape(partial(init, feet=feet, axes=axes), jax.random.key(0))
+    )
     linear = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
     stats = net.stats._replace(scale=net.stats.scale + 1, reach=np.ones((), np.float32))
     return net._replace(linear=linear, stats=stats)

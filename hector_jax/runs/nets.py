@@ -221,7 +221,7 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
     params, _, card = network.load_net(path, robot, variant)
     about = card["about"]
     try:
-        structure = jax.tree.structure(network.layout("linear", ()))
+        structure = jax.tree.structure(network.layout("linear", (), walk_config(robot)))
         linear = jax.tree.unflatten(structure, map(np.array, about["linear"]))
         held_out = list(about["held_out"])
         settings, made_of = dict(about["settings"]), dict(about["made_of"])

@@ -140,8 +140,8 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
         before = to_table(hector.structure)  # of files without this entry
         structure = from_table(f"{path}: structure", Structure, about.get("structure", before))
         config = TuneConfig.from_table(f"{path}: config", about.get("config"))
-        feet = len(config.rollout.walk.gait.offsets)
-        params = None if net is None else layout(net["variant"], tuple(net["hidden"]), feet)
+        walk = config.rollout.walk
+        params = None if net is None else layout(net["variant"], tuple(net["hidden"]), walk)
         weights = config.rollout.walk.with_others(nominal(), about.get("others", ()))
     except InputError:
         raise
@@ -169,7 +169,7 @@ def replay(path: Path) -> Replay:
         InputError: see `load`.
     """
     dump, config, about = load(path)
-    inputs = *dump[:4], effect_of(dump.params, config.rollout.walk.gait)
+    inputs = *dump[:4], effect_of(dump.params, config.rollout.walk)
     # if the CPU is the default, naming it would compile the program of a tuning once more
     is_cpu = jax.default_backend() == "cpu"
     with jax.default_device(None if is_cpu else jax.local_devices(backend="cpu")[0]):

@@ -95,7 +95,7 @@ def _tune_job(
 
 def _models(config: TuneConfig, robot: Robot, problem: Problem) -> list[dict[str, Any]]:
     """Return command, anchor and effect of the rollout for each command of a problem."""
-    effect = network.effect_of(problem.params, config.rollout.walk.gait)
+    effect = network.effect_of(problem.params, config.rollout.walk)
     model = {"anchor": standing_anchor(robot), "effect": effect}
     return [{"command": command, **model} for command in problem.commands]
 

@@ -147,7 +147,7 @@ def _walk_job(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
 def _rollout_inputs(campaign: Campaign, weights: Weights, command: Command) -> tuple[Any, ...]:
     """Return the arguments of a rollout on the plain rigid body, which the walks correct."""
     config = campaign.config.rollout
-    return config, campaign.robot, weights, command, network.effect_of(None, config.walk.gait)
+    return config, campaign.robot, weights, command, network.effect_of(None, config.walk)
 
 
 def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log) -> Grounding:
