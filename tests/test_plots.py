@@ -211,6 +211,8 @@ def test_the_epoch_of_the_least_error_on_the_validation_walks_is_marked(tmp_path
     assert lines(force)["least"].tolist() == [[30.0, held[29]]]
     assert "N$^2$" in force.get_ylabel()
     assert "(N m)$^2$" in moment.get_ylabel()
+    plots.training(tmp_path / "net.png", History(falling, 0 * falling, held, 0 * falling))
+    assert len(drawn[1].axes) == 1  # point feet have no moments
 
 
 def test_open_loop_errors_have_a_row_for_each_world(tmp_path, drawn):

@@ -234,6 +234,8 @@ def write_report(
 def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
     """Return labelled mean square errors: of force and moment, by contact and axis, of touchdowns.
 
+    What is zero for every phi, such as the moments of point feet, is left out.
+
     Args:
         errors: results of `training.report`, one per phi.
     """
@@ -245,4 +247,4 @@ def error_rows(errors: Iterable[Mapping[str, Any]]) -> list[tuple[str, list[floa
     if all(any(x.get("touchdown", ())) for x in errors):
         for i, axis in enumerate(("forward", "sideways")):
             rows.append((f"touchdown, {axis} [cm^2]", [x["touchdown"][i] for x in errors]))
-    return rows
+    return [row for row in rows if any(row[1])]

@@ -269,8 +269,11 @@ def training(path: Path, history: History) -> str:
         history: mean square errors in physical units.
     """
     kinds = {"force": "mean square error [N$^2$]", "moment": "mean square error [(N m)$^2$]"}
-    with drawing(path, 7.0, 2.7) as figure:
-        for panel, (kind, label) in zip(figure.subplots(1, 2), kinds.items(), strict=True):
+    if not np.any(history.valid_moment):  # feet without moments
+        del kinds["moment"]
+    with drawing(path, 3.5 * len(kinds), 2.7) as figure:
+        panels = figure.subplots(1, len(kinds), squeeze=False)[0]
+        for panel, (kind, label) in zip(panels, kinds.items(), strict=True):
             train, valid = (np.asarray(getattr(history, f"{p}_{kind}")) for p in ("train", "valid"))
             epochs, best = np.arange(1, len(train) + 1), int(np.argmin(valid))
             panel.plot(epochs, train, **SETS["expert"], label="training walks")
