@@ -69,8 +69,8 @@ def test_the_best_point_of_each_path_over_all_commands_is_taken(monkeypatch, tmp
     assert choice.choose(Setup(Executor(), CONFIG, ROBOT), tunings, commands, **notes) == {}
 
 
-def _between(sets, config=CONFIG, robot=ROBOT):
-    pair, notes = ("without", "with"), {"seconds": 4.0, "folder": None}
+def _between(sets, config=CONFIG, robot=ROBOT, safe=None):
+    pair, notes = ("without", "with"), {"seconds": 4.0, "folder": None, "safe": safe}
     commands = (named_command("straight"),)
     return choice.answer(Setup(Executor(), config, robot), sets, pair, 0.25, commands, **notes)
 
@@ -83,6 +83,7 @@ def test_the_answer_lies_between_two_tunings_and_plans_with_less_friction():
     jax.tree.map(np.testing.assert_array_equal, found[:2], wanted[:2])
     tuned = {n: w._replace(others={"friction": np.array(0.4)}) for n, w in sets.items()}
     assert _between(tuned).others == {"friction": pytest.approx(0.4)}  # it was asked for
+    assert _between(sets, safe=0.75).others == {"friction": pytest.approx(0.45)}
 
 
 @pytest.mark.parametrize(("friction", "planned"), [(0.05, 0.1), (1.5, 1.0)])

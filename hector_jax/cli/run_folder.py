@@ -11,9 +11,12 @@ from typing import Any, TypeVar
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
+from hector_jax.control.parameters import tunables
+from hector_jax.control.reference import PIECES
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import make_folder, write_json
-from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
@@ -22,7 +25,14 @@ from hector_jax.runs.nets import COLLECTION_CODE
 Flags = TypeVar("Flags")
 
 TIME = "%Y%m%d-%H%M%S"  # names a run
-_CODE = (*COLLECTION_CODE, "grfm.training", "sim.standin", "runs.choice", "runs.walks")
+_CODE = (
+    *COLLECTION_CODE,
+    "grfm.training",
+    "sim.standin",
+    "runs.choice",
+    "runs.front",
+    "runs.walks",
+)
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "run", "runs")
 _FREE_FLAGS = ("data", "json", "processes", "verdict", "video")  # may change when a run is resumed
@@ -33,6 +43,33 @@ def exists_error(folder: Path) -> InputError:
     return InputError(
         f"run folder {folder} exists; continue it with --resume or name another with --out"
     )
+
+
+def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
+    """Load the trajectories of a tuning and check them against the other flags.
+
+    Raises:
+        InputError: there is no such trajectory, their lengths differ, or --walks or --refresh does
+            not allow them.
+    """
+    loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
+    count, pieces = len(loaded), len(loaded[0].command.duration)
+    plants = max(args.walk_plants, 1)
+    if 0 < args.walks < (least := 2 * count * plants):
+        walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
+        raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
+    if not args.refresh:
+        return loaded
+    if args.net:
+        raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
+    if tunables(args.tune) or arguments.weights(args.start, robot).others:
+        raise InputError("--refresh takes Q and R alone, neither --tune nor a start with others")
+    if count > 1:
+        raise InputError(f"--refresh takes one trajectory, got {count}; add --each")
+    if pieces > PIECES:
+        limit = f"at most {PIECES} segments, {loaded[0].name} has {pieces}"
+        raise InputError(f"--refresh takes trajectories of {limit}")
+    return loaded
 
 
 def run_flags(args: Tune) -> Tune:

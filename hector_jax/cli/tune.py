@@ -18,7 +18,7 @@ from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
 from hector_jax.control.parameters import tunables
-from hector_jax.control.reference import PIECES, Command
+from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import save_weights, weights_tree
@@ -30,11 +30,11 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.report import Picture, print_table
+from hector_jax.report.report import Picture, front_table, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import choice, metrics, nets, tunings, verdicts
+from hector_jax.runs import choice, front, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
@@ -60,7 +60,7 @@ def tune(args: Tune) -> None:
         runs = {folder: run_folder.resume(folder, flags) for folder, flags in runs.items()}
     else:
         for folder, flags in runs.items():
-            _trajectories(flags, robot)
+            run_folder.trajectories(flags, robot)
             arguments.weights(flags.start, robot)
             if base and folder.exists():
                 raise run_folder.exists_error(folder)
@@ -68,33 +68,6 @@ def tune(args: Tune) -> None:
     for folder, flags in runs.items():
         with locked(folder):
             _tune_in(folder, flags)
-
-
-def _trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
-    """Load the trajectories of a tuning and check them against the other flags.
-
-    Raises:
-        InputError: there is no such trajectory, their lengths differ, or --walks or --refresh does
-            not allow them.
-    """
-    trajectories = arguments.load_trajectories(args.traj, robot, "; add --each")
-    count, pieces = len(trajectories), len(trajectories[0].command.duration)
-    plants = max(args.walk_plants, 1)
-    if 0 < args.walks < (least := 2 * count * plants):
-        walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
-        raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
-    if not args.refresh:
-        return trajectories
-    if args.net:
-        raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
-    if tunables(args.tune) or arguments.weights(args.start, robot).others:
-        raise InputError("--refresh takes Q and R alone, neither --tune nor a start with others")
-    if count > 1:
-        raise InputError(f"--refresh takes one trajectory, got {count}; add --each")
-    if pieces > PIECES:
-        limit = f"at most {PIECES} segments, {trajectories[0].name} has {pieces}"
-        raise InputError(f"--refresh takes trajectories of {limit}")
-    return trajectories
 
 
 class _Run(NamedTuple):
@@ -106,6 +79,11 @@ class _Run(NamedTuple):
     start: Weights
     trajectories: tuple[NamedCommand, ...]
     net: nets.TrainedNet
+
+    @property
+    def tuning(self) -> Setup:
+        """Setup of the tunings, whose loss may differ from that of the table."""
+        return front.smoothed(self.setup, self.args.smooth)
 
     @property
     def artefacts(self) -> Path:
@@ -150,7 +128,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     """Execute a run, reusing the results already in its folder."""
     start_time, made_with = time.monotonic(), environment()
     robot = load_robot(args.robot)
-    trajectories = _trajectories(args, robot)
+    trajectories = run_folder.trajectories(args, robot)
     config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
@@ -175,13 +153,14 @@ def _tune_in(folder: Path, args: Tune) -> None:
             run = run._replace(setup=run.setup._replace(config=replace(config, loss=loss)))
         settings = _note_settings(run)
         tuned = _tune_sets(run)
-        inputs = run.setup.config, robot, start, run.problems["with"]
+        inputs = run.tuning.config, robot, start, run.problems["with"]
         matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the walks
         walks = _walk_sets(run, tuned.sets)
+        points = _walk_front(run) if args.front else []
         curvature = main_directions(matrix.result(), start)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
-    result, by_name = _result(run, tuned, walks)
+    result, by_name = _result(run, tuned, walks, points)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     report = write_report(
         folder,
@@ -196,21 +175,27 @@ def _tune_in(folder: Path, args: Tune) -> None:
         best_proposal=tuned.best_proposal,
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=result.get("chosen", {}),
-        **_draw(run, tuned, *walks[trajectories[0].name]),
+        front=points,
+        **_draw(run, tuned, *walks[trajectories[0].name], points),
         config=settings,
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-    print_text = partial(_print_tables, by_name, args.seeds, show)
+    print_text = partial(_print_tables, by_name, args.seeds, points, show)
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
 
 
 def _print_tables(
-    verdicts: Mapping[str, metrics.Verdict], seeds: int, show: Callable[[], None] | None
+    verdicts: Mapping[str, metrics.Verdict],
+    seeds: int,
+    points: Sequence[front.Point],
+    show: Callable[[], None] | None,
 ) -> None:
     for name, verdict in verdicts.items():
         print_table(verdict, f"{name}, {plural(seeds, 'plant')}")
+    if points:
+        print(front_table(points))
     if show:
         show()
 
@@ -227,7 +212,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     as_lists = partial(jax.tree.map, lambda x: np.asarray(x).tolist())
     commands = [as_lists(command)._asdict() for command in run.commands.values()]
     settings = {
-        "tune": run.setup.config.as_table(),
+        "tune": run.tuning.config.as_table(),
         "net": tree_hash(run.net.params),
         "command": commands[0] if len(commands) == 1 else commands,
         "seconds": run.seconds,
@@ -263,7 +248,7 @@ def _tune_sets(run: _Run) -> _Tuned:
     """Tune without and with the net, and with each refreshed net; write the weights."""
     tune_problems = partial(
         tunings.tune,
-        run.setup,
+        run.tuning,
         folder=run.artefacts,
         start=run.start,
         journal=Journal(run.folder / METRICS),
@@ -284,7 +269,8 @@ def _tune_sets(run: _Run) -> _Tuned:
         **{name: chosen.weights for name, chosen in choices.items()},
     }
     compared, pair = {name: sets[name] for name in ("nominal", *results)}, ("without", name)
-    sets["best"] = choice.answer(setup, compared, pair, run.args.share, commands, **options)
+    inputs, safe = (setup, compared, pair, run.args.share, commands), run.args.safe
+    sets["best"] = choice.answer(*inputs, safe=safe, **options)
     proposals, best = [], ""
     if run.args.walks:
         sets["before_walks"] = sets.pop("best")
@@ -300,9 +286,19 @@ def _tune_sets(run: _Run) -> _Tuned:
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
-    _, config, robot, _ = run.setup
+    _, config, robot, _ = run.tuning
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
     return Campaign(run.folder / "walks", config, robot, start, run.commands, plants)
+
+
+def _walk_front(run: _Run) -> list[front.Point]:
+    """Tune and walk the sets of the front; write their weights."""
+    inputs, options = (run.setup, run.commands), {"seconds": run.seconds, "folder": run.artefacts}
+    pairs = front.tune(*inputs, run.problems, start=run.start, **options)
+    sets = front.points(run.setup, pairs, run.args.share)
+    for name, weights in sets.items():
+        save_weights(run.folder / "front" / f"{name}.json", weights)
+    return front.walk(*inputs, sets, **options)
 
 
 def _walk_sets(
@@ -337,7 +333,10 @@ def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
 
 
 def _result(
-    run: _Run, tuned: _Tuned, walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
+    run: _Run,
+    tuned: _Tuned,
+    walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]],
+    points: Sequence[front.Point],
 ) -> tuple[dict[str, Any], dict[str, metrics.Verdict]]:
     """Write result.json; return its content and the verdicts, of all walks and by trajectory."""
 
@@ -367,19 +366,27 @@ def _result(
     if tuned.choices:
         choices = tuned.choices.items()
         result["chosen"] = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices}
+    if points:
+        result["front"] = [point._asdict() for point in points]
     write_json(run.folder / RESULT, result)
     return result, by_name
 
 
-def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -> dict[str, Any]:
+def _draw(
+    run: _Run,
+    tuned: _Tuned,
+    standin: ScoredWalks,
+    on_hfs: ScoredWalks,
+    points: Sequence[front.Point],
+) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
     effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}
     batch = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
         curves = fidelity.curves(run.setup.robot, batch, effects)
-        inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
-        drawings = pictures.of_run(run.folder, run.setup.config, *inputs)
+        inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history, points
+        drawings = pictures.of_run(run.folder, run.tuning.config, *inputs)
     return {"pictures": drawings, "film": film.result()}
 
 

@@ -20,7 +20,17 @@ from rich.table import Table
 from rich.text import Text
 
 from hector_jax.core.inputs import plural
-from hector_jax.runs.metrics import BASELINES, FEWEST, Comparison, Summary, Verdict, rms, summarize
+from hector_jax.runs.front import Point
+from hector_jax.runs.metrics import (
+    BASELINES,
+    FEWEST,
+    Comparison,
+    Summary,
+    Verdict,
+    percent,
+    rms,
+    summarize,
+)
 
 # titles of worlds that differ from their names
 WORLDS = {"standin": "hardware stand-in", "standin-even": "hardware stand-in, family even"}
@@ -45,6 +55,23 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: in
     """
     rule = [":---" if i < words else "---:" for i in range(len(head))]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+
+
+def front_table(points: Sequence[Point]) -> str:
+    """Format the points of a front in Markdown."""
+    changes = "L against nominal [%]", "L_ctrl against expert [%]"
+    falls = "falls under a push", "falls without one"
+    rows = [
+        (
+            point.name,
+            percent(point.L),
+            percent(point.L_ctrl),
+            f"{point.falls} of {point.pushed}",
+            f"{point.falls_calm} of {point.calm}",
+        )
+        for point in points
+    ]
+    return markdown_table(("set", *changes, *falls), rows)
 
 
 def seeds_text(seeds: Sequence[int] | np.ndarray) -> str:

@@ -11,7 +11,7 @@ from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import Weights, weight_names, weights_to_vector
 from hector_jax.core.files import write_file
 from hector_jax.report.fidelity import error_rows
-from hector_jax.report.report import render
+from hector_jax.report.report import front_table, render
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning
 from hector_jax.tuning.evaluate import aligned
 
@@ -31,6 +31,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
             proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
                 is `best`; number of walks per weight set.
             chosen: chosen iteration by set, if it is not the last.
+            front: points of the front; empty if it was not walked.
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
             config, environment: resolved settings, as JSON values; versions and machine.
             command: command line that repeats this run.
@@ -38,7 +39,12 @@ def write_report(folder: Path, **contents: Any) -> Path:
     Returns:
         The file.
     """
-    functions = {"aligned": aligned, "error_rows": error_rows, "tuning_section": tuning_section}
+    functions = {
+        "aligned": aligned,
+        "error_rows": error_rows,
+        "front_table": front_table,
+        "tuning_section": tuning_section,
+    }
     write_file(folder / "report.md", render("run.md.j2", **contents, **functions).encode())
     return folder / "report.md"
 

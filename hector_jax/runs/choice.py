@@ -30,7 +30,8 @@ from hector_jax.tuning.difftune import Tuning
 
 # fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
-_FRICTION = 11 / 12  # of the controller's friction, with which the chosen weights plan
+SAFE = 11 / 12
+"""Share of the controller's friction with which the set between two tunings plans."""
 HELD_OUT = 8
 """Number of the plants of `earliest`."""
 # first seed of the plants for choice and tuning, drawn like `hfs-varied` but with other seeds; the
@@ -115,12 +116,27 @@ def choose(
     return choices
 
 
+def planned_with(setup: Setup, weights: Weights, safe: float) -> Weights:
+    """Return weights that plan with a share of the controller's friction, unless theirs is tuned.
+
+    Args:
+        setup: controller.
+        weights: weights.
+        safe: the share.
+    """
+    box, planned = TUNABLES["friction"], setup.config.rollout.walk.mpc.friction
+    friction = float(np.clip(safe * planned, box.lower, box.upper))
+    return weights._replace(others={"friction": friction, **weights.others})
+
+
 def answer(
     setup: Setup,
     sets: Mapping[str, Weights],
     pair: tuple[str, str],
     share: float,
     commands: Sequence[Command],
+    *,
+    safe: float | None = None,
     **notes: Any,
 ) -> Weights:
     """Return the set `best` of a run.
@@ -135,11 +151,15 @@ def answer(
         sets: sets by name: nominal and all tuned sets.
         pair: names of the two tunings.
         share: share of the second tuning.
+        safe: share of the controller's friction with which the set plans, whichever it is; None:
+            `SAFE` for the set between the tunings.
     """
-    box, planned = TUNABLES["friction"], setup.config.rollout.walk.mpc.friction
-    friction = float(np.clip(_FRICTION * planned, box.lower, box.upper))
-    mixture = between(sets[pair[0]], sets[pair[1]], share)
-    mixture = mixture._replace(others={"friction": friction, **mixture.others})
+    mixture = planned_with(setup, between(sets[pair[0]], sets[pair[1]], share), safe or SAFE)
+    if safe:
+        tuned = {
+            name: planned_with(setup, w, safe) for name, w in sets.items() if name != "nominal"
+        }
+        sets = {**sets, **tuned}
     plants = drawn_plants(setup.robot, setup.robot.description.tuning.choice_plants)
     if not plants:
         return mixture

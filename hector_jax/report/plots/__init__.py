@@ -23,6 +23,7 @@ from hector_jax.report.motion import COLOURS, Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
+from hector_jax.runs.front import Point
 from hector_jax.runs.matrix import Cells, Column, columns_of, sets_of, trajectories_of
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
@@ -283,6 +284,30 @@ def training(path: Path, history: History) -> str:
             top = 1.6 * np.percentile(np.concatenate([train, valid]), 90)
             panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
     return caption("training")
+
+
+def front(path: Path, points: Sequence[Point]) -> str:
+    """Draw L, L_ctrl and falls of the sets of a front.
+
+    Args:
+        path: file to write.
+        points: the points; nominal and expert first.
+    """
+    tunings: dict[str, list[Point]] = {}
+    for point in points:
+        tunings.setdefault(point.name.partition("_safe_")[0], []).append(point)
+    with drawing(path, 7.0, 4.2) as figure:
+        axes = figure.subplots()
+        for name, look in looks_of(tunings).items():
+            x, y = np.array([(point.L_ctrl, point.L) for point in tunings[name]]).T
+            axes.plot(x, y, **look.line)
+            axes.plot(x, y, **look.dot, label=label_of(name).replace("_", " "))
+            for point in tunings[name]:
+                text = {"textcoords": "offset points", "xytext": (5, 4), "fontsize": 8}
+                axes.annotate(f"{point.falls}", (point.L_ctrl, point.L), **text)
+        axes.set(xlabel="change of L_ctrl against expert [%]")
+        axes.set(ylabel="change of L against nominal [%]")
+    return caption("front", pushed=points[0].pushed)
 
 
 def matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
