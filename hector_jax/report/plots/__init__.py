@@ -272,7 +272,7 @@ def training(path: Path, history: History) -> str:
     kinds = {"force": "mean square error [N$^2$]", "moment": "mean square error [(N m)$^2$]"}
     if not np.any(history.valid_moment):  # feet without moments
         del kinds["moment"]
-    with drawing(path, 3.5 * len(kinds), 2.7) as figure:
+    with drawing(path, max(3.5 * len(kinds), 5.0), 2.7) as figure:  # the legend needs 5 inches
         panels = figure.subplots(1, len(kinds), squeeze=False)[0]
         for panel, (kind, label) in zip(panels, kinds.items(), strict=True):
             train, valid = (np.asarray(getattr(history, f"{p}_{kind}")) for p in ("train", "valid"))
