@@ -22,7 +22,7 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.description import HECTOR, PlantSizes
 from hector_jax.runs.metrics import Interval, Score, bootstrap, falls_comparable
 from hector_jax.sim.changes import TRUNK_TOP, Change
-from hector_jax.sim.world import NO_PUSH, Push
+from hector_jax.sim.world import NO_PUSH, Push, push_along
 
 DIRECTIONS = 45 * np.arange(8)  # [deg] of the pushes, from ahead to the left
 PUSH_START, PUSH_TIME, PUSH_WALK = 0.8, 0.1, 2.5  # [s] the walk includes the recovery
@@ -100,13 +100,10 @@ def make_scenes(
     command = named_command(config.traj)
     # t = 0 begins a cycle
     delays = gait.tick * gait.cycle * np.arange(config.phases) / config.phases
-    angles = np.deg2rad(DIRECTIONS)
-    directions = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
     start, end = SLIPPERY
 
-    def pushed(force: np.ndarray, t: float) -> Scene:
-        push = Push(*(np.array([x]) for x in (force, PUSH_START + t, PUSH_TIME)))
-        return Scene(command, PUSH_WALK, push)
+    def pushed(force: float, side: float, t: float) -> Scene:
+        return Scene(command, PUSH_WALK, push_along(side, force, PUSH_START + t, PUSH_TIME))
 
     def changed(change: Change) -> Scene:
         return Scene(command, changes=(change,))
@@ -114,7 +111,7 @@ def make_scenes(
     scenes = {Level("calm", config.traj): [Scene(command)]}
     for force in sizes.push * np.array(config.forces):
         scenes[Level("push", float(force))] = [
-            pushed(force * direction, t) for direction in directions for t in delays
+            pushed(force, side, t) for side in np.deg2rad(DIRECTIONS) for t in delays
         ]
     for friction in config.frictions:
         scenes[Level("friction", friction)] = [

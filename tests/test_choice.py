@@ -86,6 +86,20 @@ def test_the_answer_lies_between_two_tunings_and_plans_with_less_friction():
     assert _between(sets, safe=0.75).others == {"friction": pytest.approx(0.45)}
 
 
+def test_whichever_set_is_taken_plans_with_the_friction_that_is_asked_for(monkeypatch):
+    def ratios(setup, sets, *inputs, **notes):
+        del setup, inputs, notes
+        assert "friction" not in sets["nominal"].others
+        return {name: np.array([float(name != "with")]) for name in sets}
+
+    monkeypatch.setattr(choice, "_ratios", ratios)
+    description = replace(ROBOT.description, tuning=TuningSettings(choice_plants=3))
+    sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
+    asks = ROBOT._replace(description=description)
+    assert _between(sets, robot=asks).others == {}
+    assert _between(sets, robot=asks, safe=0.75).others == {"friction": pytest.approx(0.45)}
+
+
 @pytest.mark.parametrize(("friction", "planned"), [(0.05, 0.1), (1.5, 1.0)])
 def test_the_answer_can_be_read_whatever_the_controllers_friction(tmp_path, friction, planned):
     sets = {"nominal": nominal(), "without": nominal(), "with": expert()}

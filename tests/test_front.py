@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from model import CONFIG, ROBOT
 
+from hector_jax.cli import run_folder
+from hector_jax.cli import tune as command
+from hector_jax.cli.flags import Tune
 from hector_jax.control.reference import named_command
+from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import between, expert, nominal
+from hector_jax.core.inputs import InputError
 from hector_jax.report import plots
 from hector_jax.report.report import front_table
 from hector_jax.runs import choice, front, tunings
@@ -61,8 +66,8 @@ def test_the_sets_lie_between_two_tunings_and_plan_with_less_and_less_friction()
 
 
 @pytest.fixture
-def points(monkeypatch, tmp_path):
-    """Points of walks in which one set falls under pushes from behind and tracks twice as well."""
+def walked(monkeypatch, tmp_path):
+    """Walks in which one set falls under pushes to the front and tracks twice as well."""
     seen = []
 
     def score_jobs(setup, jobs, *, title, folder):
@@ -73,13 +78,13 @@ def points(monkeypatch, tmp_path):
 
         def score(case, job):
             mine = case[0].startswith("mine-")
-            pushed = job.push.force.any()
-            falls = mine and pushed and job.push.force[0, 0] > 0.0
+            falls = mine and job.push.force.any() and job.push.force[0, 0] > 0.0
             scale = 1.0 + case[1]  # by plant, so that only paired ratios are all alike
             L, L_ctrl = scale * (0.5 if mine else 1.0), scale * (1.2 if mine else 1.0)
-            losses = {"L": np.array(L), "L_ctrl": np.array(L_ctrl)}
+            losses = dict.fromkeys(("L_Eul", "L_pos", "L"), np.array(L))
+            losses |= {"L_ctrl": np.array(L_ctrl)}
             scored = score_like(loss=CONFIG.loss)._replace(losses=losses, fallen=np.array(falls))
-            return SimpleNamespace(score=scored), None
+            return SimpleNamespace(score=scored, startup=""), None
 
         return {case: score(case, job) for case, job in jobs.items()}
 
@@ -88,10 +93,12 @@ def points(monkeypatch, tmp_path):
     return front.walk(SETUP, COMMANDS, {"mine": expert()}, **options), seen
 
 
-def test_all_sets_walk_alone_and_under_pushes_from_all_sides_on_the_same_plants(points):
-    (*_, mine), seen = points
+def test_all_sets_walk_alone_and_under_pushes_from_all_sides_on_the_same_plants(walked):
+    result, seen = walked
     calm = len(COMMANDS) * front.PLANTS
-    assert mine == pytest.approx(("mine", -50.0, 20.0, 4 * calm, 8 * calm, 0, calm))
+    assert result.falls == {"nominal": 0, "expert": 0, "mine": 4 * calm}
+    assert result.pushed == 8 * calm
+    assert not any(score.fallen.any() for score in result.calm.scores.values())
     assert len(seen) == 3 * 9 * calm
     pushed = {tuple(np.round(job.push.force[0], 3)) for _, job in seen if job.push.force.any()}
     assert len(pushed) == 8
@@ -101,9 +108,51 @@ def test_all_sets_walk_alone_and_under_pushes_from_all_sides_on_the_same_plants(
     assert not others & {float(plant.mass) for plant in plants}
 
 
-def test_the_front_is_a_table_and_a_picture(points, tmp_path):
-    rows = front_table(points[0]).splitlines()
-    assert rows[-1] == "| mine | -50 | +20 | 32 of 64 | 0 of 8 |"
-    caption = plots.front(tmp_path / "front.png", points[0])
-    assert "64 walks under a push" in caption
+def test_the_front_is_a_table_and_a_picture(walked, tmp_path):
+    result, _ = walked
+    rows = front_table(result).splitlines()
+    assert rows[-1] == "| mine | -50 [-50, -50] | +20 [+20, +20] | 32 of 64 | 0 of 8 |"
+    assert "64 walks under a push" in plots.front(tmp_path / "front.png", result)
     assert (tmp_path / "front.png").stat().st_size > 0
+
+
+def _run(tmp_path, **flags):
+    course = NamedCommand("straight", COMMANDS["straight"])
+    net = SimpleNamespace(params="a net")
+    return command._Run(SETUP, tmp_path, Tune(**flags), nominal(), (course,), net)
+
+
+def test_the_command_tunes_smoothly_and_takes_a_safe_set(monkeypatch, tmp_path):
+    there = SimpleNamespace(tuning=SimpleNamespace(ten=nominal(), converged=expert()))
+    seen = {}
+
+    def tune(setup, *_, **__):
+        seen["L_ctrl"] = alphas(setup.config.loss)["L_ctrl"]
+        return {"without": there, "with": there}
+
+    monkeypatch.setattr(tunings, "tune", tune)
+    tuned = command._tune_sets(_run(tmp_path, smooth=3.0, safe=0.75))
+    assert seen["L_ctrl"] == 3.0 * alphas(CONFIG.loss)["L_ctrl"]
+    assert tuned.sets["best"].others == {"friction": pytest.approx(0.45)}
+
+
+def test_the_command_stores_the_sets_of_the_front(monkeypatch, tmp_path):
+    pairs = {smooth: [nominal(), expert()] for smooth in front.SMOOTH}
+    monkeypatch.setattr(front, "tune", lambda *_, **__: pairs)
+    monkeypatch.setattr(front, "walk", lambda setup, commands, sets, **_: sorted(sets))
+    names = command._walk_front(_run(tmp_path, front=True))
+    assert names == sorted(path.stem for path in (tmp_path / "front").glob("*.json"))
+    assert len(names) == 9
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ({"safe": 0.8, "start": "best"}, "--safe and --front set the friction"),
+        ({"front": True, "tune": ("friction",)}, "--safe and --front set the friction"),
+        ({"front": True, "refresh": 1}, "--front tunes through the first net"),
+    ],
+)
+def test_what_a_front_cannot_be_with_is_refused(flags, words):
+    with pytest.raises(InputError, match=words):
+        run_folder.trajectories(Tune(**flags), ROBOT)

@@ -14,6 +14,7 @@ from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import tuning_section, write_report
+from hector_jax.runs.front import Front
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.walks import Change
 from hector_jax.tuning.curvature import Curvature, Direction
@@ -56,6 +57,8 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         best_proposal="",
         cases=0,
         chosen={},
+        front=None,
+        smooth=1.0,
     )
 
 
@@ -248,3 +251,14 @@ def test_a_tuning_on_walks_shows_each_set_and_its_falls(tmp_path):
     assert "| 1, model | -12.3 | -10.0 |" in text
     assert "| 2, model | -5.0 | fell |" in text
     assert "Tuning on walks" not in write_report(tmp_path, **_report()).read_text()
+
+
+def test_a_front_and_what_counted_while_tuning_are_in_the_report(tmp_path):
+    plain = write_report(tmp_path, **_report()).read_text()
+    front = Front(pretend_verdict(), dict.fromkeys(SETS, 3), 64)
+    text = write_report(tmp_path, **{**_report(), "front": front, "smooth": 3.0}).read_text()
+    assert report.front_table(front) in text
+    assert text.count("3 of 64") == len(SETS)
+    for words in ("## The front", "L_ctrl counted 3 times in the tunings"):
+        assert words in text
+        assert words not in plain

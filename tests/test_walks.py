@@ -14,7 +14,7 @@ import pytest
 from model import AHEAD, BRIEF
 from pretend import pretend_history
 
-from hector_jax.cli import propose
+from hector_jax.cli import propose, run_folder
 from hector_jax.cli import tune as command
 from hector_jax.cli.flags import Propose, Report, Tune
 from hector_jax.control.reference import named_command
@@ -280,4 +280,4 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     assert (tmp_path / "weights" / "before_walks.json").exists()
     assert walks.changes(tuned.proposals)[0].change == 0.0
     with pytest.raises(InputError, match=r"--walks must be 0 or at least 6 .*, got 5"):
-        command._trajectories(Tune(walks=5, walk_plants=3), robot)
+        run_folder.trajectories(Tune(walks=5, walk_plants=3), robot)

@@ -35,7 +35,14 @@ _CODE = (
 )
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "run", "runs")
-_FREE_FLAGS = ("data", "json", "processes", "verdict", "video")  # may change when a run is resumed
+_FREE_FLAGS = (
+    "data",
+    "front",
+    "json",
+    "processes",
+    "verdict",
+    "video",
+)  # may change when a run is resumed
 
 
 def exists_error(folder: Path) -> InputError:
@@ -50,7 +57,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
 
     Raises:
         InputError: there is no such trajectory, their lengths differ, or --walks or --refresh does
-            not allow them.
+            not allow them; --safe or --front beside a friction or a refresh.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
     count, pieces = len(loaded), len(loaded[0].command.duration)
@@ -58,11 +65,16 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
+    numbers = *tunables(args.tune), *arguments.weights(args.start, robot).others
+    if (args.safe or args.front) and "friction" in numbers:
+        raise InputError("--safe and --front set the friction, which --tune or --start has already")
     if not args.refresh:
         return loaded
+    if args.front:
+        raise InputError("--front tunes through the first net, so it cannot be with --refresh")
     if args.net:
         raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
-    if tunables(args.tune) or arguments.weights(args.start, robot).others:
+    if numbers:
         raise InputError("--refresh takes Q and R alone, neither --tune nor a start with others")
     if count > 1:
         raise InputError(f"--refresh takes one trajectory, got {count}; add --each")

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,7 @@ from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import Picture, front_table, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.runs import choice, front, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.setup import Setup
@@ -133,6 +133,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
+    data = arguments.robot_folder(args.data, args.robot, robot)
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
@@ -144,7 +145,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
             args=args,
             start=start,
             trajectories=trajectories,
-            net=net or _net(pool, args, robot),
+            net=net or nets.load_or_train(pool, robot, data, args.variant),
         )
         norms = tunings.gradient_norms(run.setup, run.problems)
         if args.alpha == "auto":
@@ -156,7 +157,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         inputs = run.tuning.config, robot, start, run.problems["with"]
         matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the walks
         walks = _walk_sets(run, tuned.sets)
-        points = _walk_front(run) if args.front else []
+        points = _walk_front(run) if args.front else None
         curvature = main_directions(matrix.result(), start)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
@@ -176,6 +177,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=result.get("chosen", {}),
         front=points,
+        smooth=args.smooth,
         **_draw(run, tuned, *walks[trajectories[0].name], points),
         config=settings,
         environment=made_with,
@@ -189,20 +191,15 @@ def _tune_in(folder: Path, args: Tune) -> None:
 def _print_tables(
     verdicts: Mapping[str, metrics.Verdict],
     seeds: int,
-    points: Sequence[front.Point],
+    points: front.Front | None,
     show: Callable[[], None] | None,
 ) -> None:
     for name, verdict in verdicts.items():
         print_table(verdict, f"{name}, {plural(seeds, 'plant')}")
     if points:
-        print(front_table(points))
+        print(f"sets around `best`\n{front_table(points)}")
     if show:
         show()
-
-
-def _net(pool: Executor, args: Tune, robot: Robot) -> nets.TrainedNet:
-    data = arguments.robot_folder(args.data, args.robot, robot)
-    return nets.load_or_train(pool, robot, data, args.variant)
 
 
 def _note_settings(run: _Run) -> dict[str, Any]:
@@ -212,7 +209,7 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     as_lists = partial(jax.tree.map, lambda x: np.asarray(x).tolist())
     commands = [as_lists(command)._asdict() for command in run.commands.values()]
     settings = {
-        "tune": run.tuning.config.as_table(),
+        "tune": run.setup.config.as_table(),
         "net": tree_hash(run.net.params),
         "command": commands[0] if len(commands) == 1 else commands,
         "seconds": run.seconds,
@@ -291,7 +288,7 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
     return Campaign(run.folder / "walks", config, robot, start, run.commands, plants)
 
 
-def _walk_front(run: _Run) -> list[front.Point]:
+def _walk_front(run: _Run) -> front.Front:
     """Tune and walk the sets of the front; write their weights."""
     inputs, options = (run.setup, run.commands), {"seconds": run.seconds, "folder": run.artefacts}
     pairs = front.tune(*inputs, run.problems, start=run.start, **options)
@@ -336,7 +333,7 @@ def _result(
     run: _Run,
     tuned: _Tuned,
     walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]],
-    points: Sequence[front.Point],
+    points: front.Front | None,
 ) -> tuple[dict[str, Any], dict[str, metrics.Verdict]]:
     """Write result.json; return its content and the verdicts, of all walks and by trajectory."""
 
@@ -367,7 +364,8 @@ def _result(
         choices = tuned.choices.items()
         result["chosen"] = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices}
     if points:
-        result["front"] = [point._asdict() for point in points]
+        falls = {"falls_pushed": points.falls, "pushed": points.pushed}
+        result["front"] = metrics.as_result(points.calm, "drawn") | falls
     write_json(run.folder / RESULT, result)
     return result, by_name
 
@@ -377,7 +375,7 @@ def _draw(
     tuned: _Tuned,
     standin: ScoredWalks,
     on_hfs: ScoredWalks,
-    points: Sequence[front.Point],
+    points: front.Front | None,
 ) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
     effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}

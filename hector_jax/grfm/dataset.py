@@ -40,7 +40,8 @@ class Dataset(NamedTuple):
     """Samples of phi, n of them; those of one walk follow one another in time."""
 
     window: Window  # input of phi, yaw frame
-    label: Wrench  # (n, feet, 3) each, mean effect over the tick, yaw frame
+    # (n, feet, 3) each, mean effect over the tick, yaw frame; without moments for point feet
+    label: Wrench
     legs: Load  # (n, 3) each, load on the rigid body in addition to the effect, yaw frame
     # [m] from the planned touchdown to the foot, yaw frame
     touchdown_error: Float[Array, "n feet 3"]

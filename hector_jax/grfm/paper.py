@@ -1,10 +1,10 @@
 """The paper's GRFM-Net, and a linear map for comparison.
 
-Each of two nets, one for forces and one for moments, reads the current and the two past commands of
-all feet (18 numbers for two feet), passes them through three layers (linear, layer normalisation,
-softsign; 64 wide) and returns the ground's forces or moments at all feet (6). Inputs and outputs
-are standardised by statistics of the training samples. A net has to beat the best affine map of the
-same inputs.
+Each of two nets, one for forces and one for moments (none for point feet), reads the current and
+the two past commands of all feet (18 numbers for two feet), passes them through three layers
+(linear, layer normalisation, softsign; 64 wide) and returns the ground's forces or moments at all
+feet (6). Inputs and outputs are standardised by statistics of the training samples. A net has to
+beat the best affine map of the same inputs.
 
 Mirror images of the samples are our addition: with 51 training walks they lowered the held-out
 force error by 5 to 10 % and the moment error by 4 to 6 %.

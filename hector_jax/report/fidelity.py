@@ -183,6 +183,8 @@ def curves(
 ) -> dict[str, Wrench]:
     """Return commanded, predicted and measured wrenches of the first walk, for a picture.
 
+    Point feet have no moments in any of them.
+
     Args:
         robot: the body that walked.
         walks: as for `make_dataset`.

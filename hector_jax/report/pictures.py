@@ -1,6 +1,6 @@
 """The pictures and the film of each command, drawn by plots and video.py."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from hector_jax.report.video import VideoUnavailable, write_film, write_strip
 from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
 from hector_jax.runs.folder import Histories
-from hector_jax.runs.front import Point
+from hector_jax.runs.front import Front
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import Loss
 
@@ -31,7 +31,7 @@ def of_run(
     walks: Mapping[str, Trajectory],
     ground: Mapping[str, Wrench],
     training: History,
-    points: Sequence[Point],
+    points: Front | None,
 ) -> list[Picture]:
     """Draw the pictures of a tuning into `pictures/` of its folder.
 
@@ -43,7 +43,7 @@ def of_run(
         walks: one walk by set, at the plan interval.
         ground: result of `fidelity.curves`.
         training: errors of the net by epoch.
-        points: of the front; empty if it was not walked.
+        points: result of `front.walk`; None without.
 
     Returns:
         The pictures, in the order of the report.

@@ -20,14 +20,14 @@ from rich.table import Table
 from rich.text import Text
 
 from hector_jax.core.inputs import plural
-from hector_jax.runs.front import Point
+from hector_jax.runs.front import Front
 from hector_jax.runs.metrics import (
     BASELINES,
     FEWEST,
     Comparison,
     Summary,
     Verdict,
-    percent,
+    compare,
     rms,
     summarize,
 )
@@ -55,23 +55,6 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: in
     """
     rule = [":---" if i < words else "---:" for i in range(len(head))]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
-
-
-def front_table(points: Sequence[Point]) -> str:
-    """Format the points of a front in Markdown."""
-    changes = "L against nominal [%]", "L_ctrl against expert [%]"
-    falls = "falls under a push", "falls without one"
-    rows = [
-        (
-            point.name,
-            percent(point.L),
-            percent(point.L_ctrl),
-            f"{point.falls} of {point.pushed}",
-            f"{point.falls_calm} of {point.calm}",
-        )
-        for point in points
-    ]
-    return markdown_table(("set", *changes, *falls), rows)
 
 
 def seeds_text(seeds: Sequence[int] | np.ndarray) -> str:
@@ -140,6 +123,18 @@ def baselines(verdict: Verdict) -> list[str]:
 def change_text(comparison: Comparison, part: str = "L", void: str = f" \\{VOID}") -> str:
     """Format a change in % with its interval and, if falls make it void, a mark."""
     return comparison.change[part].text() + ("" if comparison.counts else void)
+
+
+def front_table(front: Front) -> str:
+    """Format the results of a front in Markdown."""
+    changes = "L against nominal [%]", "L_ctrl against expert [%]"
+    rows = []
+    for name, score in front.calm.scores.items():
+        against = (compare(front.calm, name, baseline) for baseline in BASELINES)
+        texts = [change_text(c, part) for c, part in zip(against, ("L", "L_ctrl"), strict=True)]
+        falls = f"{front.falls[name]} of {front.pushed}", f"{score.fallen.sum()} of {score.L.size}"
+        rows.append((name, *texts, *falls))
+    return markdown_table(("set", *changes, "falls under a push", "falls without one"), rows)
 
 
 def legend(verdict: Verdict) -> list[str]:

@@ -31,7 +31,8 @@ def write_report(folder: Path, **contents: Any) -> Path:
             proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
                 is `best`; number of walks per weight set.
             chosen: chosen iteration by set, if it is not the last.
-            front: points of the front; empty if it was not walked.
+            front: result of `front.walk`; None without.
+            smooth: how often L_ctrl counted in the tunings.
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
             config, environment: resolved settings, as JSON values; versions and machine.
             command: command line that repeats this run.

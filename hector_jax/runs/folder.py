@@ -59,7 +59,8 @@ class RunRequest(NamedTuple):
     """Settings with which a run was started."""
 
     trajectory: str  # the first if there are several
-    loss: Loss
+    loss: Loss  # of the table
+    smooth: float  # how often L_ctrl counted while tuning
     data: Path  # folder of its net
     net: Path | None  # file of the net, if it is not in `data`
     variant: str  # of the net
@@ -92,13 +93,14 @@ def read_request(folder: Path) -> RunRequest:
         return RunRequest(
             trajectory=str(flags["traj"] if isinstance(flags["traj"], str) else flags["traj"][0]),
             loss=with_alphas(loss),
+            smooth=float(flags.get("smooth", 1.0)),
             data=Path(flags["data"]),
             net=Path(flags["net"]) if flags.get("net") else None,
             variant=str(flags.get("variant", "residual")),
             robot=Path(flags["robot"]) if flags.get("robot") else None,
             body=config.get("robot"),
         )
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(
             f"{folder / CONFIG}: expected the settings of a run of `hector tune` ({error!r})"
         ) from None

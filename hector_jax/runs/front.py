@@ -2,16 +2,15 @@
 
 Two numbers move a tuned set along this front. `smooth` multiplies the weight of L_ctrl in the loss
 that is tuned: the commands change less and the robot tracks worse. `safe` is the share of the
-controller's friction with which the set plans: less friction makes it fall less often under a push
-and, on fast turns, track worse. The points walk undisturbed and under pushes, on plants by which
-nothing else is chosen or evaluated.
+controller's friction with which the set plans: with less it falls a little less often under pushes
+and tracks worse, most of all on fast turns. The points walk undisturbed and under pushes, on plants
+by which nothing else is chosen or evaluated.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -19,13 +18,13 @@ import numpy as np
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, between, expert, nominal
 from hector_jax.runs import choice, tunings
-from hector_jax.runs.metrics import Score
+from hector_jax.runs.metrics import Verdict, make_verdict
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
-from hector_jax.runs.verdicts import score_jobs
+from hector_jax.runs.verdicts import ScoredWalk, say_faults, score_jobs
 from hector_jax.sim.loop import Job
-from hector_jax.sim.world import NO_PUSH, Push
-from hector_jax.tuning.loss import with_alphas
+from hector_jax.sim.world import NO_PUSH, push_along
+from hector_jax.tuning.loss import smoother
 
 SMOOTH = (1.0, 3.0, 10.0)
 SAFE = (1.0, choice.SAFE, 0.75)
@@ -34,23 +33,18 @@ SIDES = np.deg2rad(22.5 + 45 * np.arange(8))  # [rad] of the pushes, from ahead 
 _FORCE, _START, _TIME, _WALK = 90.0, 1.05, 0.1, 2.5  # [N] of HECTOR, [s]; includes the recovery
 
 
-class Point(NamedTuple):
-    """Results of one set; changes are medians of paired ratios over plants and trajectories."""
+class Front(NamedTuple):
+    """Walks of nominal, expert and the sets of a front."""
 
-    name: str
-    L: float  # against nominal [%]
-    L_ctrl: float  # against expert [%]
-    falls: int  # under a push
-    pushed: int  # walks under a push
-    falls_calm: int  # in walks without a push
-    calm: int
+    calm: Verdict  # of walks without a push; each plant walks every command
+    falls: dict[str, int]  # under a push, by set
+    pushed: int  # walks of each set under a push
 
 
 def smoothed(setup: Setup, smooth: float) -> Setup:
     """Return the setup of tunings in which L_ctrl counts `smooth` times."""
-    loss = setup.config.loss
-    alphas = {term.name: smooth * term.weight for term in loss if term.name == "L_ctrl"}
-    return setup._replace(config=replace(setup.config, loss=with_alphas(alphas, loss)))
+    config = setup.config
+    return setup._replace(config=replace(config, loss=smoother(config.loss, smooth)))
 
 
 def tune(
@@ -109,7 +103,7 @@ def walk(
     *,
     seconds: float,
     folder: Path,
-) -> list[Point]:
+) -> Front:
     """Walk nominal, expert and the sets of a front, undisturbed and under pushes from all sides.
 
     Args:
@@ -121,10 +115,9 @@ def walk(
     robot = setup.robot
     sets = {"nominal": nominal(robot), "expert": expert(robot), **sets}
     force = _FORCE * robot.description.plants.push
-    sides = np.stack([np.cos(SIDES), np.sin(SIDES), 0.0 * SIDES], axis=1)
-    pushes = [Push(*(np.array([x]) for x in (force * side, _START, _TIME))) for side in sides]
     scenes = {"calm": (NO_PUSH, seconds)}
-    scenes |= {f"push{i}": (push, _WALK) for i, push in enumerate(pushes)}
+    for i, side in enumerate(SIDES):
+        scenes[f"push{i}"] = push_along(side, force, _START, _TIME), _WALK
     plants = choice.drawn_plants(robot, PLANTS, _FIRST_SEED)
     keys = {
         (f"{name}-{command}-{scene}", seed): (name, command, scene, seed)
@@ -137,26 +130,11 @@ def walk(
         jobs[case] = Job(*inputs, push=push)
     title = "walking the front, with and without pushes"
     scored = score_jobs(setup, jobs, title=title, folder=folder / "front")
-    scores: dict[tuple[str, bool], list[Score]] = {}  # by set, without a push or with one
+    walks: dict[str, dict[bool, list[ScoredWalk]]] = {name: {True: [], False: []} for name in sets}
     for case, (name, _, scene, _) in keys.items():
-        scores.setdefault((name, scene == "calm"), []).append(scored[case][0].score)
-
-    def change(name: str, baseline: str, term: str) -> float:
-        pairs = zip(scores[name, True], scores[baseline, True], strict=True)
-        ratios = [float(one.losses[term] / other.losses[term]) for one, other in pairs]
-        return 100.0 * (median(ratios) - 1.0)
-
-    def falls(name: str, calm: bool) -> tuple[int, int]:
-        fallen = [bool(score.fallen) for score in scores[name, calm]]
-        return sum(fallen), len(fallen)
-
-    return [
-        Point(
-            name,
-            change(name, "nominal", "L"),
-            change(name, "expert", "L_ctrl"),
-            *falls(name, False),
-            *falls(name, True),
-        )
-        for name in sets
-    ]
+        walks[name][scene == "calm"].append(scored[case][0])
+    say_faults({name: group[True] + group[False] for name, group in walks.items()})
+    calm = {name: [walk.score for walk in group[True]] for name, group in walks.items()}
+    verdict = make_verdict(setup.config.loss, [*range(PLANTS)] * len(commands), calm)
+    falls = {n: sum(bool(w.score.fallen) for w in group[False]) for n, group in walks.items()}
+    return Front(verdict, falls, len(commands) * PLANTS * len(SIDES))

@@ -56,6 +56,12 @@ class Push(NamedTuple):
 NO_PUSH = Push(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
+def push_along(side: float, force: float, start: float, duration: float) -> Push:
+    """Return one level push along `side`, an angle from ahead to the left [rad]."""
+    vector = force * np.array([np.cos(side), np.sin(side), 0.0])
+    return Push(*(np.array([x]) for x in (vector, start, duration)))
+
+
 class Imperfections(NamedTuple):
     """Properties of a plant that are unknown to the controller."""
 

@@ -190,6 +190,12 @@ def with_alphas(weights: Mapping[str, float], loss: Loss = PAPER_LOSS) -> Loss:
     return weighted
 
 
+def smoother(loss: Loss, factor: float) -> Loss:
+    """Return a loss in which L_ctrl, if it has that term, counts `factor` times."""
+    weights = {term.name: factor * term.weight for term in loss if term.name == "L_ctrl"}
+    return with_alphas(weights, loss)
+
+
 def loss_of_robot(description: Description) -> Loss:
     """Return the paper's loss with the weights of a robot's description.
 

@@ -23,7 +23,7 @@ from hector_jax.report.motion import COLOURS, Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
-from hector_jax.runs.front import Point
+from hector_jax.runs.front import Front
 from hector_jax.runs.matrix import Cells, Column, columns_of, sets_of, trajectories_of
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
@@ -226,14 +226,16 @@ def wrenches(
     count = round(seconds / period)
     labels = ["$F_x$ [N]", "$F_y$ [N]", "$F_z$ [N]", "$M_x$ [N m]", "$M_y$ [N m]", "$M_z$ [N m]"]
     order = ("measured", "commanded", "linear", "paper", "predicted")
-    with drawing(path, 10.0, 4.4) as figure:
-        panels = figure.subplots(2, 3, sharex=True)
+    # point feet have no moments
+    rows = 1 + any(np.nan_to_num(curve.moment).any() for curve in curves.values())
+    with drawing(path, 10.0, 0.4 + 2.0 * rows) as figure:
+        panels = figure.subplots(rows, 3, sharex=True, squeeze=False)
         for name in (name for name in order if name in curves):
             wrench = np.concatenate([np.asarray(part)[:count, 0] for part in curves[name]], axis=1)
             look = {"baseline": None, "label": label_of(name), **CURVES[name]}
-            for panel, values in zip(panels.flat, wrench.T, strict=True):
+            for panel, values in zip(panels.flat, wrench.T, strict=False):
                 panel.stairs(values, period * np.arange(count + 1), **look)
-        for panel, label in zip(panels.flat, labels, strict=True):
+        for panel, label in zip(panels.flat, labels, strict=False):
             panel.axvline(seconds / 2, color="0.75", linewidth=0.8, zorder=0)
             panel.set_ylabel(label)
             style.widen(panel, 5.0 if "[N]" in label else 0.5)
@@ -286,28 +288,30 @@ def training(path: Path, history: History) -> str:
     return caption("training")
 
 
-def front(path: Path, points: Sequence[Point]) -> str:
+def front(path: Path, result: Front) -> str:
     """Draw L, L_ctrl and falls of the sets of a front.
 
     Args:
         path: file to write.
-        points: the points; nominal and expert first.
+        result: the walks.
     """
-    tunings: dict[str, list[Point]] = {}
-    for point in points:
-        tunings.setdefault(point.name.partition("_safe_")[0], []).append(point)
+    tunings: dict[str, list[str]] = {}
+    for name in result.falls:
+        tunings.setdefault(name.partition("_safe_")[0], []).append(name)
+    change = lambda name, i, part: compare(result.calm, name, BASELINES[i]).change[part].value  # noqa: E731
     with drawing(path, 7.0, 4.2) as figure:
         axes = figure.subplots()
-        for name, look in looks_of(tunings).items():
-            x, y = np.array([(point.L_ctrl, point.L) for point in tunings[name]]).T
-            axes.plot(x, y, **look.line)
-            axes.plot(x, y, **look.dot, label=label_of(name).replace("_", " "))
-            for point in tunings[name]:
+        for tuning, look in looks_of(tunings).items():
+            places = [(change(name, 1, "L_ctrl"), change(name, 0, "L")) for name in tunings[tuning]]
+            axes.plot(*zip(*places, strict=True), **look.line)
+            label = label_of(tuning).replace("_", " ")
+            axes.plot(*zip(*places, strict=True), **look.dot, label=label)
+            for name, place in zip(tunings[tuning], places, strict=True):
                 text = {"textcoords": "offset points", "xytext": (5, 4), "fontsize": 8}
-                axes.annotate(f"{point.falls}", (point.L_ctrl, point.L), **text)
+                axes.annotate(f"{result.falls[name]}", place, **text)
         axes.set(xlabel="change of L_ctrl against expert [%]")
         axes.set(ylabel="change of L against nominal [%]")
-    return caption("front", pushed=points[0].pushed)
+    return caption("front", pushed=result.pushed)
 
 
 def matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
