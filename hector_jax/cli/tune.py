@@ -137,8 +137,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     say(f"the run folder is {folder}")
     with workers(args.processes) as pool:
         for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
-            name = trajectories[0].name
-            say(f"before any tuning, {name} on hfs with nominal weights: {line}")
+            say(f"before any tuning, {trajectories[0].name} on hfs with nominal weights: {line}")
         run = _Run(
             setup=Setup(pool, config, robot, made_with.get("commit", "")),
             folder=folder,
