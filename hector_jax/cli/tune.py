@@ -67,6 +67,7 @@ def tune(args: Tune) -> None:
         runs = {run_folder.begin(folder, flags): flags for folder, flags in runs.items()}
     for folder, flags in runs.items():
         with locked(folder):
+            say(f"the run folder is {folder}")
             _tune_in(folder, flags)
 
 
@@ -132,9 +133,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
     config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
-    net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     data = arguments.robot_folder(args.data, args.robot, robot)
-    say(f"the run folder is {folder}")
+    net = nets.load_net(args.net, robot, args.variant)[0] if args.net else None
     with workers(args.processes) as pool:
         for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
             say(f"before any tuning, {trajectories[0].name} on hfs with nominal weights: {line}")
