@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from model import CONFIG, ROBOT
+from pretend import pretend_history, pretend_verdict
 
 from hector_jax.cli import run_folder
 from hector_jax.cli import tune as command
@@ -15,15 +16,23 @@ from hector_jax.control.reference import named_command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import between, expert, nominal
 from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import State
 from hector_jax.report import plots
 from hector_jax.report.report import front_table
 from hector_jax.runs import choice, front, tunings
 from hector_jax.runs.metrics import score_like
 from hector_jax.runs.setup import Setup
+from hector_jax.runs.tunings import Problem, Tuned
+from hector_jax.runs.verdicts import ScoredWalk
+from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import alphas
 
 SETUP = Setup(Executor(), CONFIG, ROBOT)
 COMMANDS = {"straight": named_command("straight"), "stop-and-go": named_command("stop-and-go")}
+
+
+def _tuned(weights):
+    return Tuned(Tuning(pretend_history(3), nominal(), weights, "done"), "")
 
 
 def test_a_smoother_tuning_counts_the_changes_of_the_command_more_and_nothing_else():
@@ -34,13 +43,14 @@ def test_a_smoother_tuning_counts_the_changes_of_the_command_more_and_nothing_el
     assert smooth.rollout == CONFIG.rollout
 
 
-def test_each_smoothness_is_tuned_with_its_loss_and_judged_with_that_of_the_robot(monkeypatch):
+def test_each_smoothness_is_tuned_with_its_loss_and_judged_with_that_of_the_robot(
+    monkeypatch, tmp_path
+):
     def tune(setup, problems, folder, *, title, start):
         del folder, title
-        assert start == "start"
+        np.testing.assert_array_equal(start.Q.euler, nominal().Q.euler)
         weight = alphas(setup.config.loss)["L_ctrl"]
-        results = (SimpleNamespace(converged=(name, weight)) for name in problems)
-        return dict(zip(problems, map(lambda r: SimpleNamespace(tuning=r), results), strict=True))
+        return {name: _tuned(jax.tree.map(lambda w: w * weight, expert())) for name in problems}
 
     def choose(setup, results, commands, **options):
         del results, options
@@ -50,10 +60,13 @@ def test_each_smoothness_is_tuned_with_its_loss_and_judged_with_that_of_the_robo
 
     monkeypatch.setattr(tunings, "tune", tune)
     monkeypatch.setattr(choice, "choose", choose)
-    problems = {"without": None, "with": None}
-    options = {"start": "start", "seconds": 4.0, "folder": front.Path("kept")}
+    problems = dict.fromkeys(("without", "with"), Problem(COMMANDS["straight"], None))
+    options = {"start": nominal(), "seconds": 4.0, "folder": tmp_path}
     tuned = front.tune(SETUP, COMMANDS, problems, **options)
-    assert tuned == {s: [("without", s), ("with", s)] for s in front.SMOOTH}
+    assert list(tuned) == list(front.SMOOTH)
+    for smooth, pair in tuned.items():
+        assert len(pair) == 2
+        np.testing.assert_allclose(pair[1].Q.euler, smooth * expert().Q.euler)
 
 
 def test_the_sets_lie_between_two_tunings_and_plan_with_less_and_less_friction():
@@ -69,6 +82,7 @@ def test_the_sets_lie_between_two_tunings_and_plan_with_less_and_less_friction()
 def walked(monkeypatch, tmp_path):
     """Walks in which one set falls under pushes to the front and tracks twice as well."""
     seen = []
+    anywhere = State(*np.zeros((4, 3)))
 
     def score_jobs(setup, jobs, *, title, folder):
         del title
@@ -84,7 +98,7 @@ def walked(monkeypatch, tmp_path):
             losses = dict.fromkeys(("L_Eul", "L_pos", "L"), np.array(L))
             losses |= {"L_ctrl": np.array(L_ctrl)}
             scored = score_like(loss=CONFIG.loss)._replace(losses=losses, fallen=np.array(falls))
-            return SimpleNamespace(score=scored, startup=""), None
+            return ScoredWalk(scored, np.ones(()), anywhere, "", ""), None
 
         return {case: score(case, job) for case, job in jobs.items()}
 
@@ -123,8 +137,7 @@ def _run(tmp_path, **flags):
 
 
 def test_the_command_tunes_smoothly_and_takes_a_safe_set(monkeypatch, tmp_path):
-    there = SimpleNamespace(tuning=SimpleNamespace(ten=nominal(), converged=expert()))
-    seen = {}
+    there, seen = _tuned(expert()), {}
 
     def tune(setup, *_, **__):
         seen["L_ctrl"] = alphas(setup.config.loss)["L_ctrl"]
@@ -139,10 +152,18 @@ def test_the_command_tunes_smoothly_and_takes_a_safe_set(monkeypatch, tmp_path):
 def test_the_command_stores_the_sets_of_the_front(monkeypatch, tmp_path):
     pairs = {smooth: [nominal(), expert()] for smooth in front.SMOOTH}
     monkeypatch.setattr(front, "tune", lambda *_, **__: pairs)
-    monkeypatch.setattr(front, "walk", lambda setup, commands, sets, **_: sorted(sets))
-    names = command._walk_front(_run(tmp_path, front=True))
-    assert names == sorted(path.stem for path in (tmp_path / "front").glob("*.json"))
-    assert len(names) == 9
+    walked = front.Front(pretend_verdict(), {}, 64)
+    seen = []
+
+    def walk(setup, commands, sets, **options):
+        del setup, commands, options
+        seen.extend(sets)
+        return walked
+
+    monkeypatch.setattr(front, "walk", walk)
+    assert command._walk_front(_run(tmp_path, front=True)) is walked
+    assert len(seen) == 9
+    assert sorted(seen) == sorted(path.stem for path in (tmp_path / "front").glob("*.json"))
 
 
 @pytest.mark.parametrize(
