@@ -132,7 +132,7 @@ def test_the_front_is_a_table_and_a_picture(walked, tmp_path):
 
 def _run(tmp_path, **flags):
     course = NamedCommand("straight", COMMANDS["straight"])
-    net = SimpleNamespace(params="a net")
+    net = SimpleNamespace(params=None)
     return command._Run(SETUP, tmp_path, Tune(**flags), nominal(), (course,), net)
 
 
@@ -177,3 +177,11 @@ def test_the_command_stores_the_sets_of_the_front(monkeypatch, tmp_path):
 def test_what_a_front_cannot_be_with_is_refused(flags, words):
     with pytest.raises(InputError, match=words):
         run_folder.trajectories(Tune(**flags), ROBOT)
+
+
+def test_a_front_that_was_added_to_a_run_stays_when_it_is_resumed_again(tmp_path):
+    folder = run_folder.begin(tmp_path / "run", Tune())
+    added = run_folder.resume(folder, Tune(front=True, data=tmp_path))
+    assert added.front
+    command._note_settings(_run(folder, front=True))
+    assert run_folder.resume(folder, Tune(data=tmp_path)).front

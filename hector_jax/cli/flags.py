@@ -140,7 +140,7 @@ class Tune(Configured):
     # times that L_ctrl counts while tuning (not in the table): above 1, smoother commands
     smooth: Annotated[float, Range(0.01, 100)] = 1.0
     # share of the controller's friction with which `best` plans: with less it tracks worse and
-    # falls a little less under pushes; by default 11/12 for the set between two tunings
+    # may fall less under pushes; by default 11/12 for the set between two tunings
     safe: Annotated[float | None, Range(0.1, 1)] = None
     front: bool = False  # tune and walk nine sets around `best`, of other --smooth and --safe
     refresh: Annotated[int, Range(0, 100)] = 0  # times to collect at the new weights and repeat

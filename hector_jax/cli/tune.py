@@ -30,7 +30,7 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.report import Picture, front_table, print_table
+from hector_jax.report.report import VOID, Picture, front_table, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
@@ -196,7 +196,7 @@ def _print_tables(
     for name, verdict in verdicts.items():
         print_table(verdict, f"{name}, {plural(seeds, 'plant')}")
     if points:
-        print(f"sets around `best`\n{front_table(points)}")
+        print(f"sets around `best`\n{front_table(points, VOID)}")
     if show:
         show()
 
@@ -219,8 +219,11 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     run_folder.check_agreement(run.folder, recorded, as_read)
     if recorded.get("start", as_read["start"]) != as_read["start"]:  # a number added or removed
         raise InputError(f"{run.folder}: begun with a start of other numbers beside Q and R")
-    write_json(path, recorded | settings)
-    return recorded | settings
+    # a front may be added by a later call, and stays
+    flags = recorded.get("flags", {}) | {"front": run.args.front}
+    settings = recorded | settings | {"flags": flags}
+    write_json(path, settings)
+    return settings
 
 
 def _refresh(

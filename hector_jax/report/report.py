@@ -125,13 +125,14 @@ def change_text(comparison: Comparison, part: str = "L", void: str = f" \\{VOID}
     return comparison.change[part].text() + ("" if comparison.counts else void)
 
 
-def front_table(front: Front) -> str:
-    """Format the results of a front in Markdown."""
+def front_table(front: Front, void: str = f" \\{VOID}") -> str:
+    """Format the results of a front in Markdown; a comparison that falls make void has a mark."""
     changes = "L against nominal [%]", "L_ctrl against expert [%]"
     rows = []
     for name, score in front.calm.scores.items():
         against = (compare(front.calm, name, baseline) for baseline in BASELINES)
-        texts = [change_text(c, part) for c, part in zip(against, ("L", "L_ctrl"), strict=True)]
+        parts = zip(against, ("L", "L_ctrl"), strict=True)
+        texts = [change_text(comparison, part, void) for comparison, part in parts]
         falls = f"{front.falls[name]} of {front.pushed}", f"{score.fallen.sum()} of {score.L.size}"
         rows.append((name, *texts, *falls))
     return markdown_table(("set", *changes, "falls under a push", "falls without one"), rows)

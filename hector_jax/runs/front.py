@@ -2,8 +2,8 @@
 
 Two numbers move a tuned set along this front. `smooth` multiplies the weight of L_ctrl in the loss
 that is tuned: the commands change less and the robot tracks worse. `safe` is the share of the
-controller's friction with which the set plans: with less it falls a little less often under pushes
-and tracks worse, most of all on fast turns. The points walk undisturbed and under pushes, on plants
+controller's friction with which the set plans: with less it may fall less often under pushes, and
+it tracks worse, most of all on fast turns. The points walk undisturbed and under pushes, on plants
 by which nothing else is chosen or evaluated.
 """
 
