@@ -19,7 +19,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State
 from hector_jax.report import plots
 from hector_jax.report.report import front_table
-from hector_jax.runs import choice, front, tunings
+from hector_jax.runs import choice, front, tunings, verdicts
 from hector_jax.runs.metrics import score_like
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem, Tuned
@@ -84,14 +84,14 @@ def walked(monkeypatch, tmp_path):
     seen = []
     anywhere = State(*np.zeros((4, 3)))
 
-    def score_jobs(setup, jobs, *, title, folder):
-        del title
+    def score_jobs(setup, jobs, *, title, folder, **options):
+        del title, options
         assert setup is SETUP
         assert folder == tmp_path / "front"
         seen.extend(jobs.items())
 
         def score(case, job):
-            mine = case[0].startswith("mine-")
+            mine = case[0].partition("-")[0] == "mine"
             falls = mine and job.push.force.any() and job.push.force[0, 0] > 0.0
             scale = 1.0 + case[1]  # by plant, so that only paired ratios are all alike
             L, L_ctrl = scale * (0.5 if mine else 1.0), scale * (1.2 if mine else 1.0)
@@ -102,7 +102,7 @@ def walked(monkeypatch, tmp_path):
 
         return {case: score(case, job) for case, job in jobs.items()}
 
-    monkeypatch.setattr(front, "score_jobs", score_jobs)
+    monkeypatch.setattr(verdicts, "score_jobs", score_jobs)
     options = {"seconds": 4.0, "folder": tmp_path}
     return front.walk(SETUP, COMMANDS, {"mine": expert()}, **options), seen
 

@@ -35,14 +35,8 @@ _CODE = (
 )
 # flags of a call, not of the run that it begins or resumes
 _CALL_FLAGS = ("config", "each", "out", "resume", "run", "runs")
-_FREE_FLAGS = (
-    "data",
-    "front",
-    "json",
-    "processes",
-    "verdict",
-    "video",
-)  # may change when a run is resumed
+# flags that may change when a run is resumed
+_FREE_FLAGS = ("data", "front", "json", "processes", "verdict", "video")
 
 
 def exists_error(folder: Path) -> InputError:

@@ -17,13 +17,13 @@ import numpy as np
 
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, between, expert, nominal
-from hector_jax.runs import choice, tunings
+from hector_jax.runs import choice, tunings, verdicts
 from hector_jax.runs.metrics import Verdict, make_verdict
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Problem
-from hector_jax.runs.verdicts import ScoredWalk, say_faults, score_jobs
+from hector_jax.runs.verdicts import ScoredWalk
 from hector_jax.sim.loop import Job
-from hector_jax.sim.world import NO_PUSH, push_along
+from hector_jax.sim.world import push_along
 from hector_jax.tuning.loss import smoother
 
 SMOOTH = (1.0, 3.0, 10.0)
@@ -109,32 +109,31 @@ def walk(
     Args:
         setup: workers, controller and loss, nominal body.
         commands, seconds: commands by name, and the length of a walk without a push.
-        sets: sets by name.
+        sets: sets by name, without a hyphen in it.
         folder: folder of the artefacts; walks whose scores are in it are not repeated.
     """
     robot = setup.robot
     sets = {"nominal": nominal(robot), "expert": expert(robot), **sets}
-    force = _FORCE * robot.description.plants.push
-    scenes = {"calm": (NO_PUSH, seconds)}
-    for i, side in enumerate(SIDES):
-        scenes[f"push{i}"] = push_along(side, force, _START, _TIME), _WALK
-    plants = choice.drawn_plants(robot, PLANTS, _FIRST_SEED)
-    keys = {
-        (f"{name}-{command}-{scene}", seed): (name, command, scene, seed)
-        for name, command, scene, seed in product(sets, commands, scenes, range(PLANTS))
-    }
+    plants, seeds = choice.drawn_plants(robot, PLANTS, _FIRST_SEED), range(PLANTS)
+    folder, force = folder / "front", _FORCE * robot.description.plants.push
+    options = {"seconds": seconds, "folder": folder}
+    alone = [
+        verdicts.judge(
+            setup, sets, command, plants, seeds, title=f"walking the front, {name}", **options
+        ).scores
+        for name, command in commands.items()
+    ]
+    calm = {name: [score for scores in alone for score in scores[name]] for name in sets}
+    verdict = make_verdict(setup.config.loss, [*seeds] * len(commands), calm)
     jobs = {}
-    for case, (name, command, scene, seed) in keys.items():
-        push, length = scenes[scene]
-        inputs = sets[name], commands[command], plants[seed], length, seed
-        jobs[case] = Job(*inputs, push=push)
-    title = "walking the front, with and without pushes"
-    scored = score_jobs(setup, jobs, title=title, folder=folder / "front")
-    walks: dict[str, dict[bool, list[ScoredWalk]]] = {name: {True: [], False: []} for name in sets}
-    for case, (name, _, scene, _) in keys.items():
-        walks[name][scene == "calm"].append(scored[case][0])
-    say_faults({name: group[True] + group[False] for name, group in walks.items()})
-    calm = {name: [walk.score for walk in group[True]] for name, group in walks.items()}
-    verdict = make_verdict(setup.config.loss, [*range(PLANTS)] * len(commands), calm)
-    falls = {n: sum(bool(w.score.fallen) for w in group[False]) for n, group in walks.items()}
+    for name, command, (i, side), seed in product(sets, commands, enumerate(SIDES), seeds):
+        push = push_along(side, force, _START, _TIME)
+        inputs = sets[name], commands[command], plants[seed], _WALK, seed
+        jobs[f"{name}-{command}-push{i}", seed] = Job(*inputs, push=push)
+    scored = verdicts.score_jobs(setup, jobs, title="pushing the front", folder=folder)
+    pushed: dict[str, list[ScoredWalk]] = {name: [] for name in sets}
+    for (case, _), (walk, _) in scored.items():
+        pushed[case.partition("-")[0]].append(walk)  # there is no hyphen in the names of sets
+    verdicts.say_faults(pushed)
+    falls = {name: sum(bool(w.score.fallen) for w in walks) for name, walks in pushed.items()}
     return Front(verdict, falls, len(commands) * PLANTS * len(SIDES))

@@ -298,17 +298,19 @@ def front(path: Path, result: Front) -> str:
     tunings: dict[str, list[str]] = {}
     for name in result.falls:
         tunings.setdefault(name.partition("_safe_")[0], []).append(name)
-    change = lambda name, i, part: compare(result.calm, name, BASELINES[i]).change[part].value  # noqa: E731
+    text = {"textcoords": "offset points", "xytext": (5, 4), "fontsize": 8}
     with drawing(path, 7.0, 4.2) as figure:
         axes = figure.subplots()
         for tuning, look in looks_of(tunings).items():
-            places = [(change(name, 1, "L_ctrl"), change(name, 0, "L")) for name in tunings[tuning]]
+            places, label = [], label_of(tuning).replace("_", " ")
+            for name in tunings[tuning]:
+                nominal, expert = (compare(result.calm, name, other) for other in BASELINES)
+                places.append((expert.change["L_ctrl"].value, nominal.change["L"].value))
+                filled = look.color if nominal.counts and expert.counts else "white"
+                dot = dict(look.dot, markerfacecolor=filled)
+                axes.plot(*places[-1], **dot, label=label if len(places) == 1 else None)
+                axes.annotate(f"{result.falls[name]}", places[-1], **text)
             axes.plot(*zip(*places, strict=True), **look.line)
-            label = label_of(tuning).replace("_", " ")
-            axes.plot(*zip(*places, strict=True), **look.dot, label=label)
-            for name, place in zip(tunings[tuning], places, strict=True):
-                text = {"textcoords": "offset points", "xytext": (5, 4), "fontsize": 8}
-                axes.annotate(f"{result.falls[name]}", place, **text)
         axes.set(xlabel="change of L_ctrl against expert [%]")
         axes.set(ylabel="change of L against nominal [%]")
     return caption("front", pushed=result.pushed)
