@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from model import CONFIG, ROBOT
 
-from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import between, expert, nominal
-from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.robot.description import TuningSettings
+from hector_jax.robot.description import PlantSizes, TuningSettings
 from hector_jax.runs import choice, verdicts
 from hector_jax.runs.metrics import score_like
 from hector_jax.runs.setup import Setup
@@ -75,21 +73,23 @@ def _between(sets, config=CONFIG, robot=ROBOT, safe=None):
     return choice.answer(Setup(Executor(), config, robot), sets, pair, 0.25, commands, **notes)
 
 
-def test_the_answer_lies_between_two_tunings_and_plans_with_less_friction():
+def test_the_answer_lies_between_two_tunings_with_narrower_steps_and_a_limited_error():
     sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
     found = _between(sets)
-    assert found.others == {"friction": pytest.approx(0.55)}
+    assert found.others == {"position_limit": 0.08, "footstep_width": 0.07}
     wanted = between(nominal(), expert(), 0.25)
     jax.tree.map(np.testing.assert_array_equal, found[:2], wanted[:2])
-    tuned = {n: w._replace(others={"friction": np.array(0.4)}) for n, w in sets.items()}
-    assert _between(tuned).others == {"friction": pytest.approx(0.4)}  # it was asked for
-    assert _between(sets, safe=0.75).others == {"friction": pytest.approx(0.45)}
+    tuned = {n: w._replace(others={"footstep_width": np.array(0.06)}) for n, w in sets.items()}
+    assert _between(tuned).others == {"position_limit": 0.08, "footstep_width": 0.06}
+    assert _between(sets, safe=0.05).others["position_limit"] == 0.05
+    sizes = replace(ROBOT.description, plants=PlantSizes(trunk_com=2.0))
+    assert _between(sets, robot=ROBOT._replace(description=sizes)).others["position_limit"] == 0.16
 
 
-def test_whichever_set_is_taken_plans_with_the_friction_that_is_asked_for(monkeypatch):
+def test_whichever_set_is_taken_has_the_limit_that_was_given(monkeypatch):
     def ratios(setup, sets, *inputs, **notes):
         del setup, inputs, notes
-        assert "friction" not in sets["nominal"].others
+        assert not sets["nominal"].others
         return {name: np.array([float(name != "with")]) for name in sets}
 
     monkeypatch.setattr(choice, "_ratios", ratios)
@@ -97,16 +97,7 @@ def test_whichever_set_is_taken_plans_with_the_friction_that_is_asked_for(monkey
     sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
     asks = ROBOT._replace(description=description)
     assert _between(sets, robot=asks).others == {}
-    assert _between(sets, robot=asks, safe=0.75).others == {"friction": pytest.approx(0.45)}
-
-
-@pytest.mark.parametrize(("friction", "planned"), [(0.05, 0.1), (1.5, 1.0)])
-def test_the_answer_can_be_read_whatever_the_controllers_friction(tmp_path, friction, planned):
-    sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
-    walk = replace(CONFIG.rollout.walk, mpc=MpcConfig(friction=friction))
-    config = replace(CONFIG, rollout=replace(CONFIG.rollout, walk=walk))
-    save_weights(tmp_path / "best.json", _between(sets, config))
-    assert load_weights(tmp_path / "best.json").others == {"friction": planned}
+    assert _between(sets, robot=asks, safe=0.05).others == {"position_limit": 0.05}
 
 
 @pytest.mark.parametrize("winner", ["with", "between"])

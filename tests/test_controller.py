@@ -19,7 +19,7 @@ from hector_jax.control.controller import (
 )
 from hector_jax.control.gait import GaitConfig
 from hector_jax.control.legs import Measurement, stance_torques, trunk_position
-from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.mpc import Horizon, MpcConfig, limit_distance
 from hector_jax.control.parameters import TUNABLES, Q
 from hector_jax.control.reference import Anchor, named_command
 from hector_jax.control.weights import expert
@@ -42,11 +42,12 @@ feet_of = jax.jit(lambda measurement: measured_feet(ROBOT, measurement))
 
 
 @partial(jax.jit, static_argnames="max_contacts")
-def planned(tick, memory, measurement, max_contacts=1):
+def planned(tick, memory, measurement, max_contacts=1, limit=np.inf):
+    parameters = TUNABLES["position_limit"].write(CONFIG.parameters(expert()), limit)
     return step_plan(
         CONFIG,
         ROBOT,
-        CONFIG.parameters(expert()),
+        parameters,
         command=STRAIGHT,
         anchor=ANCHOR,
         tick=tick,
@@ -176,7 +177,7 @@ def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing(
 
         return jax.jvp(force, (parameters,), (moved,))[1]
 
-    parameters = CONFIG.parameters(expert())
+    parameters = TUNABLES["position_limit"].write(CONFIG.parameters(expert()), 0.1)
     parameters = jax.tree.map(lambda x: np.asarray(x, float), parameters)
     still = jax.tree.map(np.zeros_like, parameters)
     felt = {
@@ -233,6 +234,28 @@ def test_the_stance_foot_carries_the_robot_and_the_other_nothing(tick, foot):
 def test_being_behind_pushes_ahead():
     push = [float(at(2, standing(x=x))[1].wrench.force[0, 0]) for x in (-0.03, 0.0, 0.03)]
     assert push[0] > push[1] > push[2]
+
+
+def test_an_error_beyond_the_limit_counts_as_the_limit():
+    def force(x, limit):
+        memory = init_memory(ROBOT, standing(x=x))
+        _, decided = planned(jnp.array(2), memory, standing(x=x), limit=limit)
+        return np.asarray(decided.wrench.force)
+
+    # the reference is 1 cm ahead of the anchor at tick 2
+    np.testing.assert_allclose(force(-0.3, 0.05), force(-0.04, np.inf), atol=1e-6)
+    np.testing.assert_array_equal(force(-0.03, 0.05), force(-0.03, np.inf))
+    # to the side and ahead: only the distance shrinks, not the direction nor the height
+    state = standing().state
+    away = state._replace(position=state.position + jnp.array([0.3, -0.4, 0.02]))
+    ahead = State(*jnp.zeros((4, 3, 3)))
+    horizon = Horizon(ahead, ahead.euler, *[jnp.zeros((3, 2))] * 2, jnp.ones((3, 2), bool))
+    moved = limit_distance(horizon, away, state, 0.1).reference
+    np.testing.assert_allclose(moved.position, [[0.24, -0.32, 0.0]] * 3, atol=1e-9)
+    unlimited = jax.grad(
+        lambda x: limit_distance(horizon, x, state, np.inf).reference.position[0, 0]
+    )
+    assert not any(part.any() for part in unlimited(state))  # and is finite without an error
 
 
 def test_the_swing_clock_starts_at_lift_off():

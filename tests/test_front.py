@@ -27,6 +27,7 @@ from hector_jax.runs.verdicts import ScoredWalk
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import alphas
 
+SAFE = "inf", "0.08", "0.04"
 SETUP = Setup(Executor(), CONFIG, ROBOT)
 COMMANDS = {"straight": named_command("straight"), "stop-and-go": named_command("stop-and-go")}
 
@@ -69,13 +70,13 @@ def test_each_smoothness_is_tuned_with_its_loss_and_judged_with_that_of_the_robo
         np.testing.assert_allclose(pair[1].Q.euler, smooth * expert().Q.euler)
 
 
-def test_the_sets_lie_between_two_tunings_and_plan_with_less_and_less_friction():
+def test_the_sets_lie_between_two_tunings_and_limit_the_position_error_more_and_more():
     sets = front.points(SETUP, {1.0: [nominal(), expert()], 10.0: [expert(), expert()]}, 0.25)
     assert len(sets) == 2 * len(front.SAFE)
-    friction = [sets[f"smooth_1_safe_{safe:.2f}"].others["friction"] for safe in front.SAFE]
-    np.testing.assert_allclose(friction, [0.6, 0.55, 0.45])
+    limits = [sets[f"smooth_1_safe_{safe}"].others.get("position_limit") for safe in SAFE]
+    assert limits == [None, 0.08, 0.04]
     middle = between(nominal(), expert(), 0.25)
-    jax.tree.map(np.testing.assert_array_equal, sets["smooth_1_safe_1.00"][:2], middle[:2])
+    jax.tree.map(np.testing.assert_array_equal, sets["smooth_1_safe_inf"][:2], middle[:2])
 
 
 @pytest.fixture
@@ -144,9 +145,9 @@ def test_the_command_tunes_smoothly_and_takes_a_safe_set(monkeypatch, tmp_path):
         return {"without": there, "with": there}
 
     monkeypatch.setattr(tunings, "tune", tune)
-    tuned = command._tune_sets(_run(tmp_path, smooth=3.0, safe=0.75))
+    tuned = command._tune_sets(_run(tmp_path, smooth=3.0, safe=0.05))
     assert seen["L_ctrl"] == 3.0 * alphas(CONFIG.loss)["L_ctrl"]
-    assert tuned.sets["best"].others == {"friction": pytest.approx(0.45)}
+    assert tuned.sets["best"].others == {"position_limit": 0.05, "footstep_width": 0.07}
 
 
 def test_the_command_stores_the_sets_of_the_front(monkeypatch, tmp_path):
@@ -169,8 +170,8 @@ def test_the_command_stores_the_sets_of_the_front(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        ({"safe": 0.8, "start": "best"}, "--safe and --front set the friction"),
-        ({"front": True, "tune": ("friction",)}, "--safe and --front set the friction"),
+        ({"safe": 0.8, "start": "best"}, "--safe and --front set the position limit"),
+        ({"front": True, "start": "best"}, "--safe and --front set the position limit"),
         ({"front": True, "refresh": 1}, "--front tunes through the first net"),
     ],
 )

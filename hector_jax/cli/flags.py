@@ -139,9 +139,9 @@ class Tune(Configured):
     share: Annotated[float, Range(0, 1)] = 0.5
     # times that L_ctrl counts while tuning (not in the table): above 1, smoother commands
     smooth: Annotated[float, Range(0.01, 100)] = 1.0
-    # share of the controller's friction with which `best` plans: with less it tracks worse and
-    # may fall less under pushes; by default 11/12 for the set between two tunings
-    safe: Annotated[float | None, Range(0.1, 1)] = None
+    # position error [m] beyond which `best` pulls no harder: with less it falls less under pushes
+    # and tracks worse; by default 0.08 m times the robot's size for the set between two tunings
+    safe: Annotated[float | None, Range(0.001, 10)] = None
     front: bool = False  # tune and walk nine sets around `best`, of other --smooth and --safe
     refresh: Annotated[int, Range(0, 100)] = 0  # times to collect at the new weights and repeat
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing

@@ -51,7 +51,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
 
     Raises:
         InputError: there is no such trajectory, their lengths differ, or --walks or --refresh does
-            not allow them; --safe or --front beside a friction or a refresh.
+            not allow them; --safe or --front beside a position limit or a refresh.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
     count, pieces = len(loaded), len(loaded[0].command.duration)
@@ -60,8 +60,8 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
     numbers = *tunables(args.tune), *arguments.weights(args.start, robot).others
-    if (args.safe or args.front) and "friction" in numbers:
-        raise InputError("--safe and --front set the friction, which --tune or --start has already")
+    if (args.safe or args.front) and "position_limit" in numbers:
+        raise InputError("--safe and --front set the position limit, which --start has already")
     if not args.refresh:
         return loaded
     if args.front:

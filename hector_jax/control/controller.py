@@ -20,7 +20,7 @@ from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, integrat
 from hector_jax.control.footstep import Feet, FootstepConfig, FootstepParameters
 from hector_jax.control.gait import PATTERNS, GaitConfig
 from hector_jax.control.legs import LegConfig, LegParameters, Measurement
-from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, solve_mpc
+from hector_jax.control.mpc import Horizon, MpcConfig, MpcProblem, limit_distance, solve_mpc
 from hector_jax.control.parameters import TUNABLES, Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
@@ -232,6 +232,7 @@ def plan(
     )
     dt = config.gait.tick
     reference = reference_at(dt, command, anchor, tick)
+    horizon = limit_distance(horizon, state, reference, parameters.mpc.position_limit)
     disturbance = integrate_error(parameters.mpc.integral, disturbance, state, reference, dt)
     problem = MpcProblem(robot, parameters.mpc, state, horizon, disturbance)
     wrench, solution = solve_mpc(config.mpc, problem, dt=config.mpc_step, max_contacts=max_contacts)

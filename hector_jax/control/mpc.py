@@ -13,6 +13,7 @@ Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, bec
 foot in the air has no M_z; see also `contact`.
 """
 
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, cast
@@ -54,6 +55,7 @@ class MpcParameters(NamedTuple):
     friction: Any  # mu
     max_force: Any  # [N] per foot
     effort_reference: Any  # share of the robot's weight in the force reference of R
+    position_limit: Any  # [m] see `limit_distance`
     integral: IntegralGains
 
 
@@ -70,6 +72,7 @@ class MpcConfig:
     sole_width: float = 1.0  # share of a flat sole's half width that the plan uses
     line_friction: bool = True  # False removes LINE_FRICTION from the constraints
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
+    position_limit: float | None = None  # [m] largest horizontal error that counts; None: any
     horizontal_gain: float = 0.0  # [1/s^3] of `IntegralGains`, as the next three
     height_gain: float = 0.0
     tilt_gain: float = 0.0
@@ -81,6 +84,8 @@ class MpcConfig:
     def __post_init__(self) -> None:
         rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
         rules |= {"sole_width": SHARE, "step_ticks": AT_LEAST_ONE}
+        if self.position_limit is not None:
+            rules["position_limit"] = POSITIVE
         rules |= {f"{name}_gain": NOT_NEGATIVE for name in IntegralGains._fields}
         check(self, **rules, effort_reference=("zero", "gravity"))
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
@@ -96,9 +101,15 @@ class MpcConfig:
 
     def parameters(self, weights: Weights) -> MpcParameters:
         """Return the traced numbers."""
-        effort_reference = float(self.effort_reference == "gravity")
         gains = IntegralGains(self.horizontal_gain, self.height_gain, self.tilt_gain, self.yaw_gain)
-        return MpcParameters(weights, self.friction, self.max_force, effort_reference, gains)
+        return MpcParameters(
+            weights,
+            friction=self.friction,
+            max_force=self.max_force,
+            effort_reference=float(self.effort_reference == "gravity"),
+            position_limit=math.inf if self.position_limit is None else self.position_limit,
+            integral=gains,
+        )
 
     @property
     def contact_model(self) -> ContactModel:
@@ -120,6 +131,26 @@ class Horizon(NamedTuple):
     lever: Float[Array, "N feet 3"]  # centre of mass to foot points [m]
     foot_yaw: Float[Array, "N feet"]  # [rad]
     contact: Bool[Array, "N feet"]
+
+
+def limit_distance(
+    horizon: Horizon, state: State, reference: State, limit: Float[Array, ""]
+) -> Horizon:
+    """Shift the reference horizontally so that it is at most `limit` [m] away from the robot now.
+
+    A push or a slip moves the robot further than tracking ever does. Weights that track tightly
+    would ask for all the friction there is to pull it back, and it would fall.
+
+    Args:
+        horizon: of the MPC.
+        state, reference: current and desired base state.
+        limit: largest distance; infinite: no shift.
+    """
+    away = (state.position - reference.position) * np.array([1.0, 1.0, 0.0])
+    distance = jnp.sqrt(away @ away + 1e-12)  # has a derivative at zero
+    shift = away * (jnp.maximum(distance - limit, 0.0) / distance)
+    moved = horizon.reference._replace(position=horizon.reference.position + shift)
+    return horizon._replace(reference=moved)
 
 
 class MpcProblem(NamedTuple):

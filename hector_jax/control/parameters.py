@@ -75,6 +75,7 @@ TUNABLES = {
     "tilt_gain": Tunable("mpc.integral.tilt", 0.0, 1000.0),
     "yaw_gain": Tunable("mpc.integral.yaw", 0.0, 1000.0),
     "friction": Tunable("mpc.friction", 0.1, 1.0),
+    "position_limit": Tunable("mpc.position_limit", 1e-3, 10.0),
     "gravity_compensation": Tunable("legs.gravity_compensation", 0.0, 1.0),
     "foot_height": Tunable("legs.height", 0.02, 0.2),
     "kp": Tunable("legs.kp", 1.0, 300.0, each_joint=True),

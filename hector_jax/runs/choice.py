@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, between
 from hector_jax.core.console import say
@@ -30,8 +29,9 @@ from hector_jax.tuning.difftune import Tuning
 
 # fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
-SAFE = 11 / 12
-"""Share of the controller's friction with which the set between two tunings plans."""
+LIMIT, WIDTH = 0.08, 7 / 8
+"""Position error of HECTOR [m] that the set between two tunings limits, and the share of the
+controller's foot distance with which it walks."""
 HELD_OUT = 8
 """Number of the plants of `earliest`."""
 # first seed of the plants for choice and tuning, drawn like `hfs-varied` but with other seeds; the
@@ -116,17 +116,33 @@ def choose(
     return choices
 
 
-def planned_with(setup: Setup, weights: Weights, safe: float) -> Weights:
-    """Return weights that plan with a share of the controller's friction, unless theirs is tuned.
+def limited(weights: Weights, limit: float) -> Weights:
+    """Return weights with a limit [m] of the position error, unless theirs is tuned or infinite."""
+    others = {"position_limit": limit} if np.isfinite(limit) else {}
+    return weights._replace(others=others | weights.others)
+
+
+def default_limit(robot: Robot) -> float:
+    """Return the limit [m] of the position error for the set between two tunings."""
+    return LIMIT * robot.description.plants.trunk_com
+
+
+def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: float) -> Weights:
+    """Return the set between two tunings, which walks with narrower steps and a limited error.
+
+    Weights that track tightly fall under a push that looser ones survive: the error becomes so
+    large that they ask for all the friction there is to pull the robot back. On a slippery floor
+    they fall because a foot further out needs more horizontal force.
 
     Args:
         setup: controller.
-        weights: weights.
-        safe: the share.
+        pair: two tuned sets.
+        share: share of the second one.
+        limit: limit of the position error [m]; infinite for none.
     """
-    box, planned = TUNABLES["friction"], setup.config.rollout.walk.mpc.friction
-    friction = float(np.clip(safe * planned, box.lower, box.upper))
-    return weights._replace(others={"friction": friction, **weights.others})
+    weights = limited(between(*pair, share), limit)
+    width = WIDTH * setup.config.rollout.walk.footstep.width
+    return weights._replace(others={"footstep_width": width, **weights.others})
 
 
 def answer(
@@ -142,23 +158,21 @@ def answer(
     """Return the set `best` of a run.
 
     Between two tunings, gains from the faults of one model are half lost, and gains that both
-    tunings share remain. The set between them plans with less friction than the controller
-    assumes. If the description of the robot requires drawn plants, one of the tuned sets is taken
-    where it walks better on them, because the models are less exact for such robots.
+    tunings share remain. If the description of the robot requires drawn plants, one of the tuned
+    sets is taken where it walks better on them, because the models are less exact for such robots.
 
     Args:
         setup, commands, notes: see `choose`.
         sets: sets by name: nominal and all tuned sets.
         pair: names of the two tunings.
         share: share of the second tuning.
-        safe: share of the controller's friction with which the set plans, whichever it is; None:
-            `SAFE` for the set between the tunings.
+        safe: limit of the position error [m], whichever set it is; None: `default_limit` for the
+            set between the tunings.
     """
-    mixture = planned_with(setup, between(sets[pair[0]], sets[pair[1]], share), safe or SAFE)
-    if safe:
-        tuned = {
-            name: planned_with(setup, w, safe) for name, w in sets.items() if name != "nominal"
-        }
+    limit = default_limit(setup.robot) if safe is None else safe
+    mixture = between_tunings(setup, [sets[name] for name in pair], share, limit)
+    if safe is not None:
+        tuned = {name: limited(w, safe) for name, w in sets.items() if name != "nominal"}
         sets = {**sets, **tuned}
     plants = drawn_plants(setup.robot, setup.robot.description.tuning.choice_plants)
     if not plants:

@@ -114,6 +114,11 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
             f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
             "gradient is zero; a weights file can set it"
         )
+    if name == "position_limit":
+        return (
+            f"{name} cannot be tuned by gradients: no rollout is pushed that far, so its gradient "
+            "is zero; a weights file or --safe can set it"
+        )
     if path.startswith("footstep.") and walk.footstep.rule == "paper":
         return f"{name} has no part in the paper's rule"
     start, box = walk.with_others(nominal(), [name]).others[name], Range(lower, upper)
