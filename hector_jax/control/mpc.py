@@ -134,7 +134,7 @@ class Horizon(NamedTuple):
 
 
 def limit_distance(
-    horizon: Horizon, state: State, reference: State, limit: Float[Array, ""]
+    horizon: Horizon, state: State, reference: State, limit: float | Float[Array, ""]
 ) -> Horizon:
     """Shift the reference horizontally so that it is at most `limit` [m] away from the robot now.
 
