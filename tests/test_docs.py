@@ -186,7 +186,9 @@ def test_tests_that_pages_name_are_there():
 
 def test_the_best_set_is_half_way_between_the_sets_that_the_page_names():
     without, tuned = (load_weights(DOCS / f"results/best/{n}.json") for n in ("without", "with"))
-    half_way = between(without, tuned)._replace(others={"friction": 0.55})
+    half_way = between(without, tuned)._replace(
+        others={"position_limit": 0.08, "footstep_width": 0.07}
+    )
     jax.tree.map(np.testing.assert_allclose, best(), half_way)
 
 
@@ -325,32 +327,28 @@ def test_the_table_of_more_than_weights_is_that_of_its_walks():
 
 def test_the_falls_of_best_are_those_of_their_file():
     scenes = json.loads((DOCS / "results/best/falls.json").read_text())["scenes"]
-    page, readme = (DOCS / "results.md").read_text(), (ROOT / "README.md").read_text()
-    for course, each in scenes.items():
-        for scene, one in each.items():
-            names = ("nominal", "best planned with 0.6", "best")
-            nominal, planned, found = (one["falls"].get(name) for name in names)
-            if not max(x or 0 for x in (nominal, planned, found)):
-                continue
-            what = re.sub("push |floor ", "", scene)
-            row = re.search(rf"^\| {course}, {what} \| (.*) \|$", page, re.MULTILINE)
-            if row is None:
-                assert (course, nominal) == ("s", one["walks"]) or scene == "push 50 N", scene
-                continue
-            cells = row[1].replace("*", "").split(" | ")
-            assert cells[:2] == [str(nominal), str(planned)], scene
-            if found is None:
-                assert cells[2].startswith("not walked")
-                continue
-            more = one["fell_where_nominal_did_not"]["best"]
-            fewer = one["nominal_fell_where_it_did_not"]["best"]
-            p = scipy.stats.binomtest(more, more + fewer, alternative="greater").pvalue
-            assert cells[2] == str(found)
-            if cells[3].startswith("<"):
-                assert p < float(cells[3][1:])
-            else:
-                assert float(cells[3]) == pytest.approx(p, abs=0.0051)  # two decimals
-    falls = {course: scenes[course]["push 100 N"]["falls"] for course in scenes}
-    pair = [falls[course]["best"] for course in ("straight", "c")]
-    assert f"({pair[0]} and {pair[1]} of 192, nominal {falls['straight']['nominal']}" in readme
-    assert f"({falls['s']['best']} against {falls['s']['nominal']}, with 75 N" in readme
+    page = " ".join((DOCS / "results.md").read_text().split())
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    walked = [(course, *item) for course, each in scenes.items() for item in each.items()]
+    none, clear = 0, []
+    for course, scene, one in walked:
+        more = one["fell_where_nominal_did_not"]["best"]
+        fewer = one["nominal_fell_where_it_did_not"]["best"]
+        p = scipy.stats.binomtest(more, more + fewer, alternative="greater").pvalue if more else 1.0
+        nominal, found = (one["falls"][name] for name in ("nominal", "best"))
+        clear += [(nominal, found, one["walks"])] if p < 0.05 else []
+        none += not nominal and not found
+        row = re.search(
+            rf"\| {course}, {re.sub('push |floor ', '', scene)} \| ([^|]*\|[^|]*\|[^|]*)\|", page
+        )
+        if row is None:  # none fall, or all
+            assert nominal == found
+            assert nominal in (0, one["walks"])
+            continue
+        shown = row[1].replace("*", "").split(" | ")
+        assert shown[:2] == [str(nominal), str(found)], scene
+        assert float(shown[2]) == pytest.approx(p, abs=0.0051)  # two decimals
+    assert f"In the other {none} kinds of scenes neither falls" in page
+    ((nominal, found, walks),) = clear
+    assert f"in one of {len(walked)} kinds of walks" in readme
+    assert f"under 100 N ({found} against {nominal} of {walks}" in readme

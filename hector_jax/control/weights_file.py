@@ -47,7 +47,7 @@ def best(robot: Robot | None = None) -> Weights:
     """Read the tuned weights shipped with a robot: `ROBOT-best.json` beside its ROBOT.toml.
 
     HECTOR's, which are the default, are the row `best` of `hector tune --traj all`, including the
-    planner's friction (docs/results.md).
+    limit of the position error and the width of the steps (docs/results.md).
 
     Raises:
         InputError: one line, if the robot has no such file or the file is invalid.
