@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from model import CONFIG, ROBOT
 
+from hector_jax.control.footstep import FootstepConfig
+from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.reference import named_command
 from hector_jax.control.weights import between, expert, nominal
-from hector_jax.robot.description import PlantSizes, TuningSettings
+from hector_jax.control.weights_file import load_weights, save_weights
+from hector_jax.robot.description import TuningSettings
 from hector_jax.runs import choice, verdicts
 from hector_jax.runs.metrics import score_like
 from hector_jax.runs.setup import Setup
@@ -82,8 +85,18 @@ def test_the_answer_lies_between_two_tunings_with_narrower_steps_and_a_limited_e
     tuned = {n: w._replace(others={"footstep_width": np.array(0.06)}) for n, w in sets.items()}
     assert _between(tuned).others == {"position_limit": 0.08, "footstep_width": 0.06}
     assert _between(sets, safe=0.05).others["position_limit"] == 0.05
-    sizes = replace(ROBOT.description, plants=PlantSizes(trunk_com=2.0))
-    assert _between(sets, robot=ROBOT._replace(description=sizes)).others["position_limit"] == 0.16
+    tall = ROBOT._replace(standing_height=2 * ROBOT.standing_height)
+    assert _between(sets, robot=tall).others["position_limit"] == 0.161
+
+
+@pytest.mark.parametrize(("limit", "width", "wanted"), [(1e-4, 0.1, 1e-3), (20.0, 0.3, 10.0)])
+def test_the_answer_can_be_read_whatever_the_controllers_numbers(tmp_path, limit, width, wanted):
+    sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
+    own = {"mpc": MpcConfig(position_limit=limit), "footstep": FootstepConfig(width=width)}
+    rollout = replace(CONFIG.rollout, walk=replace(CONFIG.rollout.walk, **own))
+    save_weights(tmp_path / "best.json", _between(sets, replace(CONFIG, rollout=rollout)))
+    others = {"position_limit": wanted, "footstep_width": min(0.875 * width, 0.2)}
+    assert load_weights(tmp_path / "best.json").others == pytest.approx(others)
 
 
 def test_whichever_set_is_taken_has_the_limit_that_was_given(monkeypatch):

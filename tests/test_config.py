@@ -82,7 +82,7 @@ def test_what_is_written_is_read_as_it_was(tmp_path, kind):
         elif isinstance(old, int | float):
             moved[field.name] = old + 1 if isinstance(old, int) else old / 2
         elif field.name == "safe":
-            moved[field.name] = 0.75  # a number or nothing
+            moved[field.name] = 0.05  # a number or nothing
         elif isinstance(old, tuple):
             moved[field.name] = (*old, _MORE.get(field.name, "more"))
         elif field.name not in ("config", "variant", "engine", "alpha", "world", "gait", "family"):

@@ -330,6 +330,7 @@ def test_the_falls_of_best_are_those_of_their_file():
     page = " ".join((DOCS / "results.md").read_text().split())
     readme = " ".join((ROOT / "README.md").read_text().split())
     walked = [(course, *item) for course, each in scenes.items() for item in each.items()]
+    walked = [item for item in walked if not item[1].startswith("calm")]
     none, clear = 0, []
     for course, scene, one in walked:
         more = one["fell_where_nominal_did_not"]["best"]

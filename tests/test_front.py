@@ -27,7 +27,7 @@ from hector_jax.runs.verdicts import ScoredWalk
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.loss import alphas
 
-SAFE = "inf", "0.08", "0.04"
+SAFE = "10", "0.08", "0.04"
 SETUP = Setup(Executor(), CONFIG, ROBOT)
 COMMANDS = {"straight": named_command("straight"), "stop-and-go": named_command("stop-and-go")}
 
@@ -73,10 +73,10 @@ def test_each_smoothness_is_tuned_with_its_loss_and_judged_with_that_of_the_robo
 def test_the_sets_lie_between_two_tunings_and_limit_the_position_error_more_and_more():
     sets = front.points(SETUP, {1.0: [nominal(), expert()], 10.0: [expert(), expert()]}, 0.25)
     assert len(sets) == 2 * len(front.SAFE)
-    limits = [sets[f"smooth_1_safe_{safe}"].others.get("position_limit") for safe in SAFE]
-    assert limits == [None, 0.08, 0.04]
+    limits = [sets[f"smooth_1_safe_{safe}"].others["position_limit"] for safe in SAFE]
+    assert limits == [10.0, 0.08, 0.04]
     middle = between(nominal(), expert(), 0.25)
-    jax.tree.map(np.testing.assert_array_equal, sets["smooth_1_safe_inf"][:2], middle[:2])
+    jax.tree.map(np.testing.assert_array_equal, sets["smooth_1_safe_10"][:2], middle[:2])
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_the_command_stores_the_sets_of_the_front(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        ({"safe": 0.8, "start": "best"}, "--safe and --front set the position limit"),
+        ({"safe": 0.05, "start": "best"}, "--safe and --front set the position limit"),
         ({"front": True, "start": "best"}, "--safe and --front set the position limit"),
         ({"front": True, "refresh": 1}, "--front tunes through the first net"),
     ],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hector_jax.control.controller import WalkConfig
+from hector_jax.control.mpc import MpcConfig
 from hector_jax.control.parameters import TUNABLES, bounds
 from hector_jax.control.weights import (
     Weights,
@@ -103,6 +104,7 @@ BOXES = {
     "tilt_gain": (0.0, 1000.0),
     "yaw_gain": (0.0, 1000.0),
     "friction": (0.1, 1.0),
+    "position_limit": (1e-3, 10.0),  # [m]
     "gravity_compensation": (0.0, 1.0),
     "foot_height": (0.02, 0.2),  # [m]
     "kp": (1.0, 300.0),  # [N m/rad]
@@ -111,7 +113,8 @@ BOXES = {
 
 
 def test_each_number_beside_the_weights_has_its_box_and_its_default_inside():
-    parameters = WalkConfig().parameters(nominal())
+    parameters = WalkConfig(mpc=MpcConfig(position_limit=0.1)).parameters(nominal())
+    assert BOXES.keys() == TUNABLES.keys()
     for name, (low, high) in BOXES.items():
         assert (TUNABLES[name].lower, TUNABLES[name].upper) == (low, high), name
         default = np.asarray(TUNABLES[name].read(parameters))

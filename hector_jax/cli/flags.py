@@ -139,8 +139,8 @@ class Tune(Configured):
     share: Annotated[float, Range(0, 1)] = 0.5
     # times that L_ctrl counts while tuning (not in the table): above 1, smoother commands
     smooth: Annotated[float, Range(0.01, 100)] = 1.0
-    # position error [m] beyond which `best` pulls no harder: with less it falls less under pushes
-    # and tracks worse; by default 0.08 m times the robot's size for the set between two tunings
+    # limit [m] of the position error that the MPC sees in `best`: with less it tracks worse and may
+    # fall less under pushes; default 0.19 of the robot's height, for the set between two tunings
     safe: Annotated[float | None, Range(0.001, 10)] = None
     front: bool = False  # tune and walk nine sets around `best`, of other --smooth and --safe
     refresh: Annotated[int, Range(0, 100)] = 0  # times to collect at the new weights and repeat

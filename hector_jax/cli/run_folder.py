@@ -59,8 +59,9 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
-    numbers = *tunables(args.tune), *arguments.weights(args.start, robot).others
-    if (args.safe or args.front) and "position_limit" in numbers:
+    others = arguments.weights(args.start, robot).others
+    numbers = *tunables(args.tune), *others
+    if (args.safe or args.front) and "position_limit" in others:
         raise InputError("--safe and --front set the position limit, which --start has already")
     if not args.refresh:
         return loaded

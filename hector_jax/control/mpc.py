@@ -10,7 +10,8 @@ contact model. `max_contacts` is the largest number of feet in stance at once; i
 the inputs of the others have zero columns and a unit Hessian, so that shapes stay static.
 
 Differences from the paper: the cost is on x_1..x_N instead of x_0..x_{N-1}, because x_0 is given; a
-foot in the air has no M_z; see also `contact`.
+foot in the air has no M_z; the reference may be shifted towards the robot, see `limit_distance`;
+see also `contact`.
 """
 
 import math
@@ -146,7 +147,7 @@ def limit_distance(
         state, reference: current and desired base state.
         limit: largest distance; infinite: no shift.
     """
-    away = (state.position - reference.position) * np.array([1.0, 1.0, 0.0])
+    away = (state.position - reference.position).at[2].set(0.0)
     distance = jnp.sqrt(away @ away + 1e-12)  # has a derivative at zero
     shift = away * (jnp.maximum(distance - limit, 0.0) / distance)
     moved = horizon.reference._replace(position=horizon.reference.position + shift)

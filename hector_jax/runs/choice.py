@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, between
 from hector_jax.core.console import say
@@ -29,9 +30,9 @@ from hector_jax.tuning.difftune import Tuning
 
 # fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
-LIMIT, WIDTH = 0.08, 7 / 8
-"""Position error of HECTOR [m] that the set between two tunings limits, and the share of the
-controller's foot distance with which it walks."""
+LIMIT, WIDTH = 0.19, 7 / 8
+"""Numbers of the set between two tunings: limit of the position error as a share of the height of
+the centre of mass (8 cm for HECTOR), and width of the steps as a share of the controller's."""
 HELD_OUT = 8
 """Number of the plants of `earliest`."""
 # first seed of the plants for choice and tuning, drawn like `hfs-varied` but with other seeds; the
@@ -116,19 +117,21 @@ def choose(
     return choices
 
 
-def limited(weights: Weights, limit: float) -> Weights:
-    """Return weights with a limit [m] of the position error, unless theirs is tuned or infinite."""
-    others = {"position_limit": limit} if np.isfinite(limit) else {}
-    return weights._replace(others=others | weights.others)
+def completed(weights: Weights, **others: float) -> Weights:
+    """Return weights with numbers beside Q and R, within their boxes, where they have none."""
+    boxes = {name: (TUNABLES[name].lower, TUNABLES[name].upper) for name in others}
+    within = {name: float(np.clip(value, *boxes[name])) for name, value in others.items()}
+    return weights._replace(others={**within, **weights.others})
 
 
-def default_limit(robot: Robot) -> float:
-    """Return the limit [m] of the position error for the set between two tunings."""
-    return LIMIT * robot.description.plants.trunk_com
+def default_limit(setup: Setup) -> float:
+    """Return the limit [m] of the position error: the controller's, else `LIMIT`."""
+    own = setup.config.rollout.walk.mpc.position_limit
+    return round(LIMIT * float(setup.robot.standing_height), 3) if own is None else own
 
 
 def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: float) -> Weights:
-    """Return the set between two tunings, which walks with narrower steps and a limited error.
+    """Return the set between two tunings, with narrower steps and a limit of the position error.
 
     Weights that track tightly fall under a push that looser ones survive: the error becomes so
     large that they ask for all the friction there is to pull the robot back. On a slippery floor
@@ -138,11 +141,10 @@ def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: 
         setup: controller.
         pair: two tuned sets.
         share: share of the second one.
-        limit: limit of the position error [m]; infinite for none.
+        limit: limit of the position error that the MPC sees [m]; infinite for none.
     """
-    weights = limited(between(*pair, share), limit)
     width = WIDTH * setup.config.rollout.walk.footstep.width
-    return weights._replace(others={"footstep_width": width, **weights.others})
+    return completed(between(*pair, share), position_limit=limit, footstep_width=width)
 
 
 def answer(
@@ -169,11 +171,11 @@ def answer(
         safe: limit of the position error [m], whichever set it is; None: `default_limit` for the
             set between the tunings.
     """
-    limit = default_limit(setup.robot) if safe is None else safe
+    limit = default_limit(setup) if safe is None else safe
     mixture = between_tunings(setup, [sets[name] for name in pair], share, limit)
     if safe is not None:
-        tuned = {name: limited(w, safe) for name, w in sets.items() if name != "nominal"}
-        sets = {**sets, **tuned}
+        tuned = {name: w for name, w in sets.items() if name != "nominal"}
+        sets = sets | {name: completed(w, position_limit=safe) for name, w in tuned.items()}
     plants = drawn_plants(setup.robot, setup.robot.description.tuning.choice_plants)
     if not plants:
         return mixture

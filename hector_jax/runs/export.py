@@ -247,7 +247,7 @@ def weights_cpp(weights: Weights, config: WalkConfig, robot: Robot, *, name: str
         line=LINE_FRICTION in mpc.on("inputs"),
     )
     others = weights_tree(weights).get("others", {}).items()
-    notes = [f"// ATTENTION: tuned with {name} {value}.\n" for name, value in others]
+    notes = [f"// ATTENTION: walks with {name} {value}.\n" for name, value in others]
     Q = _cpp_array("Q", np.concatenate(weights.Q), _STATES)
     Alpha = _cpp_array("Alpha", input_weights(weights), _INPUTS)
     return "".join([header, _ATTENTION * bool(numbers.effort_reference), *notes, Q, Alpha])

@@ -1,9 +1,9 @@
 """The step `front`: how tracking, smooth commands and falls are traded for each other.
 
 Two numbers move a tuned set along this front. `smooth` multiplies the weight of L_ctrl in the loss
-that is tuned: the commands change less and the robot tracks worse. `safe` is the position error
-beyond which the MPC does not pull harder: with less the robot falls less often under pushes, and it
-tracks worse. The points walk undisturbed and under pushes, on plants by which nothing else is
+that is tuned: the commands change less and the robot tracks worse. `safe` is the limit [m]
+of the position error that the MPC sees: with less the robot may fall less often under pushes, and
+it tracks worse. The points walk undisturbed and under pushes, on plants by which nothing else is
 chosen or evaluated.
 """
 
@@ -27,7 +27,7 @@ from hector_jax.sim.world import push_along
 from hector_jax.tuning.loss import smoother
 
 SMOOTH = (1.0, 3.0, 10.0)
-SAFE = (np.inf, 1.0, 0.5)  # shares of the limit of the position error of `best`
+SAFE = (np.inf, 1.0, 0.5)  # shares of the limit of the position error of `best`; inf: no limit
 PLANTS, _FIRST_SEED = 4, 6800  # not those of `choice`
 SIDES = np.deg2rad(22.5 + 45 * np.arange(8))  # [rad] of the pushes, from ahead to the left
 _FORCE, _START, _TIME, _WALK = 90.0, 1.05, 0.1, 2.5  # [N] of HECTOR, [s]; includes the recovery
@@ -87,12 +87,12 @@ def points(
         pairs: tuned sets without and with the net, by `smooth`.
         share: share of the second one.
     """
-    limits = choice.default_limit(setup.robot) * np.array(SAFE)
-    return {
-        f"smooth_{smooth:g}_safe_{limit:.2f}": choice.between_tunings(setup, pair, share, limit)
-        for smooth, pair in pairs.items()
-        for limit in limits
-    }
+    sets, limits = {}, choice.default_limit(setup) * np.array(SAFE)
+    for (smooth, pair), limit in product(pairs.items(), limits):
+        weights = choice.between_tunings(setup, pair, share, limit)
+        safe = weights.others["position_limit"]
+        sets[f"smooth_{smooth:g}_safe_{safe:.2g}"] = weights
+    return sets
 
 
 def walk(

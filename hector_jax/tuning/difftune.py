@@ -116,8 +116,8 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
         )
     if name == "position_limit":
         return (
-            f"{name} cannot be tuned by gradients: no rollout is pushed that far, so its gradient "
-            "is zero; a weights file or --safe can set it"
+            f"{name} cannot be tuned by gradients: the errors of a rollout are mostly below it, so "
+            "that its gradient is mostly zero; a weights file or --safe can set it"
         )
     if path.startswith("footstep.") and walk.footstep.rule == "paper":
         return f"{name} has no part in the paper's rule"
