@@ -127,7 +127,7 @@ def test_the_front_is_a_table_and_a_picture(walked, tmp_path):
     result, _ = walked
     rows = front_table(result).splitlines()
     assert rows[-1] == "| mine | -50 [-50, -50] | +20 [+20, +20] | 32 of 64 | 0 of 8 |"
-    assert "64 walks under a push" in plots.front(tmp_path / "front.png", result)
+    assert "against falls" in plots.front(tmp_path / "front.png", result)
     assert (tmp_path / "front.png").stat().st_size > 0
 
 

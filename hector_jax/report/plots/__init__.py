@@ -298,22 +298,26 @@ def front(path: Path, result: Front) -> str:
     tunings: dict[str, list[str]] = {}
     for name in result.falls:
         tunings.setdefault(name.partition("_safe_")[0], []).append(name)
-    text = {"textcoords": "offset points", "xytext": (5, 4), "fontsize": 8}
-    with drawing(path, 7.0, 4.2) as figure:
-        axes = figure.subplots()
+    with drawing(path, 9.0, 4.2) as figure:
+        panels = figure.subplots(1, 2, sharey=True)
         for tuning, look in looks_of(tunings).items():
             places, label = [], label_of(tuning).replace("_", " ")
             for name in tunings[tuning]:
                 nominal, expert = (compare(result.calm, name, other) for other in BASELINES)
-                places.append((expert.change["L_ctrl"].value, nominal.change["L"].value))
+                x = expert.change["L_ctrl"].value, result.falls[name]
+                places.append((*x, nominal.change["L"].value))
                 filled = look.color if nominal.counts and expert.counts else "white"
                 dot = dict(look.dot, markerfacecolor=filled)
-                axes.plot(*places[-1], **dot, label=label if len(places) == 1 else None)
-                axes.annotate(f"{result.falls[name]}", places[-1], **text)
-            axes.plot(*zip(*places, strict=True), **look.line)
-        axes.set(xlabel="change of L_ctrl against expert [%]")
-        axes.set(ylabel="change of L against nominal [%]")
-    return caption("front", pushed=result.pushed)
+                for panel, side in zip(panels, x, strict=True):
+                    panel.plot(side, places[-1][2], **dot, label=label)
+                    label = None  # one entry in the legend
+            *sides, L = zip(*places, strict=True)
+            for panel, side in zip(panels, sides, strict=True):
+                panel.plot(side, L, **look.line)
+        panels[0].set(xlabel="change of L_ctrl against expert [%]")
+        panels[0].set(ylabel="change of L against nominal [%]")
+        panels[1].set(xlabel=f"falls in {result.pushed} walks under a push")
+    return caption("front")
 
 
 def matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
