@@ -144,7 +144,8 @@ def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: 
         limit: limit of the position error that the MPC sees [m]; infinite for none.
     """
     width = WIDTH * setup.config.rollout.walk.footstep.width
-    return completed(between(*pair, share), position_limit=limit, footstep_width=width)
+    one, other = pair
+    return completed(between(one, other, share), position_limit=limit, footstep_width=width)
 
 
 def answer(
@@ -175,7 +176,7 @@ def answer(
     mixture = between_tunings(setup, [sets[name] for name in pair], share, limit)
     if safe is not None:
         tuned = {name: w for name, w in sets.items() if name != "nominal"}
-        sets = sets | {name: completed(w, position_limit=safe) for name, w in tuned.items()}
+        sets = {**sets, **{n: completed(w, position_limit=safe) for n, w in tuned.items()}}
     plants = drawn_plants(setup.robot, setup.robot.description.tuning.choice_plants)
     if not plants:
         return mixture
