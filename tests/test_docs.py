@@ -213,7 +213,10 @@ def test_the_table_of_the_readme_is_that_of_the_results():
     for name in COMMANDS:
         result = json.loads((DOCS / "results" / "best" / f"{name}.json").read_text())
         expected[name, "best"] = result["sets"]["best"]["standin"]["change"]
-    for which in ("without", "with", "shared_mean", "best", "ceiling"):
+        path = DOCS / "results" / "tunables" / f"standin-{name}.json"
+        sets = json.loads(path.read_text())["sets"]
+        expected[name, "integral"] = sets["integral_best"]["standin"]["change"]
+    for which in ("without", "with", "shared_mean", "best", "integral", "ceiling"):
         each = [expected[name, which][base] for name in COMMANDS for base in ("nominal", "expert")]
         texts = [f"{one['median']:.0f} [{one['low']:.0f}, {one['high']:.0f}]" for one in each]
         assert shown[which] == texts, which
