@@ -81,7 +81,8 @@ class Flags:
     sets: tuple[str, ...] = SETS
     phases: tuple[int, ...] = (0, 10, 20, 30)  # gait ticks at which the command starts
     lead: int = 40  # ticks in place before t = 0 on the model, beside none
-    ranks: int = 64  # weight sets about nominal for each rank correlation; 0 leaves them out
+    ranks: int = 64  # weight sets for each rank correlation; 0 leaves them out
+    about: Path | None = None  # weights about which these are drawn; nominal by default
     effort_about: Literal["zero", "weight"] = "zero"  # MpcConfig.effort_reference
     stance_weight: bool = False  # LegConfig.gravity_compensation
     processes: int = 2  # one core each
@@ -244,7 +245,7 @@ def _model_job(
     return np.array(rows), np.array(losses)
 
 
-def measure(flags: Flags, loaded: Mapping[str, Weights]) -> Result:
+def measure(flags: Flags, loaded: Mapping[str, Weights], center: Weights) -> Result:
     """Evaluate gradients and losses on the model and on the hfs."""
     robot = jax.tree.map(np.asarray, load_robot())
     walk = WalkConfig(
@@ -261,7 +262,7 @@ def measure(flags: Flags, loaded: Mapping[str, Weights]) -> Result:
     sampled = {
         f"ranks-{name}-{factor:g}": [
             Point(weights, command, tick)
-            for weights in sample_weights(nominal(), factor, flags.ranks)
+            for weights in sample_weights(center, factor, flags.ranks)
             for tick in flags.phases
         ]
         for name, command in commands.items()
@@ -356,13 +357,17 @@ def report(flags: Flags, result: Result) -> Path:
         paragraphs += [
             "## Order of weight sets",
             f"Spearman's rank correlation of L on the model and on the hfs over {flags.ranks} "
-            "weight sets, drawn log-uniformly about nominal, each loss the mean over the start "
-            "phases; a fall counts as the loss charges it. `hfs, other phases` is the correlation "
-            "of the simulator with itself, every other phase against the rest.",
+            f"weight sets, drawn log-uniformly about {flags.about or 'nominal'}, each loss the "
+            "mean over the start phases; a fall counts as the loss charges it. `hfs, other phases` "
+            "is the correlation of the simulator with itself, every other phase against the rest.",
             alignment.rank_table(ranks),
         ]
     numbers = {
-        "flags": {k: v for k, v in vars(flags).items() if k not in ("data", "out", "tuned")},
+        "flags": {
+            k: str(v) if isinstance(v, Path) else v
+            for k, v in vars(flags).items()
+            if k not in ("data", "out", "tuned")
+        },
         "engine": result.engine,
         "weights": direction_names(),
         "rows": {
@@ -451,8 +456,9 @@ def main() -> None:
     flags = tyro.cli(Flags)
     setup_jax()
     loaded = {name: load_weights(path) for name, path in flags.tuned.items()}
+    center = load_weights(flags.about) if flags.about else nominal()
     make_folder(flags.out)
-    print(report(flags, measure(flags, loaded)))
+    print(report(flags, measure(flags, loaded, center)))
 
 
 if __name__ == "__main__":

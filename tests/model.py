@@ -24,6 +24,8 @@ LEARNS_TOUCHDOWNS = ROBOT._replace(
 ANCHOR = standing_anchor(ROBOT)
 SHORT = RolloutConfig(ticks=50)
 CONFIG = TuneConfig(rollout=SHORT)
+# of the set `best`
+BEST_OTHERS = {"position_limit": 0.08, "footstep_width": 0.07, "footstep_feedback": 0.08}
 # the numbers beside Q and R of tests that have some: in MJX other names are another program
 OTHERS = ("footstep_width", "foot_height", "kp", "kd")
 PLAIN = effect_of(None, WalkConfig())

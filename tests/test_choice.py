@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from model import CONFIG, ROBOT
+from model import BEST_OTHERS, CONFIG, ROBOT
 
 from hector_jax.control.footstep import FootstepConfig
 from hector_jax.control.mpc import MpcConfig
@@ -79,11 +79,11 @@ def _between(sets, config=CONFIG, robot=ROBOT, safe=None):
 def test_the_answer_lies_between_two_tunings_with_narrower_steps_and_a_limited_error():
     sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
     found = _between(sets)
-    assert found.others == {"position_limit": 0.08, "footstep_width": 0.07}
+    assert found.others == BEST_OTHERS
     wanted = between(nominal(), expert(), 0.25)
     jax.tree.map(np.testing.assert_array_equal, found[:2], wanted[:2])
     tuned = {n: w._replace(others={"footstep_width": np.array(0.06)}) for n, w in sets.items()}
-    assert _between(tuned).others == {"position_limit": 0.08, "footstep_width": 0.06}
+    assert _between(tuned).others == {**found.others, "footstep_width": 0.06}
     assert _between(sets, safe=0.05).others["position_limit"] == 0.05
     tall = ROBOT._replace(standing_height=2 * ROBOT.standing_height)
     assert _between(sets, robot=tall).others["position_limit"] == 0.161
@@ -96,6 +96,7 @@ def test_the_answer_can_be_read_whatever_the_controllers_numbers(tmp_path, limit
     rollout = replace(CONFIG.rollout, walk=replace(CONFIG.rollout.walk, **own))
     save_weights(tmp_path / "best.json", _between(sets, replace(CONFIG, rollout=rollout)))
     others = {"position_limit": wanted, "footstep_width": min(0.875 * width, 0.2)}
+    others["footstep_feedback"] = 0.08
     assert load_weights(tmp_path / "best.json").others == pytest.approx(others)
 
 

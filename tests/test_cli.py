@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import table
 import table_steps
+from model import BEST_OTHERS
 from pretend import pretend_verdict
 from synthetic import synthetic_walk
 
@@ -176,7 +177,7 @@ def test_a_robot_without_a_best_set_says_so(monkeypatch, capsys, tmp_path):
 def test_the_name_best_is_the_set_of_the_robot():
     found = arguments.weights("best", load_robot())
     jax.tree.map(np.testing.assert_array_equal, found, best())
-    assert found.others == {"position_limit": 0.08, "footstep_width": 0.07}
+    assert found.others == BEST_OTHERS
 
 
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
@@ -385,7 +386,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         load_weights(run / "weights" / f"{name}.json")
         for name in ("without", "with_refreshed", "best")
     )
-    assert best.others == {"position_limit": 0.08, "footstep_width": 0.07}
+    assert best.others == BEST_OTHERS
     half_way = between(without, refreshed)._replace(others=best.others)
     jax.tree.map(np.testing.assert_allclose, best, half_way)
     assert result["refresh"][0].keys() == {"old", "new"}
@@ -426,8 +427,7 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
     )
     assert tuned.others["turn_lead"] != 0.5
     mixed = between(without, tuned, 0.25)
-    beside = {"position_limit": 0.08, "footstep_width": 0.07}
-    mixed = mixed._replace(others={**beside, **mixed.others})
+    mixed = mixed._replace(others={**BEST_OTHERS, **mixed.others})
     jax.tree.map(np.testing.assert_allclose, answer, mixed)
     assert "- turn_lead: 0.5 at the start" in Path("both/report.md").read_text()
     assert "walking: straight, c" in Path("both/report.md").read_text()

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.stats
+from model import BEST_OTHERS
 from table import PROGRAM, SETS
 from table import Flags as Table
 
@@ -186,9 +187,7 @@ def test_tests_that_pages_name_are_there():
 
 def test_the_best_set_is_half_way_between_the_sets_that_the_page_names():
     without, tuned = (load_weights(DOCS / f"results/best/{n}.json") for n in ("without", "with"))
-    half_way = between(without, tuned)._replace(
-        others={"position_limit": 0.08, "footstep_width": 0.07}
-    )
+    half_way = between(without, tuned)._replace(others=BEST_OTHERS)
     jax.tree.map(np.testing.assert_allclose, best(), half_way)
 
 

@@ -81,11 +81,12 @@ def test_online_asks_for_no_file_by_itself_and_for_whole_windows():
         online.Flags(seconds=5.0)
 
 
-def test_a_missing_file_of_tuned_weights_is_refused_and_not_written(monkeypatch, tmp_path, capsys):
+@pytest.mark.parametrize("flag", [["--tuned", "straight"], ["--about"]])
+def test_a_missing_file_of_weights_is_refused_and_not_written(monkeypatch, tmp_path, capsys, flag):
     path = tmp_path / "mistyped.json"
     transfer = script("transfer")
     out = tmp_path / "out"
-    arguments = ["transfer.py", "--tuned", "straight", str(path), "--out", str(out)]
+    arguments = ["transfer.py", *flag, str(path), "--out", str(out)]
     monkeypatch.setattr(sys, "argv", arguments)
     assert exit_code("transfer", transfer.main) == 2
     assert str(path) in capsys.readouterr().err

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from model import CONFIG, ROBOT
+from model import BEST_OTHERS, CONFIG, ROBOT
 from pretend import pretend_history, pretend_verdict
 
 from hector_jax.cli import run_folder
@@ -147,7 +147,7 @@ def test_the_command_tunes_smoothly_and_takes_a_safe_set(monkeypatch, tmp_path):
     monkeypatch.setattr(tunings, "tune", tune)
     tuned = command._tune_sets(_run(tmp_path, smooth=3.0, safe=0.05))
     assert seen["L_ctrl"] == 3.0 * alphas(CONFIG.loss)["L_ctrl"]
-    assert tuned.sets["best"].others == {"position_limit": 0.05, "footstep_width": 0.07}
+    assert tuned.sets["best"].others == {**BEST_OTHERS, "position_limit": 0.05}
 
 
 def test_the_command_stores_the_sets_of_the_front(monkeypatch, tmp_path):

@@ -30,9 +30,10 @@ from hector_jax.tuning.difftune import Tuning
 
 # fractions of the accepted iterations at which a path is walked
 SHARES = (0.0, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 3 / 4, 1.0)
-LIMIT, WIDTH = 0.19, 7 / 8
+LIMIT, WIDTH, FEEDBACK = 0.19, 7 / 8, 2 / 3
 """Numbers of the set between two tunings: limit of the position error as a share of the height of
-the centre of mass (8 cm for HECTOR), and width of the steps as a share of the controller's."""
+the centre of mass (8 cm for HECTOR); width and velocity feedback of the steps as shares of the
+controller's."""
 HELD_OUT = 8
 """Number of the plants of `earliest`."""
 # first seed of the plants for choice and tuning, drawn like `hfs-varied` but with other seeds; the
@@ -131,11 +132,12 @@ def default_limit(setup: Setup) -> float:
 
 
 def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: float) -> Weights:
-    """Return the set between two tunings, with narrower steps and a limit of the position error.
+    """Return the set between two tunings, with a limit of the position error and calmer steps.
 
     Weights that track tightly fall under a push that looser ones survive: the error becomes so
-    large that they ask for all the friction there is to pull the robot back. On a slippery floor
-    they fall because a foot further out needs more horizontal force.
+    large that they ask for all the friction there is to pull the robot back, while the steps
+    follow its velocity. On a slippery floor they fall because a foot further out needs more
+    horizontal force.
 
     Args:
         setup: controller.
@@ -143,9 +145,13 @@ def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: 
         share: share of the second one.
         limit: limit of the position error that the MPC sees [m]; infinite for none.
     """
-    width = WIDTH * setup.config.rollout.walk.footstep.width
-    one, other = pair
-    return completed(between(one, other, share), position_limit=limit, footstep_width=width)
+    footstep, (one, other) = setup.config.rollout.walk.footstep, pair
+    return completed(
+        between(one, other, share),
+        position_limit=limit,
+        footstep_width=round(WIDTH * footstep.width, 4),
+        footstep_feedback=round(FEEDBACK * footstep.feedback, 4),
+    )
 
 
 def answer(
