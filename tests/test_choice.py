@@ -76,7 +76,7 @@ def _between(sets, config=CONFIG, robot=ROBOT, safe=None):
     return choice.answer(Setup(Executor(), config, robot), sets, pair, 0.25, commands, **notes)
 
 
-def test_the_answer_lies_between_two_tunings_with_narrower_steps_and_a_limited_error():
+def test_the_answer_lies_between_two_tunings_with_other_steps_and_a_limited_error():
     sets = {"nominal": nominal(), "without": nominal(), "with": expert()}
     found = _between(sets)
     assert found.others == BEST_OTHERS

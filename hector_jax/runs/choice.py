@@ -132,12 +132,12 @@ def default_limit(setup: Setup) -> float:
 
 
 def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: float) -> Weights:
-    """Return the set between two tunings, with a limit of the position error and calmer steps.
+    """Return the set between two tunings, with `LIMIT`, `WIDTH` and `FEEDBACK`.
 
     Weights that track tightly fall under a push that looser ones survive: the error becomes so
-    large that they ask for all the friction there is to pull the robot back, while the steps
-    follow its velocity. On a slippery floor they fall because a foot further out needs more
-    horizontal force.
+    large that they ask for all the friction there is to pull the robot back. On a slippery floor
+    they fall because a foot further out needs more horizontal force. With less feedback of the
+    velocity they fall less under pushes on curves (docs/notes.md, Robustness).
 
     Args:
         setup: controller.
