@@ -6,7 +6,7 @@ import ceiling
 import jax
 import numpy as np
 import pytest
-from ceiling import Flags, changes, plant_losses, search
+from ceiling import Flags, Walked, changes, search, walk_sets
 from model import AHEAD, BRIEF
 
 from hector_jax.control.weights import nominal, scale_weights, weights_to_vector
@@ -26,7 +26,11 @@ def bowl(pool, campaign, engine, sets):
     for weights in sets:
         distance = np.sum((np.log(weights_to_vector(weights)) - target) ** 2)
         gain = sum((weights.others[name] - 0.3) ** 2 for name in weights.others)
-        yield np.full(len(campaign.cases), 1.0 + distance + 10.0 * gain)
+        losses = np.full(len(campaign.cases), 1.0 + distance + 10.0 * gain)
+        yield Walked(losses, losses < 0.0)
+
+
+ENGINE = SimpleNamespace(name="bowl", modules=())
 
 
 @pytest.fixture
@@ -40,22 +44,22 @@ def campaign(tmp_path):
 
 
 def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaign, monkeypatch):
-    monkeypatch.setattr(ceiling, "plant_losses", bowl)
+    monkeypatch.setattr(ceiling, "walk_sets", bowl)
     start, flags = campaign.start, Flags(generations=60, population=12)
-    found = search(None, campaign, None, flags)
-    losses = [next(bowl(None, campaign, None, [w]))[0] for w in (start, found)]
+    found = search(None, campaign, ENGINE, flags)
+    losses = [next(bowl(None, campaign, None, [w])).losses[0] for w in (start, found)]
     assert losses[1] - 1.0 < 0.05 * (losses[0] - 1.0)
     record = campaign.folder / "generations.jsonl"
     lines = record.read_bytes().splitlines(keepends=True)
     record.write_bytes(b"".join(lines[:25]))
-    again = search(None, campaign, None, flags)
+    again = search(None, campaign, ENGINE, flags)
     jax.tree.map(np.testing.assert_array_equal, again, found)
     assert record.read_bytes() == b"".join(lines)
     record.write_bytes(lines[0] + b'{"steps": [[0.0]], "losses": [1.0]}\n')
     with pytest.raises(InputError, match="line 2 is damaged: steps"):
-        search(None, campaign, None, flags)
+        search(None, campaign, ENGINE, flags)
     with pytest.raises(InputError, match="record of another search: its seed is 0, expected 5"):
-        search(None, campaign, None, Flags(seed=5, population=12))
+        search(None, campaign, ENGINE, Flags(seed=5, population=12))
 
 
 def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(campaign, monkeypatch):
@@ -65,11 +69,20 @@ def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(camp
         del pool, config, robot, exact
         for number, job in enumerate(jobs):
             assert job.seed == number % 2
-            yield SimpleNamespace(loss=number, residual=np.array([0.0, 1.0 * (number == 3)]))
+            residual, fallen = np.array([0.0, 1.0 * (number == 3)]), np.array([number == 1])
+            yield SimpleNamespace(loss=number, residual=residual, fallen=fallen)
 
     sets = [nominal(), GOAL]
-    rows = list(plant_losses(None, campaign, SimpleNamespace(walk=walk), sets))
-    np.testing.assert_array_equal(rows, [[0.0, 1.0], [2.0, np.inf]])
+    rows = list(walk_sets(None, campaign, SimpleNamespace(walk=walk), sets))
+    np.testing.assert_array_equal([row.losses for row in rows], [[0.0, 1.0], [2.0, np.inf]])
+    np.testing.assert_array_equal([row.fallen for row in rows], [[False, True], [False, False]])
+
+
+def test_a_start_with_an_unsolved_qp_is_refused(campaign, monkeypatch):
+    unsolved = Walked(np.array([1.0, np.inf]), np.array([False, False]))
+    monkeypatch.setattr(ceiling, "walk_sets", lambda *_: iter([unsolved]))
+    with pytest.raises(InputError, match="--start: a QP of these weights is not solved"):
+        search(None, campaign, ENGINE, Flags(population=12))
 
 
 def test_changes_are_medians_over_plants_of_each_command():

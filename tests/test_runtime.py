@@ -100,3 +100,23 @@ def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_
     programs = [path.name.split("-")[0] for path in (tmp_path / "hector_jax" / "jax").iterdir()]
     assert programs.count("jit_plan") == 2  # for all feet on the ground, and for one
     assert programs.count("jit_evaluate") == 1
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("", "FLAG="),
+        ("--xla_a=1 word", "FLAG= --xla_a=1 word"),
+        ("FLAG=dot --xla_a=1", "FLAG=dot --xla_a=1"),
+        ("flags.txt", "flags.txt"),
+    ],
+)
+@pytest.mark.parametrize("version", [(0, 10, 1), (0, 10, 2), (0, 12, 0, 1), (0, 13, 0)])
+def test_ynnpack_is_turned_off_where_the_flag_is_known(monkeypatch, version, before, after):
+    flag = "--xla_cpu_experimental_ynn_fusion_type"
+    before, after = (text.replace("FLAG", flag) for text in (before, after))
+    monkeypatch.setattr("jaxlib.version.__version_info__", version)
+    monkeypatch.setenv("XLA_FLAGS", before)
+    runtime._without_ynnpack()
+    known = (0, 10, 2) <= version < (0, 13)
+    assert os.environ["XLA_FLAGS"] == (after if known else before)

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple, cast
 
 from hector_jax.core.inputs import InputError, one_line
 
+_YNNPACK = "--xla_cpu_experimental_ynn_fusion_type"
 _LEAST_MEMORY = 3e9  # [B] of address space: JAX alone takes 1.3 GB, compiling a walk 2.3 GB
 
 
@@ -97,17 +98,19 @@ def check_jax(on_cpu: bool = False) -> None:
 
 
 def _without_ynnpack() -> None:
-    """Turn off sums by YNNPACK on the CPU; call before JAX starts, which reads XLA_FLAGS once.
+    """Turn off XLA's YNNPACK on the CPU; call before JAX starts, which reads XLA_FLAGS once.
 
-    They read memory that nothing has written: with jaxlib 0.12 a third of the programs of the plain
-    net gave NaN, and 0.10.2 has wrong sums (jax-ml/jax issue 39103).
+    Its sums read memory that nothing has written: with jaxlib 0.12 a third of the programs of the
+    plain net gave NaN, and 0.10.2 has wrong sums (jax-ml/jax issue 39103). An unknown flag ends a
+    process, so only the versions that are known to know it are given it.
     """
     from jaxlib.version import __version_info__ as version
 
-    if (0, 10, 2) <= version < (0, 13):  # an unknown flag ends a process, so only where it is known
-        flags = os.environ.get("XLA_FLAGS", "").split()
-        flags = dict.fromkeys([*flags, "--xla_cpu_experimental_ynn_fusion_type="])
-        os.environ["XLA_FLAGS"] = " ".join(flags)
+    flags = os.environ.get("XLA_FLAGS", "")
+    in_file = flags.strip()[:1] not in ("", "-")  # XLA_FLAGS can name a file of flags
+    if (0, 10, 2) <= version < (0, 13) and _YNNPACK not in flags and not in_file:
+        # first, because XLA ignores what follows a word without a dash
+        os.environ["XLA_FLAGS"] = f"{_YNNPACK}= {flags}".strip()
 
 
 @cache

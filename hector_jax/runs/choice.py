@@ -132,7 +132,10 @@ def default_limit(setup: Setup) -> float:
 
 
 def between_tunings(setup: Setup, pair: Sequence[Weights], share: float, limit: float) -> Weights:
-    """Return the set between two tunings, with `LIMIT`, `WIDTH` and `FEEDBACK`.
+    """Return the set between two tunings, with a limit of the position error and other steps.
+
+    What the tunings have beside Q and R stays; else the steps have the shares `WIDTH` and
+    `FEEDBACK` of the controller's numbers.
 
     Weights that track tightly fall under a push that looser ones survive: the error becomes so
     large that they ask for all the friction there is to pull the robot back. On a slippery floor
