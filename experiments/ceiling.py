@@ -190,7 +190,7 @@ def main() -> None:
             title,
             name,
             *changes(losses[title, "nominal"], of_set),
-            int(walked[title, name].fallen.sum()),
+            str(walked[title, name].fallen.sum()),
         ]
         for (title, name), of_set in losses.items()
     ]

@@ -1,5 +1,8 @@
 """The search over many plants, on a bowl in place of a simulator."""
 
+import json
+import sys
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import ceiling
@@ -89,6 +92,22 @@ def test_changes_are_medians_over_plants_of_each_command():
     baseline = np.full((5, 2), 2.0)
     losses = np.array([[1.0, 2.0]] * 5)
     assert changes(baseline, losses) == ["-50 [-50, -50]", "+0 [+0, +0]"]
+
+
+def test_the_report_compares_the_sets_on_both_groups_of_plants(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(ceiling, "walk_sets", bowl)
+    monkeypatch.setattr(ceiling, "search", lambda pool, campaign, *_: campaign.start)
+    monkeypatch.setattr(ceiling, "workers", lambda count: nullcontext())
+    monkeypatch.setattr(sys, "argv", ["ceiling.py", "--plants", "4", "--out", str(tmp_path)])
+    ceiling.main()
+    path = tmp_path / "weights" / "report.md"
+    assert str(path) in capsys.readouterr().out
+    text = path.read_text()
+    assert "on plants 100 to 103 of hfs-varied; `others` are 104 to 107." in text
+    assert text.count("| nominal | +0 [+0, +0] |") == 2
+    numbers = json.loads((tmp_path / "weights" / "ceiling.json").read_text())
+    assert np.shape(numbers["losses"]["others found"]) == (4, 3)
+    assert (tmp_path / "weights" / "weights.json").exists()
 
 
 @pytest.mark.parametrize("name", ["plants", "generations", "population"])
