@@ -2,6 +2,7 @@
 
 import json
 import sys
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -49,20 +50,20 @@ def campaign(tmp_path):
 def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaign, monkeypatch):
     monkeypatch.setattr(ceiling, "walk_sets", bowl)
     start, flags = campaign.start, Flags(generations=60, population=12)
-    found = search(None, campaign, ENGINE, flags)
+    found = search(Executor(), campaign, ENGINE, flags)
     losses = [next(bowl(None, campaign, None, [w])).losses[0] for w in (start, found)]
     assert losses[1] - 1.0 < 0.05 * (losses[0] - 1.0)
     record = campaign.folder / "generations.jsonl"
     lines = record.read_bytes().splitlines(keepends=True)
     record.write_bytes(b"".join(lines[:25]))
-    again = search(None, campaign, ENGINE, flags)
+    again = search(Executor(), campaign, ENGINE, flags)
     jax.tree.map(np.testing.assert_array_equal, again, found)
     assert record.read_bytes() == b"".join(lines)
     record.write_bytes(lines[0] + b'{"steps": [[0.0]], "losses": [1.0]}\n')
     with pytest.raises(InputError, match="line 2 is damaged: steps"):
-        search(None, campaign, ENGINE, flags)
+        search(Executor(), campaign, ENGINE, flags)
     with pytest.raises(InputError, match="record of another search: its seed is 0, expected 5"):
-        search(None, campaign, ENGINE, Flags(seed=5, population=12))
+        search(Executor(), campaign, ENGINE, Flags(seed=5, population=12))
 
 
 def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(campaign, monkeypatch):
@@ -85,7 +86,7 @@ def test_a_start_with_an_unsolved_qp_is_refused(campaign, monkeypatch):
     unsolved = Walked(np.array([1.0, np.inf]), np.array([False, False]))
     monkeypatch.setattr(ceiling, "walk_sets", lambda *_: iter([unsolved]))
     with pytest.raises(InputError, match="--start: a QP of these weights is not solved"):
-        search(None, campaign, ENGINE, Flags(population=12))
+        search(Executor(), campaign, ENGINE, Flags(population=12))
 
 
 def test_changes_are_medians_over_plants_of_each_command():

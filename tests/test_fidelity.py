@@ -89,7 +89,8 @@ def test_what_follows_a_fall_is_not_predicted(robot, walks, drifts):
     broken = jax.tree.map(np.copy, two)._replace(fallen=fallen)
     broken.state.position[1, 20:] = 7.0
     here = fidelity.drift(robot, last_command, broken, np.zeros(2, int))
-    np.testing.assert_allclose(here.position, drifts["raw"].position)
+    # two walks at once may round otherwise than one
+    np.testing.assert_allclose(here.position, drifts["raw"].position, atol=1e-12)
     short = walks._replace(fallen=walks.fallen[:, :30])
     with pytest.raises(ValueError, match="30 ticks are too short to predict 40 ticks"):
         fidelity.drift(robot, last_command, short, np.zeros(1, int))
