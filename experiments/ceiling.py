@@ -14,16 +14,16 @@ Report, weights and the generations so far are in OUT/TUNE; a later call continu
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import jax
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from lib import write_report
 
 from hector_jax.control.parameters import tunables
@@ -39,9 +39,9 @@ from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import tunings
+from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.metrics import bootstrap
+from hector_jax.runs.setup import Setup
 from hector_jax.runs.walks import Campaign, space_of, weights_at
 from hector_jax.search.cmaes import Generation, add_row, read_journal, to_generation
 from hector_jax.sim.engine import Engine, choose_engine
@@ -72,31 +72,31 @@ class Flags:
         check(self, **counts, population=Range(4), spread=POSITIVE, seed=SEED, first_plant=SEED)
 
 
-class Walked(NamedTuple):
-    """Results of a weight set in the cases of a campaign, plant by plant."""
+def losses_of(
+    pool: Executor, campaign: Campaign, engine: Engine, sets: Sequence[Weights], batch: int
+) -> Iterator[Float[np.ndarray, " cases"]]:
+    """Yield the losses of each set in all cases of a campaign; infinite where a QP is not solved.
 
-    losses: Float[np.ndarray, " cases"]  # infinite if a QP was not solved
-    fallen: Bool[np.ndarray, " cases"]
-
-
-def walk_sets(
-    pool: Executor, campaign: Campaign, engine: Engine, sets: Sequence[Weights]
-) -> Iterator[Walked]:
-    """Yield the results of each weight set."""
+    Args:
+        pool, campaign, engine: workers; plants and commands; engine of the walks.
+        sets: weight sets.
+        batch: number of walks for which a program is compiled, see `Engine`.
+    """
     config, cases = campaign.config, campaign.cases
     jobs = [
         Job(weights, command, cast(Imperfections, plant), campaign.seconds, case)
         for weights in sets
         for case, (plant, command) in enumerate(cases)
     ]
-    walks = engine.walk(pool, config.rollout.walk, campaign.robot, jobs, exact=False)
+    options = {"exact": False, "batch": batch}
+    walks = engine.walk(pool, config.rollout.walk, campaign.robot, jobs, **options)
     for _ in sets:
-        rows = [
-            (float(loss_of(config.loss, walk)), walk.residual.max(), walk.fallen.any())
-            for walk in islice(walks, len(cases))
-        ]
-        losses, worst, fallen = map(np.array, zip(*rows, strict=True))
-        yield Walked(np.where(worst <= SOLVED, losses, np.inf), fallen)
+        yield np.array(
+            [
+                float(loss_of(config.loss, walk)) if walk.residual.max() <= SOLVED else np.inf
+                for walk in islice(walks, len(cases))
+            ]
+        )
 
 
 def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> Weights:
@@ -117,10 +117,8 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         "plants": [tree_hash(plant) for plant in campaign.plants],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
-    size, dimensions = (
-        flags.population,
-        len(direction_names(campaign.start) + campaign.config.others),
-    )
+    size = flags.population
+    dimensions = len(direction_names(campaign.start) + campaign.config.others)
 
     def parse(row: dict[str, list]) -> Generation:
         generation = to_generation(row["steps"], row["losses"])
@@ -130,7 +128,8 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
 
     path = campaign.folder / "generations.jsonl"
     rows, space = read_journal(path, head, what="search", parse=parse), space_of(pool, campaign)
-    at_start = next(walk_sets(pool, campaign, engine, [campaign.start])).losses
+    losses = partial(losses_of, pool, campaign, engine, batch=size * len(campaign.cases))
+    at_start = next(losses([campaign.start]))
     if not np.isfinite(at_start).all():
         raise InputError("--start: a QP of these weights is not solved on at least one plant")
     evolution = CMA(np.zeros(dimensions), flags.spread, seed=flags.seed, population_size=size)
@@ -139,23 +138,14 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
             points = np.stack([evolution.ask() for _ in range(size)])
             if number == len(rows):
                 sets = [weights_at(campaign, space, space.clip(point)) for point in points]
-                walked = walk_sets(pool, campaign, engine, sets)
-                rows.append(to_generation(points, [np.mean(w.losses / at_start) for w in walked]))
+                rows.append(to_generation(points, [np.mean(x / at_start) for x in losses(sets)]))
                 add_row(path, {k: v.tolist() for k, v in rows[-1]._asdict().items()})
             # the points as they were drawn, though one outside the box walked at its edge
-            losses = rows[number].losses
-            evolution.tell(list(zip(rows[number].steps, losses.tolist(), strict=True)))
-            remark = f"mean L against the start {np.median(losses):.3f}"
+            steps, ratios = rows[number]
+            evolution.tell(list(zip(steps, ratios.tolist(), strict=True)))
+            remark = f"mean L against the start {np.median(ratios):.3f}"
             report_progress(number + 1, flags.generations, remark)
     return weights_at(campaign, space, space.clip(evolution.mean))
-
-
-def changes(
-    baseline: Float[np.ndarray, "plants commands"], losses: Float[np.ndarray, "plants commands"]
-) -> list[str]:
-    """Return the median change of L on each command in %, with its interval."""
-    ratios = 100.0 * (losses / baseline - 1.0)
-    return [bootstrap(partial(np.median, axis=-1), x).text("{:+.0f}".format) for x in ratios.T]
 
 
 def main() -> None:
@@ -168,44 +158,40 @@ def main() -> None:
     commands = {name: named_command(name) for name in COMMANDS}
     folder, count, first = flags.out / "-".join(flags.tune), flags.plants, flags.first_plant
     make_folder(folder)
-
-    def campaign(first: int) -> Campaign:
-        seeds = range(first, first + count)
-        plants = [named_world("hfs-varied", seed, robot.description) for seed in seeds]
-        return Campaign(folder, config, robot, start, commands, plants)
-
-    searched, others = campaign(first), campaign(first + count)
+    seeds = range(first, first + 2 * count)
+    plants = [named_world("hfs-varied", seed, robot.description) for seed in seeds]
+    campaign = Campaign(folder, config, robot, start, commands, plants[:count])
     with workers(flags.processes) as pool:
-        answer = search(pool, searched, engine, flags)
+        answer = search(pool, campaign, engine, flags)
         save_weights(folder / "weights.json", answer)
         sets = {"nominal": nominal(robot), "expert": expert(robot), "start": start, "found": answer}
-        walked = {  # set by set: in MJX all weights of a batch have the same numbers beside Q and R
-            (title, name): next(walk_sets(pool, each, engine, [weights]))
-            for title, each in (("searched", searched), ("others", others))
-            for name, weights in sets.items()
+        judge = partial(verdicts.judge, Setup(pool, config, robot), sets, folder=folder / "scores")
+        scores = {
+            name: judge(command, plants, seeds, title=f"walking {name}").scores
+            for name, command in commands.items()
         }
-    losses = {key: each.losses.reshape(count, -1) for key, each in walked.items()}
-    rows = [
-        [
-            title,
-            name,
-            *changes(losses[title, "nominal"], of_set),
-            str(walked[title, name].fallen.sum()),
-        ]
-        for (title, name), of_set in losses.items()
-    ]
-    walks = flags.generations * flags.population * len(searched.cases)
+    rows, numbers = [], {}
+    for title, part in (("searched", slice(count)), ("others", slice(count, None))):
+        for name in sets:
+            each = [
+                metrics.make_verdict(
+                    config.loss, seeds[part], {n: of[n][part] for n in ("nominal", name)}
+                )
+                for of in scores.values()
+            ]
+            changes = [metrics.compare(v, name, "nominal").change["L"].text() for v in each]
+            falls = sum(int(v.scores[name].fallen.sum()) for v in each)
+            rows.append([title, name, *changes, str(falls)])
+            numbers[f"{title} {name}"] = [v.scores[name].L.tolist() for v in each]
+    walks = flags.generations * flags.population * len(campaign.cases)
     text = (
         f"{walks} walks, engine {engine.title}, on plants {first} to {first + count - 1} of "
         f"hfs-varied; `others` are {first + count} to {first + 2 * count - 1}. Change of L against "
-        "nominal in %, median over the plants with its 95 % interval."
+        "nominal in %, median over the plants with its 95 % interval, walked in MuJoCo C."
     )
-    numbers = {
-        "flags": {k: str(v) if isinstance(v, Path) else v for k, v in asdict(flags).items()},
-        "losses": {f"{title} {name}": x.tolist() for (title, name), x in losses.items()},
-    }
     table = markdown_table(["plants", "set", *commands, "falls"], rows)
     path, title = folder / "report.md", "A search over many plants"
+    numbers = {"losses": numbers}
     print(write_report(path, title, [text, table], numbers=numbers, json_name="ceiling.json"))
 
 

@@ -10,13 +10,14 @@ import ceiling
 import jax
 import numpy as np
 import pytest
-from ceiling import Flags, Walked, changes, search, walk_sets
+from ceiling import Flags, losses_of, search
 from model import AHEAD, BRIEF
 
 from hector_jax.control.weights import nominal, scale_weights, weights_to_vector
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
+from hector_jax.runs import metrics, verdicts
 from hector_jax.runs.walks import Campaign
 from hector_jax.sim.world import named_world
 from hector_jax.tuning.difftune import TuneConfig
@@ -24,14 +25,13 @@ from hector_jax.tuning.difftune import TuneConfig
 GOAL = scale_weights(nominal(), np.linspace(-0.5, 0.5, 18))
 
 
-def bowl(pool, campaign, engine, sets):
-    del pool, engine
+def bowl(pool, campaign, engine, sets, batch=0):
+    del pool, engine, batch
     target = np.log(weights_to_vector(GOAL))
     for weights in sets:
         distance = np.sum((np.log(weights_to_vector(weights)) - target) ** 2)
         gain = sum((weights.others[name] - 0.3) ** 2 for name in weights.others)
-        losses = np.full(len(campaign.cases), 1.0 + distance + 10.0 * gain)
-        yield Walked(losses, losses < 0.0)
+        yield np.full(len(campaign.cases), 1.0 + distance + 10.0 * gain)
 
 
 ENGINE = SimpleNamespace(name="bowl", modules=())
@@ -48,10 +48,10 @@ def campaign(tmp_path):
 
 
 def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaign, monkeypatch):
-    monkeypatch.setattr(ceiling, "walk_sets", bowl)
+    monkeypatch.setattr(ceiling, "losses_of", bowl)
     start, flags = campaign.start, Flags(generations=60, population=12)
     found = search(Executor(), campaign, ENGINE, flags)
-    losses = [next(bowl(None, campaign, None, [w])).losses[0] for w in (start, found)]
+    losses = [next(bowl(None, campaign, None, [w]))[0] for w in (start, found)]
     assert losses[1] - 1.0 < 0.05 * (losses[0] - 1.0)
     record = campaign.folder / "generations.jsonl"
     lines = record.read_bytes().splitlines(keepends=True)
@@ -69,34 +69,37 @@ def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaig
 def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(campaign, monkeypatch):
     monkeypatch.setattr(ceiling, "loss_of", lambda loss, walk: walk.loss)
 
-    def walk(pool, config, robot, jobs, *, exact):
+    def walk(pool, config, robot, jobs, *, exact, batch):
         del pool, config, robot, exact
+        assert batch == 7
         for number, job in enumerate(jobs):
             assert job.seed == number % 2
-            residual, fallen = np.array([0.0, 1.0 * (number == 3)]), np.array([number == 1])
-            yield SimpleNamespace(loss=number, residual=residual, fallen=fallen)
+            yield SimpleNamespace(loss=number, residual=np.array([0.0, 1.0 * (number == 3)]))
 
     sets = [nominal(), GOAL]
-    rows = list(walk_sets(None, campaign, SimpleNamespace(walk=walk), sets))
-    np.testing.assert_array_equal([row.losses for row in rows], [[0.0, 1.0], [2.0, np.inf]])
-    np.testing.assert_array_equal([row.fallen for row in rows], [[False, True], [False, False]])
+    rows = list(losses_of(None, campaign, SimpleNamespace(walk=walk), sets, 7))
+    np.testing.assert_array_equal(rows, [[0.0, 1.0], [2.0, np.inf]])
 
 
 def test_a_start_with_an_unsolved_qp_is_refused(campaign, monkeypatch):
-    unsolved = Walked(np.array([1.0, np.inf]), np.array([False, False]))
-    monkeypatch.setattr(ceiling, "walk_sets", lambda *_: iter([unsolved]))
+    monkeypatch.setattr(ceiling, "losses_of", lambda *_, batch: iter([np.array([1.0, np.inf])]))
     with pytest.raises(InputError, match="--start: a QP of these weights is not solved"):
         search(Executor(), campaign, ENGINE, Flags(population=12))
 
 
-def test_changes_are_medians_over_plants_of_each_command():
-    baseline = np.full((5, 2), 2.0)
-    losses = np.array([[1.0, 2.0]] * 5)
-    assert changes(baseline, losses) == ["-50 [-50, -50]", "+0 [+0, +0]"]
-
-
 def test_the_report_compares_the_sets_on_both_groups_of_plants(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(ceiling, "walk_sets", bowl)
+    def judge(setup, sets, command, plants, seeds, **notes):
+        del setup, command, notes
+        assert list(seeds) == list(range(100, 108))
+        assert len(plants) == 8
+        like, scores = metrics.score_like(), {}
+        for number, name in enumerate(sets):
+            L = np.where(np.arange(8) < 4, 1.0 + number, 4.0 - number)
+            rows = [like._replace(losses={**like.losses, "L": x}, fallen=x > 3.0) for x in L]
+            scores[name] = rows
+        return SimpleNamespace(scores=scores)
+
+    monkeypatch.setattr(verdicts, "judge", judge)
     monkeypatch.setattr(ceiling, "search", lambda pool, campaign, *_: campaign.start)
     monkeypatch.setattr(ceiling, "workers", lambda count: nullcontext())
     monkeypatch.setattr(sys, "argv", ["ceiling.py", "--plants", "4", "--out", str(tmp_path)])
@@ -105,9 +108,12 @@ def test_the_report_compares_the_sets_on_both_groups_of_plants(tmp_path, monkeyp
     assert str(path) in capsys.readouterr().out
     text = path.read_text()
     assert "on plants 100 to 103 of hfs-varied; `others` are 104 to 107." in text
-    assert text.count("| nominal | +0 [+0, +0] |") == 2
+    assert "| searched | found | +300 [+300, +300] | +300" in text
+    assert "| others | found | -75 [-75, -75] | -75 [-75, -75] | -75 [-75, -75] | 0 |" in text
+    assert "| others | nominal | +0.0 [+0.0, +0.0] |" in text
+    assert "| 12 |" in text
     numbers = json.loads((tmp_path / "weights" / "ceiling.json").read_text())
-    assert np.shape(numbers["losses"]["others found"]) == (4, 3)
+    assert numbers["losses"]["others found"] == [[1.0] * 4] * 3
     assert (tmp_path / "weights" / "weights.json").exists()
 
 
