@@ -246,7 +246,13 @@ def _model_job(
 
 
 def measure(flags: Flags, loaded: Mapping[str, Weights], center: Weights) -> Result:
-    """Evaluate gradients and losses on the model and on the hfs."""
+    """Evaluate gradients and losses on the model and on the hfs.
+
+    Args:
+        flags: what to compare.
+        loaded: tuned weights by trajectory; those of other trajectories are tuned here.
+        center: weights about which the sets of the rank correlations are drawn.
+    """
     robot = jax.tree.map(np.asarray, load_robot())
     walk = WalkConfig(
         mpc=MpcConfig(effort_reference="gravity" if flags.effort_about == "weight" else "zero"),
@@ -363,11 +369,7 @@ def report(flags: Flags, result: Result) -> Path:
             alignment.rank_table(ranks),
         ]
     numbers = {
-        "flags": {
-            k: str(v) if isinstance(v, Path) else v
-            for k, v in vars(flags).items()
-            if k not in ("data", "out", "tuned")
-        },
+        "flags": {k: v for k, v in vars(flags).items() if not isinstance(v, Path | dict)},
         "engine": result.engine,
         "weights": direction_names(),
         "rows": {
