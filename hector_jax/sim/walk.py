@@ -105,8 +105,8 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
 
     XLA runs a kernel for each of a hundred operations and distributes them to its threads, which
     takes several times as long as the operations: a call marked as small is compiled into one
-    kernel. If that fails, because an operation exists only as a kernel of its own, the call is
-    compiled as usual.
+    kernel. If that fails, because an operation exists only as a kernel of its own (products have
+    one unless `setup_jax` has turned off YNNPACK), the call is compiled as usual.
     """
 
     def torques(*packed: Array) -> Array:
@@ -121,7 +121,7 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
             return jax.jit(torques)(*packed)
 
     if jax.default_backend() == "cpu":
-        compiled = jax.jit(small_call, compiler_options=_LOOPS)
+        compiled = jax.jit(small_call)
         with suppress(jax.errors.JaxRuntimeError):
             compiled(*(np.zeros(sum(leaf.size for leaf in leaves)) for _, leaves in layouts))
             return compiled
@@ -129,7 +129,6 @@ def _torques(config: WalkConfig, *layouts: Layout) -> Callable[..., Array]:
 
 
 _BLOCK = 10  # ticks that are sampled by one call, whose cost hardly grows with their number
-_LOOPS = {"xla_cpu_experimental_ynn_fusion_type": ""}  # products are loops, not library calls
 _pack = jax.jit(pack)
 _push_forces = jax.jit(jax.vmap(push_force, in_axes=(None, 0)))
 
