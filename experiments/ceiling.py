@@ -36,6 +36,7 @@ from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.runtime import setup_jax, workers
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
 from hector_jax.core.trajectory import SOLVED
+from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
@@ -88,15 +89,12 @@ def losses_of(
         for weights in sets
         for case, (plant, command) in enumerate(cases)
     ]
-    options = {"exact": False, "batch": batch}
-    walks = engine.walk(pool, config.rollout.walk, campaign.robot, jobs, **options)
+    walks = engine.walk(pool, config.rollout.walk, campaign.robot, jobs, exact=False, batch=batch)
+    losses = jax.jit(jax.vmap(partial(loss_of, config.loss)))
     for _ in sets:
-        yield np.array(
-            [
-                float(loss_of(config.loss, walk)) if walk.residual.max() <= SOLVED else np.inf
-                for walk in islice(walks, len(cases))
-            ]
-        )
+        of_set = stack(list(islice(walks, len(cases))))
+        solved = of_set.residual.max(axis=1) <= SOLVED
+        yield np.where(solved, losses(of_set), np.inf)
 
 
 def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> Weights:

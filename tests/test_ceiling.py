@@ -5,6 +5,7 @@ import sys
 from concurrent.futures import Executor
 from contextlib import nullcontext
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import ceiling
 import jax
@@ -23,6 +24,11 @@ from hector_jax.sim.world import named_world
 from hector_jax.tuning.difftune import TuneConfig
 
 GOAL = scale_weights(nominal(), np.linspace(-0.5, 0.5, 18))
+
+
+class Walk(NamedTuple):
+    loss: np.ndarray
+    residual: np.ndarray
 
 
 def bowl(pool, campaign, engine, sets, batch=0):
@@ -74,7 +80,7 @@ def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(camp
         assert batch == 7
         for number, job in enumerate(jobs):
             assert job.seed == number % 2
-            yield SimpleNamespace(loss=number, residual=np.array([0.0, 1.0 * (number == 3)]))
+            yield Walk(np.array(float(number)), np.array([0.0, 1.0 * (number == 3)]))
 
     sets = [nominal(), GOAL]
     rows = list(losses_of(None, campaign, SimpleNamespace(walk=walk), sets, 7))
