@@ -26,9 +26,9 @@ import tyro
 from jaxtyping import Float
 from lib import write_report
 
-from hector_jax.control.parameters import tunables
+from hector_jax.control.parameters import split_by_model
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import Weights, direction_names, expert, nominal
+from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best, load_weights, save_weights, weights_tree
 from hector_jax.core.console import bar, exit_code
 from hector_jax.core.files import make_folder
@@ -111,12 +111,14 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         "robot": robot_hash(campaign.robot),
         "settings": content_key(campaign.config, code=engine.modules),
         "engine": engine.name,
+        "numbers": list(campaign.numbers),
         "start": weights_tree(campaign.start),
         "plants": [tree_hash(plant) for plant in campaign.plants],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
     size = flags.population
-    dimensions = len(direction_names(campaign.start) + campaign.config.others)
+    space = space_of(pool, campaign)
+    dimensions = len(space.box)
 
     def parse(row: dict[str, list]) -> Generation:
         generation = to_generation(row["steps"], row["losses"])
@@ -125,7 +127,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         return generation
 
     path = campaign.folder / "generations.jsonl"
-    rows, space = read_journal(path, head, what="search", parse=parse), space_of(pool, campaign)
+    rows = read_journal(path, head, what="search", parse=parse)
     losses = partial(losses_of, pool, campaign, engine, batch=size * len(campaign.cases))
     at_start = next(losses([campaign.start]))
     if not np.isfinite(at_start).all():
@@ -152,13 +154,14 @@ def main() -> None:
     setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
     start = best(robot) if flags.start is None else load_weights(flags.start, robot)
-    config = tunings.tune_config(robot, others=tunables(flags.tune))
+    others, of_legs = split_by_model(flags.tune)
+    config = tunings.tune_config(robot, others=others)
     commands = {name: named_command(name) for name in COMMANDS}
     folder, count, first = flags.out / "-".join(flags.tune), flags.plants, flags.first_plant
     make_folder(folder)
     seeds = range(first, first + 2 * count)
     plants = [named_world("hfs-varied", seed, robot.description) for seed in seeds]
-    campaign = Campaign(folder, config, robot, start, commands, plants[:count])
+    campaign = Campaign(folder, config, robot, start, commands, plants[:count], of_legs=of_legs)
     with workers(flags.processes) as pool:
         answer = search(pool, campaign, engine, flags)
         save_weights(folder / "weights.json", answer)

@@ -27,6 +27,8 @@ GOAL = scale_weights(nominal(), np.linspace(-0.5, 0.5, 18))
 
 
 class Walk(NamedTuple):
+    """A walk whose loss is known."""
+
     loss: np.ndarray
     residual: np.ndarray
 

@@ -187,7 +187,7 @@ def test_every_number_that_the_plan_reads_has_a_derivative_and_compiles_nothing(
         for name, one in TUNABLES.items()
         if not name.startswith("k")
     }
-    unfelt = {"gravity_compensation", "foot_height"}
+    unfelt = {"gravity_compensation", "foot_height", "landing"}
     assert felt == {name: name not in unfelt for name in felt}
     slope(TUNABLES["footstep_feedback"].write(parameters, np.array(0.3)), still)
     assert len(compiled) == 1

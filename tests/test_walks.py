@@ -19,7 +19,7 @@ from hector_jax.cli import tune as command
 from hector_jax.cli.flags import Propose, Report, Tune
 from hector_jax.control.reference import named_command
 from hector_jax.control.trajectories import NamedCommand
-from hector_jax.control.weights import expert, nominal
+from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.control.weights_file import load_weights, save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
@@ -121,6 +121,54 @@ def test_a_start_that_falls_is_refused(robot, pool, in_process, tmp_path):
     row = walks.Row(np.zeros(18), "start", None, np.array([np.inf]), 1.0)
     with pytest.raises(InputError, match="the start fell"):
         walks.next_proposal(pool, one, space, [row])
+
+
+@pytest.fixture
+def with_legs(robot, pool, tmp_path):
+    config = replace(CONFIG, others=("turn_lead",))
+    one = replace(campaign(tmp_path, robot), config=config, of_legs=("foot_height", "kp"))
+    save_tree(tmp_path / "metric.npz", {"matrix": np.eye(19)}, kind="metric", robot=robot)
+    return one, walks.space_of(pool, one)
+
+
+def test_numbers_of_the_legs_are_coordinates_of_their_own_within_their_boxes(with_legs):
+    one, space = with_legs
+    assert space.box.shape == (25, 2)
+    point = np.zeros(25)
+    point[[19, 21, 24]] = 1.0, -1.0, 100.0
+    start, moved = one.start.others, walks.weights_at(one, space, point).others
+    assert moved["foot_height"] == pytest.approx(start["foot_height"] + 0.018)
+    assert moved["kp"] == pytest.approx(start["kp"] * [1.0, 0.5, 1.0, 1.0, 1.0] + [0, 0, 0, 0, 280])
+    assert moved["turn_lead"] == start["turn_lead"]
+    assert walks.weights_at(one, space, point).Q.euler == pytest.approx(one.start.Q.euler)
+
+
+def test_the_slope_of_the_model_is_zero_along_the_numbers_of_the_legs(with_legs):
+    one, space = with_legs
+
+    def loss(point):
+        weights = walks.weights_at(one, space, point)
+        return weights_to_vector(weights).sum() + weights.others["turn_lead"]
+
+    point = np.linspace(-0.1, 0.1, 25)
+    weights = walks.weights_at(one, space, point)
+    gradient = jax.tree.map(np.ones_like, weights)
+    slope = walks._slope(one, space, weights, gradient)
+    steps = 1e-5 * np.eye(25)
+    differences = [(loss(point + step) - loss(point - step)) / 2e-5 for step in steps]
+    np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6)
+    np.testing.assert_array_equal(slope[19:], 0.0)
+
+
+def test_gains_that_start_out_of_their_box_are_refused(robot, tmp_path):
+    start = nominal(robot)._replace(others={"kp": np.array([60.0, 60.0, 60.0, 60.0, 0.5])})
+    with pytest.raises(InputError, match=r"kp starts at .* 0.5\], expected from 1 to 300"):
+        replace(campaign(tmp_path, robot), start=start, of_legs=("kp",))
+
+
+def test_the_numbers_of_the_legs_cannot_be_tuned_without_walks(robot):
+    with pytest.raises(InputError, match="--tune kp foot_height: .* add --walks"):
+        run_folder.trajectories(Tune(tune=("kp", "foot_height"), traj=("straight",)), robot)
 
 
 @pytest.fixture(scope="module")

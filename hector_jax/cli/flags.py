@@ -34,8 +34,9 @@ Iterations = Annotated[int, Range(10, 10_000)]  # at least the ten of the paper,
 Seconds = Annotated[float, Range(0.01, 600)]  # at least one tick
 Footsteps = Literal["footstep_feedback", "footstep_width", "turn_lead"]
 Gains = Literal["horizontal_gain", "height_gain", "tilt_gain", "yaw_gain"]
-Groups = Literal["weights", "footsteps", "integral", "all"]
-Tunables = Literal[Groups, Footsteps, "effort_reference", "friction", Gains]
+Groups = Literal["weights", "footsteps", "integral", "all", "legs"]
+Legs = Literal["gravity_compensation", "foot_height", "landing", "kp", "kd"]
+Tunables = Literal[Groups, Footsteps, "effort_reference", "friction", Gains, Legs]
 Variant = Literal["residual", "paper"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
 Engine = Literal["auto", OneEngine]
@@ -129,7 +130,8 @@ class Tune(Configured):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
-    # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name
+    # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name;
+    # by walks also legs
     tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 100  # largest number of iterations
@@ -171,7 +173,8 @@ class Propose:
     folder: Folder  # of this tuning; a later call needs no other flag
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     start: Weights = "best"  # weights of the first walk: nominal, expert, best or a weights file
-    # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name
+    # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name;
+    # by walks also legs
     tune: tuple[Tunables, ...] = ("weights",)
     seed: Seed = 0  # of the random numbers
     processes: Processes = 2  # worker processes, one core each

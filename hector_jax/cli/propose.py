@@ -9,7 +9,7 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Propose, Report
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.control.parameters import tunables
+from hector_jax.control.parameters import split_by_model
 from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
@@ -87,8 +87,9 @@ def _campaign(args: Propose) -> Campaign:
     """
     robot = jax.tree.map(np.asarray, load_robot(args.robot))
     trajectories = arguments.load_trajectories(args.traj, robot)
-    config = tunings.tune_config(robot, others=tunables(args.tune))
+    others, of_legs = split_by_model(args.tune)
+    config = tunings.tune_config(robot, others=others)
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    return Campaign(args.folder, config, robot, start, commands, seed=args.seed)
+    return Campaign(args.folder, config, robot, start, commands, seed=args.seed, of_legs=of_legs)

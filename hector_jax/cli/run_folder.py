@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.control.parameters import tunables
+from hector_jax.control.parameters import split_by_model, tunables
 from hector_jax.control.reference import PIECES
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
@@ -59,6 +59,12 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
+    _, of_legs = split_by_model(args.tune)
+    if of_legs and not args.walks:
+        raise InputError(
+            f"--tune {' '.join(of_legs)}: the rigid-body model has no joints, so only walks can "
+            "tune this; add --walks"
+        )
     others = arguments.weights(args.start, robot).others
     numbers = *tunables(args.tune), *others
     if (args.safe or args.front) and "position_limit" in others:

@@ -17,7 +17,7 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
-from hector_jax.control.parameters import tunables
+from hector_jax.control.parameters import split_by_model
 from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
@@ -130,7 +130,8 @@ def _tune_in(folder: Path, args: Tune) -> None:
     start_time, made_with = time.monotonic(), environment()
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
-    config = tunings.tune_config(robot, iterations=args.iterations, others=tunables(args.tune))
+    others, _ = split_by_model(args.tune)
+    config = tunings.tune_config(robot, iterations=args.iterations, others=others)
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     data = arguments.robot_folder(args.data, args.robot, robot)
@@ -287,7 +288,9 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
     _, config, robot, _ = run.tuning
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
-    return Campaign(run.folder / "walks", config, robot, start, run.commands, plants)
+    _, of_legs = split_by_model(run.args.tune)
+    folder = run.folder / "walks"
+    return Campaign(folder, config, robot, start, run.commands, plants, of_legs=of_legs)
 
 
 def _walk_front(run: _Run) -> front.Front:

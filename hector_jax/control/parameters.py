@@ -44,6 +44,11 @@ class Tunable(NamedTuple):
     upper: float
     each_joint: bool = False  # an array with a number for each joint of a leg, else a scalar
 
+    @property
+    def of_legs(self) -> bool:
+        """True if the rigid-body model does not have it, so that only walks can tune it."""
+        return self.path.startswith("legs.")
+
     def shape(self, robot: Robot | None = None) -> tuple[int, ...]:
         """Return the shape of the entry in a robot's `Weights.others`, HECTOR by default."""
         description = HECTOR if robot is None else robot.description
@@ -78,6 +83,7 @@ TUNABLES = {
     "position_limit": Tunable("mpc.position_limit", 1e-3, 10.0),
     "gravity_compensation": Tunable("legs.gravity_compensation", 0.0, 1.0),
     "foot_height": Tunable("legs.height", 0.02, 0.2),
+    "landing": Tunable("legs.landing", -0.05, 0.05),
     "kp": Tunable("legs.kp", 1.0, 300.0, each_joint=True),
     "kd": Tunable("legs.kd", 0.05, 10.0, each_joint=True),
 }
@@ -90,9 +96,11 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "footsteps": _FOOTSTEPS,
     "integral": _INTEGRAL,
     "all": (*_FOOTSTEPS, "effort_reference", *_INTEGRAL),
+    "legs": ("gravity_compensation", "foot_height", "landing", "kp", "kd"),
 }
 """Groups of numbers that are tuned together. Friction and step width are in none of them: the
-tuner's model knows neither the friction of the ground nor collisions of the legs."""
+tuner's model knows neither the friction of the ground nor collisions of the legs. Only walks tune
+those of `legs`, which are not in `all`."""
 
 
 def tunables(names: Iterable[str]) -> tuple[str, ...]:
@@ -102,6 +110,18 @@ def tunables(names: Iterable[str]) -> tuple[str, ...]:
     ('footstep_feedback', 'turn_lead')
     """
     return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
+
+
+def split_by_model(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names that gradients tune, and those of the legs, which only walks tune.
+
+    >>> split_by_model(["turn_lead", "foot_height"])
+    (('turn_lead',), ('foot_height',))
+    """
+    parts: tuple[list[str], list[str]] = [], []
+    for name in tunables(names):
+        parts[name in TUNABLES and TUNABLES[name].of_legs].append(name)
+    return tuple(parts[0]), tuple(parts[1])
 
 
 def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Weights, Weights]:

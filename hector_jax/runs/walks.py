@@ -37,7 +37,7 @@ from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, one_line, plural
-from hector_jax.core.settings import read_json
+from hector_jax.core.settings import Range, read_json
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
@@ -81,10 +81,21 @@ class Campaign:
     commands: Mapping[str, Command]
     plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
     seed: int = 0
+    of_legs: tuple[str, ...] = ()  # numbers that the model does not have, beside config.others
 
     def __post_init__(self) -> None:
-        start = init(self.config, self.start).best
-        object.__setattr__(self, "start", jax.tree.map(np.asarray, start))
+        walk, start = self.config.rollout.walk, init(self.config, self.start).best
+        start = walk.with_others(jax.tree.map(np.asarray, start), self.of_legs)
+        for name in self.of_legs:
+            box = Range(TUNABLES[name].lower, TUNABLES[name].upper)
+            if any(number not in box for number in np.atleast_1d(start.others[name]).tolist()):
+                raise InputError(f"{name} starts at {start.others[name]}, expected {box}")
+        object.__setattr__(self, "start", start)
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the numbers beside Q and R that are tuned."""
+        return *self.config.others, *self.of_legs
 
     @property
     def cases(self) -> list[tuple[Imperfections | None, Command]]:
@@ -101,26 +112,31 @@ class Campaign:
 
 
 def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
-    """Return bounds of the steps: of log-weights, and of other numbers in tenths of their range."""
+    """Return bounds of the steps: of log-weights, and of other numbers in units of `_unit`."""
     bounds = [log_bounds(campaign.start)]
-    for name in campaign.config.others:
-        tunable, start = TUNABLES[name], float(campaign.start.others[name])
-        bounds.append((np.array([[tunable.lower, tunable.upper]]) - start) / _unit(name))
+    for name in campaign.numbers:
+        limits = np.array([TUNABLES[name].lower, TUNABLES[name].upper])
+        start = np.reshape(campaign.start.others[name], (-1, 1))
+        bounds.append((limits - start) / np.reshape(_unit(campaign, name), (-1, 1)))
     return np.concatenate(bounds)
 
 
-def _unit(name: str) -> float:
-    """Return the unit step of a tunable number: a tenth of its range."""
+def _unit(campaign: Campaign, name: str) -> Any:
+    """Return the unit steps of a number: a tenth of its range, of joint gains half of the start."""
+    if TUNABLES[name].each_joint:
+        return 0.5 * campaign.start.others[name]
     return 0.1 * (TUNABLES[name].upper - TUNABLES[name].lower)
 
 
 def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
     """Return the weights of a point."""
-    steps, count = space.to_steps @ point, len(direction_names(campaign.start))
-    weights = project(campaign.start, steps[:count])
+    steps, first = space.to_steps @ point, len(direction_names(campaign.start))
+    weights = project(campaign.start, steps[:first])
     others = dict(weights.others)
-    for name, step in zip(campaign.config.others, steps[count:], strict=True):
-        tunable, value = TUNABLES[name], others[name] + step * _unit(name)
+    for name in campaign.numbers:
+        tunable, start = TUNABLES[name], others[name]
+        step = np.reshape(steps[first : (first := first + np.size(start))], np.shape(start))
+        value = start + step * _unit(campaign, name)
         others[name] = np.clip(value, tunable.lower, tunable.upper)
     return weights._replace(others=others)
 
@@ -128,8 +144,11 @@ def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"])
 def _slope(campaign: Campaign, space: Space, weights: Weights, gradient: Weights) -> np.ndarray:
     """Return the gradient with respect to the point from that with respect to the weights."""
     by_log = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
-    others = [float(gradient.others[name]) * _unit(name) for name in campaign.config.others]
-    return space.to_steps.T @ np.append(directions(weights) @ by_log, others)
+    by_step = np.zeros(len(space.box))  # the model's loss does not depend on the last ones
+    of_model = [float(gradient.others[n]) * _unit(campaign, n) for n in campaign.config.others]
+    slopes = np.append(directions(weights) @ by_log, of_model)
+    by_step[: len(slopes)] = slopes
+    return space.to_steps.T @ by_step
 
 
 # Jobs of worker processes
@@ -197,6 +216,8 @@ def read_history(campaign: Campaign) -> list[Row]:
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
+        # left out where there are none, so that older records can be continued
+        **({"of_legs": list(campaign.of_legs)} if campaign.of_legs else {}),
     }
 
     def parse(row: Mapping[str, Any]) -> Row:

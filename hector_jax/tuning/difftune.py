@@ -108,20 +108,21 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
     """Return why gradients of the rigid-body model cannot tune a number; empty if they can."""
     if name not in TUNABLES:
         return unknown("tunable", name, TUNABLES)
-    path, lower, upper, _ = TUNABLES[name]
-    if path.startswith("legs."):
+    tunable = TUNABLES[name]
+    if tunable.of_legs:
         return (
             f"{name} cannot be tuned by gradients: the rigid-body model has no joints, so its "
-            "gradient is zero; a weights file can set it"
+            "gradient is zero; a weights file can set it, or --walks tune it"
         )
     if name == "position_limit":
         return (
             f"{name} cannot be tuned by gradients: the errors of a rollout are mostly below it, so "
             "that its gradient is mostly zero; a weights file or --safe can set it"
         )
-    if path.startswith("footstep.") and walk.footstep.rule == "paper":
+    if tunable.path.startswith("footstep.") and walk.footstep.rule == "paper":
         return f"{name} has no part in the paper's rule"
-    start, box = walk.with_others(nominal(), [name]).others[name], Range(lower, upper)
+    start = walk.with_others(nominal(), [name]).others[name]
+    box = Range(tunable.lower, tunable.upper)
     return "" if start in box else f"{name} starts at {start}, expected {box}"
 
 
