@@ -251,6 +251,24 @@ def test_what_the_readme_says_of_the_verdict_is_in_its_file():
     ) in text
 
 
+def test_what_the_readme_says_of_the_verdict_of_best_is_in_its_file():
+    result = json.loads((DOCS / "verdict" / "best" / "verdict.json").read_text())
+    cells = [of for one in result["columns"] for of in one["trajectories"].values()]
+    text = " ".join((ROOT / "README.md").read_text().split())
+    gains = []
+    for name in ("best", "integral"):
+        changes = [of[name]["change"] for of in cells]
+        assert all(change[base]["high"] < 0 for change in changes for base in change)
+        medians = [-round(change["nominal"]["median"]) for change in changes]
+        gains += [min(medians), max(medians), result["sets"][name]["falls"]]
+    walks = result["sets"]["best"]["walks"]
+    assert f"below nominal and expert in {len(cells)} of {len(cells)} cases without a zero" in text
+    assert (
+        "`best` gains {} to {} % against nominal and falls in {} of {walks} walks, `integral` "
+        "{} to {} % and {}".format(*gains, walks=walks)
+    ) in text
+
+
 def test_pages_have_titles_of_their_own():
     titles = [re.search(r"^# (.+)$", path.read_text(), re.MULTILINE).group(1) for path in PAGES]
     assert sorted(titles) == sorted(set(titles))
@@ -323,6 +341,25 @@ def test_the_table_of_more_than_weights_is_that_of_its_walks():
         ]
         numbers = [f"{x:.0f}" for x in changes] + [str(one["falls"]) for one in each.values()]
         assert f"| {name} | {' | '.join(numbers)} |" in page
+
+
+def test_the_table_of_the_search_over_many_plants_is_that_of_its_walks():
+    walks = json.loads((DOCS / "results/many-plants/walks.json").read_text())
+    pushed = walks["s_100_N"]
+    page = (DOCS / "results.md").read_text().split("\n## A search over many plants\n")[1]
+    nominal, best = (np.array([*walks["L"][name].values()]) for name in ("nominal", "best"))
+    for name in ("best", "integral, best", "all, best", "all, with", "search, weights"):
+        L = np.array([*walks["L"][name].values()])
+        medians = [f"{x:.0f}" for x in 100 * (np.median(L / nominal, axis=1) - 1)]
+        means = " ".join(f"{x:.0f}" for x in 100 * np.expm1(np.log(L / best).mean(axis=1)))
+        end = " "
+        if name in pushed["falls"]:
+            ratio = pushed["L_ratio_where_both_stay_up"][name]
+            end = f" {pushed['falls'][name]} | {ratio:.2f} "
+        assert re.search(rf"\| {name} \| [\d,]+ \| {' [|] '.join(medians)} \| {means} \|", page), (
+            name
+        )
+        assert end in page.split(f"| {name} |")[1].split("\n")[0]
 
 
 def test_the_falls_of_best_are_those_of_their_file():
