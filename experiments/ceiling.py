@@ -73,6 +73,9 @@ class Flags:
         check(self, **counts, population=Range(4), spread=POSITIVE, seed=SEED, first_plant=SEED)
 
 
+_losses = jax.jit(jax.vmap(loss_of, in_axes=(None, 0)))
+
+
 def losses_of(
     pool: Executor, campaign: Campaign, engine: Engine, sets: Sequence[Weights], batch: int
 ) -> Iterator[Float[np.ndarray, " cases"]]:
@@ -90,11 +93,10 @@ def losses_of(
         for case, (plant, command) in enumerate(cases)
     ]
     walks = engine.walk(pool, config.rollout.walk, campaign.robot, jobs, exact=False, batch=batch)
-    losses = jax.jit(jax.vmap(partial(loss_of, config.loss)))
     for _ in sets:
         of_set = stack(list(islice(walks, len(cases))))
         solved = of_set.residual.max(axis=1) <= SOLVED
-        yield np.where(solved, losses(of_set), np.inf)
+        yield np.where(solved, _losses(config.loss, of_set), np.inf)
 
 
 def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> Weights:
@@ -154,14 +156,16 @@ def main() -> None:
     setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
     start = best(robot) if flags.start is None else load_weights(flags.start, robot)
-    others, of_legs = split_by_model(flags.tune)
+    others, leg_numbers = split_by_model(flags.tune)
     config = tunings.tune_config(robot, others=others)
     commands = {name: named_command(name) for name in COMMANDS}
     folder, count, first = flags.out / "-".join(flags.tune), flags.plants, flags.first_plant
     make_folder(folder)
     seeds = range(first, first + 2 * count)
     plants = [named_world("hfs-varied", seed, robot.description) for seed in seeds]
-    campaign = Campaign(folder, config, robot, start, commands, plants[:count], of_legs=of_legs)
+    campaign = Campaign(
+        folder, config, robot, start, commands, plants[:count], leg_numbers=leg_numbers
+    )
     with workers(flags.processes) as pool:
         answer = search(pool, campaign, engine, flags)
         save_weights(folder / "weights.json", answer)

@@ -108,8 +108,8 @@ BOXES = {
     "gravity_compensation": (0.0, 1.0),
     "foot_height": (0.02, 0.2),  # [m]
     "landing": (-0.05, 0.05),  # [m]
-    "kp": (1.0, 300.0),  # [N m/rad]
-    "kd": (0.05, 10.0),  # [N m s/rad]
+    "kp": (1.0, 3000.0),  # [N m/rad]
+    "kd": (0.05, 100.0),  # [N m s/rad]
 }
 
 

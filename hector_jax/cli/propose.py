@@ -87,9 +87,11 @@ def _campaign(args: Propose) -> Campaign:
     """
     robot = jax.tree.map(np.asarray, load_robot(args.robot))
     trajectories = arguments.load_trajectories(args.traj, robot)
-    others, of_legs = split_by_model(args.tune)
+    others, leg_numbers = split_by_model(args.tune)
     config = tunings.tune_config(robot, others=others)
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    return Campaign(args.folder, config, robot, start, commands, seed=args.seed, of_legs=of_legs)
+    return Campaign(
+        args.folder, config, robot, start, commands, seed=args.seed, leg_numbers=leg_numbers
+    )

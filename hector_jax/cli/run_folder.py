@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
+from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import split_by_model, tunables
 from hector_jax.control.reference import PIECES
 from hector_jax.control.trajectories import NamedCommand
@@ -21,6 +22,7 @@ from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
+from hector_jax.runs.walks import with_leg_numbers
 
 Flags = TypeVar("Flags")
 
@@ -51,7 +53,8 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
 
     Raises:
         InputError: there is no such trajectory, their lengths differ, or --walks or --refresh does
-            not allow them; --safe or --front beside a position limit or a refresh.
+            not allow them; --safe or --front beside a position limit or a refresh; numbers of the
+            legs without --walks, with --front or out of their boxes.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
     count, pieces = len(loaded), len(loaded[0].command.duration)
@@ -59,13 +62,12 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
-    _, of_legs = split_by_model(args.tune)
-    if of_legs and not args.walks:
-        raise InputError(
-            f"--tune {' '.join(of_legs)}: the rigid-body model has no joints, so only walks can "
-            "tune this; add --walks"
-        )
-    others = arguments.weights(args.start, robot).others
+    start, (_, leg_numbers) = arguments.weights(args.start, robot), split_by_model(args.tune)
+    if leg_numbers and (args.front or not args.walks):
+        text = "only --walks can tune what the rigid-body model does not have, without --front"
+        raise InputError(f"--tune {' '.join(leg_numbers)}: {text}")
+    with_leg_numbers(walk_config(robot), start, leg_numbers)
+    others = start.others
     numbers = *tunables(args.tune), *others
     if (args.safe or args.front) and "position_limit" in others:
         raise InputError("--safe and --front set the position limit, which --start has already")

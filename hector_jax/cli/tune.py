@@ -288,9 +288,9 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
     _, config, robot, _ = run.tuning
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
-    _, of_legs = split_by_model(run.args.tune)
+    _, numbers = split_by_model(run.args.tune)
     folder = run.folder / "walks"
-    return Campaign(folder, config, robot, start, run.commands, plants, of_legs=of_legs)
+    return Campaign(folder, config, robot, start, run.commands, plants, leg_numbers=numbers)
 
 
 def _walk_front(run: _Run) -> front.Front:

@@ -24,6 +24,7 @@ from hector_jax.control.footstep import FootstepParameters
 from hector_jax.control.legs import LegParameters
 from hector_jax.control.mpc import MpcParameters
 from hector_jax.control.weights import Weights, nominal
+from hector_jax.core.settings import Range
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
 
@@ -84,8 +85,8 @@ TUNABLES = {
     "gravity_compensation": Tunable("legs.gravity_compensation", 0.0, 1.0),
     "foot_height": Tunable("legs.height", 0.02, 0.2),
     "landing": Tunable("legs.landing", -0.05, 0.05),
-    "kp": Tunable("legs.kp", 1.0, 300.0, each_joint=True),
-    "kd": Tunable("legs.kd", 0.05, 10.0, each_joint=True),
+    "kp": Tunable("legs.kp", 1.0, 3000.0, each_joint=True),
+    "kd": Tunable("legs.kd", 0.05, 100.0, each_joint=True),
 }
 """Numbers that can be tuned in addition to Q and R, by their names in `Weights.others`."""
 
@@ -113,7 +114,7 @@ def tunables(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def split_by_model(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names that gradients tune, and those of the legs, which only walks tune.
+    """Return the names that are not of the legs, and those of the legs, which only walks tune.
 
     >>> split_by_model(["turn_lead", "foot_height"])
     (('turn_lead',), ('foot_height',))
@@ -122,6 +123,14 @@ def split_by_model(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ..
     for name in tunables(names):
         parts[name in TUNABLES and TUNABLES[name].of_legs].append(name)
     return tuple(parts[0]), tuple(parts[1])
+
+
+def out_of_box(name: str, start: Any) -> str:
+    """Return why a tuning of a number cannot start at a value; empty if it can."""
+    box = Range(TUNABLES[name].lower, TUNABLES[name].upper)
+    if all(number in box for number in np.ravel(start).tolist()):
+        return ""
+    return f"{name} starts at {start}, expected {box}"
 
 
 def bounds(others: Iterable[str] = (), like: Weights | None = None) -> tuple[Weights, Weights]:

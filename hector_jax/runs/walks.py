@@ -24,7 +24,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.parameters import TUNABLES
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import TUNABLES, out_of_box
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import (
     Weights,
@@ -37,7 +38,7 @@ from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, one_line, plural
-from hector_jax.core.settings import Range, read_json
+from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
@@ -81,21 +82,17 @@ class Campaign:
     commands: Mapping[str, Command]
     plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
     seed: int = 0
-    of_legs: tuple[str, ...] = ()  # numbers that the model does not have, beside config.others
+    leg_numbers: tuple[str, ...] = ()  # of the legs, which the model does not have
 
     def __post_init__(self) -> None:
-        walk, start = self.config.rollout.walk, init(self.config, self.start).best
-        start = walk.with_others(jax.tree.map(np.asarray, start), self.of_legs)
-        for name in self.of_legs:
-            box = Range(TUNABLES[name].lower, TUNABLES[name].upper)
-            if any(number not in box for number in np.atleast_1d(start.others[name]).tolist()):
-                raise InputError(f"{name} starts at {start.others[name]}, expected {box}")
+        start = jax.tree.map(np.asarray, init(self.config, self.start).best)
+        start = with_leg_numbers(self.config.rollout.walk, start, self.leg_numbers)
         object.__setattr__(self, "start", start)
 
     @property
     def numbers(self) -> tuple[str, ...]:
         """Names of the numbers beside Q and R that are tuned."""
-        return *self.config.others, *self.of_legs
+        return *self.config.others, *self.leg_numbers
 
     @property
     def cases(self) -> list[tuple[Imperfections | None, Command]]:
@@ -109,6 +106,18 @@ class Campaign:
 
 
 # Points and weights
+
+
+def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> Weights:
+    """Return the weights from which numbers of the legs are tuned, with these numbers.
+
+    Raises:
+        InputError: a number is out of its box.
+    """
+    start = walk.with_others(start, names)
+    for reason in filter(None, (out_of_box(name, start.others[name]) for name in names)):
+        raise InputError(f"--tune: {reason}")
+    return start
 
 
 def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
@@ -130,15 +139,14 @@ def _unit(campaign: Campaign, name: str) -> Any:
 
 def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
     """Return the weights of a point."""
-    steps, first = space.to_steps @ point, len(direction_names(campaign.start))
-    weights = project(campaign.start, steps[:first])
-    others = dict(weights.others)
-    for name in campaign.numbers:
+    others = dict(campaign.start.others)
+    sizes = [len(direction_names(campaign.start)), *(np.size(others[n]) for n in campaign.numbers)]
+    of_weights, *steps = np.split(space.to_steps @ point, np.cumsum(sizes)[:-1])
+    for name, step in zip(campaign.numbers, steps, strict=True):
         tunable, start = TUNABLES[name], others[name]
-        step = np.reshape(steps[first : (first := first + np.size(start))], np.shape(start))
-        value = start + step * _unit(campaign, name)
+        value = start + step.reshape(np.shape(start)) * _unit(campaign, name)
         others[name] = np.clip(value, tunable.lower, tunable.upper)
-    return weights._replace(others=others)
+    return project(campaign.start, of_weights)._replace(others=others)
 
 
 def _slope(campaign: Campaign, space: Space, weights: Weights, gradient: Weights) -> np.ndarray:
@@ -216,8 +224,8 @@ def read_history(campaign: Campaign) -> list[Row]:
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
-        # left out where there are none, so that older records can be continued
-        **({"of_legs": list(campaign.of_legs)} if campaign.of_legs else {}),
+        # left out where there are none, so that older folders of `hector propose` can be continued
+        **({"leg_numbers": list(campaign.leg_numbers)} if campaign.leg_numbers else {}),
     }
 
     def parse(row: Mapping[str, Any]) -> Row:
@@ -381,6 +389,8 @@ def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
             inputs = repeat(campaign), repeat(weights), range(cases)
             rows = add_walk(campaign, rows, proposal, list(pool.map(_walk_job, *inputs)))
         report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
+    if campaign.leg_numbers and all(row.method in ("start", "model") for row in rows):
+        say(f"{', '.join(campaign.leg_numbers)} were not moved: walks beyond the model are needed")
     if not _stood(rows[0]):
         say("the set from which to tune on walks fell, or a QP was not solved; it is kept as it is")
     return rows

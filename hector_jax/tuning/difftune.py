@@ -26,12 +26,12 @@ import optax
 from jaxtyping import Float, Int
 
 from hector_jax.control.controller import WalkConfig
-from hector_jax.control.parameters import TUNABLES, bounds
+from hector_jax.control.parameters import TUNABLES, bounds, out_of_box
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, short_repr, unknown
-from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, Range, check, from_table
+from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, check, from_table
 from hector_jax.core.trajectory import Wrench
 from hector_jax.core.tree import where
 from hector_jax.robot.model import Robot
@@ -121,9 +121,7 @@ def _why_not_tunable(walk: WalkConfig, name: str) -> str:
         )
     if tunable.path.startswith("footstep.") and walk.footstep.rule == "paper":
         return f"{name} has no part in the paper's rule"
-    start = walk.with_others(nominal(), [name]).others[name]
-    box = Range(tunable.lower, tunable.upper)
-    return "" if start in box else f"{name} starts at {start}, expected {box}"
+    return out_of_box(name, walk.with_others(nominal(), [name]).others[name])
 
 
 class TuneState(NamedTuple):
