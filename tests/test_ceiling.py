@@ -75,7 +75,7 @@ def test_the_search_finds_the_bottom_and_continues_after_its_generations(campaig
 
 
 def test_each_set_walks_all_plants_and_an_unsolved_walk_counts_as_the_worst(campaign, monkeypatch):
-    monkeypatch.setattr(ceiling, "loss_of", lambda loss, walk: walk.loss)
+    monkeypatch.setattr(ceiling, "_losses", lambda loss, walks: walks.loss)
 
     def walk(pool, config, robot, jobs, *, exact, batch):
         del pool, config, robot, exact
