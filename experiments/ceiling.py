@@ -26,7 +26,7 @@ import tyro
 from jaxtyping import Float
 from lib import write_report
 
-from hector_jax.control.parameters import split_by_model
+from hector_jax.control.parameters import leg_numbers, model_numbers
 from hector_jax.control.reference import COMMANDS, named_command
 from hector_jax.control.weights import Weights, expert, nominal
 from hector_jax.control.weights_file import best, load_weights, save_weights, weights_tree
@@ -42,8 +42,9 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key, robot_hash
+from hector_jax.runs.campaign import Campaign, weights_at
 from hector_jax.runs.setup import Setup
-from hector_jax.runs.walks import Campaign, space_of, weights_at
+from hector_jax.runs.walks import space_of
 from hector_jax.search.cmaes import Generation, add_row, read_journal, to_generation
 from hector_jax.sim.engine import Engine, choose_engine
 from hector_jax.sim.loop import Job
@@ -156,16 +157,14 @@ def main() -> None:
     setup_jax()
     robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
     start = best(robot) if flags.start is None else load_weights(flags.start, robot)
-    others, leg_numbers = split_by_model(flags.tune)
-    config = tunings.tune_config(robot, others=others)
+    config = tunings.tune_config(robot, others=model_numbers(flags.tune))
     commands = {name: named_command(name) for name in COMMANDS}
     folder, count, first = flags.out / "-".join(flags.tune), flags.plants, flags.first_plant
     make_folder(folder)
     seeds = range(first, first + 2 * count)
     plants = [named_world("hfs-varied", seed, robot.description) for seed in seeds]
-    campaign = Campaign(
-        folder, config, robot, start, commands, plants[:count], leg_numbers=leg_numbers
-    )
+    inputs = folder, config, robot, start, commands, plants[:count]
+    campaign = Campaign(*inputs, leg_numbers=leg_numbers(flags.tune))
     with workers(flags.processes) as pool:
         answer = search(pool, campaign, engine, flags)
         save_weights(folder / "weights.json", answer)

@@ -19,7 +19,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, verdicts
-from hector_jax.runs.walks import Campaign
+from hector_jax.runs.campaign import Campaign
 from hector_jax.sim.world import named_world
 from hector_jax.tuning.difftune import TuneConfig
 

@@ -25,6 +25,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import save_tree
 from hector_jax.robot.model import load_robot
+from hector_jax.runs import campaign as campaigns
 from hector_jax.runs import walk_log, walks
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
@@ -68,7 +69,7 @@ def pool():
 
 def campaign(folder, robot, plants=(None,), seed=0):
     inputs = folder, CONFIG, robot, nominal(robot), COMMAND, plants, seed
-    return walks.Campaign(*inputs, leg_numbers=("foot_height",))
+    return campaigns.Campaign(*inputs, leg_numbers=("foot_height",))
 
 
 @pytest.fixture(scope="module")
@@ -137,26 +138,26 @@ def test_numbers_of_the_legs_are_coordinates_of_their_own_within_their_boxes(wit
     assert space.box.shape == (25, 2)
     point = np.zeros(25)
     point[[19, 21, 24]] = 1.0, -1.0, 1e3
-    start, moved = one.start.others, walks.weights_at(one, space, point).others
+    start, moved = one.start.others, campaigns.weights_at(one, space, point).others
     assert moved["foot_height"] == pytest.approx(start["foot_height"] + 0.018)
     assert moved["kp"] == pytest.approx(
         start["kp"] * [1.0, 0.5, 1.0, 1.0, 1.0] + [0, 0, 0, 0, 2980]
     )
     assert moved["turn_lead"] == start["turn_lead"]
-    assert walks.weights_at(one, space, point).Q.euler == pytest.approx(one.start.Q.euler)
+    assert campaigns.weights_at(one, space, point).Q.euler == pytest.approx(one.start.Q.euler)
 
 
 def test_the_slope_of_the_model_is_zero_along_the_numbers_of_the_legs(with_legs):
     one, space = with_legs
 
     def loss(point):
-        weights = walks.weights_at(one, space, point)
+        weights = campaigns.weights_at(one, space, point)
         return weights_to_vector(weights).sum() + weights.others["turn_lead"]
 
     point = np.linspace(-0.1, 0.1, 25)
-    weights = walks.weights_at(one, space, point)
+    weights = campaigns.weights_at(one, space, point)
     gradient = jax.tree.map(np.ones_like, weights)
-    slope = walks._slope(one, space, weights, gradient)
+    slope = campaigns.slope_of(one, space, weights, gradient)
     steps = 1e-5 * np.eye(25)
     differences = [(loss(point + step) - loss(point - step)) / 2e-5 for step in steps]
     np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-6)
@@ -274,7 +275,7 @@ def test_the_points_of_a_folder_stay_in_one_metric(monkeypatch, pool, in_process
     one, _, rows = in_process
     monkeypatch.setattr(walks.tunings, "gauss_newton_job", None)
     space = walks.space_of(pool, one)
-    again = walks.weights_at(one, space, rows[-1].point)
+    again = campaigns.weights_at(one, space, rows[-1].point)
     kept = load_weights(walks.weights_path(one, len(rows) - 1), one.robot)
     jax.tree.map(np.testing.assert_array_equal, again, kept)
 

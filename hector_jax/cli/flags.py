@@ -130,8 +130,7 @@ class Tune(Configured):
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
-    # weights: Q and R; beside them footsteps, integral (no steady errors), all, or numbers by name;
-    # with --walks also legs
+    # weights: Q and R; also footsteps, integral, all, legs (with --walks), or numbers by name
     tune: tuple[Tunables, ...] = ("weights",)
     seeds: Plants = 8  # stand-in plants to evaluate on
     iterations: Iterations = 100  # largest number of iterations
@@ -173,8 +172,7 @@ class Propose:
     folder: Folder  # of this tuning; a later call needs no other flag
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     start: Weights = "best"  # weights of the first walk: nominal, expert, best or a weights file
-    # weights: Q and R; beside them footsteps, integral (no steady errors), all, legs, or numbers by
-    # name
+    # weights: Q and R; also footsteps, integral, all, legs, or numbers by name
     tune: tuple[Tunables, ...] = ("weights",)
     seed: Seed = 0  # of the random numbers
     processes: Processes = 2  # worker processes, one core each

@@ -9,14 +9,14 @@ from hector_jax.cli import arguments, run_folder
 from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import Propose, Report
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.control.parameters import split_by_model
+from hector_jax.control.parameters import leg_numbers, model_numbers
 from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError, plural
 from hector_jax.core.runtime import workers
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import tunings, walk_log, walks
+from hector_jax.runs.campaign import Campaign
 from hector_jax.runs.folder import CONFIG
-from hector_jax.runs.walks import Campaign
 
 
 def propose(args: Propose) -> None:
@@ -87,11 +87,9 @@ def _campaign(args: Propose) -> Campaign:
     """
     robot = jax.tree.map(np.asarray, load_robot(args.robot))
     trajectories = arguments.load_trajectories(args.traj, robot)
-    others, leg_numbers = split_by_model(args.tune)
-    config = tunings.tune_config(robot, others=others)
+    config = tunings.tune_config(robot, others=model_numbers(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
-    return Campaign(
-        args.folder, config, robot, start, commands, seed=args.seed, leg_numbers=leg_numbers
-    )
+    inputs = args.folder, config, robot, start, commands
+    return Campaign(*inputs, seed=args.seed, leg_numbers=leg_numbers(args.tune))

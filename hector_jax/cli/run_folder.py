@@ -12,7 +12,7 @@ from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.control.controller import walk_config
-from hector_jax.control.parameters import split_by_model, tunables
+from hector_jax.control.parameters import leg_numbers, tunables
 from hector_jax.control.reference import PIECES
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
@@ -20,9 +20,9 @@ from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.cache import robot_hash
+from hector_jax.runs.campaign import with_leg_numbers
 from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
-from hector_jax.runs.walks import with_leg_numbers
 
 Flags = TypeVar("Flags")
 
@@ -33,6 +33,7 @@ _CODE = (
     "sim.standin",
     "runs.choice",
     "runs.front",
+    "runs.campaign",
     "runs.walks",
 )
 # flags of a call, not of the run that it begins or resumes
@@ -62,11 +63,11 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
-    start, (_, leg_numbers) = arguments.weights(args.start, robot), split_by_model(args.tune)
-    if leg_numbers and (args.front or not args.walks):
+    start, of_legs = arguments.weights(args.start, robot), leg_numbers(args.tune)
+    if of_legs and (args.front or not args.walks):
         text = "only --walks can tune what the rigid-body model does not have, without --front"
-        raise InputError(f"--tune {' '.join(leg_numbers)}: {text}")
-    with_leg_numbers(walk_config(robot), start, leg_numbers)
+        raise InputError(f"--tune {' '.join(of_legs)}: {text}")
+    with_leg_numbers(walk_config(robot), start, of_legs)
     others = start.others
     numbers = *tunables(args.tune), *others
     if (args.safe or args.front) and "position_limit" in others:

@@ -17,7 +17,7 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.cli.flags import BASELINES, Tune, Walk
 from hector_jax.cli.parse import as_command
 from hector_jax.cli.verdict import small_verdict
-from hector_jax.control.parameters import split_by_model
+from hector_jax.control.parameters import leg_numbers, model_numbers
 from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, expert, nominal
@@ -130,8 +130,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
     start_time, made_with = time.monotonic(), environment()
     robot = load_robot(args.robot)
     trajectories = run_folder.trajectories(args, robot)
-    others, _ = split_by_model(args.tune)
-    config = tunings.tune_config(robot, iterations=args.iterations, others=others)
+    config = tunings.tune_config(robot, iterations=args.iterations, others=model_numbers(args.tune))
     config = arguments.with_length(config, trajectories[0])
     start = arguments.weights(args.start, robot)
     data = arguments.robot_folder(args.data, args.robot, robot)
@@ -158,7 +157,6 @@ def _tune_in(folder: Path, args: Tune) -> None:
         matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the walks
         walks = _walk_sets(run, tuned.sets)
         points = _walk_front(run) if args.front else None
-        curvature = main_directions(matrix.result(), start)
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
     result, by_name = _result(run, tuned, walks, points)
@@ -168,7 +166,7 @@ def _tune_in(folder: Path, args: Tune) -> None:
         trajectory=run.name,
         verdict=by_name[run.name],
         norms=norms,
-        curvature=curvature,
+        curvature=main_directions(matrix.result(), start),
         errors=run.net.errors,
         tunings=tuned.tunings,
         shifts=tuned.shifts,
@@ -288,9 +286,8 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
     """Return the settings of the tuning on the walks of --walks, from the result of the tunings."""
     _, config, robot, _ = run.tuning
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
-    _, numbers = split_by_model(run.args.tune)
-    folder = run.folder / "walks"
-    return Campaign(folder, config, robot, start, run.commands, plants, leg_numbers=numbers)
+    inputs = run.folder / "walks", config, robot, start, run.commands, plants
+    return Campaign(*inputs, leg_numbers=leg_numbers(run.args.tune))
 
 
 def _walk_front(run: _Run) -> front.Front:

@@ -113,16 +113,18 @@ def tunables(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
 
 
-def split_by_model(names: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names that are not of the legs, and those of the legs, which only walks tune.
+def leg_numbers(names: Iterable[str]) -> tuple[str, ...]:
+    """Return those of the tunable names that only walks tune; see `tunables`.
 
-    >>> split_by_model(["turn_lead", "foot_height"])
-    (('turn_lead',), ('foot_height',))
+    >>> leg_numbers(["turn_lead", "foot_height"])
+    ('foot_height',)
     """
-    parts: tuple[list[str], list[str]] = [], []
-    for name in tunables(names):
-        parts[name in TUNABLES and TUNABLES[name].of_legs].append(name)
-    return tuple(parts[0]), tuple(parts[1])
+    return tuple(n for n in tunables(names) if n in TUNABLES and TUNABLES[n].of_legs)
+
+
+def model_numbers(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the other tunable names; see `leg_numbers`."""
+    return tuple(n for n in tunables(names) if n not in leg_numbers((n,)))
 
 
 def out_of_box(name: str, start: Any) -> str:

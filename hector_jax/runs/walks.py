@@ -15,8 +15,7 @@ cases, each divided by its loss at the start, so that all count alike.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from itertools import product, repeat
+from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,15 +23,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.control.controller import WalkConfig
-from hector_jax.control.parameters import TUNABLES, out_of_box
 from hector_jax.control.reference import Command
 from hector_jax.control.weights import (
     Weights,
-    direction_names,
-    directions,
     largest_changes,
-    weights_to_vector,
 )
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
@@ -42,17 +36,16 @@ from hector_jax.core.settings import read_json
 from hector_jax.core.trajectory import no_samples
 from hector_jax.core.tree_file import load_tree, save_tree, tree_hash
 from hector_jax.grfm import network
-from hector_jax.robot.model import Robot
 from hector_jax.runs import tunings
 from hector_jax.runs.cache import content_key, robot_hash
+from hector_jax.runs.campaign import Campaign, box_of, slope_of, weights_at
 from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, trajectory_of
 from hector_jax.search import few_walks
-from hector_jax.search.cmaes import add_row, log_bounds, project, read_journal
+from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
-from hector_jax.sim.world import Imperfections
-from hector_jax.tuning.difftune import TuneConfig, init, step_status
+from hector_jax.tuning.difftune import step_status
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding
 from hector_jax.tuning.status import StepStatus
@@ -69,94 +62,6 @@ class Row(NamedTuple):
     predicted: float | None
     losses: Float[np.ndarray, " cases"]  # infinite where the robot fell or a QP was not solved
     margin: float  # share of the way to a fall, the largest of the cases
-
-
-@dataclass(frozen=True, eq=False)
-class Campaign:
-    """Settings of a tuning on walks."""
-
-    folder: Path
-    config: TuneConfig  # its rollout as long as the walks
-    robot: Robot
-    start: Weights  # completed by all numbers that are tuned; the feet share one R
-    commands: Mapping[str, Command]
-    plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
-    seed: int = 0
-    leg_numbers: tuple[str, ...] = ()  # of the legs, which the model does not have
-
-    def __post_init__(self) -> None:
-        start = jax.tree.map(np.asarray, init(self.config, self.start).best)
-        start = with_leg_numbers(self.config.rollout.walk, start, self.leg_numbers)
-        object.__setattr__(self, "start", start)
-
-    @property
-    def numbers(self) -> tuple[str, ...]:
-        """Names of the numbers beside Q and R that are tuned."""
-        return *self.config.others, *self.leg_numbers
-
-    @property
-    def cases(self) -> list[tuple[Imperfections | None, Command]]:
-        """Plant and command of each walk of a weight set."""
-        return list(product(self.plants, self.commands.values()))
-
-    @property
-    def seconds(self) -> float:
-        """Length of a walk."""
-        return self.config.rollout.ticks * self.config.rollout.walk.gait.tick
-
-
-# Points and weights
-
-
-def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> Weights:
-    """Return the weights from which numbers of the legs are tuned, with these numbers.
-
-    Raises:
-        InputError: a number is out of its box.
-    """
-    start = walk.with_others(start, names)
-    for reason in filter(None, (out_of_box(name, start.others[name]) for name in names)):
-        raise InputError(f"--tune: {reason}")
-    return start
-
-
-def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
-    """Return bounds of the steps: of log-weights, and of other numbers in units of `_unit`."""
-    bounds = [log_bounds(campaign.start)]
-    for name in campaign.numbers:
-        limits = np.array([TUNABLES[name].lower, TUNABLES[name].upper])
-        start = np.reshape(campaign.start.others[name], (-1, 1))
-        bounds.append((limits - start) / np.reshape(_unit(campaign, name), (-1, 1)))
-    return np.concatenate(bounds)
-
-
-def _unit(campaign: Campaign, name: str) -> Any:
-    """Return the unit steps of a number: a tenth of its range, of joint gains half of the start."""
-    if TUNABLES[name].each_joint:
-        return 0.5 * campaign.start.others[name]
-    return 0.1 * (TUNABLES[name].upper - TUNABLES[name].lower)
-
-
-def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
-    """Return the weights of a point."""
-    others = dict(campaign.start.others)
-    sizes = [len(direction_names(campaign.start)), *(np.size(others[n]) for n in campaign.numbers)]
-    of_weights, *steps = np.split(space.to_steps @ point, np.cumsum(sizes)[:-1])
-    for name, step in zip(campaign.numbers, steps, strict=True):
-        tunable, start = TUNABLES[name], others[name]
-        value = start + step.reshape(np.shape(start)) * _unit(campaign, name)
-        others[name] = np.clip(value, tunable.lower, tunable.upper)
-    return project(campaign.start, of_weights)._replace(others=others)
-
-
-def _slope(campaign: Campaign, space: Space, weights: Weights, gradient: Weights) -> np.ndarray:
-    """Return the gradient with respect to the point from that with respect to the weights."""
-    by_log = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
-    by_step = np.zeros(len(space.box))  # the model's loss does not depend on the last ones
-    of_model = [float(gradient.others[n]) * _unit(campaign, n) for n in campaign.config.others]
-    slopes = np.append(directions(weights) @ by_log, of_model)
-    by_step[: len(slopes)] = slopes
-    return space.to_steps.T @ by_step
 
 
 # Jobs of worker processes
@@ -206,7 +111,7 @@ def space_of(pool: Executor, campaign: Campaign) -> Space:
         matrix = pool.submit(tunings.gauss_newton_job, *inputs).result()
         save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
     tree, _ = load_tree(path, {"matrix": np.zeros((0, 0))}, kind="metric", robot=campaign.robot)
-    return few_walks.space_of(tree["matrix"], _box(campaign))
+    return few_walks.space_of(tree["matrix"], box_of(campaign))
 
 
 def read_history(campaign: Campaign) -> list[Row]:
@@ -215,7 +120,7 @@ def read_history(campaign: Campaign) -> list[Row]:
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size = len(_box(campaign))
+    size = len(box_of(campaign))
     head = {
         "format": 1,
         "robot": robot_hash(campaign.robot),
@@ -287,7 +192,7 @@ def pending(campaign: Campaign, rows: Sequence[Row]) -> Proposal | None:
         if table.get("walk") != len(rows):
             return None
         point = np.array(table["point"], float)
-        if point.shape != (len(_box(campaign)),):
+        if point.shape != (len(box_of(campaign)),):
             raise ValueError(f"a point of shape {point.shape}")
         return Proposal(point, table["method"], table["predicted"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -331,7 +236,9 @@ def _model(pool: Executor, campaign: Campaign, space: Space, rows: Sequence[Row]
         if any(step_status(campaign.config, case) != StepStatus.ACCEPTED for _, case in cases):
             return _REFUSED, np.zeros_like(point)
         loss = sum(scale * float(case.loss) for scale, case in cases)
-        grad = sum(scale * _slope(campaign, space, weights, case.gradient) for scale, case in cases)
+        grad = sum(
+            scale * slope_of(campaign, space, weights, case.gradient) for scale, case in cases
+        )
         return float(np.log(loss)), np.asarray(grad / loss)
 
     return model

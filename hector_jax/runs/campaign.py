@@ -1,0 +1,111 @@
+"""The settings of a tuning on walks, and the coordinates of its weight sets.
+
+A point stands for a weight set: steps of log-weights and of other numbers, in the metric of the
+model (`search.few_walks.Space`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from hector_jax.control.controller import WalkConfig
+from hector_jax.control.parameters import TUNABLES, out_of_box
+from hector_jax.control.reference import Command
+from hector_jax.control.weights import Weights, direction_names, directions, weights_to_vector
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.model import Robot
+from hector_jax.search.cmaes import log_bounds, project
+from hector_jax.search.few_walks import Space
+from hector_jax.sim.world import Imperfections
+from hector_jax.tuning.difftune import TuneConfig, init
+
+
+@dataclass(frozen=True, eq=False)
+class Campaign:
+    """Settings of a tuning on walks."""
+
+    folder: Path
+    config: TuneConfig  # its rollout as long as the walks
+    robot: Robot
+    start: Weights  # completed by all numbers that are tuned; the feet share one R
+    commands: Mapping[str, Command]
+    plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
+    seed: int = 0
+    leg_numbers: tuple[str, ...] = ()  # of the legs, which the model does not have
+
+    def __post_init__(self) -> None:
+        start = jax.tree.map(np.asarray, init(self.config, self.start).best)
+        start = with_leg_numbers(self.config.rollout.walk, start, self.leg_numbers)
+        object.__setattr__(self, "start", start)
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """Names of the numbers beside Q and R that are tuned."""
+        return *self.config.others, *self.leg_numbers
+
+    @property
+    def cases(self) -> list[tuple[Imperfections | None, Command]]:
+        """Plant and command of each walk of a weight set."""
+        return list(product(self.plants, self.commands.values()))
+
+    @property
+    def seconds(self) -> float:
+        """Length of a walk."""
+        return self.config.rollout.ticks * self.config.rollout.walk.gait.tick
+
+
+def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> Weights:
+    """Return the weights from which numbers of the legs are tuned, with these numbers.
+
+    Raises:
+        InputError: a number is out of its box.
+    """
+    start = walk.with_others(start, names)
+    for reason in filter(None, (out_of_box(name, start.others[name]) for name in names)):
+        raise InputError(f"--tune: {reason}")
+    return start
+
+
+def box_of(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
+    """Return bounds of the steps: of log-weights, and of other numbers in units of `_unit`."""
+    bounds = [log_bounds(campaign.start)]
+    for name in campaign.numbers:
+        limits = np.array([TUNABLES[name].lower, TUNABLES[name].upper])
+        start = np.reshape(campaign.start.others[name], (-1, 1))
+        bounds.append((limits - start) / np.reshape(_unit(campaign, name), (-1, 1)))
+    return np.concatenate(bounds)
+
+
+def _unit(campaign: Campaign, name: str) -> Any:
+    """Return the unit steps of a number: a tenth of its range, of joint gains half of the start."""
+    if TUNABLES[name].each_joint:
+        return 0.5 * campaign.start.others[name]
+    return 0.1 * (TUNABLES[name].upper - TUNABLES[name].lower)
+
+
+def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"]) -> Weights:
+    """Return the weights of a point."""
+    others = dict(campaign.start.others)
+    sizes = [len(direction_names(campaign.start)), *(np.size(others[n]) for n in campaign.numbers)]
+    of_weights, *steps = np.split(space.to_steps @ point, np.cumsum(sizes)[:-1])
+    for name, step in zip(campaign.numbers, steps, strict=True):
+        tunable, start = TUNABLES[name], others[name]
+        value = start + step.reshape(np.shape(start)) * _unit(campaign, name)
+        others[name] = np.clip(value, tunable.lower, tunable.upper)
+    return project(campaign.start, of_weights)._replace(others=others)
+
+
+def slope_of(campaign: Campaign, space: Space, weights: Weights, gradient: Weights) -> np.ndarray:
+    """Return the gradient with respect to the point from that with respect to the weights."""
+    by_log = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
+    by_step = np.zeros(len(space.box))  # the model's loss does not depend on the last ones
+    of_model = [float(gradient.others[n]) * _unit(campaign, n) for n in campaign.config.others]
+    slopes = np.append(directions(weights) @ by_log, of_model)
+    by_step[: len(slopes)] = slopes
+    return space.to_steps.T @ by_step
