@@ -42,7 +42,7 @@ from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key, robot_hash
-from hector_jax.runs.campaign import Campaign, weights_at
+from hector_jax.runs.campaign import Campaign, box_of, weights_at
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.walks import space_of
 from hector_jax.search.cmaes import Generation, add_row, read_journal, to_generation
@@ -119,9 +119,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         "plants": [tree_hash(plant) for plant in campaign.plants],
         **{name: getattr(flags, name) for name in ("population", "spread", "seed")},
     }
-    size = flags.population
-    space = space_of(pool, campaign)
-    dimensions = len(space.box)
+    size, dimensions = flags.population, len(box_of(campaign))
 
     def parse(row: dict[str, list]) -> Generation:
         generation = to_generation(row["steps"], row["losses"])
@@ -130,7 +128,7 @@ def search(pool: Executor, campaign: Campaign, engine: Engine, flags: Flags) -> 
         return generation
 
     path = campaign.folder / "generations.jsonl"
-    rows = read_journal(path, head, what="search", parse=parse)
+    rows, space = read_journal(path, head, what="search", parse=parse), space_of(pool, campaign)
     losses = partial(losses_of, pool, campaign, engine, batch=size * len(campaign.cases))
     at_start = next(losses([campaign.start]))
     if not np.isfinite(at_start).all():

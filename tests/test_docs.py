@@ -265,11 +265,16 @@ def test_what_the_readme_says_of_the_verdict_of_best_is_in_its_file():
         medians = [-round(change["nominal"]["median"]) for change in changes]
         gains += [min(medians), max(medians), result["sets"][name]["falls"]]
     walks = result["sets"]["best"]["walks"]
-    assert f"below nominal and expert in {len(cells)} of {len(cells)} cases without a zero" in text
+    assert f"below nominal and expert in {len(cells)} of {len(cells)} cases and no interval" in text
     assert (
         "`best` gains {} to {} % against nominal and falls in {} of {walks} walks, `integral` "
-        "{} to {} % and {}".format(*gains, walks=walks)
+        "gains {} to {} % and falls in {} ".format(*gains, walks=walks)
     ) in text
+
+
+@pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
+def test_no_text_is_taken_for_a_comment(path):
+    assert re.findall(r"^\s*% .*", path.read_text(), re.MULTILINE) == []
 
 
 def test_pages_have_titles_of_their_own():
@@ -362,6 +367,13 @@ def test_the_table_of_the_search_over_many_plants_is_that_of_its_walks():
         cells = [*medians, means, *end]
         row = re.search(rf"^\| {name} \| [\d,]+ \| (.*) \|$", page, re.MULTILINE).group(1)
         assert [cell.strip() for cell in row.split("|")] == [str(cell) for cell in cells]
+    there = {n: np.array([*x.values()]) for n, x in walks["L_where_searched"].items()}
+    ratios = {name: np.median(L / there["nominal"], axis=1) for name, L in there.items()}
+    of_weights, of_all = (
+        " ".join(f"{x:.0f}" for x in 100 * (ratios[f"search, {name}"] - 1))
+        for name in ("weights", "all")
+    )
+    assert f"is {of_weights} (weights) and {of_all} % (all)" in page
 
 
 def test_the_falls_of_best_are_those_of_their_file():

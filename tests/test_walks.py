@@ -170,9 +170,18 @@ def test_gains_that_start_out_of_their_box_are_refused(robot, tmp_path):
         replace(campaign(tmp_path, robot), start=start, leg_numbers=("kp",))
 
 
-def test_the_numbers_of_the_legs_cannot_be_tuned_without_walks(robot):
+@pytest.mark.parametrize("flags", [{}, {"walks": 8, "front": True}])
+def test_the_numbers_of_the_legs_are_tuned_by_walks_alone_and_in_no_front(robot, flags):
     with pytest.raises(InputError, match="--tune kp foot_height: only --walks can tune"):
-        run_folder.trajectories(Tune(tune=("kp", "foot_height"), traj=("straight",)), robot)
+        run_folder.trajectories(Tune(tune=("kp", "foot_height"), **flags), robot)
+
+
+def test_too_few_walks_to_move_the_legs_are_reported(monkeypatch, pool, with_legs, capsys):
+    one, _ = with_legs
+    row = walks.Row(np.zeros(25), "start", None, np.ones(1), 0.1)
+    monkeypatch.setattr(walks, "read_history", lambda campaign: [row])
+    walks.tune_on_walks(pool, one, 1)
+    assert "foot_height, kp were not moved" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

@@ -67,7 +67,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if of_legs and (args.front or not args.walks):
         text = "only --walks can tune what the rigid-body model does not have, without --front"
         raise InputError(f"--tune {' '.join(of_legs)}: {text}")
-    with_leg_numbers(walk_config(robot), start, of_legs)
+    with_leg_numbers(walk_config(robot), start, of_legs)  # checks them before anything is tuned
     others = start.others
     numbers = *tunables(args.tune), *others
     if (args.safe or args.front) and "position_limit" in others:

@@ -113,7 +113,7 @@ def tunables(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(member for name in names for member in GROUPS.get(name, (name,))))
 
 
-def leg_numbers(names: Iterable[str]) -> tuple[str, ...]:
+def leg_numbers(names: Sequence[str]) -> tuple[str, ...]:
     """Return those of the tunable names that only walks tune; see `tunables`.
 
     >>> leg_numbers(["turn_lead", "foot_height"])
@@ -122,9 +122,10 @@ def leg_numbers(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(n for n in tunables(names) if n in TUNABLES and TUNABLES[n].of_legs)
 
 
-def model_numbers(names: Iterable[str]) -> tuple[str, ...]:
+def model_numbers(names: Sequence[str]) -> tuple[str, ...]:
     """Return the other tunable names; see `leg_numbers`."""
-    return tuple(n for n in tunables(names) if n not in leg_numbers((n,)))
+    of_legs = leg_numbers(names)
+    return tuple(name for name in tunables(names) if name not in of_legs)
 
 
 def out_of_box(name: str, start: Any) -> str:

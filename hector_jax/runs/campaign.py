@@ -67,8 +67,9 @@ def with_leg_numbers(walk: WalkConfig, start: Weights, names: Sequence[str]) -> 
         InputError: a number is out of its box.
     """
     start = walk.with_others(start, names)
-    for reason in filter(None, (out_of_box(name, start.others[name]) for name in names)):
-        raise InputError(f"--tune: {reason}")
+    for name in names:
+        if reason := out_of_box(name, start.others[name]):
+            raise InputError(f"--tune: {reason}")
     return start
 
 
@@ -101,11 +102,14 @@ def weights_at(campaign: Campaign, space: Space, point: Float[np.ndarray, " n"])
     return project(campaign.start, of_weights)._replace(others=others)
 
 
-def slope_of(campaign: Campaign, space: Space, weights: Weights, gradient: Weights) -> np.ndarray:
+def slope_of(
+    campaign: Campaign, space: Space, weights: Weights, gradient: Weights
+) -> Float[np.ndarray, " n"]:
     """Return the gradient with respect to the point from that with respect to the weights."""
     by_log = np.asarray(weights_to_vector(gradient)) * np.asarray(weights_to_vector(weights))
-    by_step = np.zeros(len(space.box))  # the model's loss does not depend on the last ones
-    of_model = [float(gradient.others[n]) * _unit(campaign, n) for n in campaign.config.others]
-    slopes = np.append(directions(weights) @ by_log, of_model)
-    by_step[: len(slopes)] = slopes
-    return space.to_steps.T @ by_step
+    others = [
+        float(gradient.others[name]) * _unit(campaign, name) for name in campaign.config.others
+    ]
+    of_model = np.append(directions(weights) @ by_log, others)
+    # the model's loss does not depend on the numbers of the legs, which come last
+    return space.to_steps.T @ np.pad(of_model, (0, len(space.box) - len(of_model)))
