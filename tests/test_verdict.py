@@ -18,6 +18,7 @@ from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
 from hector_jax.core.tree import stack
 from hector_jax.report import matrix as report
+from hector_jax.report import plots
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import matrix, verdicts
@@ -179,6 +180,13 @@ def test_the_report_has_a_page_its_numbers_and_a_picture(tmp_path, drawn):
     panels = drawn[0].axes
     assert [panel.get_title() for panel in panels] == ["straight", "s"]
     assert [text.get_text() for text in panels[1].texts] == ["2 fell"]
+
+
+def test_an_interval_beyond_the_edge_of_the_picture_ends_at_the_edge(tmp_path, drawn):
+    cells = {(C, "s"): cell(tuned=40e6)}  # ten times nominal
+    plots.matrix(tmp_path / "verdict.png", cells, report.title_of)
+    ends = np.concatenate([line.get_xdata() for line in drawn[0].axes[0].lines])
+    assert ends.max() == 60.0
 
 
 def test_one_set_beside_nominal_is_enough_and_is_printed(capsys):
