@@ -257,10 +257,8 @@ def shared(flags: Shared) -> None:
     effects, commands = whole_net(flags, robot), {n: named_command(n) for n in names}
     problems = [problem(nominal(), [scenario(robot, c)]) for c in commands.values()]
     alone = tune(flags, robot, effects, problems, "one set for each")
-    scales = alone.history.evaluation.loss[:, 0]
-    walks = [
-        scenario(robot, c, scale=float(k)) for c, k in zip(commands.values(), scales, strict=True)
-    ]
+    scales = alone.history.evaluation.loss[:, 0].tolist()
+    walks = [scenario(robot, c, scale=k) for c, k in zip(commands.values(), scales, strict=True)]
     tails = {"mean of all": 1.0, "worst of all": 0.0}
     problems = [problem(nominal(), walks, tail) for tail in tails.values()]
     together = tune(flags, robot, effects, problems, "one set for all")

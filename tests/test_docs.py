@@ -272,6 +272,34 @@ def test_what_the_readme_says_of_the_verdict_of_best_is_in_its_file():
     ) in text
 
 
+def test_what_the_readme_says_of_pinocchio_and_the_quadruped_is_in_their_files():
+    names = ("pinocchio", "quadruped")
+    pinocchio, quadruped = (
+        json.loads((DOCS / "verdict" / name / "verdict.json").read_text()) for name in names
+    )
+    text = " ".join((ROOT / "README.md").read_text().split())
+    cells = [of for one in pinocchio["columns"] for of in one["trajectories"].values()]
+    gains, sets = [], pinocchio["sets"]
+    for name in ("best", "integral"):
+        changes = [of[name]["change"]["nominal"] for of in cells]
+        assert all(change["high"] < 0 for change in changes)
+        medians = [-round(change["median"]) for change in changes]
+        gains += [min(medians), max(medians)]
+        assert sets[name]["falls"] == 0
+        assert sets[name]["against"]["nominal"]["void"] == 2
+    assert (
+        "they gain {} to {} and {} to {} % and fall in none of {walks} walks; `nominal` falls in "
+        "{falls}, in 2 of {cells} cases".format(*gains, **sets["nominal"], cells=len(cells))
+    ) in text
+    ratios = [
+        np.divide(of["with"]["L"]["by_seed"], of["nominal"]["L"]["by_seed"])
+        for one in quadruped["columns"]
+        for of in one["trajectories"].values()
+    ]
+    walks = np.concatenate(ratios)
+    assert f"worse than nominal in {np.sum(walks > 1)} of {len(walks)} walks" in text
+
+
 @pytest.mark.parametrize("path", READ, ids=lambda path: path.stem)
 def test_no_text_is_taken_for_a_comment(path):
     assert re.findall(r"^\s*% .*", path.read_text(), re.MULTILINE) == []

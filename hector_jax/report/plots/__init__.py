@@ -359,8 +359,7 @@ def _draw_sets(panel: Axes, verdicts: Sequence[Verdict], names: Sequence[str]) -
             value, low, high = comparison.change["L"]
             dot = dict(look.dot, markerfacecolor=look.color if comparison.counts else "white")
             dot |= {"marker": r"$\rightarrow$", "markersize": 9} if value > _WORST else {}
-            ends = np.minimum([low, high], _WORST)
-            panel.plot(ends, [y, y], color=look.color, linewidth=1.6)
+            panel.plot(np.minimum([low, high], _WORST), [y, y], color=look.color, linewidth=1.6)
             label = label_of(name) if not row else None
             panel.plot(min(value, _WORST), y, **dot, zorder=3, label=label)
             if falls := int(verdict.scores[name].fallen.sum()):
