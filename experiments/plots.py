@@ -335,7 +335,7 @@ def gradients(
         def bars(x: np.ndarray, rows: np.ndarray, width: float, name: str, **look: Any) -> None:
             mean = rows.mean(axis=0)
             size = np.linalg.norm(mean)
-            axes.bar(x, mean / size, width, label=f"{name}, {size / 1e6:.1f}e6", **look)
+            axes.bar(x, mean / size, width, label=f"{name}, {size / 1e6:.2g}e6", **look)
 
         bars(at, simulator, 0.9, "hfs", facecolor="0.95", edgecolor="0.3", linewidth=0.9)
         size = np.linalg.norm(simulator.mean(axis=0))

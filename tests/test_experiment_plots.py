@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 import plots
 
 from hector_jax.control.weights import direction_names, weight_names
@@ -111,11 +112,14 @@ def test_pictures_show_survival_ratio_and_newtons_of_sets_of_any_name(tmp_path, 
 
 
 def test_pictures_show_gradients_of_unit_length_and_the_losses_of_both(tmp_path, drawn):
-    plots.gradients(tmp_path / "a.png", direction_names(), TRUTH, {"command": -TRUTH, "net": TRUTH})
+    truth = 1e4 * TRUTH
+    plots.gradients(tmp_path / "a.png", direction_names(), truth, {"command": -truth, "net": truth})
     bars = {bars.get_label().split(",")[0]: bars for bars in drawn[0].axes[0].containers}
     unit = TRUTH.mean(axis=0) / np.linalg.norm(TRUTH.mean(axis=0))
     for name, sign in (("hfs", 1), ("command", -1), ("net", 1)):
         np.testing.assert_allclose([bar.get_height() for bar in bars[name]], sign * unit)
+        length = float(bars[name].get_label().split(", ")[1])  # in the legend
+        assert length == pytest.approx(np.linalg.norm(truth.mean(axis=0)), rel=0.05)
     losses = np.exp(RNG.normal(size=8)) * 1e6
     key = ("straight", "1.5")
     models, told = {key: {"net": 2 * losses}}, {key: {"net": 0.9}}
