@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-import pytest
 import plots
+import pytest
 
 from hector_jax.control.weights import direction_names, weight_names
 
