@@ -74,7 +74,7 @@ def _problem(config: WalkConfig, robot: Robot, seed: int) -> Problem:
         contact=np.asarray(gait.contact(config.gait, jnp.asarray(ticks))),
     )
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 24)
-    weights = vector_to_weights(np.asarray(weights_to_vector(expert())) * factors)
+    weights = vector_to_weights(weights_to_vector(expert()) * factors)
     return Problem(jax.tree.map(np.asarray, weights), state, horizon, rng.normal(size=INPUTS))
 
 

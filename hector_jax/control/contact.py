@@ -42,7 +42,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.part import Part
 from hector_jax.core.trajectory import State
@@ -79,7 +79,7 @@ class ContactModel(Part):
     def wrench(self, yaw: Float[Array, ""]) -> tuple[Array, Array]:
         """Return the matrices (3, inputs) from a foot's inputs to force and moment, world frame."""
         selection = jnp.asarray(self.selection, jnp.result_type(yaw))
-        return selection[:3], rot_z(yaw) @ selection[3:]
+        return selection[:3], contract("xy,yi->xi", rot_z(yaw), selection[3:])
 
 
 class Contact(NamedTuple):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import State
 
@@ -59,7 +59,7 @@ def integrate_error(
         return dt * jnp.stack(gain) * error / (1.0 + (error / _LARGE) ** 2)
 
     horizontal, height, tilt, yaw = (jnp.asarray(gain, float) for gain in gains)
-    offset = rot_z(-state.euler[2]) @ (state.position - reference.position)
+    offset = contract("xy,y->x", rot_z(-state.euler[2]), state.position - reference.position)
     return Disturbance(
         previous.linear + increment((horizontal, horizontal, height), offset),
         previous.angular + increment((tilt, tilt, yaw), state.euler - reference.euler),

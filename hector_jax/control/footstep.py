@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import State
@@ -91,7 +91,7 @@ def touchdown_points(
     yaw = state.euler[2] + reference.ang_velocity[2] * (remaining + stance / 2)
     outwards = parameters.width * jnp.tile(jnp.array([1.0, -1.0]), len(yaw) // 2)
     hips = jnp.stack([jnp.asarray(robot.foot_ahead), outwards, jnp.zeros(len(yaw))], axis=1)
-    hips = jnp.einsum("fxy,fy->fx", jax.vmap(rot_z)(yaw), hips)
+    hips = contract("fxy,fy->fx", jax.vmap(rot_z)(yaw), hips)
     lean = jnp.cross(state.velocity, reference.ang_velocity) * state.position[2] / robot.gravity[2]
     # For a foot still in stance the current sway is irrelevant at touchdown: from the next step on
     # the commanded velocity counts.

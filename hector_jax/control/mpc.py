@@ -38,7 +38,7 @@ from hector_jax.control.contact import (
 )
 from hector_jax.control.disturbance import NO_DISTURBANCE, Disturbance, IntegralGains
 from hector_jax.control.weights import Weights
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.inputs import InputError
 from hector_jax.core.part import choose_part
@@ -148,7 +148,7 @@ def limit_distance(
         limit: largest distance; infinite: no shift.
     """
     away = (state.position - reference.position).at[2].set(0.0)
-    distance = jnp.sqrt(away @ away + 1e-12)  # has a derivative at zero
+    distance = jnp.sqrt(jnp.sum(away**2) + 1e-12)  # has a derivative at zero
     shift = away * (jnp.maximum(distance - limit, 0.0) / distance)
     moved = horizon.reference._replace(position=horizon.reference.position + shift)
     return horizon._replace(reference=moved)
@@ -201,7 +201,7 @@ def _input_map(
 ) -> Float[Array, "u b"]:
     """Return G in u = G v, from the inputs of the contacts to the paper's u."""
     force, moment = jax.vmap(model.wrench)(foot_yaw)  # (feet, 3, inputs)
-    parts = [jnp.einsum("sf,fxi->fxsi", feet, part) for part in (force, moment)]
+    parts = [contract("sf,fxi->fxsi", feet, part) for part in (force, moment)]
     return jnp.stack(parts).reshape(6 * len(foot_yaw), -1)
 
 
@@ -214,7 +214,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     feet = jax.vmap(lambda c: _feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
     G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)
     # inputs change rates and velocities, which persist; angles and positions integrate them
-    turn, push = B[:, 6:9] @ G, B[:, 9:12] @ G
+    turn, push = (contract("kxu,kub->kxb", B[:, rows], G) for rows in (slice(6, 9), slice(9, 12)))
     angle_by_rate = jnp.cumsum(A[:, 0:3, 6:9], axis=0)  # for a rate that is constant from t_0 on
     later, travel = (jnp.asarray(table, dtype) for table in _double_integrator(N, dt))
     # angles after step k per rate that is constant from the end of step j on
@@ -222,11 +222,14 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     count = jnp.arange(1, N + 1, dtype=dtype)[:, None]
     rate, speed = state.ang_velocity, state.velocity
     from_yaw_frame = rot_z(jnp.asarray(state.euler[2]))
-    gained = dt * from_yaw_frame @ disturbance.angular
-    gravity = jnp.asarray(robot.gravity, dtype) - from_yaw_frame @ disturbance.linear
+    gained = dt * contract("xy,y->x", from_yaw_frame, disturbance.angular)
+    pull = contract("xy,y->x", from_yaw_frame, disturbance.linear)
+    gravity = jnp.asarray(robot.gravity, dtype) - pull
     fall = dt * count * gravity
     free = State(
-        state.euler + angle_by_rate @ rate + jnp.einsum("kjxy,y->kx", angles, gained),
+        state.euler
+        + contract("kxy,y->kx", angle_by_rate, rate)
+        + contract("kjxy,y->kx", angles, gained),
         state.position + dt * count * speed - dt * (count - 1) / 2 * fall,
         rate + count * gained,
         speed - fall,
@@ -249,7 +252,7 @@ def cost(
     N, b, dtype = config.horizon, G.shape[-1], later.dtype
     Q, R = parameters.weights.Q, input_weights(parameters.weights)
     error = jax.tree.map(lambda x, target, w: w * (x - target), free, horizon.reference, Q)
-    effort = jnp.einsum("kui,u,kuj->kij", G, R, G)
+    effort = contract("kui,u,kuj->kij", G, R, G)
     empty = jnp.repeat(1.0 - feet.sum(-1), config.contact_model.inputs, axis=-1)
     effort = effort + jax.vmap(jnp.diag)(empty)
 
@@ -259,16 +262,18 @@ def cost(
     turning += jnp.kron(overlap, jnp.diag(Q.ang_velocity))
     spin = block_diagonal(turn)
     pushing = overlap[..., None] * Q.velocity + (travel.T @ travel)[..., None] * Q.position
-    pushed = jnp.einsum("ixa,ixjb->iajb", push, jnp.einsum("ijx,jxb->ixjb", pushing, push))
+    pushed = contract("ixa,ixjb->iajb", push, contract("ijx,jxb->ixjb", pushing, push))
     P = spin.T @ (turning @ spin) + pushed.reshape(N * b, N * b) + block_diagonal(effort)
-    torque = jnp.einsum("kjxy,kx->jy", angles, error.euler) + later.T @ error.ang_velocity
-    force = travel.T @ error.position + later.T @ error.velocity
-    q = jnp.einsum("jxb,jx->jb", turn, torque) + jnp.einsum("jxb,jx->jb", push, force)
+    torque = contract("kjxy,kx->jy", angles, error.euler)
+    torque = torque + contract("kj,kx->jx", later, error.ang_velocity)
+    force = contract("kj,kx->jx", travel, error.position)
+    force = force + contract("kj,kx->jx", later, error.velocity)
+    q = contract("jxb,jx->jb", turn, torque) + contract("jxb,jx->jb", push, force)
     share = robot.mass * robot.gravity[2] / jnp.maximum(horizon.contact.sum(-1), 1)
     up = np.zeros((2, horizon.contact.shape[1], 3))  # forces and moments
     up[0, :, 2] = 1.0
     weight = share[:, None] * jnp.asarray(up.ravel(), dtype)
-    q = q - parameters.effort_reference * jnp.einsum("kui,u,ku->ki", G, R, weight)
+    q = q - parameters.effort_reference * contract("kui,u,ku->ki", G, R, weight)
     return P, q
 
 
@@ -285,10 +290,10 @@ def input_rows(config: MpcConfig, problem: MpcProblem, condensed: Condensed) -> 
         parts = [rows(constraint, contact, feet) for constraint in config.on("inputs")]
         return Rows(*map(jnp.concatenate, zip(*parts, strict=True)))
 
-    yaw = jnp.einsum("ksf,kf->ks", feet, horizon.foot_yaw)
+    yaw = contract("ksf,kf->ks", feet, horizon.foot_yaw)
     A, lower, upper = jax.vmap(jax.vmap(of_contact))(yaw)
     N, contacts = yaw.shape
-    A = jnp.einsum("st,ksri->ksrti", jnp.eye(contacts, dtype=feet.dtype), A)
+    A = contract("st,ksri->ksrti", jnp.eye(contacts, dtype=feet.dtype), A)
     return Rows(A.reshape(N, -1, condensed.inputs.shape[-1]), lower.ravel(), upper.ravel())
 
 
@@ -350,4 +355,4 @@ def solve_mpc(
     """Solve the MPC; return the first step's wrench [N, N m], world frame, and the QP solution."""
     qp, first = build_qp(config, problem, dt=dt, max_contacts=max_contacts)
     solution = solve_qp(qp, config.qp)
-    return unpack_wrench(first @ solution.x[: first.shape[1]]), solution
+    return unpack_wrench(contract("ub,b->u", first, solution.x[: first.shape[1]])), solution

@@ -100,7 +100,7 @@ def named_command(name: str) -> Command:
 
 
 def _turn(angle: Float[Array, "*batch"], v: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
-    left = v @ np.array([[0.0, 1.0], [-1.0, 0.0]], jnp.result_type(v))  # v turned by 90 degrees
+    left = jnp.stack([-v[..., 1], v[..., 0]], axis=-1)  # v turned by 90 degrees
     return jnp.cos(angle)[..., None] * v + jnp.sin(angle)[..., None] * left
 
 

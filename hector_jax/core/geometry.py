@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 
 _CROSS = np.zeros((3, 3, 3))  # e_i x e_j = sum over k of _CROSS[i, k, j] e_k
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -46,7 +46,7 @@ def rot_z(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
 
 def rotation_from_euler(euler: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Return R_wb from roll, pitch, yaw [rad]."""
-    return rot_z(euler[2]) @ rot_y(euler[1]) @ rot_x(euler[0])
+    return contract("ij,jk,kl->il", rot_z(euler[2]), rot_y(euler[1]), rot_x(euler[0]))
 
 
 def euler_rates(euler: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -55,12 +55,18 @@ def euler_rates(euler: Float[Array, "3"]) -> Float[Array, "3 3"]:
     yaw = np.roll(roll, 2, axis=0)
     roll, yaw, rest = _like(euler, roll, yaw, np.eye(3) - roll)
     by_heading = roll / jnp.cos(euler[1]) + yaw * jnp.tan(euler[1]) + rest
-    return by_heading @ rot_z(euler[2]).T
+    return contract("ij,kj->ik", by_heading, rot_z(euler[2]))
 
 
 def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Return the matrix S(v) with S(v) w = v x w."""
-    return jnp.tensordot(v, np.asarray(_CROSS, jnp.result_type(v)), 1)
+    return contract("i,ijk->jk", v, np.asarray(_CROSS, jnp.result_type(v)))
+
+
+def inverse(M: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Return the inverse in closed form, for which a GPU needs no library call."""
+    across = jnp.cross(M[np.array([1, 2, 0])], M[np.array([2, 0, 1])])  # the cofactors
+    return across.T / jnp.sum(M[0] * across[0])
 
 
 def rotation_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:

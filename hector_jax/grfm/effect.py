@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 from hector_jax.core.geometry import rot_z
 from hector_jax.core.trajectory import Load, State, Wrench
 
@@ -59,7 +59,7 @@ Vectors = TypeVar("Vectors")  # a tree of arrays whose last axis is x, y, z
 def turn(vectors: Vectors, yaw: Float[Array, ""]) -> Vectors:
     """Turn vectors about z: by `yaw` [rad] from the yaw frame to the world."""
     R = rot_z(yaw)
-    return jax.tree.map(lambda v: v @ R.T, vectors)
+    return jax.tree.map(lambda v: jnp.sum(v[..., None, :] * R, axis=-1), vectors)
 
 
 def from_yaw_frame(state: State) -> State:
@@ -68,8 +68,8 @@ def from_yaw_frame(state: State) -> State:
     return State(
         euler=state.euler * jnp.array([1.0, 1.0, 0.0]),
         position=state.position * jnp.array([0.0, 0.0, 1.0]),
-        ang_velocity=R @ state.ang_velocity,
-        velocity=R @ state.velocity,
+        ang_velocity=contract("xy,y->x", R, state.ang_velocity),
+        velocity=contract("xy,y->x", R, state.velocity),
     )
 
 

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Key
 
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 from hector_jax.core.trajectory import Load, Wrench
 from hector_jax.grfm.dataset import ACROSS, ALONG, Dataset, partners
 from hector_jax.grfm.effect import HISTORY, Effect, Phi, Window, in_dtype_of
@@ -166,8 +166,8 @@ def apply_gated(
     tick, gate = hats(window.since_switch, gated.ticks), hats(window.since_switch, gated.gates)
     ground = (
         view.stands[:, None] * view.command
-        + jnp.einsum("k,fko->fo", tick, gated.bias[view.kind])
-        + jnp.einsum("fi,fio->fo", view.changes, gated.changes[view.kind])
+        + contract("k,fko->fo", tick, gated.bias[view.kind])
+        + contract("fi,fio->fo", view.changes, gated.changes[view.kind])
     )
     legs_bias, legs, touchdown = (
         table.reshape(*table.shape[:-1], pairs, -1)
@@ -175,10 +175,10 @@ def apply_gated(
     )
     terms = jnp.concatenate([view.motion, view.changes], axis=-1)
     terms, touchdown_terms = (x.reshape(pairs, 2, -1) for x in (terms, _touchdown_terms(view)))
-    push = jnp.einsum("k,kpo->po", tick, legs_bias)[:, None]
-    push = push + jnp.einsum("g,psi,gipo->pso", gate, terms, legs)
+    push = contract("k,kpo->po", tick, legs_bias)[:, None]
+    push = push + contract("g,psi,gipo->pso", gate, terms, legs)
     pushes = from_views(push.reshape(feet, -1) * view.alone[:, None])
-    shift = touchdown[0][:, None] + jnp.einsum("psi,ipo->pso", touchdown_terms, touchdown[1:])
+    shift = touchdown[0][:, None] + contract("psi,ipo->pso", touchdown_terms, touchdown[1:])
     shift = shift.reshape(feet, -1) * jnp.asarray(signs(feet)[:, :3], shift.dtype)
     return ground, Load(pushes.force.sum(axis=0), pushes.moment.sum(axis=0)), shift
 

@@ -7,12 +7,15 @@ of P + c A'A over the active rows: the worst row enters and the worst leaves, an
 only the first wrong row changes (Murty's least-index rule, which terminates because soft rows make
 the matrix of the complementarity problem positive definite).
 
+Only once no row is wrong by a coarse tolerance is a fine one applied: with the fine one alone, rows
+enter that an inexact point touches by its rounding, and 2 % of the guesses were wrong.
+
 Rows are soft here (c = `stiffness`) and the inverse drifts, so the result is only a guess.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -41,14 +44,16 @@ class _Softness(NamedTuple):
 
     stiffness: float  # c of an active row
     proximal: float  # added to the diagonal of P
-    tolerance: float  # smaller violations and multipliers count as zero
+    coarse: float  # violations and multipliers up to it count as zero at first
+    fine: float  # and up to this one after that
     passes: int  # of the method of multipliers after a change
 
 
 def _softness(dtype: jnp.dtype) -> _Softness:
     if jnp.finfo(dtype).bits == 64:
-        return _Softness(1e4, 1e-8, 1e-10, 1)
-    return _Softness(30.0, 1e-3, 3e-6, 3)  # a leaving row divides by 1 / c: 32 bits need a small c
+        return _Softness(1e4, 1e-8, 1e-6, 1e-10, 1)
+    # a leaving row divides by 1 / c: 32 bits need a small c
+    return _Softness(30.0, 1e-3, 1e-4, 3e-6, 3)
 
 
 def fits(variables: int, rows: int) -> bool:
@@ -77,6 +82,7 @@ def guess(
         jnp.pad(P, (columns, columns)),
         jnp.pad(q, columns),
         jnp.pad(A, (rows, columns)),
+        jnp.pad(A.T, (columns, rows)),
         jnp.pad(lower, rows, constant_values=-jnp.inf),
         jnp.pad(upper, rows, constant_values=jnp.inf),
     )
@@ -103,18 +109,20 @@ class _Problem(NamedTuple):
     P: Array
     q: Array
     A: Array
+    At: Array  # A transposed
     lower: Array
     upper: Array
     number: Array  # index of each row
     c: np.ndarray
-    tolerance: np.ndarray
+    fine: np.ndarray
     one: np.ndarray
     zero: np.ndarray
     passes: int
 
 
 def _times(M: Array, v: Array) -> Array:
-    return jnp.sum(M * v[None, :], axis=1)
+    """Return M'v: a thread holds parts of columns, so that it sums most of a column alone."""
+    return jnp.sum(M * v[:, None], axis=0)
 
 
 def _inverse(n: int, P: Array, proximal: np.ndarray, one: np.ndarray, zero: np.ndarray) -> Array:
@@ -125,7 +133,7 @@ def _inverse(n: int, P: Array, proximal: np.ndarray, one: np.ndarray, zero: np.n
     eye = jnp.where(across == down, one, zero)
 
     def sweep(k: Array, M: Array) -> Array:
-        column = jnp.sum(jnp.where(down == k, M, zero), axis=1)
+        column = jnp.sum(jnp.where(across == k, M, zero), axis=0)  # M is symmetric
         pivot = jnp.sum(jnp.where(index == k, column, zero))
         # with this entry one rank-one update also sweeps row and column k, and adds 2 at (k, k)
         column = jnp.where(index == k, pivot - one, column)
@@ -145,44 +153,48 @@ def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tu
         v = _times(M, a)
         return M - (weight / (one + weight * jnp.sum(a * v))) * v[:, None] * v[None, :]
 
-    x, rows, y, side, M, count, _ = state
+    x, rows, y, side, M, tolerance, count, _ = state
     active = side != 0
     bound = jnp.where(side > 0, qp.upper, qp.lower)
     for _ in range(qp.passes):
         y = jnp.where(active, y + c * (rows - bound), zero)
-        dx = -_times(M, _times(qp.P, x) + qp.q + jnp.sum(qp.A * y[:, None], axis=0))
-        d_rows = _times(qp.A, dx)
+        dx = -_times(M, _times(qp.P, x) + qp.q + _times(qp.A, y))
+        d_rows = _times(qp.At, dx)
         x, rows, y = x + dx, rows + d_rows, jnp.where(active, y + c * d_rows, zero)
     over, under = rows - qp.upper, qp.lower - rows
     outside = jnp.where(active, -one, jnp.maximum(over, under))
     negative = jnp.where(active, jnp.where(side > 0, -y, y), -one)
-    wrong = jnp.maximum(outside, negative) > qp.tolerance
+    wrong = jnp.maximum(outside, negative) > tolerance
     first = jnp.min(jnp.where(wrong, number, ROWS))
     allowed = wrong & ((count < _LIMIT // 2) | (number == first))
     outside, negative = jnp.where(allowed, outside, -one), jnp.where(allowed, negative, -one)
-    enter, leave = jnp.max(outside) > qp.tolerance, jnp.max(negative) > qp.tolerance
+    enter, leave = jnp.max(outside) > tolerance, jnp.max(negative) > tolerance
     entering, leaving = lax.argmax(outside, 0, jnp.int32), lax.argmax(negative, 0, jnp.int32)
     M = update(M, entering, jnp.where(enter, c, zero))
     M = update(M, leaving, jnp.where(leave, -c, zero))
     side = jnp.where(enter & (number == entering), jnp.where(over > under, 1, -1), side)
     side = jnp.where(leave & (number == leaving), 0, side)
-    return x, rows, y, side, M, count + 1, enter | leave
+    changed = enter | leave
+    running = changed | (tolerance > qp.fine)
+    tolerance = jnp.where(changed, tolerance, qp.fine)
+    return x, rows, y, side, M, tolerance, count + 1, running
 
 
-def _kernel(n: int, soft: _Softness, P_ref, q_ref, A_ref, lower_ref, upper_ref, *refs) -> None:
-    out: Any = Guess(*refs)
-    P, q, A = P_ref[...], q_ref[...], A_ref[...]
-    lower, upper = lower_ref[...], upper_ref[...]
-    c, proximal, tolerance, one, zero = (np.asarray(v, P.dtype) for v in (*soft[:3], 1.0, 0.0))
+def _kernel(n: int, soft: _Softness, *refs) -> None:
+    tiles, out = refs[:6], cast(Any, Guess(*refs[6:]))
+    P, q, A, At, lower, upper = (tile[...] for tile in tiles)
+    c, proximal, coarse, fine = (np.asarray(v, P.dtype) for v in soft[:4])
+    one, zero = np.asarray(1.0, P.dtype), np.asarray(0.0, P.dtype)
     inverse = _inverse(n, P, proximal, one, zero)
     number = lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
-    qp = _Problem(P, q, A, lower, upper, number, c, tolerance, one, zero, soft.passes)
+    qp = _Problem(P, q, A, At, lower, upper, number, c, fine, one, zero, soft.passes)
     x = -_times(inverse, q)
     y, side = jnp.zeros((ROWS,), P.dtype), jnp.zeros((ROWS,), jnp.int32)
-    state = (x, _times(A, x), y, side, inverse, jnp.int32(0), jnp.asarray(True))
-    x, _, y, side, _, _, running = lax.while_loop(
+    counters = jnp.asarray(coarse), jnp.int32(0), jnp.asarray(True)
+    state = (x, _times(At, x), y, side, inverse, *counters)
+    x, _, y, side, *_, running = lax.while_loop(
         lambda state: state[-1] & (state[-2] < _LIMIT),
-        partial(_pivot, qp, lambda row: A_ref[row, :]),
+        partial(_pivot, qp, lambda row: tiles[2][row, :]),
         state,
     )
     out.x[...], out.y[...], out.side[...] = x, y, side.astype(jnp.int32)

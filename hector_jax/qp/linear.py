@@ -4,21 +4,21 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
-from hector_jax.core.arrays import Array
+from hector_jax.core.arrays import Array, contract
 
 
 def matvec(A: Array, x: Array) -> Array:
     """Return A x."""
     if A.ndim == 2:
         return A @ x
-    return jnp.einsum("krb,kb->kr", A, x.reshape(A.shape[0], A.shape[2])).ravel()
+    return contract("krb,kb->kr", A, x.reshape(A.shape[0], A.shape[2])).ravel()
 
 
 def rmatvec(A: Array, y: Array) -> Array:
     """Return A'y."""
     if A.ndim == 2:
         return y @ A
-    return jnp.einsum("krb,kr->kb", A, y.reshape(A.shape[:2])).ravel()
+    return contract("krb,kr->kb", A, y.reshape(A.shape[:2])).ravel()
 
 
 def block_diagonal(blocks: Float[Array, "N r b"]) -> Float[Array, "m n"]:
@@ -33,7 +33,7 @@ def plus_gram(P: Array, A: Array, w: Array) -> Array:
     if A.ndim == 2:
         return P + (w[:, None] * A).T @ A
     weighted = w.reshape(*A.shape[:2], 1) * A
-    return P + block_diagonal(jnp.einsum("krb,krc->kbc", weighted, A))
+    return P + block_diagonal(contract("krb,krc->kbc", weighted, A))
 
 
 def cholesky(matrix: Array) -> Array:

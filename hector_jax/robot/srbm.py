@@ -9,10 +9,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from hector_jax.core.arrays import Array
-from hector_jax.core.geometry import euler_rates, rotation_from_euler, skew
+from hector_jax.core.arrays import Array, contract
+from hector_jax.core.geometry import euler_rates, inverse, rotation_from_euler, skew
 from hector_jax.core.trajectory import Load, State, Wrench
 from hector_jax.robot.model import Robot
 
@@ -33,6 +34,15 @@ def centroidal_rates(
     return wrench.force.sum(axis=0) / robot.mass - robot.gravity, torque.sum(axis=0)
 
 
+def _in_world(R_wb: Float[Array, "3 3"], matrix: ArrayLike) -> Float[Array, "3 3"]:
+    return contract("xa,ab,yb->xy", R_wb, matrix, R_wb)
+
+
+def _momentum(robot: Robot, state: State) -> Float[Array, "3"]:
+    inertia = _in_world(rotation_from_euler(state.euler), robot.inertia)
+    return contract("xy,y->x", inertia, state.ang_velocity)
+
+
 @jax.jit  # traced once for the four stages of a step
 def rates(
     robot: Robot,
@@ -45,12 +55,11 @@ def rates(
     acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
     if load is not None:
         acceleration, torque = acceleration + load.force / robot.mass, torque + load.torque
-    R_wb = rotation_from_euler(state.euler)
-    momentum = R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
-    torque = torque - jnp.cross(state.ang_velocity, momentum)
-    ang_acceleration = R_wb @ jnp.linalg.solve(robot.inertia, R_wb.T @ torque)
+    torque = torque - jnp.cross(state.ang_velocity, _momentum(robot, state))
+    inverse_inertia = _in_world(rotation_from_euler(state.euler), inverse(robot.inertia))
+    ang_acceleration = contract("xy,y->x", inverse_inertia, torque)
     return State(
-        euler=euler_rates(state.euler) @ state.ang_velocity,
+        euler=contract("xy,y->x", euler_rates(state.euler), state.ang_velocity),
         position=state.velocity,
         ang_velocity=ang_acceleration,
         velocity=acceleration,
@@ -99,16 +108,11 @@ def unexplained(
 
     Source: Eq. 2, solved for the forces; the inverse of `step` up to terms of second order.
     """
-
-    def momentum(state: State) -> Float[Array, "3"]:
-        R_wb = rotation_from_euler(state.euler)
-        return R_wb @ (robot.inertia @ (R_wb.T @ state.ang_velocity))
-
     lever = feet - 0.5 * (before.position + after.position)
     acceleration, torque = centroidal_rates(robot, wrench, lever)
     return Load(
         force=robot.mass * ((after.velocity - before.velocity) / dt - acceleration),
-        torque=(momentum(after) - momentum(before)) / dt - torque,
+        torque=(_momentum(robot, after) - _momentum(robot, before)) / dt - torque,
     )
 
 
@@ -127,7 +131,7 @@ def linearise(
     Source: Eq. 4a.
     """
     R_wb = rotation_from_euler(euler)
-    inverse_inertia = R_wb @ jnp.linalg.inv(robot.inertia) @ R_wb.T
+    inverse_inertia = _in_world(R_wb, inverse(robot.inertia))
     eye, zero = jnp.eye(3, dtype=R_wb.dtype), jnp.zeros((3, 3), R_wb.dtype)
     A = jnp.block(
         [
@@ -145,7 +149,7 @@ def linearise(
         [
             [zero] * (2 * feet),
             [zero] * (2 * feet),
-            [moment_gain @ arm for arm in arms] + [moment_gain] * feet,
+            list(contract("xy,fyz->fxz", moment_gain, arms)) + [moment_gain] * feet,
             [force_gain] * feet + [zero] * feet,
             [zero] * (2 * feet),
         ]
