@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from hector_jax.core.arrays import contract
 from hector_jax.core.geometry import (
     euler_from_rotation,
     euler_rates,
+    inverse,
     rot_x,
     rot_y,
     rot_z,
@@ -83,3 +85,19 @@ def test_single_precision_stays_single():
     euler = jnp.array([0.1, 0.2, 0.3], jnp.float32)
     for made in (rotation_from_euler(euler), euler_rates(euler), skew(euler), wrap_angle(euler)):
         assert made.dtype == jnp.float32
+
+
+def test_an_inverse_times_its_matrix_is_the_identity():
+    M = np.random.default_rng(3).normal(size=(3, 3))  # not symmetric, unlike an inertia
+    np.testing.assert_allclose(inverse(jnp.asarray(M)) @ M, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("subscripts", "shapes"),
+    [("kjxy,kx->jy", [(4, 4, 3, 3), (4, 3)]), ("g,psi,gipo->pso", [(5,), (2, 2, 7), (5, 7, 2, 6)])],
+)
+def test_contract_is_einsum(subscripts, shapes):
+    rng = np.random.default_rng(4)
+    operands = [rng.normal(size=shape) for shape in shapes]
+    expected = np.einsum(subscripts, *operands)
+    np.testing.assert_allclose(contract(subscripts, *operands), expected, atol=1e-12)

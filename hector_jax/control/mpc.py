@@ -214,7 +214,8 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     feet = jax.vmap(lambda c: _feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
     G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)
     # inputs change rates and velocities, which persist; angles and positions integrate them
-    turn, push = (contract("kxu,kub->kxb", B[:, rows], G) for rows in (slice(6, 9), slice(9, 12)))
+    changes = B[:, 6:9], B[:, 9:12]
+    turn, push = (contract("kxu,kub->kxb", change, G) for change in changes)
     angle_by_rate = jnp.cumsum(A[:, 0:3, 6:9], axis=0)  # for a rate that is constant from t_0 on
     later, travel = (jnp.asarray(table, dtype) for table in _double_integrator(N, dt))
     # angles after step k per rate that is constant from the end of step j on

@@ -21,7 +21,8 @@ def contract(subscripts: str, *operands: ArrayLike) -> Array:
     """Return `jnp.einsum(subscripts, *operands)`, computed as a sum of products.
 
     For small operands: XLA fuses a sum of products with the operations around it, but starts a
-    kernel for each matrix product, which takes a GPU longer than the product itself.
+    kernel for each matrix product, which takes a GPU longer than the product itself. An operand has
+    each letter at most once; sizes are not checked.
 
     >>> contract("ij,j->i", jnp.eye(2), jnp.array([3.0, 4.0])).tolist()
     [3.0, 4.0]

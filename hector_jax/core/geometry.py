@@ -64,9 +64,9 @@ def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def inverse(M: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the inverse in closed form, for which a GPU needs no library call."""
-    across = jnp.cross(M[np.array([1, 2, 0])], M[np.array([2, 0, 1])])  # the cofactors
-    return across.T / jnp.sum(M[0] * across[0])
+    """Return the inverse in closed form: a factorisation would be library calls on a GPU."""
+    cofactors = jnp.cross(M[np.array([1, 2, 0])], M[np.array([2, 0, 1])])
+    return cofactors.T / jnp.sum(M[0] * cofactors[0])
 
 
 def rotation_from_quaternion(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:

@@ -27,7 +27,7 @@ from jaxtyping import Float, Int
 from hector_jax.core.arrays import Array
 
 VARIABLES, ROWS = 64, 128  # size of the kernel's tiles, limited by the registers of a program
-_LIMIT = 120  # row changes; the second half uses the least-index rule
+_LIMIT = 120  # passes; the second half uses the least-index rule
 
 
 class Guess(NamedTuple):
@@ -114,7 +114,7 @@ class _Problem(NamedTuple):
     upper: Array
     number: Array  # index of each row
     c: np.ndarray
-    fine: np.ndarray
+    fine: np.ndarray  # tolerance at the end
     one: np.ndarray
     zero: np.ndarray
     passes: int
@@ -181,8 +181,8 @@ def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tu
 
 
 def _kernel(n: int, soft: _Softness, *refs) -> None:
-    tiles, out = refs[:6], cast(Any, Guess(*refs[6:]))
-    P, q, A, At, lower, upper = (tile[...] for tile in tiles)
+    out, A_ref = cast(Any, Guess(*refs[6:])), refs[2]
+    P, q, A, At, lower, upper = (ref[...] for ref in refs[:6])
     c, proximal, coarse, fine = (np.asarray(v, P.dtype) for v in soft[:4])
     one, zero = np.asarray(1.0, P.dtype), np.asarray(0.0, P.dtype)
     inverse = _inverse(n, P, proximal, one, zero)
@@ -194,7 +194,7 @@ def _kernel(n: int, soft: _Softness, *refs) -> None:
     state = (x, _times(At, x), y, side, inverse, *counters)
     x, _, y, side, *_, running = lax.while_loop(
         lambda state: state[-1] & (state[-2] < _LIMIT),
-        partial(_pivot, qp, lambda row: tiles[2][row, :]),
+        partial(_pivot, qp, lambda row: A_ref[row, :]),
         state,
     )
     out.x[...], out.y[...], out.side[...] = x, y, side.astype(jnp.int32)

@@ -35,6 +35,7 @@ def centroidal_rates(
 
 
 def _in_world(R_wb: Float[Array, "3 3"], matrix: ArrayLike) -> Float[Array, "3 3"]:
+    """Turn a matrix (3, 3) from the trunk's axes to the world's."""
     return contract("xa,ab,yb->xy", R_wb, matrix, R_wb)
 
 
