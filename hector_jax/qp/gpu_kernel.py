@@ -15,7 +15,7 @@ Rows are soft here (c = `stiffness`) and the inverse drifts, so the result is on
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -180,9 +180,12 @@ def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tu
     return x, rows, y, side, M, tolerance, count + 1, running
 
 
-def _kernel(n: int, soft: _Softness, *refs) -> None:
-    out, A_ref = cast(Any, Guess(*refs[6:])), refs[2]
-    P, q, A, At, lower, upper = (ref[...] for ref in refs[:6])
+def _kernel(
+    n: int, soft: _Softness, P_ref, q_ref, A_ref, At_ref, lower_ref, upper_ref, *refs
+) -> None:
+    out: Any = Guess(*refs)
+    P, q, A, At = P_ref[...], q_ref[...], A_ref[...], At_ref[...]
+    lower, upper = lower_ref[...], upper_ref[...]
     c, proximal, coarse, fine = (np.asarray(v, P.dtype) for v in soft[:4])
     one, zero = np.asarray(1.0, P.dtype), np.asarray(0.0, P.dtype)
     inverse = _inverse(n, P, proximal, one, zero)

@@ -39,9 +39,10 @@ def _in_world(R_wb: Float[Array, "3 3"], matrix: ArrayLike) -> Float[Array, "3 3
     return contract("xa,ab,yb->xy", R_wb, matrix, R_wb)
 
 
-def _momentum(robot: Robot, state: State) -> Float[Array, "3"]:
-    inertia = _in_world(rotation_from_euler(state.euler), robot.inertia)
-    return contract("xy,y->x", inertia, state.ang_velocity)
+def _momentum(
+    robot: Robot, R_wb: Float[Array, "3 3"], ang_velocity: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    return contract("xy,y->x", _in_world(R_wb, robot.inertia), ang_velocity)
 
 
 @jax.jit  # traced once for the four stages of a step
@@ -56,11 +57,11 @@ def rates(
     acceleration, torque = centroidal_rates(robot, wrench, feet - state.position)
     if load is not None:
         acceleration, torque = acceleration + load.force / robot.mass, torque + load.torque
-    torque = torque - jnp.cross(state.ang_velocity, _momentum(robot, state))
-    inverse_inertia = _in_world(rotation_from_euler(state.euler), inverse(robot.inertia))
-    ang_acceleration = contract("xy,y->x", inverse_inertia, torque)
+    R_wb, rate = rotation_from_euler(state.euler), state.ang_velocity
+    torque = torque - jnp.cross(rate, _momentum(robot, R_wb, rate))
+    ang_acceleration = contract("xy,y->x", _in_world(R_wb, inverse(robot.inertia)), torque)
     return State(
-        euler=contract("xy,y->x", euler_rates(state.euler), state.ang_velocity),
+        euler=contract("xy,y->x", euler_rates(state.euler), rate),
         position=state.velocity,
         ang_velocity=ang_acceleration,
         velocity=acceleration,
@@ -111,9 +112,13 @@ def unexplained(
     """
     lever = feet - 0.5 * (before.position + after.position)
     acceleration, torque = centroidal_rates(robot, wrench, lever)
+    earlier, later = (
+        _momentum(robot, rotation_from_euler(state.euler), state.ang_velocity)
+        for state in (before, after)
+    )
     return Load(
         force=robot.mass * ((after.velocity - before.velocity) / dt - acceleration),
-        torque=(_momentum(robot, after) - _momentum(robot, before)) / dt - torque,
+        torque=(later - earlier) / dt - torque,
     )
 
 
