@@ -21,11 +21,10 @@ from oracles import (
 from benchmarks.problems import draw_problems, layer_qp
 from hector_jax.control.controller import WalkConfig
 from hector_jax.qp import QP, QpConfig, Solver, Status, check_solved, gpu_kernel, solve_qp
-from hector_jax.qp.active_set import active_set
-from hector_jax.qp.active_set import first_guess as guess_from
+from hector_jax.qp.active_set import first_guess
 from hector_jax.qp.interior_point import approach, interior_point
 from hector_jax.qp.method import JAXOPT
-from hector_jax.qp.problem import Point, normalise
+from hector_jax.qp.problem import normalise
 from hector_jax.robot.model import load_robot
 
 WALKING = 500
@@ -623,49 +622,58 @@ def test_a_q_that_is_too_large_makes_no_problem_infeasible_or_unbounded(times):
     assert np.isin(found.status, [Status.SOLVED, Status.NOT_UNIQUE]).all()
 
 
-@pytest.fixture
-def as_on_a_gpu(monkeypatch):
-    """Programs traced here take the branch of a GPU, its kernel interpreted."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
-    monkeypatch.setattr(gpu_kernel, "guess", partial(gpu_kernel.guess, interpret=True))
+INTERPRETED = partial(gpu_kernel.guess, interpret=True)
 
 
-def first_guess(qp):
-    """The normalised problem, where its active set starts from, and with which rows."""
-    qp = jax.tree.map(jnp.asarray, qp)
-    normal = normalise(TOLERANCES, qp)
-    loose = Point(-jnp.linalg.solve(normal.P, normal.q), jnp.zeros(normal.side.shape))
-    return normal, *guess_from(normal, loose)
+def as_on_a_gpu(kernel=INTERPRETED):
+    """The default solver, its guess traced as on a GPU with this kernel, interpreted here."""
+
+    def guess(qp, factor):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(jax, "default_backend", lambda: "gpu")
+            patch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
+            patch.setattr(gpu_kernel, "guess", kernel)
+            return first_guess(qp, factor)
+
+    return QpConfig(solver=Solver("interior_point", approach=approach, guess=guess))
 
 
-def test_on_a_gpu_the_kernels_guess_is_proved_at_once(as_on_a_gpu):
+def test_on_a_gpu_the_kernels_point_is_the_solution():
     config, robot = WalkConfig(), load_robot()
 
-    def tries(problem):
-        normal, start, active = first_guess(layer_qp(config, robot, problem))
-        every, most = jnp.ones((), bool), jnp.array(15)
-        _, residuals, count = active_set(
-            TOLERANCES, normal, start, active=active, enabled=every, limit=most
-        )
-        return jnp.max(residuals), count
+    def layer(qp_config, problem):
+        def first(weights):
+            qp = layer_qp(config, robot, problem._replace(weights=weights))
+            found = solve_qp(qp, qp_config)
+            return found.x[:5] @ problem.pull, found
 
-    proof, count = jax.jit(partial(jax.lax.map, tries))(draw_problems(config, robot, 100))
-    assert (proof <= TOLERANCES.target).all()
-    assert (count == 1).all()
+        return jax.grad(first, has_aux=True)(problem.weights)
+
+    problems = draw_problems(config, robot, 100)
+    slope, usual = jax.jit(partial(jax.lax.map, partial(layer, QpConfig())))(problems)
+    along, found = jax.jit(partial(jax.lax.map, partial(layer, as_on_a_gpu())))(problems)
+    assert (found.iterations == 0).all()  # nothing was corrected
+    assert (found.status == Status.SOLVED).all()
+    size = jnp.max(jnp.abs(usual.x), axis=1, keepdims=True)
+    assert (jnp.abs(found.x - usual.x) <= 1e-10 * size).all()
+    for theirs, ours in zip(*map(jax.tree.leaves, (along, slope)), strict=True):
+        np.testing.assert_allclose(theirs, ours, rtol=1e-7, atol=1e-9 * np.abs(ours).max())
 
 
-def test_on_a_gpu_a_guess_that_did_not_settle_is_not_taken(walking, as_on_a_gpu, monkeypatch):
+@pytest.mark.parametrize("settled", [False, True])
+def test_on_a_gpu_a_wrong_point_of_the_kernel_is_corrected(walking, walked, settled):
+    """One that did not settle is not taken, one that did is where the corrections start."""
+
     def lost(P, q, A, lower, upper):
-        side = jnp.ones(len(lower), jnp.int32)
-        return gpu_kernel.Guess(jnp.full_like(q, jnp.nan), lower, side, jnp.int32(0))
+        x, side = jnp.full_like(q, 1.0 if settled else jnp.nan), jnp.ones(len(lower), jnp.int32)
+        return gpu_kernel.Guess(x, jnp.ones_like(lower), side, jnp.int32(settled))
 
-    monkeypatch.setattr(gpu_kernel, "guess", lost)
-    found = jax.jit(lambda qp: first_guess(qp))(walking[3])
-    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    usual = jax.jit(lambda qp: first_guess(qp))(walking[3])
-    for one, other in zip(*map(jax.tree.leaves, (found, usual)), strict=True):
-        np.testing.assert_array_equal(one, other)
+    config = as_on_a_gpu(lost)
+    for qp, x in zip(walking[:4], walked.x[:4], strict=True):
+        found = solve(qp, config)
+        check_solved(found)
+        assert found.iterations > 0
+        np.testing.assert_allclose(found.x, x, atol=1e-9 * np.abs(x).max())
 
 
 def test_bounds_move_the_solution():

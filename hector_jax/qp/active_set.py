@@ -2,8 +2,8 @@
 
 Each iteration factorises P + rho I + A'WA once, with W equal to the cap on active rows and zero on
 the others. The QPs of walking take five iterations, and the result is exact to rounding if the
-active set converges. On a GPU a kernel (`gpu_kernel`) makes the first guess and one iteration
-confirms it.
+active set converges. On a GPU a kernel (`gpu_kernel`) solves first, and the iterations are for
+points whose residuals are too large.
 """
 
 from functools import cache, partial
@@ -149,20 +149,29 @@ def worst_sides(qp: Normal, wrong: Array, active: Array, error: Array) -> Array:
     return wrong & (error >= threshold).reshape(wrong.shape)
 
 
-def first_guess(qp: Normal, unconstrained: Point) -> tuple[Point, Array]:
-    """Return an initial point and active sides (2, m), given the unconstrained minimiser."""
+def first_guess(qp: Normal, factor: Array) -> tuple[Point, Array, Array]:
+    """Return an initial point, active sides (2, m) and residuals, infinite if not computed.
 
-    def violated(qp: Normal) -> tuple[Point, Array]:
-        outside = qp.violation(unconstrained.x)
-        return unconstrained, worst_sides(qp, outside > 0, jnp.zeros_like(qp.side), outside)
+    Args:
+        qp: the problem.
+        factor: lower Cholesky factor of P.
+    """
+    infinite = jnp.full(3, jnp.inf, qp.q.dtype)
 
-    def pivoted(qp: Normal) -> tuple[Point, Array]:
+    def violated(qp: Normal) -> tuple[Point, Array, Array]:
+        x = -cho_solve((factor, True), qp.q)
+        outside, none = qp.violation(x), jnp.zeros_like(qp.side)
+        return Point(x, none.astype(x.dtype)), worst_sides(qp, outside > 0, none, outside), infinite
+
+    def pivoted(qp: Normal) -> tuple[Point, Array, Array]:
         present = qp.side | qp.equality
         upper, lower = jnp.where(present, qp.bound, jnp.asarray(SIGN, qp.q.dtype) * jnp.inf)
         x, y, side, settled = gpu_kernel.guess(qp.P, qp.q, block_diagonal(qp.A), lower, upper)
-        z = jnp.maximum(jnp.asarray(SIGN, y.dtype) * y, 0.0)
-        usable = (settled > 0) & jnp.isfinite(jnp.sum(x) + jnp.sum(y))
-        return where(usable, (Point(x, z), jnp.stack([side > 0, side < 0])), violated(qp))
+        point = Point(x, jnp.maximum(jnp.asarray(SIGN, y.dtype) * y, 0.0))
+        residuals = qp.residuals(point)
+        found = point, jnp.stack([side > 0, side < 0]), residuals
+        nothing = jax.tree.map(jnp.zeros_like, point), jnp.zeros_like(qp.side), infinite
+        return where((settled > 0) & jnp.all(jnp.isfinite(residuals)), found, nothing)
 
     if jax.default_backend() != "gpu":
         return violated(qp)

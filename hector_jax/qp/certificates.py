@@ -1,12 +1,10 @@
 """Proofs from a QP's data and a step: curvature, unique minimiser, infeasible, unbounded."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.linalg import cho_solve
 
 from hector_jax.core.arrays import Array
 from hector_jax.qp.linear import cholesky, largest, matvec, multiplier, plus_gram, rmatvec
@@ -23,20 +21,15 @@ def _shifted(matrix: Array, shift: float) -> tuple[Array, Array]:
     return factor, jnp.isfinite(factor[-1, -1])
 
 
-def unconstrained_minimiser(tolerances: Tolerances, qp: Normal) -> tuple[Array, Array, Array]:
-    """Return the minimiser without rows, whether P is definite and whether it is semidefinite.
+def curvature(tolerances: Tolerances, qp: Normal) -> tuple[Array, Array, Array]:
+    """Return a Cholesky factor of P, whether P is definite and whether it is semidefinite.
 
     A definite P takes one factorisation.
     """
-
-    def minimiser(shift: float, qp: Normal) -> tuple[Array, Array]:
-        factor, exists = _shifted(qp.P, shift)
-        return -cho_solve((factor, True), qp.q), exists
-
-    x, definite = minimiser(-tolerances.curvature, qp)
-    proximal = partial(minimiser, tolerances.proximal)
-    x, convex = only_if(~definite, proximal, (x, definite), qp)
-    return x, definite, convex
+    factor, definite = _shifted(qp.P, -tolerances.curvature)
+    proximal = lambda qp: _shifted(qp.P, tolerances.proximal)  # noqa: E731
+    factor, convex = only_if(~definite, proximal, (factor, definite), qp)
+    return factor, definite, convex
 
 
 def only_if(enabled: Array, function: Callable, otherwise: Any, operands: Any) -> Any:

@@ -1,8 +1,9 @@
 """The solution of a QP, and its status.
 
-First the active set is guessed and corrected by signs (`active_set`). If it does not converge,
-another method approaches a solution (`interior_point`), and its active set is corrected in the same
-way. A `Solver` is the pair of both: the guess and the approach.
+First the active set is guessed and corrected by signs (`active_set`); a guess whose point has
+residuals within the target is the solution. If the active set does not converge, another method
+approaches a solution (`interior_point`), and its active set is corrected in the same way. A
+`Solver` is the pair of both: the guess and the approach.
 
 Status. All conditions are comparisons in the normalised problem; t is the tolerance.
 
@@ -33,7 +34,7 @@ from hector_jax.core.part import Part, choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.tree import where
 from hector_jax.qp.active_set import active_set, first_guess
-from hector_jax.qp.certificates import is_unique, only_if, unconstrained_minimiser
+from hector_jax.qp.certificates import curvature, is_unique, only_if
 from hector_jax.qp.interior_point import approach
 from hector_jax.qp.jaxopt_solver import box_osqp
 from hector_jax.qp.linear import largest, multiplier
@@ -59,12 +60,12 @@ class Solver(Part):
         approach: approaches a solution of the normalised problem; called as `approach(tolerances,
             qp, enabled, max_iterations=...)`; unless `enabled` it returns infinite residuals and
             no certificate.
-        guess: returns point and active sides from the unconstrained minimiser, which are tried
-            before `approach`; None starts with `approach`.
+        guess: returns point, active sides and residuals from a Cholesky factor of P, which are
+            tried before `approach`; None starts with `approach`.
     """
 
     approach: Callable[..., Approach]
-    guess: Callable[[Normal, Point], tuple[Point, Array]] | None
+    guess: Callable[[Normal, Array], tuple[Point, Array, Array]] | None
 
 
 INTERIOR_POINT = Solver("interior_point", approach=approach, guess=first_guess)
@@ -118,17 +119,18 @@ class _Best(NamedTuple):
 
 
 def _solve_rounds(
-    config: QpConfig, tolerances: Tolerances, qp: Normal, unconstrained: Point, enabled: Array
+    config: QpConfig, tolerances: Tolerances, qp: Normal, factor: Array, enabled: Array
 ) -> _Best:
-    """Return the best point: by the active set from a guess, else from the approach.
+    """Return the best point: a guess, else by the active set from it, else from the approach.
 
     Both rounds are one loop, so that the active set is compiled once.
     """
     solver = cast(Solver, config.solver)
     if solver.guess is None:
-        start, guess = unconstrained, jnp.zeros_like(qp.side)
+        start = Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
+        guess, residuals = jnp.zeros_like(qp.side), jnp.full(3, jnp.inf, qp.q.dtype)
     else:
-        start, guess = solver.guess(qp, unconstrained)
+        start, guess, residuals = solver.guess(qp, factor)
 
     def attempt(state: _Best) -> _Best:
         approaches = state.running & state.approached
@@ -149,12 +151,12 @@ def _solve_rounds(
         return _Best(*best, near.certified, iterations, jnp.ones((), bool), running)
 
     first = _Best(
-        unconstrained,
-        jnp.full(3, jnp.inf, qp.q.dtype),
+        start,
+        residuals,
         jnp.zeros(2, bool),
         jnp.zeros((), jnp.int32),
         jnp.asarray(solver.guess is None),
-        enabled,
+        enabled & (jnp.max(residuals) > tolerances.target),
     )
     return lax.while_loop(lambda state: state.running, attempt, first)
 
@@ -169,11 +171,10 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     # a trivial QP replaces an invalid one, so that no NaN reaches the solver
     trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
     normal = normalise(tolerances, where(valid, qp, trivial))
-    x, definite, convex = unconstrained_minimiser(tolerances, normal)
+    factor, definite, convex = curvature(tolerances, normal)
     normal = normal._replace(flat=~definite)
     valid &= convex
-    unconstrained = Point(x, jnp.zeros(normal.side.shape, qp.q.dtype))
-    best = _solve_rounds(config, tolerances, normal, unconstrained, valid)
+    best = _solve_rounds(config, tolerances, normal, factor, valid)
     # without a solution (infeasible, unbounded) residuals and x may be infinite
     usable = valid & jnp.all(jnp.isfinite(best.residuals))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), best.point)

@@ -104,7 +104,7 @@ class Solution(NamedTuple):
     primal_residual: Float[Array, ""]
     dual_residual: Float[Array, ""]
     gap: Float[Array, ""]
-    iterations: Int[Any, ""]  # factorisations; with jaxopt its iterations and ours
+    iterations: Int[Any, ""]  # factorisations, 0 on a GPU whose kernel solved it; jaxopt's and ours
     status: Int[Any, ""]  # a code of Status
 
 
