@@ -1,7 +1,7 @@
 """Minimise 1/2 x'Px + q'x subject to l <= A x <= u, and differentiate the minimiser.
 
 `problem` has the data and its normalised form, `active_set`, `interior_point` and `jaxopt_solver`
-the methods (`gpu_kernel` guesses an active set on a GPU), `certificates` the proofs, `method` the
+the methods (`gpu_kernel` solves small ones on a GPU), `certificates` the proofs, `method` the
 loop over the methods and the status, `derivative` the JVP rule and `solver` the public functions.
 """
 
