@@ -195,58 +195,28 @@ def weight_histories(
     return f"The {len(looks)} weights that moved most; both feet share one R."
 
 
-METHODS = {  # labels of the methods
-    "without": "DiffTune without net",
-    "with": "DiffTune with net",
-    "adam": "Adam with net",
-    "differences": "differences on the simulator",
-    "cma-es": "CMA-ES",
-    "bayes": "Bayesian, whole box",
-    "bayes near": "Bayesian, near the start",
-    "random": "random",
-}
-
-_METHOD_LINES = {
-    "without": SETS["without"],
-    "with": SETS["with"] | {"linewidth": 1.8},
-    "adam": {"color": "#63b89f", "linestyle": (0, (3, 1.2))},
-    "differences": {"color": "black", "linestyle": (0, (5, 1.5)), "linewidth": 1.1},
-    "cma-es": SETS["searched"],
-    "bayes": {"color": style.BLUE, "linestyle": (0, (5, 1.5))},
-    "bayes near": {"color": style.BLUE, "linestyle": "-"},
-    "random": {"color": style.GREY, "linestyle": "-"},
-}
-
-
-def race(
-    path: Path,
-    curves: Mapping[str, Sequence[tuple[Float[np.ndarray, " walks"], Float[np.ndarray, " walks"]]]],
-    abscissa: str,
-) -> str:
-    """Draw the lowest loss so far of each method: its repeats, and their median.
+def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str:
+    """Draw the loss of the best set so far of each entry: median and range of the repeats.
 
     Args:
         path: file to write.
-        curves: by method, abscissa and loss of each repeat.
-        abscissa: label of the abscissa.
+        curves: by entry, the losses of its repeats by number of walks.
     """
-    with drawing(path, 7.0, 4.4, legend_columns=3) as figure:
+    with drawing(path, 7.0, 4.8, legend_columns=3) as figure:
         axes = figure.subplots()
-        for name, repeats in curves.items():
-            count = min(len(losses) for _, losses in repeats)
-            x = np.median([at[:count] for at, _ in repeats], axis=0)
-            losses = np.array([losses[:count] for _, losses in repeats]) / 1e6
-            look, median = _METHOD_LINES[name], np.median(losses, axis=0)
-            if len(losses) > 1:
-                axes.step(x, losses.T, where="post", color=look["color"], alpha=0.45, lw=0.6)
-            axes.step(x, median, where="post", **look, label=METHODS[name])
-            axes.plot(x[-1], median[-1], "o", color=look["color"], markersize=3)
-        axes.set(xlabel=abscissa, ylabel="lowest L on the simulator so far [10$^6$]")
+        for i, (name, by_budget) in enumerate(curves.items()):
+            walks, losses = np.array(list(by_budget)), np.array(list(by_budget.values())) / 1e6
+            look = {"color": f"C{i % 10}", "linestyle": ("-", "--", ":")[i // 10 % 3]}
+            axes.plot(walks + 1, np.median(losses, axis=1), **look, label=name)
+            bounds = losses.min(axis=1), losses.max(axis=1)
+            axes.fill_between(walks + 1, *bounds, color=look["color"], alpha=0.1, linewidth=0)
+        axes.set(xlabel="walks", ylabel="L of the best set so far [10$^6$]", xscale="log")
+        axes.set_xticks(
+            [1, 2, 6, 11, 26, 51, 101, 201], ["0", "1", "5", "10", "25", "50", "100", "200"]
+        )
+        axes.minorticks_off()
         log_axis(axes, "y")
-    return (
-        f"Lowest loss on the high-fidelity simulator so far, by {abscissa}. Thick: median of "
-        "the repeats; thin: each repeat."
-    )
+    return "L of the best set so far by walks: median of the repeats, and their range."
 
 
 def survival(path: Path, rows: Mapping[str, Mapping[str, Any]]) -> str:

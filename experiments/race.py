@@ -1,455 +1,491 @@
-"""Do gradients through the model beat what needs walks on the simulator? The race.
+"""Is a tuning on walks ahead of what sees one number of each walk? The race.
 
-DiffTune with and without GRFM-Net, Adam in log-weights through the net, CMA-ES, Bayesian
-optimisation (in the whole box, and near the start), random draws, and DiffTune's step along forward
-differences on the simulator: from the nominal weights, in one box, judged by the loss on the
-high-fidelity simulator (hfs), against walks there and against seconds.
+`hector tune --walks` and its parts against the optimizers of `rivals.py`: from the same starts, in
+one box, on the high-fidelity simulator, one trajectory each.
 
-    python experiments/race.py --traj s --out runs/race
+    python experiments/race.py --traj s --start nominal docs/batch/shared/weights/mean-of-all.json
 
-What is random is repeated with other seeds. All go in lock-step, so that a round is one batch in
-MJX, or walks on the processes. Everything is kept under OUT and taken up again.
+Each contest is a tuning of its own with a folder under OUT/contests; a later call continues there,
+with more methods or walks too. At the end the best set of each at some budgets walks on plants that
+no one has walked.
+
+The walk of the start counts for the methods that need it. `--robot` and `--engine` choose what is
+walked; by default it is HECTOR in MuJoCo C.
 """
 
-import shutil
-import statistics
 import sys
-import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import asdict, dataclass
-from importlib.util import find_spec
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import optimizers
 import plots
 import tyro
-from lib import write_report
-from lockstep import BenchmarkResult, Round, benchmark, lowest, walks
-from optimizers import Bayes, CmaEs, Differences, Given, Optimizer, Random, Steps, adam, steps_to
+from jaxtyping import Float
+from lib import check_names, write_report
+from rivals import READ_START, RIVALS, Spent, Task
+from scipy.stats import t as student
 
 from hector_jax.control.reference import Command, named_command, standing_anchor
 from hector_jax.control.weights import Weights, nominal
+from hector_jax.control.weights_file import load_weights
+from hector_jax.core.arrays import Array
 from hector_jax.core.console import bar, exit_code, say
-from hector_jax.core.environment import environment
-from hector_jax.core.files import make_folder, write_json
+from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, Range, check, read_json
-from hector_jax.core.tree_file import tree_hash
-from hector_jax.grfm.network import Params, effect_of, load_net
-from hector_jax.grfm.training import TrainConfig
+from hector_jax.core.settings import AT_LEAST_ONE, check
+from hector_jax.core.tree_file import load_tree, save_tree
+from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table
 from hector_jax.robot.model import Robot, load_robot
-from hector_jax.runs import nets, searches
-from hector_jax.runs.cache import content_key, robot_hash
+from hector_jax.runs import tunings, verdicts, walks
+from hector_jax.runs.campaign import Campaign, box_of, weights_at
 from hector_jax.runs.setup import Setup
-from hector_jax.search.cmaes import Generation, SearchConfig
-from hector_jax.sim.engine import Engine, choose_engine
-from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
-from hector_jax.sim.world import hfs
-from hector_jax.tuning import difftune
-from hector_jax.tuning.difftune import Iteration, TuneConfig
-from hector_jax.tuning.rollout import RolloutConfig
+from hector_jax.runs.walks import Row
+from hector_jax.search import few_walks
+from hector_jax.search.few_walks import Proposal, Space
+from hector_jax.sim.engine import choose_engine
+from hector_jax.sim.world import hfs, named_world
+from hector_jax.tuning.loss import Loss, loss_of
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
-MARKS = (25, 50, 100, 200)  # the table has the lowest loss after so many walks
-ON_MODEL = ("without", "with", "adam")
-WITH_NET = ("with", "adam")
-NEAR = 3.0  # log-weights: a factor of 20 up and down
-# modules that decide the numbers
-CODE = ("search.cmaes", "tuning.difftune", "grfm.network", "sim.walk", "sim.parallel")
-OPTIMIZERS = Path(optimizers.__file__).read_text()  # part of the cache keys, as CODE
-RATE = 0.05  # of Adam, in log-weights: DiffTune's step in Q
+BUDGETS = (0, 1, 5, 10, 25, 50, 100, 200)
+WALKS = "walks"
+OURS: dict[str, dict[str, Any]] = {
+    WALKS: {},
+    "no metric": {},
+    "no grounding": {"grounded": False},
+    "no surrogate": {"methods": ("model", "evolution")},
+    "no evolution": {"methods": ("model", "surrogate")},
+    "no gradients": {"methods": ("surrogate", "evolution")},
+}
+"""The method of `hector tune --walks`, and what is left out of it."""
+METRIC = " in metric"
+METHODS = (*OURS, *RIVALS, *(name + METRIC for name in RIVALS))
+NOMINAL = "nominal"
+SPREADS = {NOMINAL: 1.0}  # first standard deviation of rivals by start
+SPREAD = 0.3  # from a tuned start
+NEAR, FAR = 3.0, 4.0  # box of rivals: log-weights, and the metric's units
+SEARCHES, SOURCES = 8, 250  # searches on the model, for rivals that learn from them; points of each
+NET = 64  # walks of the simulator that the net of a tuned start has seen
 
 
 @dataclass(frozen=True)
 class Flags:
     """What to race."""
 
-    traj: str = "s"  # straight, c or s
-    rollouts: int = 200  # walks on the simulator, of each method and repeat
-    repeats: int = 3  # seeds of what is random
-    ticks: int = 400  # of a walk, 10 ms each
-    batch: int = 10  # walks in a round, of each method and repeat
-    net: Path | None = None  # by default made here and timed, in OUT/data
+    traj: tuple[str, ...] = ("s",)
+    start: tuple[str, ...] = (NOMINAL,)  # nominal, or weights files
+    methods: tuple[str, ...] = (WALKS, *RIVALS)
+    walks: int = 200  # of each contest
+    repeats: int = 3  # seeds of each method
+    plants: int = 8  # of hfs-varied, from `first_plant` on, that judge the best sets; 0: none
+    first_plant: int = 300
+    engine: str = "c"  # what walks, one of `hector walk --engine` but mjx
+    robot: Path | None = None  # TOML file of another robot; HECTOR by default
     out: Path = Path("runs/race")  # folder of the report
-    engine: str = "auto"  # c (MuJoCo, on the processes), mjx (all at once), auto: mjx on a GPU
     processes: int = 2  # one core each
 
     def __post_init__(self) -> None:
-        count = AT_LEAST_ONE
-        check(self, rollouts=count, repeats=count, ticks=count, batch=Range(4), processes=count)
+        counts = dict.fromkeys(("walks", "repeats", "processes"), AT_LEAST_ONE)
+        check(self, **counts)
+        check_names("methods", self.methods, METHODS)
 
 
-class ModelRun(NamedTuple):
-    """Accepted weights of a method on the model, in their order."""
+class Contest(NamedTuple):
+    """One tuning of the race."""
 
-    steps: list[list[float]]  # in 18 log-weights
-    seconds: list[float]  # computing time until each, including rejected iterations
-    compiling: float  # [s], not in `seconds`
-    iterations: int  # number, including the rejected
-    iteration: float  # [s] mean time
+    traj: str
+    start: str
+    method: str
+    seed: int
 
+    @property
+    def name(self) -> str:
+        """Name of its folder."""
+        return "-".join((self.traj, self.start, self.method.replace(" ", "_"), str(self.seed)))
 
-class Prices(NamedTuple):
-    """Seconds of one core, measured on this machine."""
+    @property
+    def counts_start(self) -> bool:
+        """Whether the walk of the start is one of its walks."""
+        return self.method in OURS or self.method.removesuffix(METRIC) in READ_START
 
-    walk: float  # of a walk on the hfs in MuJoCo C, as long as those of the race
-    iterations: dict[str, float]  # of an iteration on the model with its gradient, by method
-    collection: float  # of the walks for the net, and of the plain tunings before them
-    training: float  # of the net; zero if the net was given
-
-
-class Repeat(NamedTuple):
-    """A repeat of a method."""
-
-    rounds: list[Round]
-    lowest: np.ndarray  # loss after each walk, first that of the start
-    seconds: np.ndarray  # of one core after each walk
+    def rows_after(self, budget: int) -> int:
+        """Return the number of rows that so many walks buy, that of the start included."""
+        return max(budget + (not self.counts_start), 1)
 
 
-class Results(NamedTuple):
-    """Contents of the report."""
+class _Inline(Executor):
+    """Does each job at once, in this process."""
 
-    engine: str
-    start: float  # loss
-    methods: dict[str, list[Repeat]]
-    model: dict[str, ModelRun]
-    prices: Prices
-    took: dict[str, float] | None  # [s] collection and training; None if the net was given
+    def submit(self, fn: Callable, /, *args: Any, **kwargs: Any) -> Future:
+        done: Future = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
 
 
-def _model_job(
-    method: str, config: TuneConfig, robot: Robot, command: Command, params: Params | None
-) -> ModelRun:
-    effect = effect_of(params, config.rollout.walk)
-    start, anchor, begin = nominal(), standing_anchor(robot), time.monotonic()
-    first = difftune.tune_step(config, robot, start, command, anchor, effect)
-    jax.block_until_ready(first)
-    compiled = time.monotonic()
-    rows: list[tuple[Iteration, float]] = []
-    record = lambda iteration: rows.append((iteration, time.monotonic() - compiled))  # noqa: E731
-    if method == "adam":
-        adam(config, RATE, robot, start, command, anchor, effect, record)
-    else:
-        difftune.tune(config, robot, start, command, anchor, effect, record)
-    accepted = [(i.weights, seconds) for i, seconds in rows[1:] if i.accepted]
-    return ModelRun(
-        [steps_to(start, weights).tolist() for weights, _ in accepted],
-        [seconds for _, seconds in accepted],
-        compiled - begin,
-        len(rows),
-        rows[-1][1] / len(rows),
+class Model(NamedTuple):
+    """What the model tells about a start before any walk."""
+
+    matrix: Float[np.ndarray, "n n"]  # Gauss-Newton matrix divided by the loss
+    steps: Float[np.ndarray, "m n"]  # log-weights less those of the start, of searches on the model
+    losses: Float[np.ndarray, " m"]  # their log-losses on the model
+
+
+def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Search on the model with CMA-ES; return the steps of all its points and their log-losses."""
+    (command,) = campaign.commands.values()
+    box = _box(campaign)
+    identity = np.eye(len(box))
+    space = Space(identity, identity, np.zeros(len(box)), box_of(campaign))
+    config = campaign.config.rollout
+    inputs = config, campaign.robot, command, effect_of(None, config.walk), campaign.config.loss
+    points: list[np.ndarray] = []
+    losses: list[float] = []
+
+    def walk(point: Float[np.ndarray, " n"]) -> float:
+        if len(losses) == SOURCES:
+            raise Spent
+        loss = float(np.log(_model_loss(*inputs, weights_at(campaign, space, point))))
+        points.append(point)
+        losses.append(loss if np.isfinite(loss) else max(losses, default=0.0) + 1.0)
+        return losses[-1]
+
+    _until_spent(
+        RIVALS["cma-es"], Task(walk, box, SPREAD, seed, (np.zeros((0, len(box))), np.zeros(0)))
+    )
+    return np.array(points), np.array(losses)
+
+
+@partial(jax.jit, static_argnums=0)
+def _model_loss(
+    config: RolloutConfig,
+    robot: Robot,
+    command: Command,
+    effect: jax.tree_util.Partial,
+    loss: Loss,
+    weights: Weights,
+) -> Array:
+    return loss_of(loss, rollout(config, robot, weights, command, standing_anchor(robot), effect))
+
+
+def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
+    return np.clip(box_of(campaign), -NEAR, NEAR)
+
+
+def _until_spent(rival: Callable[[Task], None], task: Task) -> None:
+    try:
+        rival(task)
+    except Spent:
+        pass
+
+
+def contest_job(campaign: Campaign, contest: Contest, model: Model, budget: int) -> None:
+    """Walk a contest to its end, from what is in its folder on."""
+    make_folder(campaign.folder)
+    space, rows = _space(campaign, contest, model), walks.read_history(campaign)
+
+    def walk(proposal: Proposal, weights: Weights) -> None:
+        rows[:] = walks.add_walk(campaign, rows, proposal, [walks.walk_case(campaign, weights, 0)])
+
+    if not rows:
+        walk(Proposal(np.zeros(len(space.box)), "start", None), campaign.start)
+    if contest.method in OURS:
+        while len(rows) < contest.rows_after(budget):
+            walk(*walks.next_proposal(_Inline(), campaign, space, rows))
+        return
+    metric, told = contest.method.endswith(METRIC), [] if contest.counts_start else rows[:1]
+
+    def to_point(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return space.clip(np.asarray(x) if metric else space.to_point @ np.asarray(x))
+
+    def loss(x: Float[np.ndarray, " n"]) -> float:
+        point, number = to_point(x), len(told)
+        if number == contest.rows_after(budget):
+            raise Spent
+        if number == len(rows):
+            walk(Proposal(point, contest.method, None), weights_at(campaign, space, point))
+        if not np.allclose(rows[number].point, point, atol=1e-6):
+            raise InputError(f"{campaign.folder}: walk {number} was another; remove the folder")
+        told.append(rows[number])
+        return float(_log_losses(rows)[number])
+
+    steps = model.steps @ space.to_point.T if metric else model.steps
+    box = np.tile([-FAR, FAR], (len(space.box), 1)) if metric else _box(campaign)
+    spread = SPREADS.get(contest.start, SPREAD)
+    task = Task(loss, box, spread, contest.seed, (steps, model.losses))
+    _until_spent(RIVALS[contest.method.removesuffix(METRIC)], task)
+
+
+def _space(campaign: Campaign, contest: Contest, model: Model) -> Space:
+    without = contest.method == "no metric"
+    return few_walks.space_of(
+        np.zeros_like(model.matrix) if without else model.matrix, box_of(campaign)
     )
 
 
-def _price_job(config: TuneConfig, robot: Robot, command: Command) -> float:
-    """Measure the seconds of a compiled walk, as the mean of three."""
-    seconds = config.rollout.ticks * config.rollout.walk.gait.tick
-    job = Job(nominal(), command, hfs(), seconds)
-    walk(config.rollout.walk, robot, job)
-    begin = time.monotonic()
-    for _ in range(3):
-        walk(config.rollout.walk, robot, job)
-    return (time.monotonic() - begin) / 3
+def _log_losses(rows: Sequence[Row]) -> Float[np.ndarray, " walks"]:
+    """Return the log-losses less that of the start; a fall is worse than all before it."""
+    losses = np.array([row.losses[0] for row in rows])
+    worst = np.maximum.accumulate(np.where(np.isfinite(losses), losses, 0.0))
+    return np.log(np.where(np.isfinite(losses), losses, np.e * worst) / losses[0])
 
 
-def _propose_job(
-    optimizer: Optimizer, start: Weights, past: Sequence[Generation]
-) -> tuple[Steps, float]:
-    begin = time.monotonic()
-    return optimizer.ask(start, past), time.monotonic() - begin
+class Entry(NamedTuple):
+    """A method from a start, on one trajectory."""
+
+    start: str
+    method: str
 
 
-def prepare(pool: Executor, flags: Flags, robot: Robot) -> tuple[Params, dict[str, float] | None]:
-    """Return the net, and the times of its making [s]; None if the net was given."""
-    if flags.net is not None:
-        return load_net(flags.net, robot, TrainConfig().variant)[0], None
-    folder, part = flags.out / "data", flags.out / "data.part"
-    if not folder.exists():
-        shutil.rmtree(part, ignore_errors=True)  # after an interruption its seconds are unknown
-        begin = time.monotonic()
-        nets.collect(pool, nets.CollectConfig(), robot, part / "walks")  # see `load_or_train`
-        collected = time.monotonic()
-        path = nets.net_path(part, TrainConfig().variant)
-        nets.train(TrainConfig(), robot, part / "walks", path)
-        seconds = {"collection": collected - begin, "training": time.monotonic() - collected}
-        write_json(part / "seconds.json", seconds)
-        part.rename(folder)
-    took = read_json(folder / "seconds.json", "the seconds of a collection and a training")
-    return nets.load_or_train(pool, robot, folder).params, took
+class Best(NamedTuple):
+    """The best set of a contest after so many walks."""
+
+    number: int  # of its walk
+    weights: Weights
+    loss: float  # L on the plant that was walked
 
 
-def on_model(
-    pool: Executor,
-    flags: Flags,
-    config: TuneConfig,
-    robot: Robot,
-    command: Command,
-    params: Params,
-) -> tuple[dict[str, ModelRun], float]:
-    """Run the methods on the model and measure the seconds of a walk; cached under OUT."""
-    # the seconds depend on the commit and on the number of processes
-    about = repr((flags.processes, environment().get("commit")))
-    key = content_key(config, RATE, command, params, robot, about, OPTIMIZERS, code=CODE)
-    path = flags.out / f"model-{key}.json"
-    if not path.exists():
-        with bar("tuning on the model, and the price of a walk") as report_progress:
-            report_progress(0, len(ON_MODEL), "compiling")
-            price = pool.submit(_price_job, config, robot, command).result()
-            running = {}
-            for name in ON_MODEL:
-                net = params if name in WITH_NET else None
-                running[name] = pool.submit(_model_job, name, config, robot, command, net)
-            runs = {name: future.result()._asdict() for name, future in running.items()}
-        write_json(path, {"walk": price, "courses": runs})
-    data = read_json(path, "runs on the model")
-    return {name: ModelRun(**data["courses"][name]) for name in ON_MODEL}, data["walk"]
+def best_after(campaign: Campaign, contest: Contest, model: Model, budget: int) -> Best:
+    """Return the set of a contest after so many walks: of ours by posterior mean, else the least L.
+
+    Raises:
+        InputError: the contest is not in the folder.
+    """
+    rows = walks.read_history(campaign)[: contest.rows_after(budget)]
+    if not rows:
+        raise InputError(f"{campaign.folder}: no walks")
+    space = _space(campaign, contest, model)
+    losses = [row.losses[0] for row in rows]
+    number = int(np.argmin(losses))
+    if contest.method in OURS:
+        number = walks.answer(campaign, space, rows)[1]
+    return Best(number, weights_at(campaign, space, rows[number].point), losses[number])
 
 
-def all_contestants(
-    flags: Flags, config: TuneConfig, model: Mapping[str, ModelRun]
-) -> dict[str, dict[str, Optimizer]]:
-    """Return all optimizers, by method and repeat."""
-    size, seeds = flags.batch, range(flags.repeats)
-    budget = max(flags.rollouts // size, 1) * size
-    random = {
-        "cma-es": lambda seed: CmaEs(SearchConfig(budget, size, seed)),
-        "bayes near": lambda seed: Bayes(seed, NEAR, most=size),
-        "bayes": lambda seed: Bayes(seed, most=size),
-        "random": lambda seed: Random(seed, most=size),
+def falls_of(campaign: Campaign, contest: Contest, budget: int) -> int:
+    """Return the number of walks of a contest that fell, or whose QPs were not solved."""
+    rows = walks.read_history(campaign)[: contest.rows_after(budget)]
+    return sum(not np.isfinite(row.losses[0]) for row in rows)
+
+
+Losses = dict[Entry, dict[int, list[float]]]
+"""L of the best sets by entry and budget, one for each repeat."""
+
+
+class Lead(NamedTuple):
+    """Ratio of the losses of an entry to those of its best rival, with its 95 % interval."""
+
+    rival: Entry
+    ratio: float
+    low: float
+    high: float
+
+
+def lead(losses: Losses, entry: Entry, budget: int, *, charge: int = 0) -> Lead:
+    """Compare an entry with the rival whose mean log-loss is least, paired by repeat.
+
+    Args:
+        losses: of all entries.
+        entry: one of ours.
+        budget: number of walks.
+        charge: walks that the entry has spent before; rivals are then those from nominal alone.
+    """
+    ours = np.log(losses[entry][max(budget - charge, 0)])
+    rivals = {
+        rival: np.log(each[budget])
+        for rival, each in losses.items()
+        if rival.method not in OURS
+        and rival.start in ({NOMINAL} if charge else {r.start for r in losses})
     }
-    return {
-        **{n: {n: Given(tuple(map(tuple, run.steps)), size)} for n, run in model.items()},
-        "differences": {"differences": Differences(config)},
-        **{name: {f"{name} {i}": make(i) for i in seeds} for name, make in random.items()},
-    }
+    best = min(rivals, key=lambda rival: np.mean(rivals[rival]))
+    count = min(len(ours), len(rivals[best]))
+    ratios = ours[:count] - rivals[best][:count]
+    error = np.std(ratios, ddof=1) / np.sqrt(count) if count > 1 else np.inf
+    reach = student.ppf(0.975, max(count - 1, 1)) * error
+    return Lead(best, *(float(np.exp(ratios.mean() + by)) for by in (0.0, -reach, reach)))
 
 
-def race(
-    pool: Executor,
-    flags: Flags,
-    config: TuneConfig,
-    robot: Robot,
-    command: Command,
-    engine: Engine,
-    contestants: Mapping[str, Optimizer],
-) -> BenchmarkResult:
-    """Run the race, continuing its journal."""
-    size = sum(optimizer.most for optimizer in contestants.values())
-    about = {
-        "trajectory": flags.traj,
-        "engine": engine.name,
-        "ticks": config.rollout.ticks,
-        "controller": repr(config.rollout.walk),
-        "loss": repr(config.loss),
-        "robot": robot_hash(robot),
-        "plant": tree_hash(hfs()),
-        "command": tree_hash(command),
-        "start": tree_hash(nominal()),
-        "settings": content_key(sorted(contestants.items()), OPTIMIZERS, code=CODE),
-    }
-
-    def propose(
-        inputs: Mapping[str, tuple[Optimizer, Weights, Sequence[Generation]]],
-    ) -> dict[str, tuple[Steps, float]]:
-        running = {name: pool.submit(_propose_job, *row) for name, row in inputs.items()}
-        return {name: future.result() for name, future in running.items()}
-
-    def walk(sets: Mapping[str, Sequence[Weights]]) -> dict[str, np.ndarray]:
-        commands = dict.fromkeys(sets, command)
-        setup, options = Setup(pool, config, robot), {"engine": engine, "at_once": size}
-        return searches.losses_on_hfs(setup, sets, commands=commands, **options)
-
-    with bar(f"racing on the high-fidelity simulator, engine {engine.name}") as report_progress:
-
-        def on_round(result: BenchmarkResult) -> None:
-            done = sum(map(walks, result.rounds.values()))
-            best = {n: lowest(result.start, rounds)[-1] for n, rounds in result.rounds.items()}
-            first = min(best, key=best.__getitem__)
-            message = f"first {first}, L {best[first] / 1e6:.3f}e6" if done else "compiling"
-            report_progress(done, flags.rollouts * len(contestants), message)
-
-        return benchmark(
-            contestants,
-            nominal(),
-            flags.rollouts,
-            propose=propose,
-            walk=walk,
-            path=flags.out / "race.jsonl",
-            about=about,
-            on_round=on_round,
-        )
-
-
-def seconds_spent(
-    name: str, rounds: Sequence[Round], model: Mapping[str, ModelRun], prices: Prices
-) -> np.ndarray:
-    """Return the seconds of one core after each walk, first that of the start."""
-    if name in model:
-        computing = np.diff([0.0, *model[name].seconds[: walks(rounds)]])
-    else:
-        parts = [np.full(n := len(r.generation.losses), r.seconds / n) for r in rounds]
-        computing = np.concatenate([np.zeros(0), *parts])
-    before = prices.collection + prices.training if name in WITH_NET else 0.0
-    return before + np.concatenate([[0.0], np.cumsum(computing + prices.walk)])
+def read_models(pool: Executor, flags: Flags, campaigns: Sequence[Campaign]) -> list[Model]:
+    """Return what the model tells of the starts; computed once, in OUT/models."""
+    paths = [flags.out / "models" / f"{campaign.folder.name}.npz" for campaign in campaigns]
+    missing = {}
+    for path, campaign in zip(paths, campaigns, strict=True):
+        if not path.exists():
+            (command,) = campaign.commands.values()
+            inputs = campaign.config, campaign.robot, campaign.start, tunings.Problem(command, None)
+            searches = [pool.submit(search_job, campaign, seed) for seed in range(SEARCHES)]
+            missing[path] = pool.submit(tunings.gauss_newton_job, *inputs), searches
+    for path, (matrix, searches) in missing.items():
+        steps, losses = zip(*(search.result() for search in searches), strict=True)
+        model = Model(matrix.result(), np.concatenate(steps), np.concatenate(losses))
+        save_tree(path, model, kind="model", robot=campaigns[0].robot)
+    like = Model(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
+    return [load_tree(path, like, kind="model", robot=campaigns[0].robot)[0] for path in paths]
 
 
 def main() -> None:
-    """Write report.md, race.json and the pictures."""
+    """Walk all contests, judge their sets, and write report.md, race.json and the pictures."""
     flags = tyro.cli(Flags)
     setup_jax()
-    command, engine = named_command(flags.traj), choose_engine(flags.engine)
-    if not all(find_spec(package) for package in ("cmaes", "sklearn")):
-        raise InputError('the race needs its extra: pip install "hector-jax[race]"')
-    make_folder(flags.out)
-    robot = jax.tree.map(np.asarray, load_robot())
-    config = TuneConfig(RolloutConfig(ticks=flags.ticks), iterations=flags.rollouts)
+    robot, engine = jax.tree.map(np.asarray, load_robot(flags.robot)), choose_engine(flags.engine)
+    config, plant = tunings.tune_config(robot), hfs(robot.description)
+    sets = {Path(name).stem: _load(name, robot) for name in flags.start}
+
+    def campaign_of(traj: str, start: str, folder: Path, **options: Any) -> Campaign:
+        inputs = folder, config, robot, sets[start], {traj: named_command(traj)}, [plant]
+        return Campaign(*inputs, engine=engine, **options)
+
+    contests = [
+        Contest(*row) for row in product(flags.traj, sets, flags.methods, range(flags.repeats))
+    ]
+    campaigns = {
+        contest: campaign_of(
+            contest.traj,
+            contest.start,
+            flags.out / "contests" / contest.name,
+            seed=contest.seed,
+            **OURS.get(contest.method, {}),
+        )
+        for contest in contests
+    }
     with workers(flags.processes) as pool:
-        params, took = prepare(pool, flags, robot)
-        params = jax.tree.map(np.asarray, params)
-        model, walk = on_model(pool, flags, config, robot, command, params)
-        methods = all_contestants(flags, config, model)
-        contestants = {k: v for repeats in methods.values() for k, v in repeats.items()}
-        result = race(pool, flags, config, robot, command, engine, contestants)
-    full = RolloutConfig().ticks / flags.ticks  # walks and tunings of the collection have 4 s
-    plain = model["without"]
-    prices = Prices(
-        walk,
-        {name: run.iteration for name, run in model.items()},
-        full * (nets.CollectConfig.walks * walk + 3 * plain.iterations * plain.iteration),
-        took["training"] if took else 0.0,
-    )
-
-    def repeat(method: str, name: str) -> Repeat:
-        rounds = result.rounds[name]
-        seconds = seconds_spent(method, rounds, model, prices)
-        return Repeat(rounds, lowest(result.start, rounds), seconds)
-
-    repeats = {m: [repeat(m, name) for name in contestants] for m, contestants in methods.items()}
-    path = report(flags, Results(engine.name, result.start, repeats, model, prices, took))
-    say(f"the report is {path}")
-
-
-def _millions(losses: Sequence[float]) -> str:
-    """Format the median of losses and, of several, their range [1e6]."""
-    median = f"{statistics.median(losses) / 1e6:.3f}"
-    if len(losses) == 1:
-        return median
-    return f"{median} [{min(losses) / 1e6:.3f}, {max(losses) / 1e6:.3f}]"
-
-
-def as_numbers(flags: Flags, results: Results) -> dict[str, dict[str, Any]]:
-    """Return the numbers of the methods for race.json."""
-    marks = [mark for mark in MARKS if mark < flags.rollouts] + [flags.rollouts]
-    return {
-        method: {
-            "best": {
-                str(mark): [float(r.lowest[min(mark, len(r.lowest) - 1)]) for r in repeats]
-                for mark in marks
-            },
-            "walks": [walks(r.rounds) for r in repeats],
-            "seconds": [float(r.seconds[-1]) for r in repeats],
-            "losses": [
-                [x for part in r.rounds for x in part.generation.losses.tolist()] for r in repeats
-            ],
-            "spent": [r.seconds.tolist() for r in repeats],
-            "last": [float(r.rounds[-1].generation.losses[-1]) for r in repeats if r.rounds],
+        pairs = list(product(flags.traj, sets))
+        starts = [campaign_of(*pair, flags.out / "-".join(pair)) for pair in pairs]
+        models = dict(zip(pairs, read_models(pool, flags, starts), strict=True))
+        inputs = [(campaigns[c], c, models[c[:2]], flags.walks) for c in contests]
+        with bar("racing") as report_progress:
+            for done, future in enumerate([pool.submit(contest_job, *row) for row in inputs], 1):
+                future.result()
+                report_progress(done, len(contests), contests[done - 1].name)
+        bests = {
+            (contest, budget): best_after(campaigns[contest], contest, models[contest[:2]], budget)
+            for contest in contests
+            for budget in _budgets(flags)
         }
-        for method, repeats in results.methods.items()
-    }
+        judged = judge(Setup(pool, config, robot), flags, bests)
+    falls = {c: falls_of(campaigns[c], c, flags.walks) for c in contests}
+    say(f"the report is {report(flags, bests, judged, falls)}")
 
 
-def report(flags: Flags, results: Results) -> Path:
-    """Write the report with its pictures and its numbers as JSON; returns its path."""
-    numbers = as_numbers(flags, results)
-    rows = [
-        [
-            plots.METHODS[method],
-            str(len(results.methods[method])),
-            *map(_millions, row["best"].values()),
-            _millions(row["last"]) if method in results.model and row["last"] else "",
-            f"{statistics.median(row['walks']):g}",
-            f"{statistics.median(row['seconds']):.0f}",
-        ]
-        for method, row in numbers.items()
-    ]
-    marks = next(iter(numbers.values()))["best"]
-    head = ["method", "repeats", *(f"after {m}" for m in marks), "its own last", "walks", "s"]
-    by_walks, by_seconds = (
-        {m: [(x(r), r.lowest) for r in repeats] for m, repeats in results.methods.items()}
-        for x in (lambda r: np.arange(len(r.lowest), dtype=float), lambda r: r.seconds)
-    )
-    out = flags.out
-    abscissa = "walks on the high-fidelity simulator"
-    captions = {
-        "rollouts.png": plots.race(out / "rollouts.png", by_walks, abscissa),
-        "seconds.png": plots.race(out / "seconds.png", by_seconds, "seconds of one core")
-        + " The methods with the net begin after its walks and its training.",
-    }
-    data = {
-        "flags": {n: str(v) for n, v in asdict(flags).items()},
-        "engine": results.engine,
-        "start": results.start,
-        "prices": results.prices._asdict(),
-        "took": results.took,
-        "courses": {name: run._asdict() for name, run in results.model.items()},
-        "methods": numbers,
-    }
-    return write_report(
-        out / "report.md",
-        "The race",
-        _text(flags, results, markdown_table(head, rows)),
-        numbers=data,
-        json_name="race.json",
-        pictures=captions,
-    )
+def _load(name: str, robot: Robot) -> Weights:
+    return nominal(robot) if name == NOMINAL else load_weights(Path(name), robot)
 
 
-def _text(flags: Flags, results: Results, table: str) -> list[str]:
-    prices, took, start = results.prices, results.took, results.start
-    iterations = ", ".join(
-        f"{plots.METHODS[n]} {prices.iterations[n]:.2f} s ({run.iterations} of them; compiling "
-        f"took {run.compiling:.0f} s and is not counted)"
-        for n, run in results.model.items()
+def _budgets(flags: Flags) -> list[int]:
+    """Return the budgets of the tables, and what the walks of the net leave of them."""
+    budgets = [budget for budget in BUDGETS if budget <= flags.walks]
+    return sorted({*budgets, *(budget - NET for budget in budgets if budget > NET)})
+
+
+Bests = Mapping[tuple[Contest, int], Best]
+
+
+def judge(setup: Setup, flags: Flags, bests: Bests) -> dict[tuple[Contest, int], float]:
+    """Return the mean L of the best sets on other plants; infinite after a fall."""
+    judged = {}
+    seeds = range(flags.first_plant, flags.first_plant + flags.plants)
+    description = setup.robot.description
+    plants = [named_world("hfs-varied", seed, description) for seed in seeds]
+    for traj in flags.traj if plants else ():
+        of_traj = {key: best for key, best in bests.items() if key[0].traj == traj}
+        sets = {_set_name(key[0], best): best.weights for key, best in of_traj.items()}
+        inputs = setup, sets, named_command(traj), plants, seeds
+        options = {"title": f"judging {traj}", "folder": flags.out / "scores"}
+        scores = verdicts.judge(*inputs, **options, engine=choose_engine(flags.engine)).scores
+        for key, best in of_traj.items():
+            each = scores[_set_name(key[0], best)]
+            fell = any(score.fallen for score in each)
+            judged[key] = np.inf if fell else float(np.mean([score.L for score in each]))
+    return judged
+
+
+def _set_name(contest: Contest, best: Best) -> str:
+    return f"start-{contest.start}" if best.number == 0 else f"{contest.name}-{best.number}"
+
+
+def _by_entry(traj: str, losses: Mapping[tuple[Contest, int], float]) -> Losses:
+    """Group the losses on a trajectory by entry and budget."""
+    grouped: Losses = {}
+    for (contest, budget), loss in losses.items():
+        if contest.traj == traj:
+            entry = grouped.setdefault(Entry(contest.start, contest.method), {})
+            entry.setdefault(budget, []).append(loss)
+    return grouped
+
+
+def report(
+    flags: Flags,
+    bests: Bests,
+    judged: Mapping[tuple[Contest, int], float],
+    falls: Mapping[Contest, int],
+) -> Path:
+    """Write the report with its pictures and its numbers; returns its path."""
+    own = {key: best.loss for key, best in bests.items()}
+    text: list[str] = []
+    numbers: dict[str, Any] = {}
+    pictures: dict[str, str] = {}
+    for traj in flags.traj:
+        on_own, on_others = _by_entry(traj, own), _by_entry(traj, judged)
+        text += [f"## {traj}", _losses_table(flags, on_own, falls, traj)]
+        if on_others:
+            title = f"Mean L on {flags.plants} other plants, median over the repeats [1e6]:"
+            text += [title, _losses_table(flags, on_others, {}, traj)]
+        for title, losses in (("the plant of the walks", on_own), ("the other plants", on_others)):
+            if losses:
+                text += [f"L against the best rival on {title}:", _leads_table(flags, losses)]
+        numbers[traj] = {
+            f"{entry.start} {entry.method}": {
+                "own": each,
+                "others": on_others.get(entry, {}),
+                "falls": [falls[c] for c in falls if c[:3] == (traj, *entry)],
+            }
+            for entry, each in on_own.items()
+        }
+        curves = {f"{e.method}, from {e.start}": each for e, each in on_own.items()}
+        pictures[f"{traj}.png"] = plots.race(flags.out / f"{traj}.png", curves)
+    intro = (
+        f"Engine {choose_engine(flags.engine).title}, {flags.walks} walks a contest, at most "
+        f"{flags.repeats} seeds. L of the best set so far on the simulator's own plant, median "
+        "over the repeats [1e6]: of the methods of `hector tune --walks` that of the least "
+        "posterior mean, of the others that of the least L."
     )
-    made = (
-        f"On this machine, {flags.processes} processes, collection took {took['collection']:.0f} s "
-        f"and training {took['training']:.0f} s, compiling included."
-        if took
-        else f"The net was taken from {flags.net}; **its training is not in the seconds**."
-    )
-    return [
-        f"Trajectory {flags.traj}, {flags.ticks} ticks, engine {results.engine}. Lowest L [1e6] on "
-        f"the high-fidelity simulator so far; all start from the nominal weights, "
-        f"{start / 1e6:.3f}, "
-        "and stay in one box. What is random: median over the repeats, and their range.",
-        table,
-        "## What is counted",
-        f"- **Walks.** Every walk counts but that of the start. The three that follow the model "
-        "learn nothing from theirs: each iterate that they accept is walked once, to be judged. "
-        "`its own last` is the loss of the iterate at which they end, without a choice by the "
-        f"simulator. The net has seen {nets.CollectConfig.walks} walks before, of all "
-        "trajectories, which are in the seconds and not in the walks.",
-        f"- **Seconds** are of one core: a walk {prices.walk:.2f} s (MuJoCo C, the mean of three "
-        "on this machine, whatever engine raced); what a method thought, measured; an iteration on "
-        f"the model with its gradient: {iterations}. The methods with the net begin "
-        f"{prices.collection + prices.training:.0f} s late: {prices.collection:.0f} s for its "
-        "walks and the three plain tunings that they follow, each priced as the plain one here, "
-        f"and {prices.training:.0f} s of training, all of it, though one net serves every "
-        "trajectory. " + made,
-        f"- **Rounds.** All go in lock-step, {flags.batch} walks a round. Bayesian optimisation is "
-        "scikit-learn's Gaussian process (Matern 5/2, a length for each weight, noise, on log L) "
-        "and the largest expected improvement, a round chosen by constant liar with the lowest "
-        "loss; its first round is that of the random draws, normal about the start with deviation "
-        f"1 in log-weights, as are those of CMA-ES. `near` may leave the start by a factor of "
-        f"{np.exp(NEAR):.0f}. Differences: 18 forward differences of 5 %, then DiffTune's step, "
-        "halved while the loss rises.",
-    ]
+    numbers |= {"flags": {name: str(value) for name, value in asdict(flags).items()}}
+    inputs = flags.out / "report.md", "The race", [intro, *text]
+    return write_report(*inputs, numbers=numbers, json_name="race.json", pictures=pictures)
+
+
+def _losses_table(flags: Flags, losses: Losses, falls: Mapping[Contest, int], traj: str) -> str:
+    budgets = [budget for budget in BUDGETS if budget <= flags.walks]
+    head = ["start", "method", "repeats", *map(str, budgets), *(["falls"] if falls else [])]
+    rows = []
+    for entry, each in losses.items():
+        cells = [f"{np.median(each[budget]) / 1e6:.3f}" for budget in budgets]
+        fell = [falls[c] for c in falls if c[:3] == (traj, *entry)]
+        rows.append(
+            [*entry, str(len(each[0])), *cells, *([f"{np.mean(fell):.1f}"] if fell else [])]
+        )
+    return markdown_table(head, rows)
+
+
+def _leads_table(flags: Flags, losses: Losses) -> str:
+    budgets = [budget for budget in BUDGETS if budget <= flags.walks]
+    rows = []
+    for entry in losses:
+        if entry.method not in OURS:
+            continue
+        charges = (0,) if entry.start == NOMINAL else (0, NET)
+        for charge in charges:
+            leads = [lead(losses, entry, budget, charge=charge) for budget in budgets]
+            cells = [f"{x.ratio:.2f} [{x.low:.2f}, {x.high:.2f}] {x.rival.method}" for x in leads]
+            rows.append([entry.start, entry.method + (f" + {charge}" if charge else ""), *cells])
+    return markdown_table(["start", "method", *map(str, budgets)], rows)
 
 
 if __name__ == "__main__":

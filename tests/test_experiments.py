@@ -123,18 +123,6 @@ def test_the_table_refuses_a_wrong_number_as_a_script_in_one_line(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_race_on_another_engine_collects_as_every_run_does(tmp_path, monkeypatch):
-    race, made = script("race"), []
-    monkeypatch.setattr(race.nets, "collect", lambda pool, config, *rest: made.append(config))
-    monkeypatch.setattr(race.nets, "train", lambda *rest: (tmp_path / "data.part").mkdir())
-    monkeypatch.setattr(
-        race.nets, "load_or_train", lambda pool, robot, folder: race.nets.TrainedNet
-    )
-    monkeypatch.setattr(race.nets.TrainedNet, "params", None, raising=False)
-    race.prepare(None, race.Flags(engine="c", out=tmp_path), None)
-    assert made == [race.nets.CollectConfig()]  # what `ground` takes up
-
-
 @pytest.mark.parametrize(
     ("flags", "fault"),
     [

@@ -5,7 +5,14 @@ import pytest
 
 from hector_jax.core import inputs
 from hector_jax.core.inputs import InputError
-from hector_jax.search.few_walks import WalkResult, incumbent, needs_model, propose, space_of
+from hector_jax.search.few_walks import (
+    METHODS,
+    WalkResult,
+    incumbent,
+    needs_model,
+    propose,
+    space_of,
+)
 
 SIZE = 5
 MATRIX = np.diag([4.0, 1.0, 0.25, 0.0])  # of four of the five steps
@@ -29,10 +36,10 @@ def walked(proposal, loss, margin=0.1):
     return WalkResult(*proposal, loss=loss, margin=margin)
 
 
-def tune(walks, truth=lambda point: bowl(GOAL, point)[0], margin=lambda point: 0.1):
+def tune(walks, truth=lambda point: bowl(GOAL, point)[0], margin=lambda point: 0.1, **options):
     history = []
     for _ in range(walks):
-        proposal = propose(SPACE, history, model)
+        proposal = propose(SPACE, history, model, **options)
         history.append(walked(proposal, truth(proposal.point), margin(proposal.point)))
     return history
 
@@ -60,6 +67,13 @@ def test_the_model_leads_first_then_the_surrogate_and_each_fourth_walk_evolution
     assert len(evolved) >= 3
     assert set(np.diff(evolved)) == {4}
     assert [needs_model(history[:i]) for i in (1, evolved[0])] == [True, False]
+
+
+@pytest.mark.parametrize("absent", METHODS)
+def test_a_method_that_may_not_propose_does_not(absent):
+    rows = tune(12, methods=[name for name in METHODS if name != absent])
+    assert {row.method for row in rows} == {"start", *METHODS} - {absent}
+    assert min(row.loss for row in rows) < rows[0].loss
 
 
 def test_what_the_model_does_not_know_is_found_by_the_walks(history):

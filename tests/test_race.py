@@ -1,174 +1,176 @@
-"""Optimizers on a bowl in place of a simulator, and the journal of their benchmark."""
+"""Rivals on a bowl in place of a simulator, and the contests of the race."""
 
-import json
+from importlib.util import find_spec
 
 import jax
 import numpy as np
 import pytest
-from lockstep import benchmark, lowest, walks
-from optimizers import Bayes, CmaEs, Differences, Given, Random, steps_to
+import race
+from model import AHEAD, BRIEF
+from rivals import RIVALS, Spent, Task
 
-from hector_jax.control.parameters import bounds
-from hector_jax.control.weights import nominal, weights_to_vector
-from hector_jax.search.cmaes import Generation, SearchConfig, log_bounds, project
+from hector_jax.control.weights import expert, nominal
+from hector_jax.core.inputs import InputError
+from hector_jax.robot.model import load_robot
+from hector_jax.runs import walks
+from hector_jax.runs.campaign import Campaign, box_of, weights_at
+from hector_jax.runs.walk_log import LogScore
+from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 
-GOAL = np.linspace(-1.0, 1.0, 18)
-OPTIMIZERS = {
-    "cma-es": CmaEs(SearchConfig(60, 10, seed=1, spread=0.3)),
-    "bayes": Bayes(1, spread=0.3),
-    "bayes near": Bayes(1, reach=1.5, spread=0.3),
-    "random": Random(1, spread=0.3),
-    "differences": Differences(TuneConfig()),
-    "given": Given(tuple(tuple(share * GOAL) for share in np.linspace(0.1, 0.9, 12))),
-}
-ABOUT = {"world": "bowl"}
+SIZE = 6
+GOAL = np.linspace(-1.0, 1.0, SIZE)
+NEEDS = {"lq-cma-es": "cma", "turbo": "botorch", "turbo on model": "botorch"}
 
 
-def loss(weights):
-    return 1.0 + np.sum((steps_to(nominal(), weights) - GOAL) ** 2)
+def bowl(point):
+    return float(np.log(1.0 + np.sum((point - GOAL) ** 2)))
 
 
-def bowl(sets):
-    return {name: np.array([loss(w) for w in each]) for name, each in sets.items()}
+def walked_by(name, seed=1, budget=60, loss=bowl, box=2.0):
+    """Return the points that a rival walks, and their losses."""
+    if not find_spec(NEEDS.get(name, "cmaes")):
+        pytest.skip(f"{NEEDS[name]} is not installed")
+    points, losses = [], []
+
+    def walk(point):
+        if len(points) == budget:
+            raise Spent
+        points.append(np.array(point))
+        losses.append(loss(points[-1]))
+        return losses[-1]
+
+    rough = 0.5 * GOAL + 0.3 * np.random.default_rng(0).standard_normal((200, SIZE))
+    source = rough, np.array([bowl(point) for point in rough])
+    with pytest.raises(Spent):
+        RIVALS[name](Task(walk, np.tile([-box, box], (SIZE, 1)), 0.5, seed, source))
+    return np.array(points), np.array(losses)
 
 
-def unasked(*_):
-    raise AssertionError("asked")
+@pytest.mark.parametrize("name", RIVALS)
+def test_a_rival_goes_downhill_within_its_box_and_repeats_itself(name):
+    points, losses = walked_by(name)
+    assert losses.min() < 0.95 * bowl(np.zeros(SIZE))
+    assert np.abs(points).max() <= 2.0 + 1e-9
+    np.testing.assert_array_equal(walked_by(name, budget=20)[0], points[:20])
 
 
-def think(asked):
-    return {name: (optimizer.ask(*known), 0.5) for name, (optimizer, *known) in asked.items()}
+@pytest.mark.parametrize("name", sorted(RIVALS.keys() - {"differences"}))
+def test_another_seed_gives_other_points(name):
+    one, other = (walked_by(name, seed, budget=20)[0] for seed in (1, 2))
+    assert np.abs(one - other).max() > 0.1
 
 
-def run(folder, optimizers=OPTIMIZERS, rollouts=60, think=think, walk=bowl):
-    path = folder / "race.jsonl"
-    return benchmark(
-        optimizers, nominal(), rollouts, propose=think, walk=walk, path=path, about=ABOUT
-    )
+def test_the_model_is_worth_walks():
+    cold, warm = (walked_by(name, budget=30)[1].min() for name in ("cma-es", "warm cma-es"))
+    assert warm < cold
 
 
-def same(one, other):
-    assert one.start == other.start
-    assert one.rounds.keys() == other.rounds.keys()
-    for name, rounds in one.rounds.items():
-        jax.tree.map(np.testing.assert_array_equal, rounds, other.rounds[name])
+def test_differences_halve_a_step_that_raises_the_loss():
+    points, losses = walked_by("differences", budget=SIZE + 4, loss=lambda x: bowl(20.0 * x))
+    np.testing.assert_allclose(points[1 : SIZE + 1], np.log(1.05) * np.eye(SIZE))
+    lengths = np.linalg.norm(points[SIZE + 1 :], axis=1)
+    assert losses[SIZE + 1] > losses[0]
+    np.testing.assert_allclose(lengths[1:] / lengths[:-1], 0.5)
 
 
 @pytest.fixture(scope="module")
-def raced(tmp_path_factory):
-    return run(tmp_path_factory.mktemp("race"))
+def robot():
+    return jax.tree.map(np.asarray, load_robot())
 
 
-@pytest.mark.parametrize("name", OPTIMIZERS)
-def test_every_optimizer_goes_downhill_within_its_budget(raced, name):
-    rounds = raced.rounds[name]
-    assert walks(rounds) == (12 if name == "given" else 60)
-    course = lowest(raced.start, rounds)
-    assert len(course) == walks(rounds) + 1
-    assert raced.start == course[0] == loss(nominal())
-    assert course[-1] < 0.95 * course[0]
+@pytest.fixture
+def bowl_walks(monkeypatch):
+    """Walk on a bowl: L falls towards the expert's weights."""
+    made = []
+
+    def walk_case(campaign, weights, case):
+        made.append(weights)
+        steps = [np.log(a / b) for a, b in zip(weights.Q, expert().Q, strict=True)]
+        score = LogScore(1.0 + float(np.sum(np.square(steps))), 0.1)
+        return score, None
+
+    monkeypatch.setattr(walks, "walk_case", walk_case)
+    monkeypatch.setattr(walks, "save_tree", lambda *args, **options: None)
+    return made
 
 
-def test_a_model_of_the_losses_is_worth_more_than_chance(raced):
-    best = {name: lowest(raced.start, rounds)[-1] for name, rounds in raced.rounds.items()}
-    assert max(best["bayes near"], best["cma-es"]) < 0.95 * best["random"]
+def contest(folder, robot, method, seed=0):
+    entry = race.Contest("short", "nominal", method, seed)
+    inputs = folder, TuneConfig(rollout=BRIEF), robot, nominal(robot), {"short": AHEAD}, [hfs()]
+    campaign = Campaign(*inputs, seed=seed, **race.OURS.get(method, {}))
+    size = len(box_of(campaign))
+    rng = np.random.default_rng(0)
+    return campaign, entry, race.Model(np.eye(size), rng.normal(size=(50, size)), rng.random(50))
 
 
-def test_the_same_seed_gives_the_same_race_and_another_one_another(raced, tmp_path):
-    same(run(tmp_path), raced)
-    start = Generation(np.zeros((1, 18)), np.ones(1))
-    for make in (Random, Bayes, lambda seed: CmaEs(SearchConfig(seed=seed))):
-        one, other = (make(seed).ask(nominal(), [start]) for seed in (1, 2))
-        assert np.abs(one - other).max() > 0.1
+@pytest.mark.parametrize("method", ["cma-es", "random in metric", "no gradients"])
+def test_a_contest_that_was_cut_ends_as_if_it_had_not_been(robot, bowl_walks, tmp_path, method):
+    one = contest(tmp_path / "one", robot, method)
+    race.contest_job(*one, 12)
+    count = one[1].rows_after(12)
+    assert count == 12 + (method != "no gradients")
+    assert len(bowl_walks) == count
+    whole = (tmp_path / "one" / "walks.jsonl").read_bytes()
+    other = contest(tmp_path / "other", robot, method)
+    race.contest_job(*other, 5)
+    race.contest_job(*other, 12)
+    assert len(bowl_walks) == 2 * count  # none twice
+    assert (tmp_path / "other" / "walks.jsonl").read_bytes() == whole
 
 
-def test_all_stay_in_the_box_and_treat_both_feet_alike():
-    # near one corner, with a loss that falls away from it
-    low, high = (np.asarray(weights_to_vector(w)) for w in bounds())
-    start = project(nominal(), np.where(np.arange(18) % 2, *log_bounds(nominal()).T[::-1]) * 0.98)
-    for optimizer in OPTIMIZERS.values():
-        if isinstance(optimizer, Given):
-            continue
-        past = [Generation(np.zeros((1, 18)), np.array([50.0]))]
-        for _ in range(3):
-            steps = optimizer.ask(start, past)
-            assert 1 <= len(steps) <= optimizer.most
-            flat = np.array([weights_to_vector(project(start, step)) for step in steps])
-            assert (flat >= low).all()
-            assert (flat <= high).all()
-            np.testing.assert_array_equal(flat[:, 12:15], flat[:, 15:18])
-            assert (steps >= log_bounds(start)[:, 0] - 1e-9).all()
-            assert (steps <= log_bounds(start)[:, 1] + 1e-9).all()
-            past.append(Generation(steps, 50.0 - np.abs(steps).sum(axis=1) / 18))
+def test_the_best_set_is_the_least_and_a_fall_is_counted(robot, bowl_walks, tmp_path):
+    campaign, entry, model = contest(tmp_path, robot, "random")
+    race.contest_job(campaign, entry, model, 20)
+    rows = walks.read_history(campaign)
+    best = race.best_after(campaign, entry, model, 10)
+    assert best.loss == min(row.losses[0] for row in rows[:11])
+    space = walks.few_walks.space_of(model.matrix, box_of(campaign))
+    expected = weights_at(campaign, space, rows[best.number].point)
+    np.testing.assert_array_equal(best.weights.Q.position, expected.Q.position)
+    assert race.falls_of(campaign, entry, 20) == 0
+    row = walks.Row(rows[0].point, "random", None, np.array([np.inf]), 1.0)
+    log_losses = race._log_losses([*rows, row])
+    assert log_losses[0] == 0.0
+    assert log_losses[-1] == pytest.approx(max(log_losses[:-1]) + 1.0)
 
 
-@pytest.mark.parametrize("cut", [0, 50])
-def test_a_race_that_was_cut_ends_as_if_it_had_not_been(raced, tmp_path, cut):
-    optimizers = {name: OPTIMIZERS[name] for name in ("cma-es", "random", "differences", "given")}
-    whole = run(tmp_path, optimizers)
-    path = tmp_path / "race.jsonl"
-    kept = path.read_bytes()
-    lines = kept.splitlines(keepends=True)
-    path.write_bytes(b"".join(lines[:4]) + lines[4][:cut])
-    same(run(tmp_path, optimizers), whole)
-    assert path.read_bytes() == kept
-    done = run(tmp_path, optimizers, walk=unasked)  # nothing is left to walk
-    same(done, whole)
-    for name, rounds in whole.rounds.items():  # nobody looks at the others
-        jax.tree.map(np.testing.assert_array_equal, rounds, raced.rounds[name])
+def test_walks_of_another_rival_are_refused(robot, bowl_walks, tmp_path):
+    race.contest_job(*contest(tmp_path, robot, "random"), 3)
+    campaign, _, model = contest(tmp_path, robot, "random")
+    with pytest.raises(InputError, match="walk 1 was another"):
+        race.contest_job(campaign, race.Contest("short", "nominal", "cma-es", 0), model, 3)
 
 
-def test_a_record_of_another_race_is_refused(tmp_path):
-    optimizers = {"random": Random(1)}
-    run(tmp_path, optimizers, 10)
-    with pytest.raises(ValueError, match="its rollouts is 10, expected 20"):
-        run(tmp_path, optimizers, 20)
-    (tmp_path / "race.jsonl").write_text("mine\n")
-    with pytest.raises(ValueError, match="not the record of a race"):
-        run(tmp_path, optimizers, 10)
+def test_a_lead_is_paired_and_charges_the_net():
+    def at(*rows):
+        return dict(zip((0, 36, 100), map(list, rows), strict=True))
+
+    losses = {
+        race.Entry("tuned", "walks"): at((2.0, 2.0), (1.5, 1.5), (1.0, 1.1)),
+        race.Entry("tuned", "cma-es"): at((2.0, 2.0), (1.4, 1.4), (1.25, 1.375)),
+        race.Entry("nominal", "random"): at((6.0, 6.0), (5.0, 5.0), (3.0, 3.0)),
+    }
+    ours = next(iter(losses))
+    found = race.lead(losses, ours, 100)
+    assert found.rival == race.Entry("tuned", "cma-es")
+    np.testing.assert_allclose(found[1:], 0.8)
+    charged = race.lead(losses, ours, 100, charge=64)
+    assert charged.rival == race.Entry("nominal", "random")
+    np.testing.assert_allclose(charged[1:], 0.5)
 
 
-def test_a_loss_without_a_number_is_the_worst_and_leaves_valid_json(tmp_path):
-    def walk(sets):
-        found = bowl(sets)
-        return {n: np.where(x > 1.1 * loss(nominal()), np.inf, x) for n, x in found.items()}
-
-    optimizers = {name: OPTIMIZERS[name] for name in ("bayes near", "cma-es", "differences")}
-    found = run(tmp_path, optimizers, 30, walk=walk)
-    lines = [json.loads(line) for line in (tmp_path / "race.jsonl").read_text().splitlines()]
-    assert None in lines[2]["cma-es"]["losses"]
-    same(run(tmp_path, optimizers, 30, walk=unasked), found)
-    for name, rounds in found.rounds.items():
-        assert lowest(found.start, rounds)[-1] < found.start, name
-
-
-def test_a_start_without_a_loss_and_no_rollouts_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="start cannot be raced from"):
-        run(tmp_path, walk=lambda sets: {name: np.array([np.nan]) for name in sets})
-    with pytest.raises(ValueError, match="at least one rollout"):
-        run(tmp_path, rollouts=0)
-
-
-def test_differences_step_by_beta_at_most_and_halve_while_the_loss_rises():
-    config = TuneConfig()
-    optimizer, start = Differences(config), nominal()
-    past = [Generation(np.zeros((1, 18)), np.array([5.0]))]
-    around = optimizer.ask(start, past)
-    np.testing.assert_allclose(around, np.log(1.05) * np.eye(18))
-    past.append(Generation(around, 5.0 + np.linspace(0.1, 1.0, 18)))
-    full = optimizer.ask(start, past)[0]
-    np.testing.assert_allclose(full[11], np.log(1 - config.beta_q))
-    np.testing.assert_allclose(full[17], np.log(1 - config.beta_r))
-    assert (full < 0).all()
-    past.append(Generation(full[None], np.array([6.0])))
-    half = optimizer.ask(start, past)[0]
-    np.testing.assert_allclose(np.exp(half) - 1, 0.5 * (np.exp(full) - 1))
-    past.append(Generation(half[None], np.array([4.0])))
-    np.testing.assert_allclose(optimizer.ask(start, past) - half, np.log(1.05) * np.eye(18))
-
-
-def test_bayes_without_its_package_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("optimizers.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match=r"hector-jax\[race\]"):
-        Bayes().ask(nominal(), [Generation(np.zeros((1, 18)), np.ones(1))])
+def test_the_report_has_every_method_and_budget(tmp_path):
+    flags = race.Flags(methods=("walks", "cma-es"), walks=10, repeats=2, out=tmp_path)
+    rows = [race.Contest("s", "nominal", m, i) for m in flags.methods for i in range(2)]
+    bests = {
+        (row, budget): race.Best(budget, nominal(), 1e6 * (6.0 - 0.1 * budget + row.seed))
+        for row in rows
+        for budget in (0, 1, 5, 10)
+    }
+    judged = {key: 2.0 * best.loss for key, best in bests.items()}
+    path = race.report(flags, bests, judged, dict.fromkeys(rows, 3))
+    text = path.read_text()
+    assert "| nominal | walks | 2 | 6.500 | 6.400 | 6.000 | 5.500 | 3.0 |" in text
+    assert text.count("1.00 [1.00, 1.00] cma-es") == 8
+    assert (tmp_path / "s.png").exists()

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import Executor
+from concurrent.futures import BrokenExecutor, Executor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -266,6 +266,27 @@ def test_a_worker_that_is_killed_is_told_in_one_line(capsys):
     assert exit_code("toy", work) == 1
     line = "toy: a worker process was killed, perhaps for want of memory\n"
     assert capsys.readouterr().err == line
+
+
+class Odd(Exception):  # noqa: N818
+    """An exception that cannot be unpickled."""
+
+    def __init__(self, one, other):
+        super().__init__(one + other)
+
+
+def _fail_oddly():
+    raise Odd("a", "b")
+
+
+def test_an_exception_that_cannot_be_unpickled_keeps_its_traceback():
+    def work():
+        with workers(1) as pool:
+            pool.submit(_fail_oddly).result()
+
+    with pytest.raises(BrokenExecutor) as caught:
+        exit_code("toy", work)
+    assert "__init__() missing 1 required" in str(caught.value.__cause__)
 
 
 def test_without_any_place_for_a_cache_a_command_ends_in_one_line(tmp_path):

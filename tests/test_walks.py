@@ -106,7 +106,7 @@ def test_eight_walks_through_files_equal_eight_in_process_to_the_last_bit(
 
 def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
     one, weights, _ = in_process
-    monkeypatch.setattr(walks, "_walk_job", None)
+    monkeypatch.setattr(walks, "walk_case", None)
     again = walks.tune_on_walks(pool, one, WALKS)
     weights_again, _ = walks.answer(one, walks.space_of(pool, one), again)
     np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
@@ -259,7 +259,7 @@ def test_a_start_that_falls_is_walked_once_and_kept(monkeypatch, robot, pool, in
     """As by a plant on which the answer of the tunings falls: the run goes on without it."""
     one = campaign(tmp_path, robot, [hfs()])
     (tmp_path / "metric.npz").write_bytes((in_process[0].folder / "metric.npz").read_bytes())
-    monkeypatch.setattr(walks, "_walk_job", _fell)
+    monkeypatch.setattr(walks, "walk_case", _fell)
     rows = walks.tune_on_walks(pool, one, WALKS)
     assert [change.change for change in walks.changes(rows)] == [None]
     sets = walks.candidates(pool, one, rows)

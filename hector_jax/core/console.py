@@ -198,7 +198,9 @@ def exit_code(name: str, work: Callable[[], None]) -> int:
             raise
         _drop(sys.stdout)
         code, text = 1, f"cannot write {error.filename or 'the output'}: {error.strerror}"
-    except BrokenExecutor:
+    except BrokenExecutor as error:
+        if error.__cause__ is not None:  # not a killed process: its exception cannot be unpickled
+            raise
         code, text = 1, "a worker process was killed, perhaps for want of memory"
     except Stopped as stopped:
         number = signal.Signals(stopped.args[0])

@@ -19,7 +19,7 @@ _NO_NUMBERS = (
     "control.weights_file core.console core.environment core.files core.inputs core.runtime"
     " core.tree_file"
 ).split()
-_PACKAGES = "hector-jax jax jaxlib flax numpy mujoco mujoco-mjx cmaes scikit-learn".split()
+_PACKAGES = "hector-jax jax jaxlib flax numpy mujoco mujoco-mjx cmaes".split()
 _ROOT = Path(__file__).parents[1]
 
 

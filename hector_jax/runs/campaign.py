@@ -21,7 +21,8 @@ from hector_jax.control.weights import Weights, direction_names, directions, wei
 from hector_jax.core.inputs import InputError
 from hector_jax.robot.model import Robot
 from hector_jax.search.cmaes import log_bounds, project
-from hector_jax.search.few_walks import Space
+from hector_jax.search.few_walks import METHODS, Space
+from hector_jax.sim.engine import MUJOCO_C, Engine
 from hector_jax.sim.world import Imperfections
 from hector_jax.tuning.difftune import TuneConfig, init
 
@@ -38,6 +39,9 @@ class Campaign:
     plants: Sequence[Imperfections | None] = (None,)  # None: the walks are made elsewhere
     seed: int = 0
     leg_numbers: tuple[str, ...] = ()  # of the legs, which the model does not have
+    engine: Engine = MUJOCO_C
+    methods: tuple[str, ...] = METHODS  # that propose
+    grounded: bool = True  # the model is corrected by the residuals of the best walk
 
     def __post_init__(self) -> None:
         start = jax.tree.map(np.asarray, init(self.config, self.start).best)

@@ -43,8 +43,8 @@ from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, traje
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
+from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
-from hector_jax.sim.walk import walk
 from hector_jax.tuning.difftune import step_status
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.grounded import Grounding, evaluate_grounded, fit_grounding
@@ -67,12 +67,14 @@ class Row(NamedTuple):
 # Jobs of worker processes
 
 
-def _walk_job(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
+def walk_case(campaign: Campaign, weights: Weights, case: int) -> ScoredLog:
+    """Walk a weight set in a case of a campaign, and score the walk."""
     config, robot = campaign.config, campaign.robot
     plant, command = campaign.cases[case]
     assert plant is not None  # None: the walks are made elsewhere
     job = Job(weights, command, plant, campaign.seconds, case)
-    log = jax.tree.map(np.asarray, log_of(walk(config.rollout.walk, robot, job)))
+    walked = next(campaign.engine.walk(None, config.rollout.walk, robot, [job]))
+    log = jax.tree.map(np.asarray, log_of(walked))
     return evaluate_log(config, robot, command, log)
 
 
@@ -84,7 +86,11 @@ def _rollout_inputs(campaign: Campaign, weights: Weights, command: Command) -> t
 
 def _ground_job(campaign: Campaign, weights: Weights, command: Command, log: Log) -> Grounding:
     trajectory = trajectory_of(log, campaign.config.rollout.walk.gait.tick)
-    return jax.device_get(fit_grounding(*_rollout_inputs(campaign, weights, command), trajectory))
+    inputs = _rollout_inputs(campaign, weights, command)
+    grounding = jax.device_get(fit_grounding(*inputs, trajectory))
+    if campaign.grounded:
+        return grounding
+    return grounding._replace(residuals=jax.tree.map(np.zeros_like, grounding.residuals))
 
 
 def _evaluate_job(
@@ -131,6 +137,7 @@ def read_history(campaign: Campaign) -> list[Row]:
         "seed": campaign.seed,
         # left out where there are none, so that older folders of `hector propose` can be continued
         **({"leg_numbers": list(campaign.leg_numbers)} if campaign.leg_numbers else {}),
+        **({} if campaign.engine == MUJOCO_C else {"engine": campaign.engine.name}),
     }
 
     def parse(row: Mapping[str, Any]) -> Row:
@@ -171,8 +178,10 @@ def next_proposal(
     if (proposal := pending(campaign, rows)) is not None:
         return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
-    model = _model(pool, campaign, space, rows) if few_walks.needs_model(history) else None
-    proposal = few_walks.propose(space, history, model, campaign.seed)
+    needs_model = "model" in campaign.methods and few_walks.needs_model(history)
+    model = _model(pool, campaign, space, rows) if needs_model else None
+    inputs = space, history, model, campaign.seed
+    proposal = few_walks.propose(*inputs, methods=campaign.methods)
     weights = weights_at(campaign, space, proposal.point)
     save_weights(weights_path(campaign, len(rows)), weights)
     fields = {**proposal._asdict(), "point": proposal.point.tolist()}
@@ -294,7 +303,7 @@ def tune_on_walks(pool: Executor, campaign: Campaign, walks: int) -> list[Row]:
             report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
             proposal, weights = next_proposal(pool, campaign, space, rows)
             inputs = repeat(campaign), repeat(weights), range(cases)
-            rows = add_walk(campaign, rows, proposal, list(pool.map(_walk_job, *inputs)))
+            rows = add_walk(campaign, rows, proposal, list(pool.map(walk_case, *inputs)))
         report_progress(len(rows) * cases, walks, _progress(campaign, space, rows))
     if campaign.leg_numbers and all(row.method in ("start", "model") for row in rows):
         say(f"{', '.join(campaign.leg_numbers)} were not moved: walks beyond the model are needed")

@@ -33,6 +33,7 @@ from hector_jax.core.inputs import require_package
 # added to the eigenvalues of the metric: a flat direction has a unit step of two e-folds
 _FLAT = 0.25
 _FIRST, _LEAST, _MOST = 1.0, 0.3, 4.0  # radius of the trust region
+METHODS = ("model", "surrogate", "evolution")
 GAIN = 0.01
 """Smallest significant gain in log-loss."""
 _STALLED = 2  # walks of the model in a row without such a gain before the surrogate takes over
@@ -108,7 +109,7 @@ def _region(history: Sequence[WalkResult]) -> _Region:
     """Compute the trust region from a history; see the module's docstring."""
     best, radius, stalls, stalled_at = 0, _FIRST, 0, None
     for i, row in enumerate(history[1:], 1):
-        if row.method == "surrogate" and stalled_at is None:  # the model repeated a point
+        if row.method != "model" and stalled_at is None:  # the model repeated a point, or is absent
             stalled_at, radius = i, _FIRST
         best_loss = history[best].loss
         gain = best_loss - row.loss
@@ -148,7 +149,12 @@ def best_walk(history: Sequence[WalkResult]) -> int:
 
 
 def propose(
-    space: Space, history: Sequence[WalkResult], model: Model | None = None, seed: int = 0
+    space: Space,
+    history: Sequence[WalkResult],
+    model: Model | None = None,
+    seed: int = 0,
+    *,
+    methods: Sequence[str] = METHODS,
 ) -> Proposal:
     """Propose the point to walk next.
 
@@ -157,6 +163,7 @@ def propose(
         history: walks so far, the start first.
         model: grounded on the best walk; only used if `needs_model`.
         seed: of the draws.
+        methods: those of METHODS that may propose; "surrogate" or "evolution" is among them.
 
     Raises:
         InputError: the packages of the extra `search` are not installed.
@@ -165,7 +172,8 @@ def propose(
     if not history:
         return Proposal(np.zeros(size), "start", None)
     region = _region(history)
-    if region.stalled_at is None:
+    since = len(history) if region.stalled_at is None else region.stalled_at
+    if region.stalled_at is None and "model" in methods:
         if model is None:
             raise ValueError("the next proposal needs the model")
         center = history[region.center].point
@@ -174,8 +182,9 @@ def propose(
         if min(np.linalg.norm(point - row.point) for row in history) > _SAME:
             return Proposal(point, "model", float(predicted))
         region = region._replace(radius=_FIRST)
-    elif (len(history) - region.stalled_at) % _EVERY == _EVERY - 1:
-        return Proposal(space.clip(_evolution(history, region.stalled_at, seed)), "evolution", None)
+    hedges = "evolution" in methods and (len(history) - since) % _EVERY == _EVERY - 1
+    if hedges or "surrogate" not in methods:
+        return Proposal(space.clip(_evolution(history, since, seed)), "evolution", None)
     return _improve(space, history, region.radius, np.random.default_rng([seed, len(history)]))
 
 
