@@ -28,7 +28,7 @@ import plots
 import tyro
 from jaxtyping import Float
 from lib import check_names, write_report
-from rivals import READ_START, RIVALS, Spent, Task
+from rivals import LEARN, READ_START, RIVALS, Spent, Task
 from scipy.stats import t as student
 
 from hector_jax.control.reference import Command, named_command, standing_anchor
@@ -133,9 +133,9 @@ class _Inline(Executor):
 class Model(NamedTuple):
     """What the model tells about a start before any walk."""
 
-    matrix: Float[np.ndarray, "n n"]  # Gauss-Newton matrix divided by the loss
+    space: Space
     steps: Float[np.ndarray, "m n"]  # log-weights less those of the start, of searches on the model
-    losses: Float[np.ndarray, " m"]  # their log-losses on the model
+    losses: Float[np.ndarray, " m"]  # their log-losses on the model; no searches, no losses
 
 
 def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -224,10 +224,9 @@ def contest_job(campaign: Campaign, contest: Contest, model: Model, budget: int)
 
 
 def _space(campaign: Campaign, contest: Contest, model: Model) -> Space:
-    without = contest.method == "no metric"
-    return few_walks.space_of(
-        np.zeros_like(model.matrix) if without else model.matrix, box_of(campaign)
-    )
+    if contest.method != "no metric":
+        return model.space
+    return few_walks.space_of(np.zeros_like(model.space.to_steps), box_of(campaign))
 
 
 def _log_losses(rows: Sequence[Row]) -> Float[np.ndarray, " walks"]:
@@ -312,22 +311,21 @@ def lead(losses: Losses, entry: Entry, budget: int, *, charge: int = 0) -> Lead:
     return Lead(best, *(float(np.exp(ratios.mean() + by)) for by in (0.0, -reach, reach)))
 
 
-def read_models(pool: Executor, flags: Flags, campaigns: Sequence[Campaign]) -> list[Model]:
-    """Return what the model tells of the starts; computed once, in OUT/models."""
-    paths = [flags.out / "models" / f"{campaign.folder.name}.npz" for campaign in campaigns]
-    missing = {}
-    for path, campaign in zip(paths, campaigns, strict=True):
-        if not path.exists():
-            (command,) = campaign.commands.values()
-            inputs = campaign.config, campaign.robot, campaign.start, tunings.Problem(command, None)
-            searches = [pool.submit(search_job, campaign, seed) for seed in range(SEARCHES)]
-            missing[path] = pool.submit(tunings.gauss_newton_job, *inputs), searches
-    for path, (matrix, searches) in missing.items():
-        steps, losses = zip(*(search.result() for search in searches), strict=True)
-        model = Model(matrix.result(), np.concatenate(steps), np.concatenate(losses))
-        save_tree(path, model, kind="model", robot=campaigns[0].robot)
-    like = Model(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros(0))
-    return [load_tree(path, like, kind="model", robot=campaigns[0].robot)[0] for path in paths]
+def read_model(pool: Executor, campaign: Campaign, *, searches: bool) -> Model:
+    """Return what the model tells of a start, with searches if a rival learns from them.
+
+    It is computed once, in the folder of the campaign.
+    """
+    path, size = campaign.folder / "searches.npz", len(box_of(campaign))
+    parts = {"steps": np.zeros((0, size)), "losses": np.zeros(0)}
+    if searches and not path.exists():
+        jobs = [pool.submit(search_job, campaign, seed) for seed in range(SEARCHES)]
+        results = zip(*(job.result() for job in jobs), strict=True)
+        parts = dict(zip(parts, map(np.concatenate, results), strict=True))
+        save_tree(path, parts, kind="searches", robot=campaign.robot)
+    if searches:
+        parts = load_tree(path, parts, kind="searches", robot=campaign.robot)[0]
+    return Model(walks.space_of(pool, campaign), **parts)
 
 
 def main() -> None:
@@ -357,8 +355,12 @@ def main() -> None:
     }
     with workers(flags.processes) as pool:
         pairs = list(product(flags.traj, sets))
-        starts = [campaign_of(*pair, flags.out / "-".join(pair)) for pair in pairs]
-        models = dict(zip(pairs, read_models(pool, flags, starts), strict=True))
+        searches = any(method.removesuffix(METRIC) in LEARN for method in flags.methods)
+        folders = {pair: flags.out / "models" / "-".join(pair) for pair in pairs}
+        models = {
+            pair: read_model(pool, campaign_of(*pair, folder), searches=searches)
+            for pair, folder in folders.items()
+        }
         inputs = [(campaigns[c], c, models[c[:2]], flags.walks) for c in contests]
         with bar("racing") as report_progress:
             for done, future in enumerate([pool.submit(contest_job, *row) for row in inputs], 1):

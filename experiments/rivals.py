@@ -190,3 +190,5 @@ RIVALS: dict[str, Callable[[Task], None]] = {
 }
 READ_START = ("turbo", "turbo on model", "differences")
 """Rivals that need the walk of the start."""
+LEARN = ("warm cma-es", "turbo on model")
+"""Rivals that learn from searches on the model."""

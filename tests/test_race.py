@@ -101,7 +101,8 @@ def contest(folder, robot, method, seed=0):
     campaign = Campaign(*inputs, seed=seed, **race.OURS.get(method, {}))
     size = len(box_of(campaign))
     rng = np.random.default_rng(0)
-    return campaign, entry, race.Model(np.eye(size), rng.normal(size=(50, size)), rng.random(50))
+    space = race.few_walks.space_of(np.eye(size), box_of(campaign))
+    return campaign, entry, race.Model(space, rng.normal(size=(50, size)), rng.random(50))
 
 
 @pytest.mark.parametrize("method", ["cma-es", "random in metric", "no gradients"])
@@ -125,8 +126,7 @@ def test_the_best_set_is_the_least_and_a_fall_is_counted(robot, bowl_walks, tmp_
     rows = walks.read_history(campaign)
     best = race.best_after(campaign, entry, model, 10)
     assert best.loss == min(row.losses[0] for row in rows[:11])
-    space = walks.few_walks.space_of(model.matrix, box_of(campaign))
-    expected = weights_at(campaign, space, rows[best.number].point)
+    expected = weights_at(campaign, model.space, rows[best.number].point)
     np.testing.assert_array_equal(best.weights.Q.position, expected.Q.position)
     assert race.falls_of(campaign, entry, 20) == 0
     row = walks.Row(rows[0].point, "random", None, np.array([np.inf]), 1.0)
