@@ -194,26 +194,28 @@ def contest_job(campaign: Campaign, contest: Contest, model: Model, budget: int)
     def walk(proposal: Proposal, weights: Weights) -> None:
         rows[:] = walks.add_walk(campaign, rows, proposal, [walks.walk_case(campaign, weights, 0)])
 
+    if len(rows) >= contest.rows_after(budget):
+        return
     if not rows:
         walk(Proposal(np.zeros(len(space.box)), "start", None), campaign.start)
     if contest.method in OURS:
         while len(rows) < contest.rows_after(budget):
             walk(*walks.next_proposal(_Inline(), campaign, space, rows))
         return
-    metric, told = contest.method.endswith(METRIC), [] if contest.counts_start else rows[:1]
+    metric, seen = contest.method.endswith(METRIC), [] if contest.counts_start else rows[:1]
 
     def to_point(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         return space.clip(np.asarray(x) if metric else space.to_point @ np.asarray(x))
 
     def loss(x: Float[np.ndarray, " n"]) -> float:
-        point, number = to_point(x), len(told)
+        point, number = to_point(x), len(seen)
         if number == contest.rows_after(budget):
             raise Spent
         if number == len(rows):
             walk(Proposal(point, contest.method, None), weights_at(campaign, space, point))
         if not np.allclose(rows[number].point, point, atol=1e-6):
             raise InputError(f"{campaign.folder}: walk {number} was another; remove the folder")
-        told.append(rows[number])
+        seen.append(rows[number])
         return float(_log_losses(rows)[number])
 
     steps = model.steps @ space.to_point.T if metric else model.steps
@@ -294,14 +296,14 @@ def lead(losses: Losses, entry: Entry, budget: int, *, charge: int = 0) -> Lead:
         losses: of all entries.
         entry: one of ours.
         budget: number of walks.
-        charge: walks that the entry has spent before; rivals are then those from nominal alone.
+        charge: walks that the start of the entry has taken, less than the budget; rivals are then
+            those from nominal alone.
     """
-    ours = np.log(losses[entry][max(budget - charge, 0)])
+    ours = np.log(losses[entry][budget - charge])
     rivals = {
         rival: np.log(each[budget])
         for rival, each in losses.items()
-        if rival.method not in OURS
-        and rival.start in ({NOMINAL} if charge else {r.start for r in losses})
+        if rival.method not in OURS and (not charge or rival.start == NOMINAL)
     }
     best = min(rivals, key=lambda rival: np.mean(rivals[rival]))
     count = min(len(ours), len(rivals[best]))
@@ -482,11 +484,12 @@ def _leads_table(flags: Flags, losses: Losses) -> str:
     for entry in losses:
         if entry.method not in OURS:
             continue
-        charges = (0,) if entry.start == NOMINAL else (0, NET)
-        for charge in charges:
-            leads = [lead(losses, entry, budget, charge=charge) for budget in budgets]
+        for charge in (0,) if entry.start == NOMINAL or NOMINAL not in flags.start else (0, NET):
+            leads = [lead(losses, entry, b, charge=charge) for b in budgets if b >= charge]
             cells = [f"{x.ratio:.2f} [{x.low:.2f}, {x.high:.2f}] {x.rival.method}" for x in leads]
-            rows.append([entry.start, entry.method + (f" + {charge}" if charge else ""), *cells])
+            blank = [""] * (len(budgets) - len(cells))
+            name = f"{entry.method}, {charge} walks before" if charge else entry.method
+            rows.append([entry.start, name, *blank, *cells])
     return markdown_table(["start", "method", *map(str, budgets)], rows)
 
 
