@@ -29,6 +29,7 @@ from hector_jax.runs import campaign as campaigns
 from hector_jax.runs import walk_log, walks
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
+from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
@@ -110,6 +111,34 @@ def test_what_was_walked_is_not_walked_again(monkeypatch, pool, in_process):
     again = walks.tune_on_walks(pool, one, WALKS)
     weights_again, _ = walks.answer(one, walks.space_of(pool, one), again)
     np.testing.assert_array_equal(weights_again.Q.euler, weights.Q.euler)
+
+
+def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
+    jobs = []
+
+    def walk_in(pool, config, robot, some, **options):
+        jobs.extend(some)
+        return (walk(config, robot, job) for job in some)
+
+    engine = MUJOCO_C._replace(name="mine", walk=walk_in)
+    one = replace(campaign(tmp_path, robot, [hfs()]), engine=engine)
+    score, _ = walks.walk_case(one, nominal(robot), 0)
+    assert len(jobs) == 1
+    assert score.loss == in_process[2][0].losses[0]
+    walks.read_history(one)
+    with pytest.raises(InputError, match="its engine is mine"):
+        walks.read_history(replace(one, engine=MUJOCO_C))
+
+
+def test_the_plain_model_is_not_grounded(robot, pool, in_process):
+    one, _, rows = in_process
+    losses = [
+        walks._model(pool, replace(one, grounded=grounded), walks.space_of(pool, one), rows[:1])
+        for grounded in (True, False)
+    ]
+    point = rows[1].point
+    assert losses[0](rows[0].point)[0] == pytest.approx(0.0)
+    assert losses[0](point)[0] != losses[1](point)[0]
 
 
 def test_the_record_of_another_tuning_is_refused(robot, in_process):
@@ -323,6 +352,7 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
 
     def on_walks(pool, one, count):
         seen.update(plants=len(one.plants), commands=list(one.commands), count=count)
+        seen["engine"] = one.engine.name
         return [row]
 
     monkeypatch.setattr(command.tunings, "tune", lambda *_, **__: {"without": there, "with": there})
@@ -333,10 +363,10 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     monkeypatch.setattr(command.choice, "earliest", lambda *_, **__: "set 1")
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))
-    setup, args = Setup(Executor(), CONFIG, robot), Tune(walks=12, walk_plants=3)
+    setup, args = Setup(Executor(), CONFIG, robot), Tune(walks=12, walk_plants=3, walk_engine="mjx")
     run = command._Run(setup, tmp_path, args, nominal(), (course,), net)
     tuned = command._tune_sets(run)
-    assert seen == {"plants": 3, "commands": ["straight"], "count": 12}
+    assert seen == {"plants": 3, "commands": ["straight"], "count": 12, "engine": "mjx"}
     np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)
     assert (tmp_path / "weights" / "before_walks.json").exists()
     assert walks.changes(tuned.proposals)[0].change == 0.0

@@ -54,7 +54,6 @@ Trajectories = tuple[Trajectory, ...]
 Run = Annotated[Path, Source.RUN]
 Folder = Annotated[Path, Source.FOLDER]
 
-
 COMMANDS: dict[str, type[Any]] = {}
 """The flags of each command, by its name."""
 
@@ -157,6 +156,7 @@ class Tune(Configured):
     # walks to spend on tuning row `best` further, on the walks themselves (docs/howto/walks.md)
     walks: Annotated[int, Range(0, 100_000)] = 0
     walk_plants: Annotated[int, Range(0, 1000)] = 2  # drawn plants of these walks; 0: the simulator
+    walk_engine: OneEngine = "c"  # of these walks; c: MuJoCo; mjx; extras: drake, pinocchio
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR

@@ -23,6 +23,7 @@ from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.campaign import with_leg_numbers
 from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
+from hector_jax.sim.engine import choose_engine
 
 Flags = TypeVar("Flags")
 
@@ -54,8 +55,9 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
 
     Raises:
         InputError: there is no such trajectory, their lengths differ, or --walks or --refresh does
-            not allow them; --safe or --front beside a position limit or a refresh; numbers of the
-            legs without --walks, with --front or out of their boxes.
+            not allow them; --walk-engine is not installed; --safe or --front beside a position
+            limit or a refresh; numbers of the legs without --walks, with --front or out of their
+            boxes.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
     count, pieces = len(loaded), len(loaded[0].command.duration)
@@ -63,6 +65,7 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
+    choose_engine(args.walk_engine)  # whether it is installed
     start, of_legs = arguments.weights(args.start, robot), leg_numbers(args.tune)
     if of_legs and (args.front or not args.walks):
         text = "only --walks can tune what the rigid-body model does not have, without --front"

@@ -39,6 +39,7 @@ from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, r
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
 from hector_jax.runs.walks import Campaign, Row, candidates, changes, tune_on_walks
+from hector_jax.sim.engine import choose_engine
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import main_directions
 from hector_jax.tuning.difftune import Tuning
@@ -138,14 +139,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
     with workers(args.processes) as pool:
         for line in tunings.compile_programs(pool, config, robot, start, trajectories[0]):
             say(f"before any tuning, {trajectories[0].name} on hfs with nominal weights: {line}")
-        run = _Run(
-            setup=Setup(pool, config, robot, made_with.get("commit", "")),
-            folder=folder,
-            args=args,
-            start=start,
-            trajectories=trajectories,
-            net=net or nets.load_or_train(pool, robot, data, args.variant),
-        )
+        setup = Setup(pool, config, robot, made_with.get("commit", ""))
+        net = net or nets.load_or_train(pool, robot, data, args.variant)
+        run = _Run(setup, folder, args, start, trajectories, net)
         norms = tunings.gradient_norms(run.setup, run.problems)
         if args.alpha == "auto":
             loss = aligned(config.loss, norms["with"])
@@ -275,7 +271,7 @@ def _tune_sets(run: _Run) -> _Tuned:
         campaign = _campaign(run, sets["before_walks"])
         proposals = tune_on_walks(setup.pool, campaign, run.args.walks)
         stages = candidates(setup.pool, campaign, proposals)
-        best = choice.earliest(setup, stages, commands, **options)
+        best = choice.earliest(setup, stages, commands, **options, engine=campaign.engine)
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
@@ -287,7 +283,8 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
     _, config, robot, _ = run.tuning
     plants = choice.drawn_plants(robot, run.args.walk_plants) or [hfs(robot.description)]
     inputs = run.folder / "walks", config, robot, start, run.commands, plants
-    return Campaign(*inputs, leg_numbers=leg_numbers(run.args.tune))
+    engine = choose_engine(run.args.walk_engine)
+    return Campaign(*inputs, leg_numbers=leg_numbers(run.args.tune), engine=engine)
 
 
 def _walk_front(run: _Run) -> front.Front:
