@@ -206,10 +206,10 @@ def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str
         axes = figure.subplots()
         for i, (name, by_budget) in enumerate(curves.items()):
             walks, losses = np.array(list(by_budget)), np.array(list(by_budget.values())) / 1e6
-            look = {"color": f"C{i % 10}", "linestyle": ("-", "--", ":")[i // 10 % 3]}
-            axes.plot(walks + 1, np.median(losses, axis=1), **look, label=name)
+            color, dashes = f"C{i % 10}", ("-", "--", ":")[i // 10 % 3]
+            axes.plot(walks + 1, np.median(losses, axis=1), dashes, color=color, label=name)
             bounds = losses.min(axis=1), losses.max(axis=1)
-            axes.fill_between(walks + 1, *bounds, color=look["color"], alpha=0.1, linewidth=0)
+            axes.fill_between(walks + 1, *bounds, color=color, alpha=0.1, linewidth=0)
         axes.set(xlabel="walks", ylabel="L of the best set so far [10$^6$]", xscale="log")
         axes.set_xticks(
             [1, 2, 6, 11, 26, 51, 101, 201], ["0", "1", "5", "10", "25", "50", "100", "200"]
