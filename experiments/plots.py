@@ -211,9 +211,8 @@ def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str
             bounds = losses.min(axis=1), losses.max(axis=1)
             axes.fill_between(walks + 1, *bounds, color=color, alpha=0.1, linewidth=0)
         axes.set(xlabel="walks", ylabel="L of the best set so far [10$^6$]", xscale="log")
-        axes.set_xticks(
-            [1, 2, 6, 11, 26, 51, 101, 201], ["0", "1", "5", "10", "25", "50", "100", "200"]
-        )
+        counts = max(curves.values(), key=len)
+        axes.set_xticks([1 + count for count in counts], [str(count) for count in counts])
         axes.minorticks_off()
         log_axis(axes, "y")
     return "L of the best set so far by walks: median of the repeats, and their range."

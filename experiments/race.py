@@ -368,10 +368,12 @@ def main() -> None:
             for done, future in enumerate([pool.submit(contest_job, *row) for row in inputs], 1):
                 future.result()
                 report_progress(done, len(contests), contests[done - 1].name)
+        budgets, both = _budgets(flags), NOMINAL in sets and len(sets) > 1
+        charged = [budget - NET for budget in budgets if both and budget >= NET]
         bests = {
             (contest, budget): best_after(campaigns[contest], contest, models[contest[:2]], budget)
             for contest in contests
-            for budget in _budgets(flags)
+            for budget in sorted({*budgets, *charged})
         }
         judged = judge(Setup(pool, config, robot), flags, bests)
     falls = {c: falls_of(campaigns[c], c, flags.walks) for c in contests}
@@ -383,9 +385,8 @@ def _load(name: str, robot: Robot) -> Weights:
 
 
 def _budgets(flags: Flags) -> list[int]:
-    """Return the budgets of the tables, and what the walks of the net leave of them."""
-    budgets = [budget for budget in BUDGETS if budget <= flags.walks]
-    return sorted({*budgets, *(budget - NET for budget in budgets if budget > NET)})
+    """Return the budgets of the tables."""
+    return [budget for budget in BUDGETS if budget < flags.walks] + [flags.walks]
 
 
 Bests = Mapping[tuple[Contest, int], Best]
@@ -466,7 +467,7 @@ def report(
 
 
 def _losses_table(flags: Flags, losses: Losses, falls: Mapping[Contest, int], traj: str) -> str:
-    budgets = [budget for budget in BUDGETS if budget <= flags.walks]
+    budgets = _budgets(flags)
     head = ["start", "method", "repeats", *map(str, budgets), *(["falls"] if falls else [])]
     rows = []
     for entry, each in losses.items():
@@ -479,7 +480,7 @@ def _losses_table(flags: Flags, losses: Losses, falls: Mapping[Contest, int], tr
 
 
 def _leads_table(flags: Flags, losses: Losses) -> str:
-    budgets = [budget for budget in BUDGETS if budget <= flags.walks]
+    budgets = _budgets(flags)
     rows = []
     for entry in losses:
         if entry.method not in OURS:

@@ -139,7 +139,7 @@ def test_walks_of_another_rival_are_refused(robot, bowl_walks, tmp_path):
     race.contest_job(*contest(tmp_path, robot, "random"), 3)
     campaign, _, model = contest(tmp_path, robot, "random")
     with pytest.raises(InputError, match="walk 1 was another"):
-        race.contest_job(campaign, race.Contest("short", "nominal", "cma-es", 0), model, 3)
+        race.contest_job(campaign, race.Contest("short", "nominal", "cma-es", 0), model, 5)
 
 
 def test_a_lead_is_paired_and_charges_the_net():
