@@ -462,7 +462,7 @@ def report(
         "posterior mean, of the others that of the least L."
     )
     numbers |= {"flags": {name: str(value) for name, value in asdict(flags).items()}}
-    inputs = flags.out / "report.md", "The race", [intro, *text]
+    inputs = flags.out / "report.md", f"The race: {flags.out.name}", [intro, *text]
     return write_report(*inputs, numbers=numbers, json_name="race.json", pictures=pictures)
 
 
