@@ -1,7 +1,8 @@
 """Is a tuning on walks ahead of what sees one number of each walk? The race.
 
-`hector tune --walks` and its parts against the optimizers of `rivals.py`: from the same starts, in
-one box, on the high-fidelity simulator, one trajectory each.
+`hector tune --walks` and its parts against the optimizers of `rivals.py`: from the same starts,
+on the high-fidelity simulator, one trajectory each. All search in the box of the weights, rivals
+within 3 of the start in log-weights or 4 in the metric of the model.
 
     python experiments/race.py --traj s --start nominal docs/batch/shared/weights/mean-of-all.json
 
@@ -96,6 +97,13 @@ class Flags:
         counts = dict.fromkeys(("walks", "repeats", "processes"), AT_LEAST_ONE)
         check(self, **counts)
         check_names("methods", self.methods, METHODS)
+        check_names("engine", [self.engine], ("c", "drake", "pinocchio"))
+        names = [Path(name).stem for name in self.start]
+        if len({*names, NOMINAL}) < len({*self.start, NOMINAL}):
+            raise InputError(
+                "Flags.start must be nominal, or files of different names other than that, got "
+                + ", ".join(self.start)
+            )
 
 
 class Contest(NamedTuple):
@@ -135,7 +143,7 @@ class Model(NamedTuple):
 
     space: Space
     steps: Float[np.ndarray, "m n"]  # log-weights less those of the start, of searches on the model
-    losses: Float[np.ndarray, " m"]  # their log-losses on the model; no searches, no losses
+    losses: Float[np.ndarray, " m"]  # their log-losses there less that of the start
 
 
 def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -146,13 +154,14 @@ def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
     space = Space(identity, identity, np.zeros(len(box)), box_of(campaign))
     config = campaign.config.rollout
     inputs = config, campaign.robot, command, effect_of(None, config.walk), campaign.config.loss
+    at_start = float(np.log(_model_loss(*inputs, campaign.start)))
     points: list[np.ndarray] = []
     losses: list[float] = []
 
     def walk(point: Float[np.ndarray, " n"]) -> float:
         if len(losses) == SOURCES:
             raise Spent
-        loss = float(np.log(_model_loss(*inputs, weights_at(campaign, space, point))))
+        loss = float(np.log(_model_loss(*inputs, weights_at(campaign, space, point)))) - at_start
         points.append(point)
         losses.append(loss if np.isfinite(loss) else max(losses, default=0.0) + 1.0)
         return losses[-1]
@@ -198,6 +207,8 @@ def contest_job(campaign: Campaign, contest: Contest, model: Model, budget: int)
         return
     if not rows:
         walk(Proposal(np.zeros(len(space.box)), "start", None), campaign.start)
+    if not np.isfinite(rows[0].losses[0]):
+        raise InputError(f"{campaign.folder}: the start fell, or a QP was not solved")
     if contest.method in OURS:
         while len(rows) < contest.rows_after(budget):
             walk(*walks.next_proposal(_Inline(), campaign, space, rows))
@@ -290,20 +301,20 @@ class Lead(NamedTuple):
 
 
 def lead(losses: Losses, entry: Entry, budget: int, *, charge: int = 0) -> Lead:
-    """Compare an entry with the rival whose mean log-loss is least, paired by repeat.
+    """Compare an entry with the rival from its start of the least mean log-loss, by repeat.
 
     Args:
         losses: of all entries.
         entry: one of ours.
         budget: number of walks.
         charge: walks that the start of the entry has taken, less than the budget; rivals are then
-            those from nominal alone.
+            those from nominal.
     """
     ours = np.log(losses[entry][budget - charge])
     rivals = {
         rival: np.log(each[budget])
         for rival, each in losses.items()
-        if rival.method not in OURS and (not charge or rival.start == NOMINAL)
+        if rival.method not in OURS and rival.start == (NOMINAL if charge else entry.start)
     }
     best = min(rivals, key=lambda rival: np.mean(rivals[rival]))
     count = min(len(ours), len(rivals[best]))
@@ -443,7 +454,7 @@ def report(
             title = f"Mean L on {flags.plants} other plants, median over the repeats [1e6]:"
             text += [title, _losses_table(flags, on_others, {}, traj)]
         for title, losses in (("the plant of the walks", on_own), ("the other plants", on_others)):
-            if losses:
+            if any(entry.method not in OURS for entry in losses):
                 text += [f"L against the best rival on {title}:", _leads_table(flags, losses)]
         numbers[traj] = {
             f"{entry.start} {entry.method}": {
@@ -456,7 +467,7 @@ def report(
         curves = {f"{e.method}, from {e.start}": each for e, each in on_own.items()}
         pictures[f"{traj}.png"] = plots.race(flags.out / f"{traj}.png", curves)
     intro = (
-        f"Engine {choose_engine(flags.engine).title}, {flags.walks} walks a contest, at most "
+        f"Engine {choose_engine(flags.engine).title}, {flags.walks} walks a contest, "
         f"{flags.repeats} seeds. L of the best set so far on the simulator's own plant, median "
         "over the repeats [1e6]: of the methods of `hector tune --walks` that of the least "
         "posterior mean, of the others that of the least L."

@@ -1,8 +1,9 @@
 """Rivals of `hector tune --walks`: optimizers of a weight set that see one number of each walk.
 
 A rival is a function of a `Task`. It walks points until the budget is spent (`Spent`) or it has
-converged, with the settings that its library recommends. The coordinates are steps of the
-log-weights, or the metric of the model; the rival cannot tell.
+converged, with the settings of its library or its tutorial, but for the first points of TuRBO,
+which are drawn about the start. The coordinates are steps of the log-weights, or the metric of the
+model; the rival cannot tell.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The GPU's guess at the active set, its kernel interpreted here."""
+"""The kernel that solves a QP on a GPU, interpreted here."""
 
 import jax
 import jax.numpy as jnp

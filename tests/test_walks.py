@@ -29,7 +29,7 @@ from hector_jax.runs import campaign as campaigns
 from hector_jax.runs import walk_log, walks
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import Tuned
-from hector_jax.sim.engine import MUJOCO_C
+from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
@@ -359,14 +359,18 @@ def test_a_run_spends_the_walks_that_were_asked_for(monkeypatch, robot, tmp_path
     monkeypatch.setattr(command.choice, "choose", lambda *_, **__: {})
     monkeypatch.setattr(command.choice, "answer", lambda *_, **__: nominal())
     monkeypatch.setattr(command, "tune_on_walks", on_walks)
+    monkeypatch.setattr(command, "choose_engine", ENGINES.get)  # installed or not
     monkeypatch.setattr(command, "candidates", lambda *_: {"set 0": nominal(), "set 1": expert()})
     monkeypatch.setattr(command.choice, "earliest", lambda *_, **__: "set 1")
     net = SimpleNamespace(params="a net")
     course = NamedCommand("straight", named_command("straight"))
-    setup, args = Setup(Executor(), CONFIG, robot), Tune(walks=12, walk_plants=3, walk_engine="mjx")
+    setup, args = (
+        Setup(Executor(), CONFIG, robot),
+        Tune(walks=12, walk_plants=3, walk_engine="drake"),
+    )
     run = command._Run(setup, tmp_path, args, nominal(), (course,), net)
     tuned = command._tune_sets(run)
-    assert seen == {"plants": 3, "commands": ["straight"], "count": 12, "engine": "mjx"}
+    assert seen == {"plants": 3, "commands": ["straight"], "count": 12, "engine": "drake"}
     np.testing.assert_array_equal(tuned.sets["best"].Q.euler, expert().Q.euler)
     assert (tmp_path / "weights" / "before_walks.json").exists()
     assert walks.changes(tuned.proposals)[0].change == 0.0

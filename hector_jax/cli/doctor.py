@@ -31,7 +31,7 @@ from hector_jax.sim.world import named_world
 
 _EXTRAS = {  # name: (package that it needs, what needs it)
     "export": ("flatbuffers", "hector export"),
-    "race": ("cma", "experiments/race.py"),
+    "race": ("botorch", "experiments/race.py"),
     "search": ("cmaes", "hector search, experiments/table.py"),
     "tensorboard": ("tensorboardX", "hector tensorboard"),
     "view": ("viser", "hector view"),

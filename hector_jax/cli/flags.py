@@ -40,8 +40,8 @@ Tunables = Literal[Groups, Footsteps, "effort_reference", "friction", Gains, Leg
 Variant = Literal["residual", "paper"]
 OneEngine = Literal["c", "mjx", "drake", "pinocchio"]
 Engine = Literal["auto", OneEngine]
-# without MJX: it has the physics of MuJoCo C and no plants with estimator errors
-JudgingEngine = Literal["c", "drake", "pinocchio", "all"]
+WalkEngine = Literal["c", "drake", "pinocchio"]  # MJX has no plants with estimator errors
+JudgingEngine = Literal[WalkEngine, "all"]
 Gait = Literal["own", "walk", "trot", "pace", "crawl", "stand"]
 Family = Literal["standin", "even"]
 PlantWorld = Literal["ideal", "hfs", "hfs-varied", "standin", "standin-even"]
@@ -156,7 +156,7 @@ class Tune(Configured):
     # walks to spend on tuning row `best` further, on the walks themselves (docs/howto/walks.md)
     walks: Annotated[int, Range(0, 100_000)] = 0
     walk_plants: Annotated[int, Range(0, 1000)] = 2  # drawn plants of these walks; 0: the simulator
-    walk_engine: OneEngine = "c"  # of these walks; c: MuJoCo; mjx; extras: drake, pinocchio
+    walk_engine: WalkEngine = "c"  # of these walks; c: MuJoCo; extras: drake, pinocchio
     processes: Processes = 2  # worker processes, one core each
     json: bool = False  # print JSON instead of the table; `run` is the folder
     robot: RobotFile = None  # TOML file of another robot, with its data in DATA/NAME; or HECTOR

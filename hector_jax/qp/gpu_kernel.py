@@ -72,7 +72,7 @@ def guess(
     upper: Float[Array, " m"],
     interpret: bool = False,
 ) -> Guess:
-    """Guess the active set of a normalised QP, for which `fits` holds; `vmap` is the GPU's grid.
+    """Solve a normalised QP for which `fits` holds, unproved; `vmap` is the GPU's grid.
 
     Args:
         P, q, A, lower, upper: the QP, P with unit diagonal, rows of A of length one; a missing
