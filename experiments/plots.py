@@ -202,7 +202,7 @@ def race(path: Path, curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str
         path: file to write.
         curves: by entry, the losses of its repeats by number of walks.
     """
-    with drawing(path, 7.0, 4.8, legend_columns=3) as figure:
+    with drawing(path, 7.0, 4.8, legend_columns=2 if max(map(len, curves)) > 20 else 4) as figure:
         axes = figure.subplots()
         for i, (name, by_budget) in enumerate(curves.items()):
             walks, losses = np.array(list(by_budget)), np.array(list(by_budget.values())) / 1e6

@@ -464,7 +464,10 @@ def report(
             }
             for entry, each in on_own.items()
         }
-        curves = {f"{e.method}, from {e.start}": each for e, each in on_own.items()}
+        names = [
+            e.method if len(flags.start) == 1 else f"{e.method}, from {e.start}" for e in on_own
+        ]
+        curves = dict(zip(names, on_own.values(), strict=True))
         pictures[f"{traj}.png"] = plots.race(flags.out / f"{traj}.png", curves)
     intro = (
         f"Engine {choose_engine(flags.engine).title}, {flags.walks} walks a contest, "
