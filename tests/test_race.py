@@ -11,10 +11,11 @@ from rivals import RIVALS, Spent, Task
 
 from hector_jax.control.weights import expert, nominal
 from hector_jax.core.inputs import InputError
+from hector_jax.core.trajectory import no_samples
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import walks
 from hector_jax.runs.campaign import Campaign, box_of, weights_at
-from hector_jax.runs.walk_log import LogScore
+from hector_jax.runs.walk_log import LogScore, log_of
 from hector_jax.sim.world import hfs
 from hector_jax.tuning.difftune import TuneConfig
 
@@ -80,15 +81,15 @@ def robot():
 
 
 @pytest.fixture
-def bowl_walks(monkeypatch):
+def bowl_walks(monkeypatch, robot):
     """Walk on a bowl: L falls towards the expert's weights."""
-    made = []
+    made, log = [], log_of(no_samples(len(robot.joint_lower), len(robot.foot_point)))
 
     def walk_case(campaign, weights, case):
         made.append(weights)
         steps = [np.log(a / b) for a, b in zip(weights.Q, expert().Q, strict=True)]
         score = LogScore(1.0 + float(np.sum(np.square(steps))), 0.1)
-        return score, None
+        return score, log
 
     monkeypatch.setattr(walks, "walk_case", walk_case)
     monkeypatch.setattr(walks, "save_tree", lambda *args, **options: None)
