@@ -17,6 +17,7 @@ walked; by default it is HECTOR in MuJoCo C.
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
@@ -40,7 +41,7 @@ from hector_jax.core.console import bar, exit_code, say
 from hector_jax.core.files import make_folder
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import setup_jax, workers
-from hector_jax.core.settings import AT_LEAST_ONE, check
+from hector_jax.core.settings import AT_LEAST_ONE, SEED, Range, check
 from hector_jax.core.tree_file import load_tree, save_tree
 from hector_jax.grfm.network import effect_of
 from hector_jax.report.report import markdown_table
@@ -95,7 +96,7 @@ class Flags:
 
     def __post_init__(self) -> None:
         counts = dict.fromkeys(("walks", "repeats", "processes"), AT_LEAST_ONE)
-        check(self, **counts)
+        check(self, **counts, plants=Range(0), first_plant=SEED)
         check_names("methods", self.methods, METHODS)
         check_names("engine", [self.engine], ("c", "drake", "pinocchio"))
         names = [Path(name).stem for name in self.start]
@@ -166,9 +167,9 @@ def search_job(campaign: Campaign, seed: int) -> tuple[np.ndarray, np.ndarray]:
         losses.append(loss if np.isfinite(loss) else max(losses, default=0.0) + 1.0)
         return losses[-1]
 
-    _until_spent(
-        RIVALS["cma-es"], Task(walk, box, SPREAD, seed, (np.zeros((0, len(box))), np.zeros(0)))
-    )
+    nothing = np.zeros((0, len(box))), np.zeros(0)
+    with suppress(Spent):
+        RIVALS["cma-es"](Task(walk, box, SPREAD, seed, nothing))
     return np.array(points), np.array(losses)
 
 
@@ -186,13 +187,6 @@ def _model_loss(
 
 def _box(campaign: Campaign) -> Float[np.ndarray, "n 2"]:
     return np.clip(box_of(campaign), -NEAR, NEAR)
-
-
-def _until_spent(rival: Callable[[Task], None], task: Task) -> None:
-    try:
-        rival(task)
-    except Spent:
-        pass
 
 
 def contest_job(campaign: Campaign, contest: Contest, model: Model, budget: int) -> None:
@@ -233,7 +227,8 @@ def contest_job(campaign: Campaign, contest: Contest, model: Model, budget: int)
     box = np.tile([-FAR, FAR], (len(space.box), 1)) if metric else _box(campaign)
     spread = SPREADS.get(contest.start, SPREAD)
     task = Task(loss, box, spread, contest.seed, (steps, model.losses))
-    _until_spent(RIVALS[contest.method.removesuffix(METRIC)], task)
+    with suppress(Spent):
+        RIVALS[contest.method.removesuffix(METRIC)](task)
 
 
 def _space(campaign: Campaign, contest: Contest, model: Model) -> Space:
@@ -264,27 +259,14 @@ class Best(NamedTuple):
     loss: float  # L on the plant that was walked
 
 
-def best_after(campaign: Campaign, contest: Contest, model: Model, budget: int) -> Best:
-    """Return the set of a contest after so many walks: of ours by posterior mean, else the least L.
-
-    Raises:
-        InputError: the contest is not in the folder.
-    """
-    rows = walks.read_history(campaign)[: contest.rows_after(budget)]
-    if not rows:
-        raise InputError(f"{campaign.folder}: no walks")
+def best_of(campaign: Campaign, contest: Contest, model: Model, rows: Sequence[Row]) -> Best:
+    """Return the best set of some walks: of ours by posterior mean, of the others the least L."""
     space = _space(campaign, contest, model)
     losses = [row.losses[0] for row in rows]
     number = int(np.argmin(losses))
     if contest.method in OURS:
         number = walks.answer(campaign, space, rows)[1]
     return Best(number, weights_at(campaign, space, rows[number].point), losses[number])
-
-
-def falls_of(campaign: Campaign, contest: Contest, budget: int) -> int:
-    """Return the number of walks of a contest that fell, or whose QPs were not solved."""
-    rows = walks.read_history(campaign)[: contest.rows_after(budget)]
-    return sum(not np.isfinite(row.losses[0]) for row in rows)
 
 
 Losses = dict[Entry, dict[int, list[float]]]
@@ -381,13 +363,14 @@ def main() -> None:
                 report_progress(done, len(contests), contests[done - 1].name)
         budgets, both = _budgets(flags), NOMINAL in sets and len(sets) > 1
         charged = [budget - NET for budget in budgets if both and budget >= NET]
+        rows = {c: walks.read_history(campaigns[c])[: c.rows_after(flags.walks)] for c in contests}
         bests = {
-            (contest, budget): best_after(campaigns[contest], contest, models[contest[:2]], budget)
-            for contest in contests
+            (c, budget): best_of(campaigns[c], c, models[c[:2]], rows[c][: c.rows_after(budget)])
+            for c in contests
             for budget in sorted({*budgets, *charged})
         }
         judged = judge(Setup(pool, config, robot), flags, bests)
-    falls = {c: falls_of(campaigns[c], c, flags.walks) for c in contests}
+    falls = {c: sum(not np.isfinite(row.losses[0]) for row in rows[c]) for c in contests}
     say(f"the report is {report(flags, bests, judged, falls)}")
 
 

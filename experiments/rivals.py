@@ -121,8 +121,7 @@ def turbo(task: Task, *, with_model: bool = False) -> None:
     prior_mean = lambda points: torch.zeros(len(points), dtype=torch.double)  # noqa: E731
     if with_model:
         some = rng.permutation(len(task.source[1]))[:_SOURCES]
-        inputs = to_cube(task.source[0][some]), torch.tensor(-task.source[1][some])
-        prior = _fitted(*inputs)
+        prior = _fitted(to_cube(task.source[0][some]), torch.tensor(-task.source[1][some]))
         prior_mean = lambda points: _mean(prior, points)  # noqa: E731
     points = [np.zeros(size), *(task.draw(rng) for _ in range(_FIRST_DRAWS - 1))]
     losses = [task.walk(point) for point in points]
@@ -160,10 +159,8 @@ def _mean(process: Any, points: Any) -> Any:
 
 def _parts(size: int) -> dict[str, Any]:
     """Return likelihood and kernel of the tutorial."""
-    kernels, within = (
-        import_module("gpytorch.kernels"),
-        import_module("gpytorch.constraints").Interval,
-    )
+    kernels = import_module("gpytorch.kernels")
+    within = import_module("gpytorch.constraints").Interval
     likelihood = import_module("gpytorch.likelihoods").GaussianLikelihood
     lengths = {"ard_num_dims": size, "lengthscale_constraint": within(0.005, 4.0)}
     return {

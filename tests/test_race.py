@@ -121,15 +121,14 @@ def test_a_contest_that_was_cut_ends_as_if_it_had_not_been(robot, bowl_walks, tm
     assert (tmp_path / "other" / "walks.jsonl").read_bytes() == whole
 
 
-def test_the_best_set_is_the_least_and_a_fall_is_counted(robot, bowl_walks, tmp_path):
+def test_the_best_set_is_the_least_and_a_fall_is_worse_than_all(robot, bowl_walks, tmp_path):
     campaign, entry, model = contest(tmp_path, robot, "random")
     race.contest_job(campaign, entry, model, 20)
     rows = walks.read_history(campaign)
-    best = race.best_after(campaign, entry, model, 10)
+    best = race.best_of(campaign, entry, model, rows[:11])
     assert best.loss == min(row.losses[0] for row in rows[:11])
     expected = weights_at(campaign, model.space, rows[best.number].point)
     np.testing.assert_array_equal(best.weights.Q.position, expected.Q.position)
-    assert race.falls_of(campaign, entry, 20) == 0
     row = walks.Row(rows[0].point, "random", None, np.array([np.inf]), 1.0)
     log_losses = race._log_losses([*rows, row])
     assert log_losses[0] == 0.0
@@ -141,6 +140,21 @@ def test_walks_of_another_rival_are_refused(robot, bowl_walks, tmp_path):
     campaign, _, model = contest(tmp_path, robot, "random")
     with pytest.raises(InputError, match="walk 1 was another"):
         race.contest_job(campaign, race.Contest("short", "nominal", "cma-es", 0), model, 5)
+
+
+@pytest.mark.parametrize(
+    ("flags", "fault"),
+    [
+        ({"methods": ("bayes",)}, "Flags.methods must be of walks, .*, got 'bayes'"),
+        ({"engine": "mjx"}, "Flags.engine must be of c, drake, pinocchio, got 'mjx'"),
+        ({"start": ("a/best.json", "b/best.json")}, "Flags.start must be nominal, or files of"),
+        ({"start": ("a/nominal.json",)}, "Flags.start must be nominal, or files of"),
+        ({"plants": -1}, "Flags.plants must"),
+    ],
+)
+def test_wrong_flags_are_refused_in_one_line(flags, fault):
+    with pytest.raises(InputError, match=fault):
+        race.Flags(**flags)
 
 
 def test_a_lead_is_paired_and_charges_the_net():

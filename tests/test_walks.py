@@ -130,6 +130,21 @@ def test_any_engine_walks_and_is_recorded(robot, in_process, tmp_path):
         walks.read_history(replace(one, engine=MUJOCO_C))
 
 
+@pytest.mark.parametrize("part", [{"grounded": False}, {"methods": ("surrogate",)}])
+def test_a_tuning_without_a_part_is_not_continued_with_it(robot, tmp_path, part):
+    whole = campaign(tmp_path, robot, [hfs()])
+    walks.read_history(replace(whole, **part))
+    with pytest.raises(InputError, match=f"its {next(iter(part))} is"):
+        walks.read_history(whole)
+
+
+def test_an_engine_of_walks_that_is_not_installed_is_refused_before_any_tuning(monkeypatch, robot):
+    missing = ENGINES["drake"]._replace(package="no-such-package")
+    monkeypatch.setitem(ENGINES, "drake", missing)
+    with pytest.raises(InputError, match="engine drake needs no-such-package"):
+        run_folder.trajectories(Tune(walks=12, walk_engine="drake"), robot)
+
+
 def test_the_plain_model_is_not_grounded(robot, pool, in_process):
     one, _, rows = in_process
     losses = [

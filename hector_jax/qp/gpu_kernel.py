@@ -1,4 +1,4 @@
-"""The solution of a small QP in one GPU kernel, for its residuals to prove.
+"""Solve a small QP in one GPU kernel; residuals computed outside it prove the point.
 
 A batched factorisation per iteration keeps a GPU waiting: the slowest problem of the batch
 determines how often all are factorised. Here each problem is one program with its own registers and

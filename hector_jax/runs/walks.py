@@ -127,7 +127,7 @@ def read_history(campaign: Campaign) -> list[Row]:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
     size = len(box_of(campaign))
-    head = {
+    head: dict[str, Any] = {
         "format": 1,
         "robot": robot_hash(campaign.robot),
         "settings": content_key(campaign.config, code=()),
@@ -135,10 +135,14 @@ def read_history(campaign: Campaign) -> list[Row]:
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
-        # left out where there are none, so that older folders of `hector propose` can be continued
-        **({"leg_numbers": list(campaign.leg_numbers)} if campaign.leg_numbers else {}),
-        **({} if campaign.engine == MUJOCO_C else {"engine": campaign.engine.name}),
     }
+    later = {  # with the defaults of folders that were begun before they existed
+        "leg_numbers": (list(campaign.leg_numbers), []),
+        "engine": (campaign.engine.name, MUJOCO_C.name),
+        "methods": (list(campaign.methods), list(few_walks.METHODS)),
+        "grounded": (campaign.grounded, True),
+    }
+    head |= {name: value for name, (value, default) in later.items() if value != default}
 
     def parse(row: Mapping[str, Any]) -> Row:
         point, losses = np.array(row["point"], float), np.array(row["losses"], float)
@@ -178,10 +182,10 @@ def next_proposal(
     if (proposal := pending(campaign, rows)) is not None:
         return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
-    needs_model = "model" in campaign.methods and few_walks.needs_model(history)
-    model = _model(pool, campaign, space, rows) if needs_model else None
-    inputs = space, history, model, campaign.seed
-    proposal = few_walks.propose(*inputs, methods=campaign.methods)
+    methods, model = campaign.methods, None
+    if few_walks.needs_model(history, methods):
+        model = _model(pool, campaign, space, rows)
+    proposal = few_walks.propose(space, history, model, campaign.seed, methods=methods)
     weights = weights_at(campaign, space, proposal.point)
     save_weights(weights_path(campaign, len(rows)), weights)
     fields = {**proposal._asdict(), "point": proposal.point.tolist()}

@@ -34,6 +34,7 @@ from hector_jax.core.inputs import require_package
 _FLAT = 0.25
 _FIRST, _LEAST, _MOST = 1.0, 0.3, 4.0  # radius of the trust region
 METHODS = ("model", "surrogate", "evolution")
+"""Methods that propose points, see the module's docstring."""
 GAIN = 0.01
 """Smallest significant gain in log-loss."""
 _STALLED = 2  # walks of the model in a row without such a gain before the surrogate takes over
@@ -138,9 +139,9 @@ def incumbent(space: Space, history: Sequence[WalkResult]) -> int:
     return _fit_losses(space, history)[1]
 
 
-def needs_model(history: Sequence[WalkResult]) -> bool:
+def needs_model(history: Sequence[WalkResult], methods: Sequence[str] = METHODS) -> bool:
     """Return True if the next proposal needs the model, grounded on the walk `best_walk`."""
-    return bool(history) and _region(history).stalled_at is None
+    return bool(history) and "model" in methods and _region(history).stalled_at is None
 
 
 def best_walk(history: Sequence[WalkResult]) -> int:
@@ -173,7 +174,7 @@ def propose(
         return Proposal(np.zeros(size), "start", None)
     region = _region(history)
     since = len(history) if region.stalled_at is None else region.stalled_at
-    if region.stalled_at is None and "model" in methods:
+    if needs_model(history, methods):
         if model is None:
             raise ValueError("the next proposal needs the model")
         center = history[region.center].point
