@@ -69,7 +69,7 @@ def search(
 def tune(bench: Bench, name: str, steps: int, plants: int) -> dict[str, Tuned]:
     """Tune for one trajectory without and with the net; the latter on along walks, if any steps."""
     command = named_command(name)
-    problems = {"without": Problem(command, None), "with": Problem(command, bench.params)}
+    problems = {"without": Problem((command,), None), "with": Problem((command,), bench.params)}
     title = f"tuning {name} without and with GRFM-Net"
     results = tunings.tune(bench.setup, problems, bench.folder / name, title=title)
     if steps:
@@ -97,9 +97,9 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
     """
     setup = bench.setup._replace(config=TuneConfig(iterations=PAPER_ITERATIONS + steps))
     pool, config, robot, commit = setup
-    problem = Problem(named_command(name), bench.params)
+    problem = Problem((named_command(name),), bench.params)
     simulators = [hfs(), *(hfs_drawn(seed) for seed in range(500, 499 + plants))]
-    inputs = config, robot, start, problem.command, problem.params
+    inputs = config, robot, start, problem.commands[0], problem.params
     key = content_key(*inputs, *simulators, MEASURED, code=WALKS_CODE)
     job = partial(_walk_job, config, robot, problem)
 
@@ -124,7 +124,7 @@ def tune_along_walks(bench: Bench, name: str, start: Weights, steps: int, plants
 def _walk_job(
     config: TuneConfig, robot: Robot, problem: Problem, weights: Weights, plant: Imperfections
 ) -> Evaluation:
-    controller, command = config.rollout.walk, problem.command
+    controller, (command,) = config.rollout.walk, problem.commands
     seconds = config.rollout.ticks * controller.gait.tick
     trajectory = walk(controller, robot, Job(weights, command, plant, seconds))
     effect = effect_of(problem.params, controller)

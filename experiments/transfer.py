@@ -165,7 +165,7 @@ def tuned_sets(
 ) -> dict[str, Weights]:
     """Return the weights after the paper's ten iterations by trajectory; tune if necessary."""
     problems = {
-        name: Problem(named_command(name), params)
+        name: Problem((named_command(name),), params)
         for name in flags.trajectories
         if name not in loaded
     }

@@ -63,14 +63,15 @@ def look(folder: Path, weights) -> Evaluation:
 def tune_toys(folder: Path, setup, start, problems, title, on_iteration):
     """In the place of `tunings._tunings`."""
     for name in problems:
-        yield name, descend(setup.config, start, partial(look, folder), partial(on_iteration, name))
+        tuning = descend(setup.config, start, partial(look, folder), partial(on_iteration, name))
+        yield name, tunings.Tuned(tuning, setup.commit)
 
 
 def tuning(folder: Path) -> None:
     tunings._tunings = partial(tune_toys, folder)
     tunings.tune(
         Setup(ThreadPoolExecutor(1), TuneConfig(iterations=60), ROBOT),
-        {"toy": Problem(S, None)},
+        {"toy": Problem((S,), None)},
         folder,
         title="",
         journal=Journal(folder / "metrics.jsonl"),
@@ -107,7 +108,7 @@ def table(folder: Path) -> None:
 
     verdicts.walk_jobs, tunings._tunings = walks_of, partial(tune_toys, folder)
     setup = Setup(ThreadPoolExecutor(1), TuneConfig(iterations=20), ROBOT)
-    problems = {"without": Problem(S, None)}
+    problems = {"without": Problem((S,), None)}
     with locked(folder):
         tuned = tunings.tune(setup, problems, folder / "s", title="")["without"]
         sets = {"nominal": nominal(), "expert": expert(), "without": tuned.tuning.converged}

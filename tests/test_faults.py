@@ -122,7 +122,7 @@ def tune(folder, command, params, config=CONFIG, robot=ROBOT):
     with ThreadPoolExecutor(1) as pool, TemporaryDirectory() as kept:
         found = tunings.tune(
             Setup(pool, config, robot),
-            {"with": Problem(command, params)},
+            {"with": Problem((command,), params)},
             Path(kept),
             title="tuning",
             journal=Journal(Path(kept) / "metrics.jsonl"),
@@ -233,7 +233,7 @@ def test_a_dump_of_a_worker_is_reproduced_by_the_console_script(tmp_path, params
     command = Command(np.array([0.2, 9.0]), np.array([[0.5, 0.0], [9.0, 0.0]]), np.zeros(2))
     config = TuneConfig(rollout=RolloutConfig(ticks=80), iterations=10)
     with workers(2) as pool:
-        problems = {"with": Problem(command, params)}
+        problems = {"with": Problem((command,), params)}
         kept, dumps = tmp_path / "kept", tmp_path / "dumps"
         told = tunings.tune(Setup(pool, config, ROBOT), problems, kept, title="", dumps=dumps)
         found = told["with"].tuning

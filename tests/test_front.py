@@ -61,7 +61,7 @@ def test_each_smoothness_is_tuned_with_its_loss_and_judged_with_that_of_the_robo
 
     monkeypatch.setattr(tunings, "tune", tune)
     monkeypatch.setattr(choice, "choose", choose)
-    problems = dict.fromkeys(("without", "with"), Problem(COMMANDS["straight"], None))
+    problems = dict.fromkeys(("without", "with"), Problem((COMMANDS["straight"],), None))
     options = {"start": nominal(), "seconds": 4.0, "folder": tmp_path}
     tuned = front.tune(SETUP, COMMANDS, problems, **options)
     assert list(tuned) == list(front.SMOOTH)

@@ -17,7 +17,7 @@ from hector_jax.runs import metrics, tunings, verdicts
 from hector_jax.runs.cache import content_key
 from hector_jax.runs.folder import Journal, as_line
 from hector_jax.runs.setup import Setup
-from hector_jax.runs.tunings import Problem
+from hector_jax.runs.tunings import Problem, Tuned
 from hector_jax.sim.loop import Job
 from hector_jax.sim.world import hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig, Tuning
@@ -41,7 +41,7 @@ def tuned(monkeypatch):
             names.append(name)
             for iteration in TUNING.history:
                 on_iteration(name, iteration)
-            yield name, TUNING
+            yield name, Tuned(TUNING, setup.commit)
 
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
     return names
@@ -66,7 +66,7 @@ def walked(monkeypatch):
 
 
 def tune(folder, config=CONFIG, command=S, start=None):
-    problems = {"without": Problem(command, None)}
+    problems = {"without": Problem((command,), None)}
     setup = Setup(POOL, config, ROBOT, "abc")
     return tunings.tune(setup, problems, folder, title="", start=start)["without"]
 
@@ -102,7 +102,7 @@ def test_a_tuning_from_weights_with_other_numbers_comes_back(tmp_path, monkeypat
 
     def side_by_side(setup, start, problems, title, on_iteration):
         made.append(title)
-        yield "without", Tuning(history, start, start, "12 iterations")
+        yield "without", Tuned(Tuning(history, start, start, "12 iterations"), "")
 
     monkeypatch.setattr(tunings, "_tunings", side_by_side)
     for _ in range(2):  # as tuned, and as kept
@@ -112,7 +112,7 @@ def test_a_tuning_from_weights_with_other_numbers_comes_back(tmp_path, monkeypat
 
 def test_metrics_of_a_run_that_was_cut_are_those_of_an_uncut_one(tmp_path, tuned):
     """Of two tunings one had ended; the lines that the other had written come once."""
-    problems = {"without": Problem(S, None), "with": Problem(named_command("c"), None)}
+    problems = {"without": Problem((S,), None), "with": Problem((named_command("c"),), None)}
 
     def lines(folder, problems):
         folder.mkdir(exist_ok=True)

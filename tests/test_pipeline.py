@@ -256,7 +256,7 @@ def test_one_set_for_several_lowers_the_mean_of_losses_that_count_alike(robot, m
     monkeypatch.setattr(tunings.difftune, "tune_step", tune_step)
     told, config = SimpleQueue(), TuneConfig(iterations=12)
     for others in ((), (commands[1],)):
-        problem = tunings.Problem(commands[0], None, others)
+        problem = tunings.Problem((commands[0], *others), None)
         found = tunings._tune_job(config, robot, nominal(), problem, "with", told)
         first = found.history[0].evaluation
         each = [tune_step(None, None, nominal(), c, None, None) for c in (commands[0], *others)]
@@ -284,7 +284,7 @@ def test_a_tuning_that_fails_is_told_while_others_go_on(tmp_path, monkeypatch, r
         time.sleep(30.0)
 
     monkeypatch.setattr(tunings, "_tune_job", job)
-    problems = dict.fromkeys(("without", "with"), tunings.Problem(named_command("s"), None))
+    problems = dict.fromkeys(("without", "with"), tunings.Problem((named_command("s"),), None))
     begin, pool = time.monotonic(), ThreadPoolExecutor(2)
     with pytest.raises(InputError, match="the starting weights fall"):
         tunings.tune(Setup(pool, TuneConfig(), robot), problems, tmp_path, title="tuning")

@@ -90,7 +90,7 @@ def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     robot, config = load_robot(), TuneConfig(rollout=RolloutConfig(ticks=10), iterations=1)
     straight = command_of("straight")._replace(seconds=0.1)
-    problems = {name: Problem(named_command(name), None) for name in ("straight", "c")}
+    problems = {name: Problem((named_command(name),), None) for name in ("straight", "c")}
     with runtime.workers(2) as pool:
         tunings.compile_programs(pool, config, robot, nominal(), straight)
         tunings.tune(Setup(pool, config, robot), problems, tmp_path / "tunings", title="")

@@ -46,7 +46,7 @@ def asked(monkeypatch):
     def side_by_side(setup, start, problems, title, on_iteration):
         told["tunings"].append((setup.config.iterations, *problems))
         for name in problems:
-            yield name, Tuning(pretend_history(12), nominal(), expert(), "done")
+            yield name, Tuned(Tuning(pretend_history(12), nominal(), expert(), "done"), "")
 
     def walks_of(setup, jobs, title, engine):
         for job in jobs:

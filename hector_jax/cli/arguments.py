@@ -135,11 +135,6 @@ def with_gait(robot: Robot, name: str) -> Robot:
     return robot._replace(description=replace(description, control=tuple(control.items())))
 
 
-def expand_all(texts: Sequence[str]) -> list[str]:
-    """Replace `all` by the three trajectories of the paper; drop repetitions."""
-    return list(dict.fromkeys(t for text in texts for t in (COMMANDS if text == "all" else [text])))
-
-
 def load_trajectory(text: str, robot: Robot) -> NamedCommand:
     """Load a trajectory by name or file; one line warns if it may exceed the robot's limits.
 
@@ -166,7 +161,7 @@ def trajectories_by_name(texts: Sequence[str]) -> dict[str, str]:
         InputError: two have one name, or there is no such trajectory.
     """
     names: dict[str, str] = {}
-    for text in expand_all(texts):
+    for text in [name for t in texts for name in (COMMANDS if t == "all" else [t])]:
         other = names.setdefault(name := trajectories.command_of(text).name, text)
         if other != text:
             raise InputError(f"--traj {other} and {text} are both named {name}")

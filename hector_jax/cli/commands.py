@@ -76,8 +76,7 @@ def train(args: flags.Train) -> None:
 def search(args: flags.Search) -> None:
     """Search for weights on the simulator, without gradients."""
     robot = load_robot(args.robot)
-    texts = arguments.expand_all([args.traj])
-    trajectories = [arguments.load_trajectory(text, robot) for text in texts]
+    trajectories = arguments.load_trajectories([args.traj], robot)
     commands = {trajectory.name: trajectory.command for trajectory in trajectories}
     config = SearchConfig(args.budget, args.population, args.seed, args.spread)
     engine = choose_engine(args.engine)

@@ -1,6 +1,5 @@
 """Evaluate weight sets on walks, and nets on the ground forces of held-out walks."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,12 @@ from hector_jax.cli.flags import Evaluate, Grfm, Walk
 from hector_jax.cli.parse import as_table
 from hector_jax.control.controller import walk_config
 from hector_jax.control.reference import COMMANDS, named_command
-from hector_jax.control.weights import Weights, expert, nominal
+from hector_jax.control.weights import expert, nominal
 from hector_jax.core.console import Broken, bar, say, say_if_slow
 from hector_jax.core.files import make_folder, write_json
 from hector_jax.core.inputs import InputError, plural, printable
 from hector_jax.core.runtime import workers
-from hector_jax.core.trajectory import SOLVED, Trajectory
+from hector_jax.core.trajectory import SOLVED
 from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import save_tree
 from hector_jax.grfm import training
@@ -30,7 +29,7 @@ from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
 from hector_jax.report.report import print_table
 from hector_jax.report.video import check_film
-from hector_jax.robot.model import Robot, load_robot
+from hector_jax.robot.model import load_robot
 from hector_jax.runs import metrics, nets, tunings, verdicts
 from hector_jax.runs.setup import Setup
 from hector_jax.sim.diagnosis import StartupFall, startup_fall
@@ -102,25 +101,21 @@ def walk(args: Walk) -> None:
     unsolved = int(np.sum(~(residuals <= SOLVED)))
     if args.out is not None:
         save_tree(args.out, trajectory, kind="trajectory", robot=robot, about=as_table(args))
-    title = f"{command.name} in {args.world}"
-    if engine is not MUJOCO_C:
-        title += f" in engine {engine.name}"
+    where = args.world + ("" if engine is MUJOCO_C else f" in engine {engine.name}")
+    where += "" if plant is None else f" on {plant.description.name}"
+    title = f"{command.name} in {where}, {printable(args.weights)} weights"
     result: dict[str, Any] = {
         "engine": engine.name,
         "seconds": upright if startup is None else startup.time,
         # without a plan, the fall is not due to the weights
         "fell": bool(score.fallen) and not unsolved,
+        **({} if startup is None else {"startup": startup._asdict()}),
+        **({} if plant is None else {"plant": plant.description.name}),
     }
-    if startup is not None:
-        result["startup"] = startup._asdict()
-    if plant is not None:
-        result["plant"] = plant.description.name
-        title += f" on {plant.description.name}"
     result |= {part: float(value) for part, value in score.losses.items()}
     # the errors of a walk that falls at once are NaN
     result |= {name: getattr(score, name).tolist() for name in ("rms_position", "rms_euler")}
     result |= {"plans": len(residuals), "unsolved": unsolved, "residual": float(score.residual)}
-    title += f", {printable(args.weights)} weights"
     print_result(args.json, result, partial(_print_walk, title, result, score, loss, startup))
     if unsolved:
         raise Broken(
@@ -129,24 +124,11 @@ def walk(args: Walk) -> None:
             "no result"
         )
     if args.video is not None:
-        _film(args.video, Path(args.weights).stem, trajectory, robot, walk_with)
-
-
-def _film(
-    path: Path,
-    name: str,
-    trajectory: Trajectory,
-    robot: Robot,
-    walk_with: Callable[[Weights], Trajectory],
-) -> None:
-    """Film a walk beside a walk with nominal weights, or expert weights if its own are nominal.
-
-    `walk_with` walks with other weights.
-    """
-    baseline, make_weights = ("expert", expert) if name == "nominal" else ("nominal", nominal)
-    say(f"walking with {baseline} weights for the other half of the film")
-    walks = {baseline: walk_with(make_weights(robot)), name: trajectory}
-    pictures.film(path, robot, walks)
+        name = Path(args.weights).stem
+        baseline = "expert" if name == "nominal" else "nominal"
+        say(f"walking with {baseline} weights for the other half of the film")
+        walks = {baseline: walk_with(arguments.weights(baseline, robot)), name: trajectory}
+        pictures.film(args.video, robot, walks)
 
 
 def _print_walk(

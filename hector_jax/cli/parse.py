@@ -20,14 +20,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Propose, Source, Tune, command
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
-from hector_jax.core.settings import (
-    SEED,
-    from_table,
-    read_json,
-    read_toml,
-    to_table,
-    validation_error,
-)
+from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
 
 _ABOUT = (
     "Gradient tuning of a walking robot's model predictive controller. "
@@ -55,11 +48,10 @@ def from_line(words: Sequence[str]) -> Any:
         InputError: one line with the word that is unknown, repeated, missing, unexpected or of the
             wrong type.
     """
-    others = [word for word in words if word not in _HELP]
-    helps = list(_HELP[:1] if len(others) < len(words) else ())
-    if helps and not others:
+    helps = [word for word in words if word in _HELP]
+    name, *rest = [word for word in words if word not in _HELP] or [""]
+    if helps and not name:
         return all_commands("--help")
-    name, *rest = others or [""]
     return read_flags(command(name), [*rest, *helps], f"hector {name}")
 
 
@@ -205,8 +197,7 @@ def check(flags: Any) -> None:
     """
     for field in fields(flags):
         value, label = getattr(flags, field.name), _label(field)
-        if error := validation_error(value, field.type):
-            raise InputError(f"{label} {error}")
+        convert(value, field.type, name=label)
         if value == () != field.default:
             raise InputError(f"{label} expects a value, got none")
         items = value if isinstance(value, tuple) else (value,)
@@ -236,31 +227,26 @@ def _source(kind: Any) -> Source | None:
 
 def _check_source(label: str, value: Path | str, source: Source) -> None:
     """Check that a flag names a file or folder of its source that exists; else InputError."""
-    path, hint, valid = Path(value), "", True
-    named, is_dir = value in NAMED_WEIGHTS, os.path.isdir(path)
-    if source is Source.RUN:
-        valid = is_dir
-    elif source is Source.FOLDER:
-        valid = os.path.isdir(next(x for x in (path, *path.parents) if os.path.exists(x)))
-    elif source is Source.ROBOT:
-        valid = path.suffix == ".toml"
-    elif source is Source.WEIGHTS:
-        valid = named or path.suffix or os.path.lexists(path)
-        hint = did_you_mean(str(value), NAMED_WEIGHTS)
-    elif source is Source.SETS:
-        path = Path(str(value).rpartition("=")[2])
-        named, is_dir = str(path) in NAMED_WEIGHTS, os.path.isdir(path)
-        valid = named or is_dir or path.suffix
-        hint = did_you_mean(str(path), NAMED_WEIGHTS)
+    text = str(value)
+    if source is Source.SETS:
+        text = str(Path(text.rpartition("=")[2]))  # without NAME=
+    path, named, is_dir = Path(text), text in NAMED_WEIGHTS, os.path.isdir(text)
+    existing = next(x for x in (path, *path.parents) if os.path.exists(x))
+    valid, is_file = {
+        Source.FILE: (True, True),
+        Source.RUN: (is_dir, False),
+        Source.FOLDER: (os.path.isdir(existing), False),
+        Source.EXPORTABLE: (True, not is_dir),
+        Source.WEIGHTS: (named or path.suffix or os.path.lexists(path), not named),
+        Source.SETS: (named or is_dir or path.suffix, not named and not is_dir),
+        Source.TRAJECTORY: (True, path.suffix == ".toml"),
+        Source.ROBOT: (path.suffix == ".toml", True),
+    }[source]
     if not valid:
+        of_sets = source in (Source.WEIGHTS, Source.SETS)
+        hint = did_you_mean(text, NAMED_WEIGHTS) if of_sets else ""
         raise InputError(f"{label} must be {source.value}, got {one_line(str(value))!r}{hint}")
-    if (
-        source in (Source.FILE, Source.ROBOT)
-        or (source is Source.WEIGHTS and not named)
-        or (source is Source.SETS and not named and not is_dir)
-        or (source is Source.EXPORTABLE and not is_dir)
-        or (source is Source.TRAJECTORY and path.suffix == ".toml")
-    ):
+    if is_file:
         check_file(path, "the file")
 
 

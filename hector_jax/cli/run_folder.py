@@ -17,7 +17,8 @@ from hector_jax.control.reference import PIECES
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import make_folder, write_json
-from hector_jax.core.inputs import InputError, plural, short_repr
+from hector_jax.core.inputs import InputError, plural
+from hector_jax.core.settings import convert
 from hector_jax.robot.model import Robot, load_robot
 from hector_jax.runs.cache import robot_hash
 from hector_jax.runs.campaign import with_leg_numbers
@@ -138,8 +139,7 @@ def resume(folder: Path, args: Tune) -> Tune:
     path = folder / CONFIG
     config, made_with = read_object(path), read_object(folder / VERSIONS)
     for name in ("robot", "code", "directory"):
-        if not isinstance(config.get(name), str):
-            raise InputError(f"{path}: {name} must be text, got {short_repr(config.get(name))}")
+        convert(config.get(name), str, name=f"{path}: {name}")
     begun = from_file(Tune, path)
     if config["code"] != code_hash(*_CODE):
         commit = made_with.get("commit", "no commit is noted")

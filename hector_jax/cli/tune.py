@@ -110,9 +110,9 @@ class _Run(NamedTuple):
     @property
     def problems(self) -> dict[str, tunings.Problem]:
         """Tuning problems of all trajectories, without and with the net."""
-        first, *others = self.commands.values()
+        commands = tuple(self.commands.values())
         params = {"without": None, "with": self.net.params}
-        return {name: tunings.Problem(first, net, tuple(others)) for name, net in params.items()}
+        return {name: tunings.Problem(commands, net) for name, net in params.items()}
 
 
 class _Tuned(NamedTuple):
@@ -370,11 +370,7 @@ def _result(
 
 
 def _draw(
-    run: _Run,
-    tuned: _Tuned,
-    standin: ScoredWalks,
-    on_hfs: ScoredWalks,
-    points: front.Front | None,
+    run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks, points: front.Front | None
 ) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
     effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}

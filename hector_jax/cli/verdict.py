@@ -174,26 +174,28 @@ def _plan_text(plan: Plan) -> str:
 
 def walk_cells(setup: Setup, plan: Plan, folder: Path) -> Cells:
     """Do all walks, engine by engine; walks whose scores are in the folder are not repeated."""
-    scored: dict[tuple[Column, str, str, int], verdicts.ScoredWalk] = {}
+    scored = {}
     for name, engine in plan.engines.items():
-        jobs, title = _jobs(plan, name), f"walking in {report.TITLES[name]}"
-        options = {"title": title, "folder": folder, "engine": engine}
-        by_case = verdicts.score_jobs(setup, dict(jobs.values()), **options)
-        scored |= {key: by_case[case][0] for key, (case, _) in jobs.items()}
+        options = {"title": f"walking in {report.TITLES[name]}", "folder": folder, "engine": engine}
+        scored |= verdicts.score_jobs(setup, _jobs(plan, name), **options)
     cells = {}
     for column, seeds in plan.columns.items():
         for trajectory, sets in plan.sets.items():
-            cell = column, trajectory
-            walks = {name: [scored[*cell, name, seed] for seed in seeds] for name in sets}
-            where = report.cell_text(cell)
+            case, where = partial(_case, column, trajectory), report.cell_text((column, trajectory))
+            walks = {name: [scored[case(name, seed)][0] for seed in seeds] for name in sets}
             verdicts.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
             scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
-            cells[cell] = metrics.make_verdict(setup.config.loss, seeds, scores)
+            cells[column, trajectory] = metrics.make_verdict(setup.config.loss, seeds, scores)
     return cells
 
 
-def _jobs(plan: Plan, engine: str) -> dict[tuple[Column, str, str, int], tuple[verdicts.Case, Job]]:
-    """Return the walks of an engine, each with the case under which it is stored."""
+def _case(column: Column, trajectory: str, name: str, seed: int) -> verdicts.Case:
+    """Return the name and the seed under which a walk is stored."""
+    return "-".join([*column, trajectory, name]), seed
+
+
+def _jobs(plan: Plan, engine: str) -> dict[verdicts.Case, Job]:
+    """Return the walks of an engine."""
     jobs, world = {}, "standin" if plan.family == "standin" else f"standin-{plan.family}"
     for column, seeds in plan.columns.items():
         if column.engine != engine:
@@ -205,8 +207,7 @@ def _jobs(plan: Plan, engine: str) -> dict[tuple[Column, str, str, int], tuple[v
             for trajectory, (command, seconds) in plan.trajectories.items():
                 for name, weights in plan.sets[trajectory].items():
                     job = Job(weights, command.command, plant, seconds, seed, plant=model.plant)
-                    case = f"{engine}-{column.model}-{trajectory}-{name}", seed
-                    jobs[column, trajectory, name, seed] = case, job
+                    jobs[_case(column, trajectory, name, seed)] = job
     return jobs
 
 

@@ -11,7 +11,7 @@ from hector_jax.control.parameters import TUNABLES
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, unknown
-from hector_jax.core.settings import Range, read_json, validation_error
+from hector_jax.core.settings import Range, convert, read_json
 from hector_jax.core.trajectory import State
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import Robot
@@ -146,7 +146,6 @@ def _numbers(path: Path, name: str, entry: Any, shape: tuple[int, ...], range: R
     if array.shape != shape:
         raise InputError(f"{path}: {name} must be {expected}, got {json.dumps(entry)[:60]}")
     for index, value in np.ndenumerate(array):
-        if fault := validation_error(value, float, range):
-            place = "".join(f"[{i}]" for i in index)
-            raise InputError(f"{path}: {name}{place} {fault}")
+        place = "".join(f"[{i}]" for i in index)
+        convert(value, float, range, f"{path}: {name}{place}")
     return array.astype(float)

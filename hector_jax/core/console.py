@@ -17,7 +17,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
@@ -56,15 +55,8 @@ def bar(title: str) -> Iterator[ReportProgress]:
         Function of the number done, the total and a short remark.
     """
     if console.is_terminal:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[remark]}"),
-        )
+        done, times = MofNCompleteColumn(), (TimeElapsedColumn(), "left", TimeRemainingColumn())
+        columns = "{task.description}", BarColumn(), done, *times, "{task.fields[remark]}"
         with Progress(*columns, console=console) as progress:
             task = progress.add_task(title, total=None, remark="")
             yield lambda done, total, remark="": progress.update(

@@ -92,9 +92,9 @@ def _syntax(source: bytes) -> tuple[str, list[str]]:
     tree = ast.parse(source)
     imported = _imported(tree)
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list) and body and _is_text(body[0]):
-            body.pop(0)
+        match getattr(node, "body", None):
+            case [ast.Expr(ast.Constant(str())), *_] as body:
+                body.pop(0)
     return ast.dump(tree), imported
 
 
@@ -113,7 +113,3 @@ def _imported(tree: ast.Module) -> list[str]:
             modules += [name for name in names if _source(name).exists()]  # else not a module
             modules += [module[:-1]] if module else []
     return modules
-
-
-def _is_text(node: ast.AST) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str)

@@ -40,7 +40,6 @@ def write_file(path: Path, data: bytes) -> None:
     Raises:
         WriteError: one line with the path, if the folder or the disk cannot be written.
     """
-    path = Path(path)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -54,12 +53,11 @@ def write_file(path: Path, data: bytes) -> None:
             os.fsync(folder)  # make the rename durable as well
         finally:
             os.close(folder)
-    except BaseException as error:
+    except OSError as error:
+        raise _cannot_write(path, error) from error
+    finally:
         with suppress(OSError):
-            part.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise _cannot_write(path, error) from error
-        raise
+            part.unlink()  # still there after an error
 
 
 def append_file(path: Path, data: bytes) -> None:
@@ -69,7 +67,7 @@ def append_file(path: Path, data: bytes) -> None:
         WriteError: one line with the path, if the folder or the disk cannot be written.
     """
     try:
-        with Path(path).open("ab") as file:
+        with path.open("ab") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -84,7 +82,7 @@ def make_folder(folder: Path) -> None:
         InputError: one line with the folder that cannot be created or written.
     """
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
@@ -102,14 +100,14 @@ def locked(folder: Path) -> Iterator[None]:
         InputError: one line with the folder that cannot be created or written.
     """
     make_folder(folder)
-    lock = FileLock(Path(folder) / ".lock")
+    lock = FileLock(folder / ".lock")
     try:
         lock.acquire(blocking=False)
     except Timeout:
         say(f"{folder}: another process is writing there; waiting for it to end")
         lock.acquire()
     try:
-        for part in Path(folder).glob(f".*{_PART}"):
+        for part in folder.glob(f".*{_PART}"):
             part.unlink(missing_ok=True)
         yield
     finally:

@@ -63,16 +63,17 @@ Rule = Range | tuple[str, ...]
 """Allowed range of numbers, or allowed words."""
 
 
-def convert(value: Any, kind: Any, rule: Rule | None = None) -> Any:
+def convert(value: Any, kind: Any, rule: Rule | None = None, name: str = "") -> Any:
     """Convert a value to a type: a list to a tuple, 1 to 1.0, text to a `Path`.
 
     Args:
         value: from a file or a program.
         kind: the type annotation; a range in `Annotated` takes precedence over `rule`.
         rule: allowed numbers or words; without a rule, numbers have to be finite.
+        name: name of the value, for the message.
 
     Raises:
-        InputError: `must be ..., got ...`.
+        InputError: `NAME must be ..., got ...`.
     """
     if get_origin(kind) is Annotated:
         kind, *notes = get_args(kind)
@@ -89,7 +90,8 @@ def convert(value: Any, kind: Any, rule: Rule | None = None) -> Any:
     if not valid:
         words = get_args(kind) if get_origin(kind) is Literal else ()
         hint = did_you_mean(value, words) if isinstance(value, str) else ""
-        raise InputError(f"must be {_expected(kind, rule)}, got {short_repr(value)}{hint}")
+        message = f"must be {_expected(kind, rule)}, got {short_repr(value)}{hint}"
+        raise InputError(f"{name} {message}" if name else message)
     return converted
 
 
@@ -145,12 +147,10 @@ def check(settings: Any, /, **rules: Rule) -> None:
         InputError: `CLASS.FIELD must be ..., got ...`.
     """
     for field in fields(settings):
-        value = getattr(settings, field.name)
-        error = validation_error(value, field.type, rules.get(field.name))
-        if not error and isinstance(value, list | dict):
-            error = f"must be hashable, got {short_repr(value)}"
-        if error:
-            raise InputError(f"{type(settings).__name__}.{field.name} {error}")
+        value, name = getattr(settings, field.name), f"{type(settings).__name__}.{field.name}"
+        convert(value, field.type, rules.get(field.name), name)
+        if isinstance(value, list | dict):
+            raise InputError(f"{name} must be hashable, got {short_repr(value)}")
 
 
 def choose(name: str, word: str, choices: Iterable[str]) -> str:
@@ -159,9 +159,7 @@ def choose(name: str, word: str, choices: Iterable[str]) -> str:
     Raises:
         InputError: `NAME must be ..., got ...`.
     """
-    if error := validation_error(word, str, tuple(choices)):
-        raise InputError(f"{name} {error}")
-    return word
+    return convert(word, str, tuple(choices), name)
 
 
 def read_json(path: Path, what: str, max_bytes: int = 10_000_000, **options: Any) -> Any:
@@ -229,10 +227,7 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
         if inner and value is not None:
             values[name] = from_table(f"{where}: {name}", inner, value)
             continue
-        try:
-            values[name] = convert(value, type_)
-        except InputError as error:
-            raise InputError(f"{where}: {name} {error}") from None
+        values[name] = convert(value, type_, name=f"{where}: {name}")
     for name, field in by_name.items():
         if name not in table and field.default is field.default_factory is MISSING:
             raise InputError(f"{where}: missing field {name!r}; known: {', '.join(by_name)}")

@@ -21,7 +21,7 @@ import numpy as np
 from hector_jax.core.environment import NUMERIC, versions
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, one_line, short_repr
-from hector_jax.core.settings import validation_error
+from hector_jax.core.settings import convert
 
 FORMAT = 1
 ROBOT_DIGITS = 9  # of a robot's numbers; rounding on another machine gives the same hash
@@ -33,7 +33,7 @@ Tree = TypeVar("Tree")
 def tree_hash(tree: Any, digits: int | None = None) -> str:
     """Return a hash (16 hexadecimal digits) of a tree's arrays, exact or of `digits` digits."""
     content = hashlib.sha256()
-    for name, leaf in _named_leaves(tree).items():
+    for name, leaf in named_leaves(tree).items():
         array = np.asarray(leaf)
         content.update(f"{name}{array.shape}".encode())
         if digits is None:
@@ -59,7 +59,7 @@ def save_tree(
     Raises:
         WriteError: if the file cannot be written.
     """
-    arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(tree).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
     card = {
         "format": FORMAT,
         "kind": kind,
@@ -102,7 +102,7 @@ def load_tree(
         raise InputError(
             f"{path}: made for robot {card['robot']}, the robot in use is {expected}; make it anew"
         )
-    leaves = _named_leaves(like)
+    leaves = named_leaves(like)
     if arrays.keys() != leaves.keys():
         differences = one_line(", ".join(sorted(arrays.keys() ^ leaves.keys())))
         raise InputError(f"{path}: another layout of {kind}; fields that differ: {differences}")
@@ -129,7 +129,12 @@ def read_card(path: Path, kind: str | None = None) -> dict[str, Any]:
 
 
 def _read(path: Path, kind: str | None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    data = _read_bytes(Path(path))
+    try:
+        if path.exists() and not path.is_file():  # a pipe or a device might never end
+            raise InputError(f"cannot read {path}: not a plain file")
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from error
     content, digest = data[:-_SHA256], data[-_SHA256:]
     if hashlib.sha256(content).hexdigest().encode() != digest:
         raise InputError(f"{path}: cut or changed since it was written, or not a hector_jax file")
@@ -159,20 +164,11 @@ def _check_card(path: Path, card: Any) -> None:
     for name, kind in kinds.items():
         if name not in card:
             raise InputError(f"{path}: card.{name} is missing")
-        if fault := validation_error(card[name], kind):
-            raise InputError(f"{path}: card.{name} {fault}")
+        convert(card[name], kind, name=f"{path}: card.{name}")
 
 
-def _read_bytes(path: Path) -> bytes:
-    try:
-        if path.exists() and not path.is_file():  # a pipe or a device might never end
-            raise InputError(f"cannot read {path}: not a plain file")
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from error
-
-
-def _named_leaves(tree: Any) -> dict[str, Any]:
+def named_leaves(tree: Any) -> dict[str, Any]:
+    """Return the leaves of a tree by their names in a file, such as `state.euler`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 

@@ -72,8 +72,7 @@ def tune(
         results = {name: entry.tuning for name, entry in done.items()}
         options = {"seconds": seconds, "folder": folder / "choice"}
         choices = choice.choose(setup, results, list(commands.values()), **options)
-        last = {name: tuning.converged for name, tuning in results.items()}
-        tuned[smooth] = [choices[n].weights if choices else last[n] for n in problems]
+        tuned[smooth] = [choices[n].weights if choices else results[n].converged for n in problems]
     return tuned
 
 

@@ -9,12 +9,11 @@ a change of the loss is due to the weights or to one simulator:
 - Kendall's tau of the order of the sets by their median L, between every two columns.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from itertools import combinations
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from hector_jax.runs import metrics
@@ -150,13 +149,6 @@ def worst(cells: Cells, name: str, baseline: str) -> Worst:
     return max(candidates, key=lambda candidate: candidate.change)
 
 
-def on_seeds(verdict: Verdict, seeds: np.ndarray) -> Verdict:
-    """Return the verdict on some of its seeds."""
-    rows = np.flatnonzero(np.isin(verdict.seeds, seeds))
-    scores = jax.tree.map(lambda x: x[rows], verdict.scores)
-    return verdict._replace(seeds=verdict.seeds[rows], scores=scores)
-
-
 def spreads(cells: Cells, name: str, baseline: str) -> list[Spread]:
     """Return the spread between engines for each trajectory and model with several engines."""
     result = []
@@ -165,8 +157,8 @@ def spreads(cells: Cells, name: str, baseline: str) -> list[Spread]:
             verdicts = [v for (c, t), v in cells.items() if (c.model, t) == (model, trajectory)]
             if len(verdicts) < 2:
                 continue
-            scores = [verdict.scores for verdict in _on_shared_seeds(*verdicts)]
-            medians = [100.0 * float(np.median(s[name].L / s[baseline].L) - 1.0) for s in scores]
+            losses = _losses_on_shared_seeds(verdicts)
+            medians = [100.0 * float(np.median(L[name] / L[baseline]) - 1.0) for L in losses]
             gain, spread = -max(medians), max(medians) - min(medians)
             result.append(Spread(trajectory, model, gain, spread))
     return result
@@ -181,19 +173,19 @@ def agreements(cells: Cells) -> list[Agreement]:
     result = []
     for trajectory in trajectories_of(cells):
         for pair in combinations([c for c, t in cells if t == trajectory], 2):
-            medians = [
-                [float(np.median(score.L)) for score in verdict.scores.values()]
-                for verdict in _on_shared_seeds(*(cells[column, trajectory] for column in pair))
-            ]
+            losses = _losses_on_shared_seeds([cells[column, trajectory] for column in pair])
+            medians = [[float(np.median(L)) for L in by_set.values()] for by_set in losses]
             tau = float(stats.kendalltau(*medians).statistic)
             result.append(Agreement(trajectory, *pair, tau))
     return result
 
 
-def _on_shared_seeds(*verdicts: Verdict) -> list[Verdict]:
-    """Return the verdicts on the seeds that all of them have."""
+def _losses_on_shared_seeds(verdicts: Sequence[Verdict]) -> list[dict[str, np.ndarray]]:
+    """Return L of verdicts by set, on the seeds that all of the verdicts have."""
     seeds = reduce(np.intersect1d, [verdict.seeds for verdict in verdicts])
-    return [on_seeds(verdict, seeds) for verdict in verdicts]
+    rows = [np.isin(verdict.seeds, seeds) for verdict in verdicts]
+    inputs = zip(verdicts, rows, strict=True)
+    return [{name: score.L[at] for name, score in v.scores.items()} for v, at in inputs]
 
 
 def as_result(cells: Cells, family: str) -> dict[str, Any]:

@@ -43,14 +43,8 @@ TUNING_CODE = ("tuning.difftune", "grfm.network")
 class Problem(NamedTuple):
     """Commands and model for which weights are tuned."""
 
-    command: Command
+    commands: tuple[Command, ...]  # for the same weights
     params: network.Params | None  # of the net to tune through; None: the plain rigid body
-    others: tuple[Command, ...] = ()  # further commands for the same weights
-
-    @property
-    def commands(self) -> tuple[Command, ...]:
-        """All commands."""
-        return self.command, *self.others
 
 
 class Tuned(NamedTuple):
@@ -106,7 +100,7 @@ def _tunings(
     problems: Mapping[str, Problem],
     title: str,
     on_iteration: Callable[[str, Iteration], None],
-) -> Iterator[tuple[str, Tuning]]:
+) -> Iterator[tuple[str, Tuned]]:
     """Tune several problems in parallel and yield each tuning with its name when it ends."""
     done, total = 0, setup.config.iterations * len(problems)
     inputs = setup.config, setup.robot, start
@@ -125,7 +119,7 @@ def _tunings(
                 report_progress(done, total, remark)
                 on_iteration(name, iteration)
             for future in ended:
-                yield running.pop(future), future.result()
+                yield running.pop(future), Tuned(future.result(), setup.commit)
 
 
 def tune(
@@ -159,22 +153,24 @@ def tune(
     """
     start = nominal(setup.robot) if start is None else start
     key = partial(content_key, setup.config, setup.robot, start, code=TUNING_CODE)
-    paths = {n: folder / f"tuning-{n}-{key(*problem)}.npz" for n, problem in problems.items()}
+    paths = {  # whose keys hash the first command before the net and the others after it
+        name: folder / f"tuning-{name}-{key(first, net, tuple(others))}.npz"
+        for name, ((first, *others), net) in problems.items()
+    }
 
     def on_iteration(name: str, iteration: Iteration) -> None:
         if journal is not None:
             journal.add(name, iteration)
-        command, net, others = problems[name]
-        if dumps is not None and not others:
-            inputs = {"config": setup.config, "robot": setup.robot, "command": command}
+        commands, net = problems[name]
+        if dumps is not None and len(commands) == 1:
+            inputs = {"config": setup.config, "robot": setup.robot, "command": commands[0]}
             replay.keep(dumps, name, iteration, net=net, **inputs)
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
         if journal is not None:  # in the order of the problems
             journal.write({n: stored[n].tuning.history if n in stored else () for n in problems})
         remaining = {name: problems[name] for name in missing}
-        for name, tuning in _tunings(setup, start, remaining, title, on_iteration):
-            yield name, Tuned(tuning, setup.commit)
+        return _tunings(setup, start, remaining, title, on_iteration)
 
     tuned = load_or_make(paths, make, **artefact(setup, start))
     if journal is not None:
@@ -221,7 +217,7 @@ def tuning_paths(pool: Executor, robot: Robot, folder: Path) -> list[Weights]:
 
     The tunings are saved in `folder`; their settings do not depend on later tunings.
     """
-    problems = {name: Problem(named_command(name), None) for name in COMMANDS}
+    problems = {name: Problem((named_command(name),), None) for name in COMMANDS}
     title = "tuning paths on the rigid body, for the data"
     tuned = tune(Setup(pool, tune_config(robot), robot), problems, folder, title=title)
     histories = [tuned[name].tuning.history for name in COMMANDS]
@@ -232,7 +228,7 @@ def _prepare_tuning(
     config: TuneConfig, robot: Robot, start: Weights, command: Command, trace_only: bool
 ) -> None:
     """Compile the program of a tuning, or only trace it, so that its first call need not."""
-    (model,) = _models(config, robot, Problem(command, None))
+    (model,) = _models(config, robot, Problem((command,), None))
     step, weights = partial(difftune.tune_step, config, robot), difftune.init(config, start).best
     jax.eval_shape(step, weights, **model) if trace_only else step(weights, **model)
 

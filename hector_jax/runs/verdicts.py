@@ -1,6 +1,6 @@
 """The step `judge`: walks of weight sets on plants, each score an artefact (cache.py)."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,8 +13,7 @@ from hector_jax.control.reference import Command, standing_anchor
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar, say
 from hector_jax.core.inputs import plural
-from hector_jax.core.trajectory import SOLVED, State, Trajectory
-from hector_jax.grfm.collection import walks_like
+from hector_jax.core.trajectory import SOLVED, State, Trajectory, no_samples
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import Robot
@@ -92,10 +91,9 @@ def _score_walk(setup: Setup, job: Job, walk: Trajectory, engine: Engine) -> Sco
 
 def _like(setup: Setup, with_walk: bool) -> Any:
     """Return the structure of the artefact of one walk, with or without its trajectory."""
-    walk = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walks_like(setup.robot).trajectory)
-    last = jax.tree.map(lambda x: np.zeros(np.shape(x)[1:]), walk.state)
+    walk = no_samples(len(setup.robot.joint_lower), len(setup.robot.foot_point))
     score = metrics.score_like(loss=setup.config.loss)
-    return ScoredWalk(score, np.zeros(()), last, "", ""), walk if with_walk else None
+    return ScoredWalk(score, np.zeros(()), walk.initial, "", ""), walk if with_walk else None
 
 
 def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engine) -> str:
@@ -123,7 +121,7 @@ def score_jobs(
     title: str,
     folder: Path | None = None,
     engine: Engine = MUJOCO_C,
-    with_walk: Callable[[Case], bool] = lambda case: False,
+    with_walk: Container[Case] = (),
 ) -> dict[Case, tuple[ScoredWalk, Trajectory | None]]:
     """Walk jobs and score the walks; walks whose scores are in the folder are not repeated.
 
@@ -133,7 +131,7 @@ def score_jobs(
         title: title of the progress bar.
         folder: folder of the scores; None: nothing is saved.
         engine: engine of the walks.
-        with_walk: tells whether the walk of a case is saved beside its score.
+        with_walk: cases whose walks are saved beside their scores.
 
     Raises:
         InputError: the folder cannot be written, or the engine cannot walk a job.
@@ -145,16 +143,16 @@ def score_jobs(
         new_jobs = [jobs[case] for case in missing]
         walks = walk_jobs(setup, new_jobs, title + remark, engine)
         for case, walk in zip(missing, walks, strict=True):
-            samples = at_interval(walk, tick) if with_walk(case) else None
+            samples = at_interval(walk, tick) if case in with_walk else None
             yield case, (_score_walk(setup, jobs[case], walk, engine), samples)
 
     if folder is None:
         return dict(make(list(jobs), {}))
     paths = {
-        case: folder / _file_name(setup, case, job, with_walk(case), engine)
+        case: folder / _file_name(setup, case, job, case in with_walk, engine)
         for case, job in jobs.items()
     }
-    like = lambda case: _like(setup, with_walk(case))  # noqa: E731
+    like = lambda case: _like(setup, case in with_walk)  # noqa: E731
     return load_or_make(paths, make, like=like, kind="walk", robot=setup.robot)
 
 
@@ -192,10 +190,9 @@ def judge(
         for imperfections, seed in zip(plants, seeds, strict=True)
         for name, weights in sets.items()
     }
-    with_walk = lambda case: folder is not None and case[1] == seeds[0]  # noqa: E731
-    options: dict[str, Any] = {"engine": engine, "with_walk": with_walk}
-    results = score_jobs(setup, jobs, title=title, folder=folder, **options)
+    first = [(name, seeds[0]) for name in sets] if folder else []
+    results = score_jobs(setup, jobs, title=title, folder=folder, engine=engine, with_walk=first)
     by_set = {name: [results[name, seed][0] for seed in seeds] for name in sets}
     say_faults(by_set)
-    first = {name: results[name, seeds[0]][1] for name in sets}
-    return ScoredWalks(by_set, {name: walk for name, walk in first.items() if walk is not None})
+    walks = {name: walk for (name, _), (_, walk) in results.items() if walk is not None}
+    return ScoredWalks(by_set, walks)

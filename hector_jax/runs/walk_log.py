@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from hector_jax.control.reference import Command, anchor_at, reference_at
 from hector_jax.core.inputs import InputError, one_line
 from hector_jax.core.trajectory import SOLVED, State, Trajectory, Wrench, has_fallen, no_samples
+from hector_jax.core.tree_file import named_leaves
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.difftune import TuneConfig
@@ -68,15 +69,9 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
     count = next(iter(arrays.get("joints", np.zeros(())).shape), 0)
     if not 1 <= count <= wanted:
         raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
-    shapes = {
-        "period": (),
-        **{f"initial.{name}": (3,) for name in State._fields},
-        **{f"state.{name}": (count, 3) for name in State._fields},
-        **{f"command.{name}": (count, feet, 3) for name in Wrench._fields},
-        "joints": (count, joints),
-        "fallen": (count,),
-        "residual": (count,),
-    }
+    empty = log_of(no_samples(joints, feet))
+    log_shapes = {n: np.shape(leaf) for n, leaf in named_leaves(empty).items()}
+    shapes = {"period": (), **{n: tuple(x or count for x in s) for n, s in log_shapes.items()}}
     defaults = {"fallen": np.zeros(count, bool), "residual": np.zeros(count)}
     arrays = {"period": np.array(TIME_STEP), **defaults, **arrays}
     for name, shape in shapes.items():
@@ -88,18 +83,18 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
             raise InputError(f"{path}: {name} must hold finite numbers")
     if not np.isclose(arrays["period"], TIME_STEP, rtol=1e-6):
         raise InputError(f"{path}: samples must be of {TIME_STEP} s, got {arrays['period']}")
-    rows = np.minimum(np.arange(wanted), count - 1)
-    state = State(*(arrays[f"state.{name}"][rows].astype(float) for name in State._fields))
-    down = np.asarray(has_fallen(state, *robot.description.limits))
-    fallen = np.maximum.accumulate(down | arrays["fallen"][rows].astype(bool))
-    return Log(
-        State(*(arrays[f"initial.{name}"].astype(float) for name in State._fields)),
-        state,
-        arrays["joints"][rows].astype(float),
-        Wrench(*(arrays[f"command.{name}"][rows].astype(float) for name in Wrench._fields)),
-        fallen | (np.arange(wanted) >= count),
-        arrays["residual"][rows].astype(float),
-    )
+    numbers = [arrays[name].astype(float) for name in log_shapes]
+    log = jax.tree.unflatten(jax.tree.structure(empty), numbers)
+    log = _on_samples(log, np.minimum(np.arange(wanted), count - 1))
+    down = np.asarray(has_fallen(log.state, *robot.description.limits))
+    fallen = np.maximum.accumulate(down | log.fallen.astype(bool))
+    return log._replace(fallen=fallen | (np.arange(wanted) >= count))
+
+
+def _on_samples(log: Log, rows: Any) -> Log:
+    """Return the log on some of its samples."""
+    samples = jax.tree.map(lambda x: x[rows], log._replace(initial=None))
+    return samples._replace(initial=log.initial)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -131,5 +126,4 @@ def evaluate_log(config: TuneConfig, robot: Robot, command: Command, log: Log) -
     sunk = (height - log.state.position[upright, 2].min(initial=height)) / (height - min_height)
     failed = log.fallen.any() or not log.residual.max() <= SOLVED
     score = LogScore(np.inf, 1.0) if failed else LogScore(loss, float(max(tilt, sunk)))
-    samples = jax.tree.map(lambda x: x[stride - 1 :: stride], log._replace(initial=None))
-    return score, samples._replace(initial=log.initial)
+    return score, _on_samples(log, slice(stride - 1, None, stride))

@@ -24,10 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.control.reference import Command
-from hector_jax.control.weights import (
-    Weights,
-    largest_changes,
-)
+from hector_jax.control.weights import Weights, largest_changes
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
 from hector_jax.core.files import write_json
@@ -111,8 +108,7 @@ def space_of(pool: Executor, campaign: Campaign) -> Space:
     """
     path = campaign.folder / "metric.npz"
     if not path.exists():
-        first, *others = campaign.commands.values()
-        problem = tunings.Problem(first, None, tuple(others))
+        problem = tunings.Problem(tuple(campaign.commands.values()), None)
         inputs = campaign.config, campaign.robot, campaign.start, problem
         matrix = pool.submit(tunings.gauss_newton_job, *inputs).result()
         save_tree(path, {"matrix": matrix}, kind="metric", robot=campaign.robot)
@@ -155,15 +151,14 @@ def read_history(campaign: Campaign) -> list[Row]:
 
 
 def _walked(rows: Sequence[Row]) -> list[WalkResult]:
-    """Return the rows with their mean loss over the cases."""
-    return [WalkResult(*row[:3], _log_loss(rows, row), row.margin) for row in rows]
+    """Return the rows with the logarithm of their mean loss over the cases relative to the start.
 
-
-def _log_loss(rows: Sequence[Row], row: Row) -> float:
-    """Return the logarithm of the mean loss relative to the start; infinite if not finite."""
+    It is infinite if the mean loss is not finite.
+    """
     with np.errstate(invalid="ignore"):
-        ratio = np.mean(row.losses / rows[0].losses)
-    return float(np.log(ratio)) if np.isfinite(ratio) else np.inf
+        ratios = [np.mean(row.losses / rows[0].losses) for row in rows]
+    losses = [float(np.log(ratio)) if np.isfinite(ratio) else np.inf for ratio in ratios]
+    return [WalkResult(*row[:3], L, row.margin) for row, L in zip(rows, losses, strict=True)]
 
 
 def next_proposal(
@@ -182,10 +177,9 @@ def next_proposal(
     if (proposal := pending(campaign, rows)) is not None:
         return proposal, weights_at(campaign, space, proposal.point)
     history = _walked(rows)
-    methods, model = campaign.methods, None
-    if few_walks.needs_model(history, methods):
-        model = _model(pool, campaign, space, rows)
-    proposal = few_walks.propose(space, history, model, campaign.seed, methods=methods)
+    has_model = few_walks.needs_model(history, campaign.methods)
+    model = _model(pool, campaign, space, rows) if has_model else None
+    proposal = few_walks.propose(space, history, model, campaign.seed, methods=campaign.methods)
     weights = weights_at(campaign, space, proposal.point)
     save_weights(weights_path(campaign, len(rows)), weights)
     fields = {**proposal._asdict(), "point": proposal.point.tolist()}
