@@ -36,10 +36,10 @@ from hector_jax.robot.model import Robot
 from hector_jax.tuning import sensitivity
 from hector_jax.tuning.difftune import Iteration, TuneConfig, step_status, step_weights
 from hector_jax.tuning.evaluate import Evaluation
-from hector_jax.tuning.grounded import MeasuredState, carry_from, command_history
+from hector_jax.tuning.grounded import MeasuredState, carry_from
 from hector_jax.tuning.loss import Loss, losses
-from hector_jax.tuning.rollout import Carry, RolloutConfig
-from hector_jax.tuning.sensitivity import Sensitivities, Varied, no_tangents, step_sensitivities
+from hector_jax.tuning.rollout import Carry, RolloutConfig, command_history
+from hector_jax.tuning.sensitivity import Sensitivities, no_tangents, step_sensitivities
 
 ESTIMATORS = ("carried", "cut", "model")
 
@@ -65,7 +65,7 @@ class Trace(NamedTuple):
 
     commands: Wrench  # (HISTORY, feet, 3) each, world frame, newest first
     disturbance: Disturbance  # of the controller
-    tangents: Varied  # of the carry
+    tangents: Carry  # of the `varied` carry
 
 
 def init_trace(anchor: Anchor, measured: MeasuredState, last: Wrench, weights: Weights) -> Trace:
@@ -117,7 +117,7 @@ def window_gradient(
     Source: Eq. 9-11, along measured states.
     """
 
-    def step(carried: tuple[Carry, Varied], inputs: tuple) -> tuple:
+    def step(carried: tuple[Carry, Carry], inputs: tuple) -> tuple:
         carry, tangents = carried
         tick, weights, begin, end = inputs
         if measured:

@@ -94,10 +94,13 @@ def walk_config(robot: Robot) -> WalkConfig:
             f"{path}: gait.pattern must be one of {feet} feet ({', '.join(patterns)}, or {feet} "
             f"numbers), got {short_repr(config.gait.pattern)}"
         )
-    try:
-        config.legs.check_joints(robot.description.leg_joints)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    joints = robot.description.leg_joints
+    for name, gains in (("kp", config.legs.kp), ("kd", config.legs.kd)):
+        if len(gains) != joints:
+            raise InputError(
+                f"{path}: legs.{name} must be a gain for each of the {joints} joints of a leg, "
+                f"got {short_repr(gains)}"
+            )
     return config
 
 

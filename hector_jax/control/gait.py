@@ -6,6 +6,7 @@ this foot in the pattern. A switch tick belongs to the new stance. With zero `sw
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,16 +34,16 @@ GAITS = (*PATTERNS, STAND)
 class GaitConfig:
     """Timing of the gait, in ticks."""
 
-    tick: float = 0.01  # [s] plan interval
-    stance: int = 20  # ticks of a stance
-    swing: int = 20  # ticks of a swing; 0: all feet stand
-    stand: int = 30  # ticks with all feet in stance before the gait starts (MuJoCo worlds)
-    cycles: int = 2  # gait cycles in place before t = 0 (MuJoCo worlds)
+    tick: Annotated[float, POSITIVE] = 0.01  # [s] plan interval
+    stance: Annotated[int, AT_LEAST_ONE] = 20  # ticks of a stance
+    swing: Annotated[int, NOT_NEGATIVE] = 20  # ticks of a swing; 0: all feet stand
+    # ticks with all feet in stance before the gait starts (MuJoCo worlds)
+    stand: Annotated[int, NOT_NEGATIVE] = 30
+    cycles: Annotated[int, NOT_NEGATIVE] = 2  # gait cycles in place before t = 0 (MuJoCo worlds)
     pattern: str | tuple[float, ...] = "walk"  # name in PATTERNS, or an offset for each foot
 
     def __post_init__(self) -> None:
-        rules = {"tick": POSITIVE, "stance": AT_LEAST_ONE, "swing": NOT_NEGATIVE}
-        check(self, **rules, stand=NOT_NEGATIVE, cycles=NOT_NEGATIVE)
+        check(self)
         if isinstance(self.pattern, str):
             choose("GaitConfig.pattern", self.pattern, PATTERNS)
         if not all(0.0 <= share < 1.0 for share in self.offsets) or len(self.offsets) not in FEET:

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 from hector_jax.control.footstep import Feet
 from hector_jax.core.arrays import Array
 from hector_jax.core.geometry import rotation_from_euler, wrap_angle
-from hector_jax.core.inputs import InputError, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, check
 from hector_jax.core.trajectory import State, Wrench
 from hector_jax.robot.kinematics import foot_jacobians, inverse_legs, leg_gravity
@@ -56,19 +55,6 @@ class LegConfig:
 
     def __post_init__(self) -> None:
         check(self, height=NOT_NEGATIVE, kp=NOT_NEGATIVE, kd=NOT_NEGATIVE)
-
-    def check_joints(self, joints: int) -> None:
-        """Check that there is a gain for each joint of a leg.
-
-        Raises:
-            InputError: `legs.kp must be ..., got ...`.
-        """
-        for name in ("kp", "kd"):
-            if len(gains := getattr(self, name)) != joints:
-                raise InputError(
-                    f"legs.{name} must be a gain for each of the {joints} joints of a leg, "
-                    f"got {short_repr(gains)}"
-                )
 
     @property
     def parameters(self) -> LegParameters:

@@ -17,7 +17,7 @@ see also `contact`.
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -66,29 +66,26 @@ class MpcConfig:
 
     RENAMED: ClassVar = {"effort_about": ("effort_reference", {"weight": "gravity"})}
 
-    horizon: int = 10  # steps N
-    step_ticks: int = 3  # ticks per step: dt = 0.03 s
-    friction: float = 0.6  # mu; larger than the floor's, the feet slip
-    max_force: float = 500.0  # [N] per foot
-    sole_width: float = 1.0  # share of a flat sole's half width that the plan uses
+    horizon: Annotated[int, AT_LEAST_ONE] = 10  # steps N
+    step_ticks: Annotated[int, AT_LEAST_ONE] = 3  # ticks per step: dt = 0.03 s
+    friction: Annotated[float, POSITIVE] = 0.6  # mu; larger than the floor's, the feet slip
+    max_force: Annotated[float, POSITIVE] = 500.0  # [N] per foot
+    # share of a flat sole's half width that the plan uses
+    sole_width: Annotated[float, SHARE] = 1.0
     line_friction: bool = True  # False removes LINE_FRICTION from the constraints
     effort_reference: str = "zero"  # cost on u (paper); "gravity": on u minus the weight's share
     position_limit: float | None = None  # [m] largest horizontal error that counts; None: any
-    horizontal_gain: float = 0.0  # [1/s^3] of `IntegralGains`, as the next three
-    height_gain: float = 0.0
-    tilt_gain: float = 0.0
-    yaw_gain: float = 0.0
+    # [1/s^3] of `IntegralGains`, all four
+    horizontal_gain: Annotated[float, NOT_NEGATIVE] = 0.0
+    height_gain: Annotated[float, NOT_NEGATIVE] = 0.0
+    tilt_gain: Annotated[float, NOT_NEGATIVE] = 0.0
+    yaw_gain: Annotated[float, NOT_NEGATIVE] = 0.0
     qp: QpConfig = QpConfig()
     contact: str = LINE_FOOT  # a ContactModel or its name
     constraints: tuple[str, ...] | None = None  # Constraints or names; None: the contact model's
 
     def __post_init__(self) -> None:
-        rules = {"friction": POSITIVE, "max_force": POSITIVE, "horizon": AT_LEAST_ONE}
-        rules |= {"sole_width": SHARE, "step_ticks": AT_LEAST_ONE}
-        if self.position_limit is not None:
-            rules["position_limit"] = POSITIVE
-        rules |= {f"{name}_gain": NOT_NEGATIVE for name in IntegralGains._fields}
-        check(self, **rules, effort_reference=("zero", "gravity"))
+        check(self, position_limit=POSITIVE, effort_reference=("zero", "gravity"))
         model = choose_part("MpcConfig.contact", self.contact, ContactModel, CONTACT_MODELS)
         chosen = [
             choose_part("MpcConfig.constraints", constraint, Constraint, CONSTRAINTS)

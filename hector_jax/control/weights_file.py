@@ -83,19 +83,16 @@ def load_weights(path: Path, robot: Robot | None = None) -> Weights:
         tree.pop("$schema", None)  # for editors; the content is checked here
         others = tree.pop("others", {})
     like = nominal(robot)
-    shapes: dict[str, dict[str, tuple[int, ...]]] = {
-        part: {name: w.shape for name, w in getattr(like, part)._asdict().items() if w.size}
-        for part in ("Q", "R")
-    }
-    _check_keys(path, tree, shapes.keys(), "")
-    if "moment" not in shapes["R"] and isinstance(tree["R"], dict):
+    _check_keys(path, tree, ("Q", "R"), "")
+    if not like.R.moment.size and isinstance(tree["R"], dict):
         tree["R"].pop("moment", None)
     values = {}
-    for part, entries in shapes.items():
-        _check_keys(path, tree[part], entries.keys(), f"{part}.")
+    for part in ("Q", "R"):
+        entries = {name: w for name, w in getattr(like, part)._asdict().items() if w.size}
+        _check_keys(path, tree[part], entries, f"{part}.")
         values[part] = {
-            name: _numbers(path, f"{part}.{name}", tree[part][name], shape, WEIGHTS)
-            for name, shape in entries.items()
+            name: _numbers(path, f"{part}.{name}", tree[part][name], w.shape, WEIGHTS)
+            for name, w in entries.items()
         }
     Q, R = State(**values["Q"]), like.R._replace(**values["R"])
     return Weights(Q, R, _others(path, others, robot))

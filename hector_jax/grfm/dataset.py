@@ -203,32 +203,24 @@ def with_mirror(dataset: Dataset) -> Dataset:
     The image of a sample belongs to the same walk, so that a split by walk remains one. A property
     of one side of a plant, such as the gain of a motor, moves to the other side in the image.
     """
-    other = partners(dataset.feet)
+    other, window = partners(dataset.feet), dataset.window
+    signs = State(euler=ACROSS, position=ALONG, ang_velocity=ACROSS, velocity=ALONG)
 
     def flip(wrench: Wrench) -> Wrench:
         force, moment = (part[..., other, :] for part in wrench)
         return Wrench(force * ALONG, moment * ACROSS)
 
-    def flip_state(state: State) -> State:
-        return State(
-            euler=state.euler * ACROSS,
-            position=state.position * ALONG,
-            ang_velocity=state.ang_velocity * ACROSS,
-            velocity=state.velocity * ALONG,
-        )
-
-    window = dataset.window
     image = dataset._replace(
         window=window._replace(
             commands=flip(window.commands),
             contact=window.contact[:, other],
-            base=flip_state(window.base),
+            base=jax.tree.map(np.multiply, window.base, signs),
         ),
         label=flip(dataset.label),
         legs=Load(dataset.legs.force * ALONG, dataset.legs.torque * ACROSS),
         touchdown_error=dataset.touchdown_error[:, other] * ALONG,
         lands=dataset.lands[:, other],
-        state=flip_state(dataset.state),
+        state=jax.tree.map(np.multiply, dataset.state, signs),
     )
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), dataset, image)
 

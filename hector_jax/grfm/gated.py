@@ -198,11 +198,10 @@ def labels_in_view(dataset: Dataset) -> Float[np.ndarray, "n feet axes"]:
 
 def fit_gated(dataset: Dataset) -> GatedMap:
     """Fit the maps by ridge regression; every sample counts once in the view of each foot."""
-    window = jax.tree.map(jnp.asarray, dataset.window)
-    axes = dataset.axes
-    view = jax.tree.map(np.asarray, _views(window, axes))
-    ticks, gates = np.unique(np.asarray(dataset.window.since_switch)), np.array(GATES)
-    tick, gate = (np.asarray(jax.jit(hats)(window.since_switch, knots)) for knots in (ticks, gates))
+    axes, since_switch = dataset.axes, dataset.window.since_switch
+    view = jax.tree.map(np.asarray, _views(dataset.window, axes))
+    ticks, gates = np.unique(since_switch), np.array(GATES)
+    tick, gate = (np.asarray(jax.jit(hats)(since_switch, knots)) for knots in (ticks, gates))
     feet = view.stands.shape[1]
     residual = labels_in_view(dataset) - view.stands[..., None] * view.command
     scale = _scale(view.changes.reshape(-1, view.changes.shape[-1] // axes, axes // 3, 3))

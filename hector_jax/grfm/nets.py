@@ -9,7 +9,7 @@ keeps the epoch with its least mean square error (N^2, (N m)^2) on validation wa
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import flax.linen as nn
 import jax
@@ -27,16 +27,15 @@ from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED,
 class FitConfig:
     """Settings of the fit of a phi's parameters."""
 
-    epochs: int = 200
-    batch: int = 512  # samples per step
-    learning_rate: float = 1e-3
-    l2: float = 1e-3  # on kernels
+    epochs: Annotated[int, AT_LEAST_ONE] = 200
+    batch: Annotated[int, AT_LEAST_ONE] = 512  # samples per step
+    learning_rate: Annotated[float, POSITIVE] = 1e-3
+    l2: Annotated[float, NOT_NEGATIVE] = 1e-3  # on kernels
     mirror: bool = True  # the paper's variant learns from the mirror image of each sample too
-    seed: int = 0
+    seed: Annotated[int, SEED] = 0
 
     def __post_init__(self) -> None:
-        numbers = {"epochs": AT_LEAST_ONE, "batch": AT_LEAST_ONE, "seed": SEED}
-        check(self, learning_rate=POSITIVE, l2=NOT_NEGATIVE, **numbers)
+        check(self)
 
 
 class History(NamedTuple):
@@ -137,13 +136,6 @@ def apply_net(params: dict[str, Any], x: Float[Array, "*batch n"]) -> Float[Arra
     return y
 
 
-class _Rates(NamedTuple):
-    """Numbers of the optimiser, traced: another rate needs no new compilation."""
-
-    learning: float
-    l2: float
-
-
 class _Carry(NamedTuple):
     nets: ByKind  # parameters, members stacked
     optimiser: Any  # its state
@@ -182,8 +174,9 @@ def fit_nets(
     """
     members = len(jax.tree.leaves(nets)[0])
     infinite = jnp.full(members, jnp.inf, jnp.float32)
-    rates, rows = _Rates(config.learning_rate, config.l2), []
-    carry = _Carry(nets, _optimiser(rates).init(nets), nets, (infinite,) * len(nets))
+    # traced: another rate needs no new compilation
+    rates, rows = (config.learning_rate, config.l2), []
+    carry = _Carry(nets, _optimiser(*rates).init(nets), nets, (infinite,) * len(nets))
     for epoch, key_epoch in enumerate(jax.random.split(key, config.epochs), start=1):
         carry, row = _train_epoch(
             output, config.batch, rates, scale, training, validation, carry, key_epoch
@@ -195,13 +188,11 @@ def fit_nets(
     return carry.best, History(*np.array(rows).T)
 
 
-def _optimiser(rates: _Rates) -> optax.GradientTransformation:
+def _optimiser(learning_rate: float, l2: float) -> optax.GradientTransformation:
     def kernels(nets: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", nets)
 
-    return optax.chain(
-        optax.add_decayed_weights(rates.l2, mask=kernels), optax.adam(rates.learning)
-    )
+    return optax.chain(optax.add_decayed_weights(l2, mask=kernels), optax.adam(learning_rate))
 
 
 def _squares(output: Callable[[Array, Array], Array], nets: ByKind, samples: Samples) -> ByKind:
@@ -219,7 +210,7 @@ def _squares(output: Callable[[Array, Array], Array], nets: ByKind, samples: Sam
 def _train_epoch(
     output: Callable[[Array, Array], Array],
     size: int,
-    rates: _Rates,
+    rates: tuple[float, float],
     scale: ByKind,
     training: Samples,
     validation: Samples,
@@ -229,7 +220,7 @@ def _train_epoch(
     count = len(training.x[0])
     batch = min(size, count)
     order = jax.random.permutation(key, count)[: count // batch * batch].reshape(-1, batch)
-    optimiser = _optimiser(rates)
+    optimiser = _optimiser(*rates)
 
     def loss(nets: ByKind, samples: Samples) -> tuple[Float[Array, ""], ByKind]:
         squares = _squares(output, nets, samples)

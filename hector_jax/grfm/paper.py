@@ -146,10 +146,8 @@ def apply(params: PaperParams, window: Window) -> Effect:
     """Return the effect of a trained net for one window."""
     params = in_dtype_of(window, params)
     x = _features(params.inputs, window.commands)
-    outputs = map(nets.apply_net, nets.by_kind(params), x)
-    zero = jnp.zeros(x.force.shape[-1] // HISTORY, x.force.dtype)
-    force, *moment = outputs
-    return _effect(params.outputs, Wrench(force, *moment or [zero]))
+    force, *moment = map(nets.apply_net, nets.by_kind(params), x)
+    return _effect(params.outputs, Wrench(force, *moment or [jnp.zeros_like(force)]))
 
 
 PAPER = Phi("paper", PaperParams, init, fit, apply, lambda p: nets.widths(p.force))

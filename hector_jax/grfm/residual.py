@@ -76,8 +76,7 @@ def _fit_stats(linear: GatedMap, dataset: Dataset) -> tuple[FeatureStats, np.nda
         ground, *_ = gated.apply_gated(linear, window, view)
         return view, hats(window.since_switch, linear.ticks), ground
 
-    window = jax.tree.map(jnp.asarray, dataset.window)
-    view, tick, ground = jax.tree.map(np.asarray, jax.jit(jax.vmap(evaluate))(window))
+    view, tick, ground = jax.tree.map(np.asarray, jax.jit(jax.vmap(evaluate))(dataset.window))
     feet = view.stands.shape[1]
     terms, tick = _terms(view), np.repeat(tick[:, None], feet, axis=1)
     mean, scale = (np.zeros((feet, len(linear.ticks), terms.shape[-1])) for _ in range(2))
@@ -129,8 +128,7 @@ def _samples(params: ResidualParams, dataset: Dataset) -> Samples:
         ground, *_ = gated.apply_gated(params.linear, window, view)
         return ground, *_inputs(params, window, view)
 
-    window = jax.tree.map(jnp.asarray, dataset.window)
-    ground, z, trust = jax.jit(jax.vmap(evaluate))(window)
+    ground, z, trust = jax.jit(jax.vmap(evaluate))(dataset.window)
     residual = (gated.labels_in_view(dataset) - ground) / params.residual_rms
     y = tuple(np.split(residual, residual.shape[-1] // 3, axis=-1))
     samples = Samples((z,) * len(y), y, trust[..., None])
@@ -179,14 +177,12 @@ def plain_net(gait: GaitConfig, axes: int) -> ResidualParams:
     wrench has 3 or 6 `axes`.
     """
     ticks = np.unique(np.asarray(since_switch(gait, jnp.arange(gait.cycle))))
-    feet = len(gait.offsets)
+    draw = partial(init, feet=len(gait.offsets), axes=axes)
 
     def zeros(x: Any) -> np.ndarray:
         return np.zeros([len(ticks) if n == 0 else n for n in x.shape], np.float32)
 
-    net = jax.tree.map(
-        zeros, jax.eval_shape(partial(init, feet=feet, axes=axes), jax.random.key(0))
-    )
+    net = jax.tree.map(zeros, jax.eval_shape(draw, jax.random.key(0)))
     linear = net.linear._replace(ticks=np.float32(ticks), gates=np.array(GATES, np.float32))
     stats = net.stats._replace(scale=net.stats.scale + 1, reach=np.ones((), np.float32))
     return net._replace(linear=linear, stats=stats)
@@ -195,5 +191,5 @@ def plain_net(gait: GaitConfig, axes: int) -> ResidualParams:
 def member_params(params: ResidualParams) -> ResidualParams:
     """Return each member of the ensemble as an ensemble of one, stacked on a new first axis."""
     shared = jax.tree.map(lambda p: jnp.broadcast_to(p, (MEMBERS, *jnp.shape(p))), params)
-    nets_of_member = jax.tree.map(lambda p: jnp.asarray(p)[:, None], (params.force, params.moment))
-    return shared._replace(force=nets_of_member[0], moment=nets_of_member[1])
+    members = jax.tree.map(lambda p: jnp.asarray(p)[:, None], nets.by_kind(params))
+    return nets.with_nets(shared, members)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -24,7 +23,6 @@ class TrainConfig(FitConfig):
     variant: str = "residual"  # of network.VARIANTS
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check(self, variant=tuple(VARIANTS))
 
 
@@ -74,7 +72,7 @@ def predict(effect: jax.tree_util.Partial, window: Window) -> Effect:
 
 def errors(effect: jax.tree_util.Partial, dataset: Dataset) -> Errors:
     """Return the mean square errors of a phi on a dataset."""
-    effects = predict(effect, jax.tree.map(jnp.asarray, dataset.window))
+    effects = predict(effect, dataset.window)
     squares = jax.tree.map(lambda p, y: np.asarray((p - y) ** 2), effects.wrench, dataset.label)
     axes = np.concatenate(squares, axis=-1)  # (n, feet, 6)
     touchdown = (effects.touchdown_error - dataset.touchdown_error)[dataset.lands]

@@ -27,7 +27,6 @@ class _Fixed(NamedTuple):
 
     tolerances: Tolerances
     qp: Normal
-    sign: Array  # (2, 1)
     equality: Array  # (2, m) bool: the single side of an equality, which is always active
     eye: Array
 
@@ -58,7 +57,7 @@ def _correct(
     z = z + weight * qp.violation(x)
     slope = qp.P @ x + qp.q + rmatvec(qp.A, multiplier(z))
     dx = -cho_solve((factor, True), slope)
-    x, z = x + dx, z + weight * fixed.sign * matvec(qp.A, dx)
+    x, z = x + dx, z + weight * SIGN * matvec(qp.A, dx)
     outside = qp.violation(x)
     negative, violated = z < -rounding, outside > rounding * qp.row_sizes(x)
     wrong = jnp.where(active, negative, violated) & ~fixed.equality
@@ -116,9 +115,8 @@ def active_set(
         number of iterations.
     """
     dtype = qp.q.dtype
-    sign = jnp.asarray(SIGN, dtype)
     equality = jnp.zeros_like(qp.side).at[0].set(qp.equality)
-    fixed = _Fixed(tolerances, qp, sign, equality, jnp.eye(len(qp.q), dtype=dtype))
+    fixed = _Fixed(tolerances, qp, equality, jnp.eye(len(qp.q), dtype=dtype))
     begin = _Loop(
         start,
         (active & qp.side) | equality,
@@ -167,7 +165,7 @@ def first_guess(qp: Normal, factor: Array) -> tuple[Point, Array, Array]:
         present = qp.side | qp.equality
         upper, lower = jnp.where(present, qp.bound, jnp.asarray(SIGN, qp.q.dtype) * jnp.inf)
         x, y, side, settled = gpu_kernel.guess(qp.P, qp.q, block_diagonal(qp.A), lower, upper)
-        point = Point(x, jnp.maximum(jnp.asarray(SIGN, y.dtype) * y, 0.0))
+        point = Point(x, jnp.maximum(SIGN * y, 0.0))
         residuals = qp.residuals(point)
         found = point, jnp.stack([side > 0, side < 0]), residuals
         nothing = jax.tree.map(jnp.zeros_like, point), jnp.zeros_like(qp.side), infinite

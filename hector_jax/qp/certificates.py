@@ -73,12 +73,11 @@ def rays(tolerances: Tolerances, qp: Normal, before: Point, point: Point) -> tup
         residual is below it.
     """
     dx, rise = point.x - before.x, point.z - before.z
-    sign = jnp.asarray(SIGN, dx.dtype)
     growth = jnp.where(qp.equality, rise, jnp.maximum(rise, 0.0))  # a decrease is a penalty in gap
-    gap = -jnp.sum(sign * qp.bound * growth + (growth - rise) / tolerances.certificate)
+    gap = -jnp.sum(SIGN * qp.bound * growth + (growth - rise) / tolerances.certificate)
     # differences of products that an iteration computes at both points anyway
     pull = rmatvec(qp.A, multiplier(point.z)) - rmatvec(qp.A, multiplier(before.z))
-    outside = sign * (matvec(qp.A, point.x) - matvec(qp.A, before.x))
+    outside = SIGN * (matvec(qp.A, point.x) - matvec(qp.A, before.x))
     outward = jnp.where(qp.equality, jnp.abs(outside), jnp.where(qp.side, outside, 0.0))
     change = jnp.maximum(largest(qp.P @ point.x - qp.P @ before.x), jnp.max(outward, initial=0.0))
     # if P is definite the objective is bounded

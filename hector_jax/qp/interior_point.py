@@ -6,6 +6,7 @@ multiplier + delta), so that equality rows (slack zero), redundant rows and sing
 special cases.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -26,7 +27,6 @@ class _Fixed(NamedTuple):
     tolerances: Tolerances
     qp: Normal
     least: Array  # (2,) smallest proximal parameters
-    sign: Array  # (2, 1)
     free: Array  # (2, m) bool: sides whose multiplier has no sign
     present: Array  # (2, m) bool: sides with a finite bound
     sides: Array  # number of sides whose multiplier has a sign, at least 1
@@ -42,34 +42,6 @@ class _Loop(NamedTuple):
     running: Array
 
 
-class _Newton(NamedTuple):
-    """The linear system of one iteration."""
-
-    delta: Array
-    dual: Array
-    primal: Array
-    inverse: Array
-    weight: Array
-    cholesky: Array
-
-
-def _direction(fixed: _Fixed, newton: _Newton, z: Array, product: Array) -> tuple:
-    """Return the Newton step (dx, dz, dslack) from slack * z to slack * z + product."""
-    qp, sign, weight = fixed.qp, fixed.sign, newton.weight
-
-    def refine(_: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        dx, dz = step
-        residual = newton.dual + qp.P @ dx + rmatvec(qp.A, multiplier(dz))
-        correction = -cho_solve((newton.cholesky, True), residual)
-        return dx + correction, dz + weight * sign * matvec(qp.A, correction)
-
-    # later passes remove the error of rounding and rho
-    begin = jnp.zeros_like(qp.q), newton.inverse * product - weight * newton.primal
-    dx, dz = lax.fori_loop(0, 3, refine, begin)
-    along = sign * matvec(qp.A, dx)
-    return dx, dz, jnp.where(qp.side, newton.primal - along + newton.delta * dz, 0.0)
-
-
 def _longest(qp: Normal, z: Array, slack: Array, dz: Array, dslack: Array) -> Array:
     """Return the step length at which the first slack or multiplier reaches zero."""
     rates = jnp.maximum(-dslack / slack, -dz / jnp.where(qp.side, z, 1.0))
@@ -77,12 +49,17 @@ def _longest(qp: Normal, z: Array, slack: Array, dz: Array, dslack: Array) -> Ar
     return 1.0 / jnp.maximum(fastest, jnp.finfo(z.dtype).tiny)
 
 
-def _newton(fixed: _Fixed, state: _Loop) -> tuple[_Newton, Array]:
-    """Return the factorised system at a point, and the mean product of slack and multiplier."""
-    tolerances, qp, _, sign, free, present, count, eye = fixed
+def _newton(fixed: _Fixed, state: _Loop) -> tuple[Callable[[Array], tuple], Array]:
+    """Factorise the linear system at a point.
+
+    Returns:
+        A function that returns the Newton step (dx, dz, dslack) from slack * z to slack * z +
+        product, and the mean product of slack and multiplier.
+    """
+    tolerances, qp, _, free, present, count, eye = fixed
     (x, z), slack = state.point, state.slack
     dual = qp.P @ x + qp.q + rmatvec(qp.A, multiplier(z))
-    room = sign * (qp.bound - matvec(qp.A, x))
+    room = SIGN * (qp.bound - matvec(qp.A, x))
     primal = jnp.where(present, room - jnp.where(free, 0.0, slack), 0.0)
     mu = jnp.sum(jnp.where(qp.side, slack * z, 0.0)) / count
     rho, delta = state.proximal
@@ -90,15 +67,28 @@ def _newton(fixed: _Fixed, state: _Loop) -> tuple[_Newton, Array]:
     inverse = jnp.where(present, 1.0 / softness, 0.0)
     weight = inverse * jnp.where(free, 1.0, z)
     factor = cholesky(plus_gram(qp.P + rho * eye, qp.A, weight[0] + weight[1]))
-    return _Newton(delta, dual, primal, inverse, weight, factor), mu
+
+    def refine(_: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+        dx, dz = step
+        residual = dual + qp.P @ dx + rmatvec(qp.A, multiplier(dz))
+        correction = -cho_solve((factor, True), residual)
+        return dx + correction, dz + weight * SIGN * matvec(qp.A, correction)
+
+    def direction(product: Array) -> tuple[Array, Array, Array]:
+        # later passes remove the error of rounding and rho
+        begin = jnp.zeros_like(qp.q), inverse * product - weight * primal
+        dx, dz = lax.fori_loop(0, 3, refine, begin)
+        along = SIGN * matvec(qp.A, dx)
+        return dx, dz, jnp.where(qp.side, primal - along + delta * dz, 0.0)
+
+    return direction, mu
 
 
 def _advance(fixed: _Fixed, limit: int, state: _Loop) -> _Loop:
     """Run one iteration: predictor, centring, corrector."""
     tolerances, qp, least, *_ = fixed
     (x, z), slack, dtype = state.point, state.slack, qp.q.dtype
-    newton, mu = _newton(fixed, state)
-    direction = partial(_direction, fixed, newton, z)
+    direction, mu = _newton(fixed, state)
     longest = partial(_longest, qp, z, slack)
 
     product = jnp.where(qp.side, -slack * z, 0.0)
@@ -132,14 +122,13 @@ def interior_point(
     """
     dtype = qp.q.dtype
     least = jnp.array([10.0 * tolerances.proximal, 50.0 * jnp.finfo(dtype).eps], dtype)
-    sign = jnp.asarray(SIGN, dtype)
     free = jnp.zeros_like(qp.side).at[0].set(qp.equality)
     present = qp.side | free
     count = jnp.maximum(jnp.sum(qp.side), 1)
     eye = jnp.eye(len(qp.q), dtype=dtype)
-    fixed = _Fixed(tolerances, qp, least, sign, free, present, count, eye)
+    fixed = _Fixed(tolerances, qp, least, free, present, count, eye)
     # all products of slack and multiplier are equal, however far the bound
-    room = jnp.where(qp.side, jnp.maximum(sign * qp.bound, qp.reach), 1.0)
+    room = jnp.where(qp.side, jnp.maximum(SIGN * qp.bound, qp.reach), 1.0)
     begin = Point(jnp.zeros_like(qp.q), jnp.where(qp.side, 1.0 / jnp.maximum(room, 1.0), 0.0))
     start = _Loop(begin, begin, room, least, jnp.zeros((), jnp.int32), enabled)
     advance = partial(_advance, fixed, max_iterations)

@@ -32,7 +32,7 @@ def box_osqp(
     finite = jnp.isfinite(jnp.sum(params.primal[0]) + jnp.sum(params.dual_eq))
     x = jnp.where(finite, params.primal[0], 0.0)
     y = jnp.where(finite, params.dual_eq, 0.0)
-    z = jnp.maximum(jnp.asarray(SIGN, y.dtype) * y, 0.0)
+    z = jnp.maximum(SIGN * y, 0.0)
     z = jnp.where(qp.equality, jnp.stack([y, jnp.zeros_like(y)]), jnp.where(present, z, 0.0))
     point = Point(x, z)
     certified = certificates(tolerances, qp, jax.tree.map(jnp.zeros_like, point), point)

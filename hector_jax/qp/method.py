@@ -23,7 +23,7 @@ Status. All conditions are comparisons in the normalised problem; t is the toler
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, cast
+from typing import Annotated, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -91,13 +91,12 @@ class QpConfig:
 
     solver: str = INTERIOR_POINT
     tolerance: float | None = None
-    active_set_tries: int = 15
-    max_iterations: int = 60
+    active_set_tries: Annotated[int, AT_LEAST_ONE] = 15
+    max_iterations: Annotated[int, AT_LEAST_ONE] = 60
     ratio_cap: float | None = None
 
     def __post_init__(self) -> None:
-        rules = {"tolerance": POSITIVE, "ratio_cap": POSITIVE}
-        check(self, **rules, active_set_tries=AT_LEAST_ONE, max_iterations=AT_LEAST_ONE)
+        check(self, tolerance=POSITIVE, ratio_cap=POSITIVE)
         solver = choose_part("QpConfig.solver", self.solver, Solver, SOLVERS)
         object.__setattr__(self, "solver", solver)
 

@@ -25,7 +25,8 @@ from hector_jax.core.arrays import Array
 from hector_jax.qp.linear import largest, matvec, multiplier, rmatvec
 
 INFINITE = 1e20  # a bound of at least this size is infinite, as in most solvers
-SIGN = np.array([[1.0], [-1.0]])  # a side is satisfied if sign * (A v - bound) <= 0
+# a side is satisfied if SIGN * (A v - bound) <= 0; integers, which take the dtype of the product
+SIGN = np.array([[1], [-1]])
 _ROUNDING = 8  # machine epsilons; smaller relative differences are rounding
 _SMALL = 1e-3  # keeps relative residuals meaningful if the solution is zero
 
@@ -151,7 +152,7 @@ class Normal(NamedTuple):
 
     def violation(self, x: Array) -> Array:
         """Return the violation of each side (2, m) by A x, negative inside; 0 without a side."""
-        outside = jnp.asarray(SIGN, x.dtype) * (matvec(self.A, x) - self.bound)
+        outside = SIGN * (matvec(self.A, x) - self.bound)
         return jnp.where(self.side | self.equality, outside, 0.0)
 
     def row_sizes(self, x: Array) -> Array:
@@ -180,6 +181,11 @@ class Normal(NamedTuple):
         return jnp.where(jnp.isfinite(jnp.sum(residuals)), residuals, jnp.inf)
 
 
+def _by_column(A: Array, column: Array) -> Array:
+    """Return numbers of the columns (n,) in a shape that multiplies the columns of A."""
+    return column if A.ndim == 2 else column.reshape(A.shape[0], 1, A.shape[2])
+
+
 def _scales(tolerances: Tolerances, qp: QP) -> tuple[Array, Array, Array]:
     """Return the column scales D, the scales that make rows of A D unit, and which rows are zeros.
 
@@ -194,8 +200,7 @@ def _scales(tolerances: Tolerances, qp: QP) -> tuple[Array, Array, Array]:
     widest = jnp.max(jnp.where(curved, column * reach, 0.0))
     by_reach = jnp.where(widest > 0, widest, 1.0) / jnp.where(reach > 0, reach, 1.0)
     column = jnp.where(curved, column, by_reach)
-    wide = column if qp.A.ndim == 2 else column.reshape(qp.A.shape[0], 1, qp.A.shape[2])
-    rows = qp.A * wide
+    rows = qp.A * _by_column(qp.A, column)
     peak = jnp.max(jnp.abs(rows), axis=-1, initial=0.0)
     zeros = peak <= tolerances.zero * jnp.max(peak, initial=0.0)
     peak = jnp.where(zeros, 1.0, peak)  # divide by it first, otherwise squares overflow
@@ -203,13 +208,6 @@ def _scales(tolerances: Tolerances, qp: QP) -> tuple[Array, Array, Array]:
     mean = jnp.exp(jnp.sum(jnp.log(peak)) / jnp.maximum(jnp.sum(~zeros), 1))
     row = jnp.where(zeros, 1.0 / mean, lax.rsqrt(jnp.where(zeros, 1.0, squares)) / peak)
     return column, row.ravel(), zeros.ravel()
-
-
-def _scale_rows_and_columns(A: Array, row: Array, column: Array) -> Array:
-    if A.ndim == 2:
-        return row[:, None] * A * column
-    N, r, b = A.shape
-    return row.reshape(N, r, 1) * A * column.reshape(N, 1, b)
 
 
 def normalise(tolerances: Tolerances, qp: QP) -> Normal:
@@ -220,19 +218,18 @@ def normalise(tolerances: Tolerances, qp: QP) -> Normal:
     bounded = jnp.any(finite, axis=0).reshape(qp.A.shape[:-1])
     qp = qp._replace(A=jnp.where(bounded[..., None], qp.A, 0.0))
     column, row, zeros = _scales(tolerances, qp)
-    A = _scale_rows_and_columns(qp.A, row, column)
-    sign = jnp.asarray(SIGN, A.dtype)
+    A = row.reshape(*qp.A.shape[:-1], 1) * qp.A * _by_column(qp.A, column)
     bound = jnp.where(finite, row * bound, 0.0)
     rounding = _ROUNDING * jnp.finfo(A.dtype).eps
     # no x satisfies a violated row of zeros, nor comes nearer to crossed bounds than their middle
     width = jnp.where(finite[0] & finite[1], bound[0] - bound[1], jnp.inf)
     crossed = width < 0
-    unmet = jnp.maximum(-0.5 * width, jnp.where(zeros, jnp.max(-sign * bound, axis=0), 0.0))
+    unmet = jnp.maximum(-0.5 * width, jnp.where(zeros, jnp.max(-SIGN * bound, axis=0), 0.0))
     finite &= ~zeros
     bound = jnp.where(crossed, 0.5 * (bound[0] + bound[1]), bound)
     bound = jnp.where(finite, bound, 0.0)
     q = column * qp.q
-    size = jnp.maximum(largest(q), jnp.max(-sign * bound, initial=0.0))  # violated at v = 0
+    size = jnp.maximum(largest(q), jnp.max(-SIGN * bound, initial=0.0))  # violated at v = 0
     size = jnp.where(size > 0, size, 1.0)
     bound = bound / size
     # a row narrower than rounding has no interior: it is an equality

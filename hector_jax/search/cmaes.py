@@ -14,7 +14,7 @@ all losses of the journal, with other draws.
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -110,13 +110,12 @@ def search(
     """
     searches = {name: CmaSearch(config, start) for name, start in starts.items()}
     paths = {name: Path(folder) / f"{name}.jsonl" for name in starts}
+    settings = {key: value for key, value in asdict(config).items() if key != "budget"}
     for name, search in searches.items():
         head = {
             "format": FORMAT,
             "name": name,
-            "population": config.population,
-            "seed": config.seed,
-            "spread": config.spread,
+            **settings,
             "start": np.asarray(weights_to_vector(search.start), float).tolist(),
             "directions": list(direction_names(search.start)),
             **({"others": weights_tree(search.start)["others"]} if search.start.others else {}),

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize
+from scipy.optimize import LinearConstraint, NonlinearConstraint, minimize
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import require_package
@@ -169,9 +169,8 @@ def propose(
     Raises:
         InputError: the packages of the extra `search` are not installed.
     """
-    size = len(space.box)
     if not history:
-        return Proposal(np.zeros(size), "start", None)
+        return Proposal(np.zeros(len(space.box)), "start", None)
     region = _region(history)
     since = len(history) if region.stalled_at is None else region.stalled_at
     if needs_model(history, methods):
@@ -198,17 +197,10 @@ def _minimise_in(
     iterations: int,
 ) -> tuple[Float[np.ndarray, " n"], float]:
     """Minimise in a ball and the box by SQP; returns the best point evaluated and its value."""
-    lower, upper = space.box.T
-    ball = {
-        "type": "ineq",
-        "fun": lambda x: radius**2 - np.sum((x - center) ** 2),
-        "jac": lambda x: -2.0 * (x - center),
-    }
-    box = {
-        "type": "ineq",
-        "fun": lambda x: np.append(space.to_steps @ x - lower, upper - space.to_steps @ x),
-        "jac": lambda x: np.append(space.to_steps, -space.to_steps, axis=0),
-    }
+    square = lambda x: np.sum((x - center) ** 2)  # noqa: E731
+    slope: Any = lambda x: 2.0 * (x - center)  # noqa: E731
+    ball = NonlinearConstraint(square, -np.inf, radius**2, jac=slope)
+    box = LinearConstraint(space.to_steps, *space.box.T)
     feasible: list[tuple[float, Any]] = []
 
     def value(x: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
@@ -237,6 +229,7 @@ class _Fit(NamedTuple):
     offset: float
 
 
+@jax.jit
 def _process(theta: Any, X: Any, used: Any) -> Any:
     """Return the process on a history; rows that are not `used` are padding."""
     from tinygp import GaussianProcess, kernels
@@ -247,9 +240,6 @@ def _process(theta: Any, X: Any, used: Any) -> Any:
     # without walks nearby, a slope is as large as the loss itself
     kernel = amplitude**2 * near + kernels.DotProduct() + kernels.Constant(1.0)
     return GaussianProcess(kernel, X, diag=jnp.where(used, noise**2, 1e8))
-
-
-_process_jit = jax.jit(_process)
 
 
 def _quadratic(curvature: Any, x: Any) -> Any:
@@ -279,15 +269,10 @@ def _fit(
     X, used = jnp.asarray(np.pad(points, (padding, (0, 0)))), np.pad(np.ones(count, bool), padding)
     y = jnp.asarray(np.pad(values - offset - _quadratic(curvature, points), padding))
     mean, deviation = _PRIOR
-
-    def misfit(theta: Float[np.ndarray, "3"]) -> tuple[float, Float[np.ndarray, "3"]]:
-        value, gradient = _misfit(jnp.asarray(theta), X, used, y)
-        return float(value), np.asarray(gradient, float)
-
+    misfit = partial(_misfit, X=X, used=used, y=y)
     box = np.stack([mean - 3 * deviation, mean + 3 * deviation], axis=1)
     theta = minimize(misfit, mean, jac=True, method="L-BFGS-B", bounds=box).x
-    process = _process_jit(jnp.asarray(theta), X, used)
-    return _Fit(process, y, jnp.asarray(curvature), offset)
+    return _Fit(_process(theta, X, used), y, jnp.asarray(curvature), offset)
 
 
 def _posterior(fit: _Fit, point: Array) -> tuple[Array, Array]:

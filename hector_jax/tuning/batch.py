@@ -228,9 +228,7 @@ def tune_batch(
         ValueError: no problem, or an index of a phi, a delay or a share out of range.
     """
     count = _check_problems(config, problems, effects)
-    devices = (
-        choose_devices(np.size(problems.scenarios.scale)) if devices is None else list(devices)
-    )
+    devices = list(devices or choose_devices(np.size(problems.scenarios.scale)))
     lanes = lanes_of(devices[0].platform) if lanes is None else lanes
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))

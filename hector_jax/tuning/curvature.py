@@ -73,8 +73,7 @@ def gauss_newton(
 
     def walk(logs: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
         scaled = scale_weights(weights, logs)
-        inputs = robot, scaled, command, anchor, effect, variation_of(robot)
-        trajectory = rollout(config, *inputs)
+        trajectory = rollout(config, robot, scaled, command, anchor, effect, variation_of(robot))
         return (trajectory.state, trajectory.command), trajectory
 
     def tangent_of(direction: Float[Array, " n"]) -> tuple:

@@ -17,12 +17,13 @@ iteration; `batch` compiles them into its loop on the device.
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
 from hector_jax.control.controller import WalkConfig
@@ -49,31 +50,24 @@ class TuneConfig:
 
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     loss: tuple = PAPER_LOSS  # of `LossTerm`
-    beta_q: float = 0.05  # largest relative step of a weight in Q
-    beta_r: float = 0.08  # largest relative step of a weight in R
+    beta_q: Annotated[float, POSITIVE] = 0.05  # largest relative step of a weight in Q
+    beta_r: Annotated[float, POSITIVE] = 0.08  # largest relative step of a weight in R
     others: tuple[str, ...] = ()  # names in `parameters.TUNABLES`, tuned with Q and R
-    beta_others: float = 0.02  # largest step of the others, as a share of their box
+    # largest step of the others, as a share of their box
+    beta_others: Annotated[float, POSITIVE] = 0.02
     update: str = "relative"  # or "literal": the paper's theta - beta dL/dtheta
     tie_feet: bool = True  # one R for all feet, as the robot is its own mirror image
-    iterations: int = 100  # at most
-    patience: int = 10  # iterations in which the loss must fall
-    gain: float = 5e-3  # by at least this share, or the tuning has converged
-    smallest_step: float = 1 / 128  # of the full step; below it the tuning has converged
-    residual: float = 1e-8  # largest accepted relative KKT residual: that of a solved QP
+    iterations: Annotated[int, AT_LEAST_ONE] = 100  # at most
+    patience: Annotated[int, AT_LEAST_ONE] = 10  # iterations in which the loss must fall
+    # by at least this share, or the tuning has converged
+    gain: Annotated[float, NOT_NEGATIVE] = 5e-3
+    # of the full step; below it the tuning has converged
+    smallest_step: Annotated[float, POSITIVE] = 1 / 128
+    # largest accepted relative KKT residual: that of a solved QP
+    residual: Annotated[float, POSITIVE] = 1e-8
 
     def __post_init__(self) -> None:
-        check(
-            self,
-            beta_q=POSITIVE,
-            beta_r=POSITIVE,
-            beta_others=POSITIVE,
-            update=("relative", "literal"),
-            iterations=AT_LEAST_ONE,
-            patience=AT_LEAST_ONE,
-            gain=NOT_NEGATIVE,
-            smallest_step=POSITIVE,
-            residual=POSITIVE,
-        )
+        check(self, update=("relative", "literal"))
         check_loss(self.loss)
         got = short_repr(self.others)
         if self.others and self.update != "relative":
@@ -189,23 +183,19 @@ def relative_step(
     """
 
     def scaled(tree: Any, sizes: Any, beta: float) -> Any:
-        if not jax.tree.leaves(tree):
-            return tree
         products = jax.tree.map(jnp.multiply, tree, sizes)
-        largest = jnp.max(
-            jnp.stack([jnp.max(jnp.abs(x), initial=0.0) for x in jax.tree.leaves(products)])
-        )
+        largest = jnp.max(jnp.abs(ravel_pytree(products)[0]), initial=0.0)
         factor = beta / jnp.where(largest > 0.0, largest, 1.0)
         return jax.tree.map(lambda x, size: -factor * x * size, products, sizes)
 
-    def update(updates: Any, state: optax.OptState, params: Any = None):
+    def update(updates: Any, params: Any) -> Weights:
         if params is None:
             raise ValueError("relative_step needs the weights: pass params to update")
         widths = {name: TUNABLES[name].upper - TUNABLES[name].lower for name in params.others}
         sizes = params._replace(others=widths)
-        return Weights(*map(scaled, updates, sizes, (beta_q, beta_r, beta_others))), state
+        return Weights(*map(scaled, updates, sizes, (beta_q, beta_r, beta_others)))
 
-    return optax.GradientTransformation(lambda params: optax.EmptyState(), update)
+    return optax.stateless(update)
 
 
 def _optimiser(config: TuneConfig) -> optax.GradientTransformation:

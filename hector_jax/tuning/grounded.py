@@ -21,15 +21,14 @@ from hector_jax.control.reference import Anchor, Command, anchor_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
-from hector_jax.grfm.effect import HISTORY
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluation
 from hector_jax.tuning.loss import Loss
-from hector_jax.tuning.rollout import Carry, RolloutConfig, step_carry
+from hector_jax.tuning.rollout import Carry, RolloutConfig, command_history, step_carry
 
 
 class MeasuredState(NamedTuple):
-    """Measurements at the start of a tick."""
+    """Measurements at the start of a tick; also differences of such, the residual of the model."""
 
     state: State  # of the base
     feet: Feet  # positions of the feet; those in the air are not used
@@ -37,17 +36,8 @@ class MeasuredState(NamedTuple):
 
 def measured_states(robot: Robot, state: State, joints: Array) -> MeasuredState:
     """Compute the feet of measured states and joints; all with one leading axis."""
-
-    def measured_state(state: State, joints: Array) -> MeasuredState:
-        measurement = Measurement(state, joints, jnp.zeros_like(joints))
-        return MeasuredState(state, measured_feet(robot, measurement))
-
-    return jax.vmap(measured_state)(state, joints)
-
-
-def command_history(command: Wrench) -> Wrench:
-    """Return past commands (HISTORY, feet, 3) that all equal `command`."""
-    return jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), command)
+    measurement = Measurement(state, joints, jnp.zeros_like(joints))
+    return MeasuredState(state, jax.vmap(partial(measured_feet, robot))(measurement))
 
 
 def carry_from(
@@ -55,13 +45,6 @@ def carry_from(
 ) -> Carry:
     """Return the carry of a robot that has not fallen, from its measured state."""
     return Carry(*measured, commands, anchor, disturbance, fallen=jnp.asarray(False))
-
-
-class ModelResidual(NamedTuple):
-    """Measured less modelled values at the end of a tick."""
-
-    state: State
-    feet: Feet
 
 
 class Grounding(NamedTuple):
@@ -72,7 +55,7 @@ class Grounding(NamedTuple):
 
     start: Carry  # at the end of the first tick
     tick: Int[Array, ""]  # gait tick at the start
-    residuals: ModelResidual  # (T - 1, ...)
+    residuals: MeasuredState  # (T - 1, ...) measured less modelled values at the end of a tick
 
 
 @partial(jax.jit, static_argnums=0)
@@ -107,12 +90,12 @@ def fit_grounding(
     first, command_before = jax.tree.map(lambda x: x[0], (measured, walk.command))
     anchor, tick = anchor_at(robot, walk.initial, start_tick), jnp.asarray(start_tick) + 1
 
-    def step(memory: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[tuple, ModelResidual]:
+    def step(memory: tuple[Wrench, Disturbance], inputs: tuple) -> tuple[tuple, MeasuredState]:
         begin, end, tick = inputs
         carry = carry_from(begin, anchor, *memory)
         after, _ = step_carry(config, robot, weights, command, effect, carry, tick)
-        residual = jax.tree.map(jnp.subtract, tuple(end), (after.state, after.feet))
-        return (after.commands, after.disturbance), ModelResidual(*residual)
+        residual = jax.tree.map(jnp.subtract, end, MeasuredState(after.state, after.feet))
+        return (after.commands, after.disturbance), residual
 
     begins, ends = jax.tree.map(lambda x: x[:-1], measured), jax.tree.map(lambda x: x[1:], measured)
     memory = command_history(command_before), NO_DISTURBANCE
@@ -145,7 +128,7 @@ def grounded_rollout(
     def step(carry: Carry, inputs: tuple) -> tuple[Carry, Trajectory]:
         residual, tick = inputs
         after, sample = step_carry(config, robot, weights, command, effect, carry, tick)
-        state, feet = jax.tree.map(jnp.add, (after.state, after.feet), tuple(residual))
+        state, feet = jax.tree.map(jnp.add, MeasuredState(after.state, after.feet), residual)
         fallen = carry.fallen | has_fallen(state, *robot.description.limits)
         after = after._replace(state=state, feet=feet, fallen=fallen)
         return after, sample._replace(state=state, feet=feet.position, fallen=fallen)

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError, short_repr, unknown
-from hector_jax.core.settings import NOT_NEGATIVE
+from hector_jax.core.settings import NOT_NEGATIVE, validation_error
 from hector_jax.core.trajectory import Trajectory, Wrench
 from hector_jax.robot.description import Description
 
@@ -154,9 +154,8 @@ def check_loss(loss: Any) -> None:
             f"{what} must have terms of unlike names L_..., got {short_repr(tuple(names))}"
         )
     for term in loss:
-        if not isinstance(term.weight, (int, float)) or term.weight not in NOT_NEGATIVE:
-            got = short_repr(term.weight)
-            raise InputError(f"{what}: {term.name} must be a number of at least 0, got {got}")
+        if error := validation_error(term.weight, float, NOT_NEGATIVE):
+            raise InputError(f"{what}: {term.name} {error}")
 
 
 _KEYS = {"L_Eul": "euler", "L_pos": "position"}  # keys of the weights in files

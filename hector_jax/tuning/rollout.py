@@ -113,17 +113,21 @@ class Carry(NamedTuple):
     before: Effect | None = None  # of the last tick, world frame; None without a variation
 
 
+def command_history(command: Wrench) -> Wrench:
+    """Return past commands (HISTORY, feet, 3) that all equal `command`."""
+    return jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), command)
+
+
 def init_carry(robot: Robot, anchor: Anchor, variation: Variation | None = None) -> Carry:
     """Return the carry of a robot standing at its anchor, its weight shared by all feet."""
     zero = jnp.zeros(3)
     trunk = anchor.position - robot.com_offset
     local = foot_poses(robot, jnp.asarray(robot.standing_joints)).position
     share = robot.mass / len(local) * jnp.asarray(robot.gravity)
-    force = jnp.broadcast_to(share, (HISTORY, *local.shape))
+    standing = Wrench(jnp.broadcast_to(share, local.shape), jnp.zeros_like(local))
     state = State(zero, anchor.position, zero, zero)
     feet = Feet(trunk + local, jnp.zeros(len(local)))
-    commands = Wrench(force, jnp.zeros_like(force))
-    standing = jax.tree.map(lambda w: w[0], commands)
+    commands = command_history(standing)
     before = None if variation is None else ground_effect(standing)
     return Carry(state, feet, commands, anchor, NO_DISTURBANCE, jnp.asarray(False), before)
 

@@ -13,13 +13,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, Int
 
-from hector_jax.control.disturbance import Disturbance
-from hector_jax.control.footstep import Feet
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
-from hector_jax.grfm.effect import Effect
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
 from hector_jax.tuning.rollout import (
@@ -40,25 +37,15 @@ class Sensitivities(NamedTuple):
     command: Wrench  # (n, T, feet, 3) each: du_j / dtheta
 
 
-class Varied(NamedTuple):
-    """Parts of a `Carry` that depend on the weights; its tangents have the same structure."""
+def varied(carry: Carry) -> Carry:
+    """Return the parts of a carry that depend on the weights, with None for the others.
 
-    state: State
-    feet: Feet
-    commands: Wrench
-    disturbance: Disturbance
-    position: Float[Array, "*batch 3"]  # of the anchor
-    yaw: Float[Array, "*batch"]
-    before: Effect | None  # None without a variation
+    Tangents of a carry have the same structure.
+    """
+    return carry._replace(anchor=carry.anchor._replace(tick=None), fallen=None)
 
 
-def varied(carry: Carry) -> Varied:
-    """Return the parts of a carry that depend on the weights."""
-    state, feet, commands, anchor, disturbance, _, before = carry
-    return Varied(state, feet, commands, disturbance, anchor.position, anchor.yaw, before)
-
-
-def no_tangents(carry: Carry, weights: Weights) -> Varied:
+def no_tangents(carry: Carry, weights: Weights) -> Carry:
     """Return the tangents of a start that does not depend on the weights: dx_0 / dtheta = 0."""
     count = ravel_pytree(weights)[0].size
     return jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), varied(carry))
@@ -71,15 +58,15 @@ def step_sensitivities(
     command: Command,
     effect: jax.tree_util.Partial,
     carry: Carry,
-    tangents: Varied,
+    tangents: Carry,
     tick: Int[Array, ""],
     variation: Variation | None = None,
-) -> tuple[Carry, Varied, Trajectory, Sensitivities]:
+) -> tuple[Carry, Carry, Trajectory, Sensitivities]:
     """Walk one tick of the closed loop with its n tangents.
 
     Args:
         config, robot, weights, command, effect, carry, tick, variation: see `step_carry`.
-        tangents: of the carry; the weights are the first axis.
+        tangents: of the `varied` carry; the weights are the first axis.
 
     Returns:
         The next carry and its tangents, the tick's sample, and the sample's sensitivities (n, 3).
@@ -88,15 +75,14 @@ def step_sensitivities(
     """
     theta, to_weights = ravel_pytree(weights)
 
-    def step(parts: Varied, theta: Float[jax.Array, " n"]) -> tuple:
-        state, feet, commands, disturbance, position, yaw, last = parts
-        anchor = Anchor(position, yaw, carry.anchor.tick)
-        before = Carry(state, feet, commands, anchor, disturbance, carry.fallen, last)
+    def step(parts: Carry, theta: Float[jax.Array, " n"]) -> tuple:
+        anchor = parts.anchor._replace(tick=carry.anchor.tick)
+        before = parts._replace(anchor=anchor, fallen=carry.fallen)
         inputs = to_weights(theta), command, effect, before, tick, variation
         after, sample = step_carry(config, robot, *inputs)
         return (varied(after), sample.state, sample.command), (after, sample)
 
-    def tangent_of(tangent: Varied, direction: Float[Array, " n"]) -> tuple:
+    def tangent_of(tangent: Carry, direction: Float[Array, " n"]) -> tuple:
         point = varied(carry), jnp.asarray(theta)
         return jax.jvp(step, point, (tangent, direction), has_aux=True)
 
@@ -117,7 +103,7 @@ def propagate(
 ) -> tuple[Trajectory, Sensitivities]:
     """Compute a rollout and its sensitivities by forward recursion. Source: Eq. 10."""
 
-    def tick(carried: tuple[Carry, Varied], j: Int[Array, ""]):
+    def tick(carried: tuple[Carry, Carry], j: Int[Array, ""]):
         carry, tangents, sample, columns = step_sensitivities(
             config, robot, weights, command, effect, *carried, j, variation
         )
