@@ -51,14 +51,12 @@ def measure(seconds: float = SECONDS, robot_file: Path | None = None) -> Report:
 
     @jax.jit
     def begin(row):
-        reading = sensing.unpack_reading(row)
-        measurement, yaw = sensing.measure(robot, reading, np.zeros(()), no_error)
+        measurement, yaw = sensing.measure(robot, row, np.zeros(()), no_error)
         return init_memory(robot, measurement), measurement.state, yaw
 
     @jax.jit
     def tick(robot, weights, command, anchor, number, memory, yaw, row):
-        reading = sensing.unpack_reading(row)
-        measurement, yaw = sensing.measure(robot, reading, yaw, no_error)
+        measurement, yaw = sensing.measure(robot, row, yaw, no_error)
         parameters = config.parameters(weights)
         memory, plan = step_plan(
             config,

@@ -184,7 +184,7 @@ def weight_histories(
             panel.axvline(change, **style.MARK)
             change_of = np.abs(np.log(ratios[:, single])).max(axis=0)
             for i, (color, mark) in zip(np.argsort(-change_of), looks, strict=False):
-                label = style.weight_label(names[single[int(i)]].removesuffix("_left"))
+                label = names[single[int(i)]].removesuffix("_left").replace("_", " ")
                 look = {"color": color, "marker": mark, "markersize": 2.6, "label": label}
                 panel.plot(times[: len(ratios)], ratios[:, single[i]], **look)
             panel.set(title=trajectory, xlabel="time [s]")
@@ -315,7 +315,7 @@ def gradients(
             look = {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0.0}
             bars(x, rows, 0.8 * width, name, **look)
         axes.axhline(0.0, color="black", linewidth=0.8)
-        category_axis(axes, [style.weight_label(name) for name in names], 3)
+        category_axis(axes, [name.replace("_", " ") for name in names], 3)
         axes.set_ylabel("dL / d log weight, unit length")
     return (
         "Gradients of L in log-weights, mean over start phases, each scaled to unit length; the "

@@ -38,7 +38,7 @@ def held(world, steps=400, slide=0.0):
     data.qvel[1] = slide
     for _ in range(steps):
         error = ROBOT.standing_joints - data.qpos[world.joint_qpos]
-        data.ctrl[world.actuator] = 400.0 * error - 4.0 * data.qvel[world.joint_dof]
+        data.ctrl[:] = 400.0 * error - 4.0 * data.qvel[world.joint_dof]
         mujoco.mj_step(world.model, data)
     return data
 

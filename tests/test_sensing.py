@@ -55,7 +55,7 @@ def stand(plant, height=0.0, steps=1500):
     for _ in range(steps):
         row = flat_reading(world, data)
         error = ROBOT.standing_joints - data.qpos[world.joint_qpos]
-        data.ctrl[world.actuator] = 400.0 * error - 6.0 * data.qvel[world.joint_dof]
+        data.ctrl[:] = 400.0 * error - 6.0 * data.qvel[world.joint_dof]
         mujoco.mj_step(world.model, data)
     return world, data, row
 
@@ -135,7 +135,7 @@ def test_foot_points_and_joints_count_the_backlash():
     world = build_world(hfs())
     data = mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
-    data.qpos[world.slack_qpos] = np.linspace(-0.005, 0.005, 10)
+    data.qpos[world.model.jnt_qposadr[world.slack]] = np.linspace(-0.005, 0.005, 10)
     mujoco.mj_kinematics(world.model, data)
     reading, points = foot_points(ROBOT, flat_reading(world, data))
     np.testing.assert_array_equal(reading.slack, np.linspace(-0.005, 0.005, 10))
@@ -204,7 +204,7 @@ def test_the_controller_is_told_the_truth_plus_the_error():
     world = build_world(ideal())
     data = mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
-    reading, _ = foot_points(ROBOT, flat_reading(world, data))
+    reading = flat_reading(world, data)
     true, _ = sensing.measure(ROBOT, reading, jnp.zeros(()), sensing.no_error(ROBOT))
     error = jnp.linspace(0.01, 0.22, 22)
     told, yaw = sensing.measure(ROBOT, reading, jnp.zeros(()), error)

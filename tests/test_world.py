@@ -44,11 +44,13 @@ def hung_up(imperfections):
 def knee_after(imperfections, torque=1.0, steps=20):
     """Motor-side and true travel [rad] of the left knee under a constant torque."""
     world, data = hung_up(imperfections)
-    data.ctrl[world.actuator[KNEE]] = torque
+    data.ctrl[KNEE] = torque
     start = data.qpos.copy()
     mujoco.mj_step(world.model, data, steps)
     moved = (data.qpos - start)[world.joint_qpos[KNEE]]
-    slack = (data.qpos - start)[world.slack_qpos[KNEE]] if world.slack_qpos.size else 0.0
+    slack = (
+        (data.qpos - start)[world.model.jnt_qposadr[world.slack][KNEE]] if world.slack.size else 0.0
+    )
     return moved, moved + slack
 
 
@@ -86,7 +88,7 @@ def test_joints_are_found_by_name_with_and_without_backlash():
         world = build_world(plant)
         qpos = standing_qpos(world, ROBOT.standing_joints, 1.0)
         np.testing.assert_array_equal(qpos[world.joint_qpos], ROBOT.standing_joints)
-        driven = world.model.jnt_dofadr[world.model.actuator_trnid[world.actuator, 0]]
+        driven = world.model.jnt_dofadr[world.model.actuator_trnid[:, 0]]
         np.testing.assert_array_equal(driven, world.joint_dof)
 
 
@@ -95,9 +97,9 @@ def test_backlash_adds_a_free_play_that_the_encoder_does_not_see():
     loose = ideal()._replace(backlash=np.array(width))
     world, data = hung_up(loose)
     assert world.model.nv == 26
-    data.ctrl[world.actuator[KNEE]] = 1.0
+    data.ctrl[KNEE] = 1.0
     mujoco.mj_step(world.model, data, 60)
-    slack = data.qpos[world.slack_qpos]
+    slack = data.qpos[world.model.jnt_qposadr[world.slack]]
     assert abs(slack[KNEE]) == pytest.approx(width, rel=0.15)
     assert np.abs(slack).max() < 1.2 * width
 
@@ -143,7 +145,7 @@ def dropped(imperfections, push=0.0, steps=150):
     deep, slide, foot = 0.0, 0.0, world.model.site("left_foot_point").id
     for _ in range(steps):
         error = ROBOT.standing_joints - data.qpos[world.joint_qpos]
-        data.ctrl[world.actuator] = 400.0 * error - 4.0 * data.qvel[world.joint_dof]
+        data.ctrl[:] = 400.0 * error - 4.0 * data.qvel[world.joint_dof]
         before = data.site_xpos[foot, 0]
         mujoco.mj_step(world.model, data)
         if data.ncon:

@@ -151,22 +151,19 @@ def write_report(
         environment: versions and machine.
         command: command line that repeats the verdict.
     """
-    result = matrix.as_result(cells, family) | {
-        "differs": dict(differs),
+    contents = {
         "claims": claims(cells, differs, family),
         "limits": limits(cells, differs, family),
         "config": dict(config),
         "environment": dict(environment),
     }
+    result = matrix.as_result(cells, family) | {"differs": dict(differs), **contents}
     picture = Picture("verdict.png", plots.matrix(folder / "verdict.png", cells, title_of))
     text = render(
         "matrix.md.j2",
-        claims=result["claims"],
-        limits=result["limits"],
+        **contents,
         pictures=[picture],
         tables=tables(cells),
-        config=config,
-        environment=environment,
         command=command,
         names=matrix.sets_of(cells),
         trajectories=matrix.trajectories_of(cells),

@@ -40,27 +40,16 @@ def write_report(folder: Path, **contents: Any) -> Path:
     Returns:
         The file.
     """
-    functions = {
-        "aligned": aligned,
-        "error_rows": error_rows,
-        "front_table": front_table,
-        "tuning_section": tuning_section,
-    }
-    write_file(folder / "report.md", render("run.md.j2", **contents, **functions).encode())
+    functions = (aligned, error_rows, front_table, tuning_section)
+    values = contents | {function.__name__: function for function in functions}
+    write_file(folder / "report.md", render("run.md.j2", **values).encode())
     return folder / "report.md"
 
 
 def tuning_section(name: str, tuning: Tuning, chosen: Mapping[str, int] | None = None) -> str:
     """Return the section of a tuning; a tuning on walks starts after the paper's iterations."""
-    return render(
-        "tuning.md.j2",
-        name=name,
-        tuning=tuning,
-        chosen=chosen,
-        paper=PAPER_ITERATIONS,
-        refusals=_refusals,
-        at_bounds=_at_bounds,
-    )
+    values = {"name": name, "tuning": tuning, "chosen": chosen, "paper": PAPER_ITERATIONS}
+    return render("tuning.md.j2", **values, refusals=_refusals, at_bounds=_at_bounds)
 
 
 def _refusals(refused: Sequence[Iteration]) -> list[str]:

@@ -84,8 +84,7 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
         expect(path, limits[0] <= angle <= limits[1], text)
     feet, legs = description.named_feet, description.legs
     spheres = [name for foot in feet for name in foot.contacts]
-    for name in spheres:
-        height = lowest_point(model, data, name)
+    for name, height in zip(spheres, lowest_points(data, spheres), strict=True):
         text = f"{key} has the sole at geom {name!r} {height:.4g} m above the floor, expected 0"
         expect(path, abs(height) <= ON_FLOOR, text)
     x, y, _ = np.array([data.site(foot.point).xpos for foot in feet]).T
@@ -102,14 +101,14 @@ def _check_standing(description: Description, model: mujoco.MjModel) -> None:
     low, high = contacts.min(axis=0), contacts.max(axis=0)
     text = f"{key} has the centre of mass at {com}, expected it over the feet, from {low} to {high}"
     expect(path, np.all(low <= com) and np.all(com <= high), text)
-    _check_load(description, model, data)
+    _check_load(description, data)
 
 
-def _check_load(description: Description, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def _check_load(description: Description, data: mujoco.MjData) -> None:
     """Check that each motor can hold its joint in the standing pose, the feet sharing the load."""
-    com, torques = data.subtree_com[trunk_body(model)], data.qfrc_bias.copy()
-    feet = description.named_feet
-    force = -model.opt.gravity * model.body_subtreemass[trunk_body(model)] / len(feet)
+    model, trunk, feet = data.model, trunk_body(data.model), description.named_feet
+    com, torques = data.subtree_com[trunk], data.qfrc_bias.copy()
+    force = -model.opt.gravity * model.body_subtreemass[trunk] / len(feet)
     for foot in feet:
         site = data.site(foot.point)
         J_v, J_w = np.zeros((3, model.nv)), np.zeros((3, model.nv))
@@ -118,7 +117,7 @@ def _check_load(description: Description, model: mujoco.MjModel, data: mujoco.Mj
         lever = np.array([com[0] - site.xpos[0] if len(feet) == 2 else 0.0, 0.0, 0.0])
         torques -= J_v.T @ force + J_w.T @ np.cross(lever, force)
     for index, name in enumerate(description.joints):
-        torque, limit = torques[model.joint(name).dofadr[0]], model.actuator(index).ctrlrange[1]
+        torque, limit = torques[6 + index], model.actuator(index).ctrlrange[1]
         text = f"standing takes {abs(torque):.3g} N m of joint {name!r}, which has {limit:g}"
         expect(description.model, abs(torque) <= limit, text)
 
@@ -142,9 +141,9 @@ def trunk_body(model: mujoco.MjModel) -> int:
     return int(model.jnt_bodyid[0])
 
 
-def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, sphere: str) -> float:
-    """Return the height of the lowest point of a sphere [m]."""
-    return float(data.geom(sphere).xpos[2] - model.geom(sphere).size[0])
+def lowest_points(data: mujoco.MjData, spheres: Sequence[str]) -> list[float]:
+    """Return the height of the lowest point of each sphere [m]."""
+    return [float(data.geom(s).xpos[2] - data.model.geom(s).size[0]) for s in spheres]
 
 
 def require(path: Path, kind: str, name: str, names: Sequence[str]) -> None:

@@ -357,26 +357,22 @@ def description_of(path: Path, table: dict[str, Any]) -> Description:
             f"{path}: name must be letters, digits, - and _ (it names a folder), "
             f"got {short_repr(name)}"
         )
-    weights, standing = file.weights, file.standing
+    sections = {name: getattr(file, name) for name in CONTROL}
     return Description(
         model=path.parent / file.model,
         path=path,
         name=name,
-        standing=standing if isinstance(standing, str) else tuple(standing.items()),
+        standing=_as_tuples(file.standing),
         joints=sum(file.joints.legs.values(), ()),
         linkage=file.joints.linkage,
         weld=file.joints.weld,
         armature=file.joints.armature,
         feet=tuple(file.feet.feet.values()) if file.feet else Description.feet,
         **vars(file.limits),
-        control=tuple(
-            (name, tuple(section.items()))
-            for name in CONTROL
-            if (section := getattr(file, name)) is not None
-        ),
-        nominal=weights.nominal and weights.nominal.rows(),
-        expert=weights.expert and weights.expert.rows(),
-        loss=tuple((file.loss or {}).items()),
+        control=_as_tuples({name: x for name, x in sections.items() if x is not None}),
+        nominal=file.weights.nominal and file.weights.nominal.rows(),
+        expert=file.weights.expert and file.weights.expert.rows(),
+        loss=_as_tuples(file.loss or {}),
         tuning=file.tuning,
         plants=file.plants,
     )

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError, short_repr
+from hector_jax.core.inputs import short_repr
+from hector_jax.robot.checks import expect
 from hector_jax.robot.mjcf import mujoco_errors
 
 _GEOM = mujoco.mjtGeom
@@ -69,18 +70,13 @@ def _remove_meshes(path: Path, spec: mujoco.MjSpec) -> int:
     """Remove meshes and pictures and the geoms made of them. Returns the number of parts."""
     meshes = [geom for geom in spec.geoms if geom.type in _MESHES or geom.meshname]
     for geom in meshes:
-        body = geom.parent
-        if body.name == "world":
-            if geom.contype or geom.conaffinity:
-                raise InputError(
-                    f"{path}: geom {short_repr(geom.name)} of the world is terrain, expected a "
-                    "plane at z = 0 or nothing"
-                )
-        elif not body.explicitinertial and _has_mass(spec, geom):
-            raise InputError(
-                f"{path}: body {short_repr(body.name)} has its mass from a mesh, which is not "
-                "read: give the body an <inertial>"
-            )
+        body, of_world = geom.parent, geom.parent.name == "world"
+        terrain = of_world and (geom.contype or geom.conaffinity)
+        text = f"geom {short_repr(geom.name)} of the world is terrain, expected a plane at z = 0"
+        expect(path, not terrain, f"{text} or nothing")
+        heavy = not of_world and not body.explicitinertial and _has_mass(spec, geom)
+        text = f"body {short_repr(body.name)} has its mass from a mesh, which is not read: give"
+        expect(path, not heavy, f"{text} the body an <inertial>")
     pictures = [x for x in spec.textures if x.file or x.content_type or any(x.cubefiles)]
     removed = [*meshes, *spec.meshes, *spec.hfields, *spec.skins, *pictures]
     for part in removed:
@@ -114,11 +110,9 @@ def _check_couplings(path: Path, root: ElementTree.Element, joints: Sequence[str
                 if name not in ("name", "class")
             }
             coupled = sorted(references & leg_parts)
-            if coupled and coupling.get("active") != "false":
-                raise InputError(
-                    f"{path}: <{coupling.tag}> of <{tag}> couples {', '.join(coupled)}, expected "
-                    "legs of free hinges: remove it, or weld a joint of it"
-                )
+            text = f"<{coupling.tag}> of <{tag}> couples {', '.join(coupled)}, expected legs of "
+            text += "free hinges: remove it, or weld a joint of it"
+            expect(path, not coupled or coupling.get("active") == "false", text)
 
 
 def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) -> int:
@@ -126,8 +120,8 @@ def _clean_urdf(path: Path, root: ElementTree.Element, joints: Sequence[str]) ->
     removed = 0
     for joint in root.findall("joint"):
         name = joint.get("name")
-        if joint.find("mimic") is not None and name in joints:
-            raise InputError(f"{path}: joint {name!r} mimics another one, expected a free hinge")
+        mimics = joint.find("mimic") is not None and name in joints
+        expect(path, not mimics, f"joint {name!r} mimics another one, expected a free hinge")
         _remove(joint, [part for part in joint if part.tag not in _JOINT_PARTS])
     for link in root.findall("link"):
         meshes = [part for part in link if part.find(".//mesh") is not None]

@@ -156,10 +156,8 @@ def _leg_constants(robot: Robot) -> _Leg:
     """Return the constants of all legs."""
     parts = (robot.joint_origin, robot.joint_axis, robot.foot_point, robot.sole)
     limits = (robot.joint_lower, robot.joint_upper, robot.standing_joints)
-    return _Leg(
-        *map(jnp.asarray, parts),
-        *(jnp.asarray(x).reshape(len(robot.foot_point), -1) for x in limits),
-    )
+    by_leg = (jnp.asarray(x).reshape(len(robot.foot_point), -1) for x in limits)
+    return _Leg(*map(jnp.asarray, parts), *by_leg)
 
 
 def _chain(robot: Robot, joints: Float[Array, " joints"]) -> _Chain:

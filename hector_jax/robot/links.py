@@ -75,24 +75,19 @@ def links_of(
     """
     data = data_at(model, fixed)  # the leg joints at zero, not at their reference angles
     poses = [Pose(R, p) for R, p in zip(data.xmat.reshape(-1, 3, 3), data.xpos, strict=True)]
-    roots = {-1: root} | {j: int(model.jnt_bodyid[j]) for j in joints}  # body by moving joint
-    frames = {
-        j: Pose(poses[b].R, data.xanchor[j] if j >= 0 else poses[b].p) for j, b in roots.items()
-    }
-    root_joints = {body: joint for joint, body in roots.items()}
-    moving_joint: dict[int, int] = {}  # by body; -1 for those of the trunk
-    for body in subtree(model, root):
-        inherited = moving_joint.get(int(model.body_parentid[body]), -1)
-        moving_joint[body] = root_joints.get(body, inherited)
+    roots = [root, *model.jnt_bodyid[joints].tolist()]  # body that moves each link
+    anchors = [data.xpos[root], *data.xanchor[joints]]
+    frames = [Pose(poses[b].R, anchor) for b, anchor in zip(roots, anchors, strict=True)]
+    link_of: dict[int, int] = {}  # index of the link by body
+    for b in subtree(model, root):
+        link_of[b] = roots.index(b) if b in roots else link_of[int(model.body_parentid[b])]
     links = []
-    for joint, body in roots.items():
-        frame, pose, parent = frames[joint], Pose(), -1
-        bodies = {b: frame.to(poses[b]) for b, j in moving_joint.items() if j == joint}
-        if joint >= 0:
-            parent_joint = moving_joint.get(int(model.body_parentid[body]), -1)
-            pose, parent = frames[parent_joint].to(frame), list(roots).index(parent_joint)
-        mass, com, inertia = _composite(model, bodies)
-        links.append(Link(model.body(body).name, parent, joint, pose, mass, com, inertia, bodies))
+    for index, (body, joint) in enumerate(zip(roots, (-1, *joints), strict=True)):
+        parent = link_of.get(int(model.body_parentid[body]), -1)
+        pose = frames[parent].to(frames[index]) if index else Pose()
+        bodies = {b: frames[index].to(poses[b]) for b, link in link_of.items() if link == index}
+        properties = _composite(model, bodies)
+        links.append(Link(model.body(body).name, parent, joint, pose, *properties, bodies))
     return links
 
 

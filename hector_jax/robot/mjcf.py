@@ -16,6 +16,7 @@ from pathlib import Path
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, did_you_mean, one_line, read_text, short_repr
 from hector_jax.core.settings import NOT_NEGATIVE, POSITIVE, Range
+from hector_jax.robot.checks import expect
 
 TIME_STEP = 0.001  # [s] of plant, joint control and samples of every robot
 _MOST_BYTES = 1_000_000
@@ -67,18 +68,15 @@ def read_mjcf(path: Path) -> ElementTree.Element:
         root[:] = [part for part in root if part.tag in _URDF_PARTS]
     bodies = 0
     for element, label in _labelled(path, root):
-        if element.tag in _REFUSED:
-            file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
-            raise InputError(
-                f"{path}: <{element.tag}>{file} is not accepted, expected one self-contained file"
-            )
+        file = f" of {short_repr(element.get('file'))}" if "file" in element.attrib else ""
+        text = f"<{element.tag}>{file} is not accepted, expected one self-contained file"
+        expect(path, element.tag not in _REFUSED, text)
         bodies += element.tag in ("body", "link")
         for name, value in element.attrib.items():
             if expected := _expected(element.tag, name, value):
                 message = f"{name} is {short_repr(value)}, expected {expected}"
                 raise InputError(f"{path}: {label}: {message}")
-    if bodies > _MOST_BODIES:
-        raise InputError(f"{path}: {bodies} bodies, expected at most {_MOST_BODIES}")
+    expect(path, bodies <= _MOST_BODIES, f"{bodies} bodies, expected at most {_MOST_BODIES}")
     return root
 
 
@@ -109,8 +107,7 @@ def _labelled(path: Path, root: ElementTree.Element) -> Iterator[tuple[ElementTr
     depth = {root: 1}
     yield root, f"<{root.tag}>"
     for parent in root.iter():
-        if depth[parent] > _DEEPEST:
-            raise InputError(f"{path}: elements are nested deeper than {_DEEPEST}")
+        expect(path, depth[parent] <= _DEEPEST, f"elements are nested deeper than {_DEEPEST}")
         for child in parent:
             depth[child] = depth[parent] + 1
             label = f"<{child.tag}>"

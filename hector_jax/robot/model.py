@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -121,45 +121,40 @@ def robot_of(description: Description) -> Robot:
     trunk = trunk_body(model)
     R_wb = data.xmat[trunk].reshape(3, 3)
     com = data.subtree_com[trunk]
-    joints = _joint_ids(model, description)
-    standing_joints, ranges = data.qpos[model.jnt_qposadr[joints]], model.jnt_range[joints]
+    points = np.array([data.site(foot.point).xpos for foot in description.named_feet])
+    # in the standard form the first joint is the trunk's, and the others are those of the legs
+    standing_joints, ranges = data.qpos[7:].copy(), model.jnt_range[1:]
     bodies = model.body_mass, model.body_inertia, data.ximat.reshape(-1, 3, 3), data.xipos
-    legs = _legs(description, model)
-    angles = standing_joints.reshape(len(legs.axis), -1)
-    sole = np.stack([(R_wb @ R).T for R in map(_leg_rotation, legs.axis, angles)])
+    legs, spheres, radius = _legs(description, model)
+    angles = standing_joints.reshape(len(spheres), -1)
+    sole = np.stack([(R_wb @ R).T for R in map(_leg_rotation, legs["joint_axis"], angles)])
     sole = np.where(np.abs(sole - np.eye(3)).max() <= _TOLERANCE, np.eye(3), sole)  # rounding
-    contacts = np.einsum("fij,fcj->fci", sole.mT, legs.contacts - legs.foot_point[:, None])
-    contacts[..., 2] -= legs.radius
+    contacts = np.einsum("fij,fcj->fci", sole.mT, spheres)
+    contacts[..., 2] -= radius
     check_soles(description.model, contacts)
     toe, heel, half_width = _sole_lengths(contacts)
-    return Robot(
+    contact = {1: "point", 2: "line", 4: "flat"}[contacts.shape[1]]
+    robot = Robot(
         mass=model.body_subtreemass[trunk].copy(),
         inertia=R_wb.T @ inertia_about(com, *bodies) @ R_wb,
         com_offset=R_wb.T @ (com - data.xpos[trunk]),
         gravity=0.0 - model.opt.gravity,
-        joint_origin=legs.origin,
-        joint_axis=legs.axis,
-        foot_point=legs.foot_point,
         sole=sole,
-        link_mass=legs.mass,
-        link_com=legs.com,
         toe=toe,
         heel=heel,
         half_width=half_width,
-        foot_ahead=_foot_ahead(description, R_wb, data),
-        joint_lower=ranges[:, 0],
-        joint_upper=ranges[:, 1],
+        foot_ahead=_foot_ahead(points @ R_wb),
+        joint_lower=ranges[:, 0].copy(),
+        joint_upper=ranges[:, 1].copy(),
         torque_limit=model.actuator_ctrlrange[:, 1].copy(),
         standing_joints=standing_joints,
         standing_height=com[2].copy(),
         trunk_height=data.xpos[trunk][2].copy(),
         description=description,
-        structure=Structure(
-            closed_form=_closed_form(legs, sole, ranges),
-            placed=_placed_rows(legs, angles[0], sole[0]),
-            contact={1: "point", 2: "line", 4: "flat"}[contacts.shape[1]],
-        ),
+        structure=Structure(closed_form=False, placed=(), contact=contact),
+        **legs,
     )
+    return robot._replace(structure=Structure(_closed_form(robot), _placed_rows(robot), contact))
 
 
 def compile_model(description: Description) -> mujoco.MjModel:
@@ -182,42 +177,27 @@ def build_model(description: Description) -> tuple[mujoco.MjSpec, mujoco.MjModel
     return spec, model
 
 
-class _Legs(NamedTuple):
-    """Geometry and masses of all legs, in the frames of the links."""
+def _legs(
+    description: Description, model: mujoco.MjModel
+) -> tuple[dict[str, Any], Float[np.ndarray, "feet c 3"], Float[np.ndarray, "feet c"]]:
+    """Read the legs in the pose with the trunk at the origin and all joints at zero.
 
-    origin: Float[np.ndarray, "feet j 3"]  # joint in the frame of the link above [m]
-    axis: Float[np.ndarray, "feet j 3"]
-    mass: Float[np.ndarray, "feet j"]  # [kg]
-    com: Float[np.ndarray, "feet j 3"]  # [m]
-    foot_point: Float[np.ndarray, "feet 3"]  # [m]
-    contacts: Float[np.ndarray, "feet c 3"]  # centres of their spheres [m]
-    radius: Float[np.ndarray, "feet c"]  # [m]
-
-
-def _joint_ids(model: mujoco.MjModel, description: Description) -> np.ndarray:
-    """Return the legs' joints in the order of the description."""
-    return np.array([model.joint(name).id for name in description.joints])
-
-
-def _legs(description: Description, model: mujoco.MjModel) -> _Legs:
-    """Read the legs in the pose with the trunk at the origin and all joints at zero."""
-    data = data_at(model)
-    joint = _joint_ids(model, description)
-    link = model.jnt_bodyid[joint]
-    feet = description.named_feet
-    anchor = data.xanchor[joint].reshape(len(feet), -1, 3)
-    last = anchor[:, -1]
-    points = np.array([data.site(foot.point).xpos for foot in feet])
+    Returns:
+        Fields of `Robot`; centres of the contacts' spheres from the foot points [m]; radii [m].
+    """
+    data, links, feet = data_at(model), model.jnt_bodyid[1:], description.named_feet
+    anchor = data.xanchor[1:].reshape(len(feet), -1, 3)
+    foot_point = np.array([data.site(foot.point).xpos for foot in feet]) - anchor[:, -1]
     spheres = [[model.geom(name).id for name in foot.contacts] for foot in feet]
-    return _Legs(
-        origin=np.diff(anchor, axis=1, prepend=0.0),
-        axis=data.xaxis[joint].reshape(len(feet), -1, 3).copy(),
-        mass=model.body_mass[link].reshape(len(feet), -1),
-        com=data.xipos[link].reshape(len(feet), -1, 3) - anchor,
-        foot_point=points - last,
-        contacts=data.geom_xpos[spheres] - last[:, None],
-        radius=model.geom_size[spheres, 0],
-    )
+    fields = {
+        "joint_origin": np.diff(anchor, axis=1, prepend=0.0),
+        "joint_axis": data.xaxis[1:].reshape(len(feet), -1, 3).copy(),
+        "foot_point": foot_point,
+        "link_mass": model.body_mass[links].reshape(len(feet), -1),
+        "link_com": data.xipos[links].reshape(len(feet), -1, 3) - anchor,
+    }
+    contacts = data.geom_xpos[spheres] - anchor[:, -1:] - foot_point[:, None]
+    return fields, contacts, model.geom_size[spheres, 0]
 
 
 def _leg_rotation(axes: Float[np.ndarray, "j 3"], joints: Float[np.ndarray, " j"]) -> np.ndarray:
@@ -238,49 +218,45 @@ def _sole_lengths(contacts: Float[np.ndarray, "feet c 3"]) -> list[np.ndarray]:
     return [np.asarray(length) for length in lengths]
 
 
-def _foot_ahead(
-    description: Description, R_wb: Float[np.ndarray, "3 3"], data: mujoco.MjData
-) -> Float[np.ndarray, " feet"]:
+def _foot_ahead(points: Float[np.ndarray, "feet 3"]) -> Float[np.ndarray, " feet"]:
     """Return the mean x of each foot's pair from the middle of all foot points [m]."""
-    points = np.array([data.site(foot.point).xpos for foot in description.named_feet]) @ R_wb
     pair_x = np.repeat(points[:, 0].reshape(-1, 2).mean(axis=1), 2)
     return pair_x - pair_x.mean()
 
 
-def _closed_form(legs: _Legs, sole: np.ndarray, ranges: Float[np.ndarray, "joints 2"]) -> bool:
+def _closed_form(robot: Robot) -> bool:
     """Return whether the closed-form inverse of `kinematics` holds for these legs.
 
     Yaw, roll and three pitches; thigh and shin straight down at zero; the knee bends one way only.
     """
-    if legs.axis.shape[1] != len(_CLOSED_AXES):
+    if robot.joint_axis.shape[1] != len(_CLOSED_AXES):
         return False
-    low, high = ranges.reshape(len(legs.axis), -1, 2)[:, 3].T
+    low, high = (limit[3 :: len(_CLOSED_AXES)] for limit in (robot.joint_lower, robot.joint_upper))
     one_way = np.all((high < 0.0) & (low > -np.pi)) or np.all((low > 0.0) & (high < np.pi))
-    down = legs.origin[:, 3:]
+    down = robot.joint_origin[:, 3:]
     return bool(
         one_way
-        and np.allclose(legs.axis, _CLOSED_AXES, rtol=0, atol=_TOLERANCE)
-        and np.allclose(sole, np.eye(3), rtol=0, atol=_TOLERANCE)
+        and np.allclose(robot.joint_axis, _CLOSED_AXES, rtol=0, atol=_TOLERANCE)
+        and np.allclose(robot.sole, np.eye(3), rtol=0, atol=_TOLERANCE)
         and np.all(np.abs(down[..., 0]) <= _TOLERANCE)
         and np.all(down[..., 2] < 0.0)
     )
 
 
-def _placed_rows(
-    legs: _Legs, joints: Float[np.ndarray, " j"], sole: Float[np.ndarray, "3 3"]
-) -> tuple[int, ...]:
+def _placed_rows(robot: Robot) -> tuple[int, ...]:
     """Return the rows of the first foot's twist that its leg can control in the standing pose.
 
     The rows of the position come first, then pitch, yaw and roll of the sole if the joints suffice.
     """
     rows: list[int] = []
-    axes, origin = legs.axis[0], legs.origin[0]
+    axes, origin = robot.joint_axis[0], robot.joint_origin[0]
+    joints = robot.standing_joints[: len(axes)]
     frames = [_leg_rotation(axes[:i], joints[:i]) for i in range(len(joints) + 1)]
     anchors = np.cumsum([R @ step for R, step in zip(frames, origin, strict=False)], axis=0)
-    foot = anchors[-1] + frames[-1] @ legs.foot_point[0]
+    foot = anchors[-1] + frames[-1] @ robot.foot_point[0]
     turned_axes = np.array([R @ axis for R, axis in zip(frames, axes, strict=False)])
     length = np.linalg.norm(foot - anchors[0])
-    J_w = (frames[-1] @ sole).T @ turned_axes.T
+    J_w = (frames[-1] @ robot.sole[0]).T @ turned_axes.T
     J = np.concatenate([np.cross(turned_axes, foot - anchors).T / length, J_w])
     for row in (0, 1, 2, 4, 5, 3):
         J_rows = J[[*rows, row]]

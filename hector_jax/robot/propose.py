@@ -128,9 +128,8 @@ def size_of(description: Description, robot: Robot) -> Size:
     model = compile_model(description)
     M = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, standing_data(description, model), M)
-    address = [int(model.joint(name).dofadr[0]) for name in description.joints]
     mass, height = float(robot.mass), float(robot.standing_height)
-    return Size(mass / MASS, height / HEIGHT, robot, M.diagonal()[address])
+    return Size(mass / MASS, height / HEIGHT, robot, M.diagonal()[6:])
 
 
 def _settings(size: Size) -> dict[str, Any]:

@@ -17,17 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
-from hector_jax.robot.checks import ON_FLOOR, lowest_point
+from hector_jax.robot.checks import ON_FLOOR, expect, lowest_points
 from hector_jax.robot.description import Description, Foot, NamedFoot
 from hector_jax.robot.links import Link, Pose, pose_of
 from hector_jax.robot.mjcf import TIME_STEP
 
 CONTACT_RADIUS = 0.01  # [m]
-SHAPES = tuple(
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
-    for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
-)
+SHAPES = tuple(range(int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX) + 1))
 SOLVER = {
     "timestep": TIME_STEP,
     "integrator": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
@@ -55,6 +51,7 @@ _SCENE = """<mujoco>
 _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = SHAPES
 _ROBOT_GEOM = {"friction": [0.1, 0.005, 0.0001], "solmix": 0.0, "priority": 0}
 _SITE = {"size": [0.005] * 3, "group": 4}
+_TOUCHES_NOTHING = {"contype": 0, "conaffinity": 0}
 _FLOOR_BITS = {"contype": 0, "conaffinity": 1, "condim": 3}
 _GREY, _DARK = [0.75, 0.78, 0.82, 1.0], [0.1, 0.1, 0.1, 1.0]
 _STICK = 0.02  # [m] radius
@@ -156,7 +153,7 @@ def _add_geoms(
         shape, size = int(model.geom_type[g]), model.geom_size[g]
         name, material = model.geom(g).name, int(model.geom_matid[g])
         rgba = np.array(model.mat_rgba[material] if material >= 0 else model.geom_rgba[g])
-        fields: dict = {"group": int(model.geom_group[g]), "rgba": rgba}
+        fields: dict = {"group": int(model.geom_group[g]), "rgba": rgba, **_TOUCHES_NOTHING}
         if name in named:
             fields |= {**_ROBOT_GEOM, **_FLOOR_BITS}
         elif collide[g]:
@@ -164,8 +161,6 @@ def _add_geoms(
             fields |= {**_ROBOT_GEOM, "contype": bits[0], "conaffinity": bits[1], "condim": 1}
             if collide[geoms].all():  # nothing else is drawn
                 fields |= {"group": 2, "rgba": [*rgba[:3], 1.0]}
-        else:
-            fields |= {"contype": 0, "conaffinity": 0}
         body.add_geom(
             name=name, type=shape, size=size, pos=pose.p, quat=pose.quat, mass=0.0, **fields
         )
@@ -194,10 +189,9 @@ def _add_sticks(pieces: Pieces, bodies: Sequence) -> None:
     drawn = model.geom_bodyid[np.isin(model.geom_type, SHAPES)]
     for index, link in enumerate(links):
         ends = [(int(model.body_parentid[b]), pose.p) for b, pose in link.bodies.items()]
-        for child in links[1:]:
-            if child.parent == index:
-                parent = int(model.body_parentid[model.jnt_bodyid[child.joint]])
-                ends.append((parent, child.pose.p))
+        children = [child for child in links[1:] if child.parent == index]
+        parents = model.body_parentid[model.jnt_bodyid[[child.joint for child in children]]]
+        ends += [(int(b), child.pose.p) for b, child in zip(parents, children, strict=True)]
         for parent, end in ends:
             if parent in link.bodies and parent not in drawn:
                 _add_stick(bodies[index], link.bodies[parent].p, end, _STICK)
@@ -207,17 +201,16 @@ def _add_stick(
     body: mujoco.MjsBody, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
 ) -> None:
     if np.linalg.norm(end - start) > radius:
-        fields = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": 2, "rgba": _GREY}
+        fields = {**_TOUCHES_NOTHING, "mass": 0.0, "group": 2, "rgba": _GREY}
         body.add_geom(type=_CAPSULE, size=[radius, 0.0, 0.0], fromto=[*start, *end], **fields)
 
 
-def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> tuple[mujoco.MjModel, mujoco.MjData]:
+def _standing_data(spec: mujoco.MjSpec, pieces: Pieces) -> mujoco.MjData:
     """Return the robot in the standing pose, with the trunk's origin at the world's."""
-    model = spec.compile()
-    data = mujoco.MjData(model)
+    data = mujoco.MjData(spec.compile())
     data.qpos[:] = [0.0, 0.0, 0.0, *pieces.trunk_quat, *pieces.angles]
-    mujoco.mj_kinematics(model, data)
-    return model, data
+    mujoco.mj_kinematics(data.model, data)
+    return data
 
 
 def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, leg: int) -> None:
@@ -227,22 +220,20 @@ def _add_foot(spec: mujoco.MjSpec, description: Description, pieces: Pieces, leg
     link = pieces.links[last]
     if foot.body is not None:
         poses = {model.body(b).name: pose for b, pose in link.bodies.items()}
-        if foot.body not in poses:
-            raise InputError(
-                f"{path}: feet.{description.legs[leg]}.body is {foot.body!r}, expected one that "
-                f"joint {description.joints[last - 1]!r} moves: {', '.join(poses)}"
-            )
+        text = f"feet.{description.legs[leg]}.body is {foot.body!r}, expected one that joint "
+        text += f"{description.joints[last - 1]!r} moves: {', '.join(poses)}"
+        expect(path, foot.body in poses, text)
         _add_foot_by_points(spec, foot, names, pieces, link, poses[foot.body])
         return
     for name in names.contacts:
         geom = spec.geom(name)
-        if geom is None or geom.parent.name != link.name or geom.type != _SPHERE:
-            raise InputError(f"{path}: no sphere {name!r} on body {link.name!r}")
-    site = next((s for s in range(model.nsite) if model.site(s).name == names.point), None)
-    if site is None or int(model.site_bodyid[site]) not in link.bodies:
-        raise InputError(f"{path}: no site {names.point!r} on body {link.name!r}")
-    pose = link.bodies[int(model.site_bodyid[site])]
-    point = pose.p + pose.R @ model.site_pos[site]
+        on_link = geom and geom.parent.name == link.name and geom.type == _SPHERE
+        expect(path, on_link, f"no sphere {name!r} on body {link.name!r}")
+    sites = [model.site(s) for s in range(model.nsite) if model.site_bodyid[s] in link.bodies]
+    sites = [site for site in sites if site.name == names.point]
+    expect(path, sites, f"no site {names.point!r} on body {link.name!r}")
+    pose = link.bodies[int(sites[0].bodyid[0])]
+    point = pose.p + pose.R @ sites[0].pos
     spec.body(link.name).add_site(name=names.point, pos=point, **_SITE)
 
 
@@ -251,7 +242,7 @@ def _add_foot_by_points(
 ) -> None:
     """Add the site and spheres whose lowest points in the standing pose are the contacts."""
     contacts = np.array([pose.p + pose.R @ np.array(contact) for contact in foot.contacts])
-    _, data = _standing_data(spec, pieces)
+    data = _standing_data(spec, pieces)
     R, body = data.body(link.name).xmat.reshape(3, 3), spec.body(link.name)
     up = CONTACT_RADIUS * R.T[:, 2]
     for contact in contacts:
@@ -277,17 +268,13 @@ def _add_standing(spec: mujoco.MjSpec, description: Description, pieces: Pieces)
     Raises:
         InputError: a contact is more than ON_FLOOR above the lowest one.
     """
-    model, data = _standing_data(spec, pieces)
     names = [name for foot in description.named_feet for name in foot.contacts]
-    heights = [lowest_point(model, data, name) for name in names]
+    heights = lowest_points(_standing_data(spec, pieces), names)
     low = min(heights)
-    if max(heights) - low > ON_FLOOR:
-        offsets = (f"{name} {1e3 * (h - low):.1f}" for name, h in zip(names, heights, strict=True))
-        raise InputError(
-            f"{description.model}: standing, the soles are not level: contacts above the lowest "
-            f"one [mm]: {', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the "
-            "standing angles"
-        )
+    offsets = (f"{name} {1e3 * (h - low):.1f}" for name, h in zip(names, heights, strict=True))
+    text = "standing, the soles are not level: contacts above the lowest one [mm]: "
+    text += f"{', '.join(offsets)}; expected at most {1e3 * ON_FLOOR:g}: change the standing angles"
+    expect(description.model, max(heights) - low <= ON_FLOOR, text)
     qpos = [0.0, 0.0, -low, *pieces.trunk_quat, *pieces.angles]
     spec.body(pieces.links[0].name).pos = qpos[:3]
     spec.add_key(name=description.standing_key, qpos=qpos)

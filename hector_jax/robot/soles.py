@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import FEET
+from hector_jax.robot.checks import expect
 from hector_jax.robot.links import data_at, subtree
 from hector_jax.robot.rebuild import SHAPES
 from hector_jax.robot.survey import Survey
@@ -54,11 +54,11 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
         InputError: one line: the feet differ.
     """
     data = data_at(survey.model, angles)
-    axes = [_axes(survey, data, leg) for leg in survey.legs]
-    points = [_floor_points(survey, data, leg, R) for leg, R in zip(survey.legs, axes, strict=True)]
+    axes = [_axes(data, leg) for leg in survey.legs]
+    points = [_floor_points(data, leg, R) for leg, R in zip(survey.legs, axes, strict=True)]
     guessed = not all(map(len, points))
     if guessed:
-        points = [_inertia_box(survey, data, leg) for leg in survey.legs]
+        points = [_inertia_box(data, leg) for leg in survey.legs]
     elif named := _named_soles(survey, data):
         return named
     outlines = [_outline(of_foot, len(survey.legs[0])) for of_foot in points]
@@ -66,15 +66,13 @@ def find_soles(survey: Survey, angles: Mapping[str, float] | None = None) -> tup
     names = FEET[len(survey.legs)]
     for first in range(0, len(outlines), 2):
         left, right = outlines[first], _mirrored(outlines[first + 1])
-        if len(left) != len(right) or np.abs(left - right).max() > tolerance:
-            raise InputError(
-                f"{survey.path}: the {names[first]} foot touches at {np.round(left, 4).tolist()} "
-                f"from its last joint and the mirrored {names[first + 1]} one at "
-                f"{np.round(right, 4).tolist()}, expected the same"
-            )
+        text = f"the {names[first]} foot touches at {np.round(left, 4).tolist()} from its last "
+        text += f"joint and the mirrored {names[first + 1]} one at {np.round(right, 4).tolist()}"
+        same = len(left) == len(right) and np.abs(left - right).max() <= tolerance
+        expect(survey.path, same, f"{text}, expected the same")
         mean = np.round(0.5 * (left + right), 4)
-        for leg, contacts in ((first, mean), (first + 1, _mirrored(mean))):
-            soles.append(_sole(survey, data, leg, contacts, axes[leg], guessed))
+        for i, contacts in ((first, mean), (first + 1, _mirrored(mean))):
+            soles.append(_sole(data, survey.legs[i][-1], contacts, axes[i], guessed))
     return tuple(soles)
 
 
@@ -84,9 +82,8 @@ def _mirrored(contacts: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c 3"]:
     return contacts[order] * [1.0, -1.0, 1.0]
 
 
-def _foot_geoms(survey: Survey, leg: Sequence[int]) -> list[int]:
+def _foot_geoms(model: mujoco.MjModel, leg: Sequence[int]) -> list[int]:
     """Return the colliding primitives of a foot; with the floor, if the file has one."""
-    model = survey.model
     bodies = subtree(model, int(model.jnt_bodyid[leg[-1]]))
     contype, conaffinity = model.geom_contype, model.geom_conaffinity
     collide = (contype | conaffinity) > 0
@@ -99,9 +96,9 @@ def _foot_geoms(survey: Survey, leg: Sequence[int]) -> list[int]:
     return np.flatnonzero(chosen).tolist()
 
 
-def _axes(survey: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
+def _axes(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "3 3"]:
     """Return the axes of the sole in the trunk frame, as columns."""
-    boxes = [g for g in _foot_geoms(survey, leg) if survey.model.geom_type[g] == _BOX]
+    boxes = [g for g in _foot_geoms(data.model, leg) if data.model.geom_type[g] == _BOX]
     if not boxes:
         return np.eye(3)
     R = data.geom_xmat[min(boxes, key=lambda g: data.geom_xpos[g][2])].reshape(3, 3)
@@ -115,23 +112,23 @@ def _axes(survey: Survey, data: mujoco.MjData, leg: Sequence[int]) -> Float[np.n
 
 
 def _floor_points(
-    survey: Survey, data: mujoco.MjData, leg: Sequence[int], axes: Float[np.ndarray, "3 3"]
+    data: mujoco.MjData, leg: Sequence[int], axes: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Return the points of the sole in its axes, from the last joint."""
-    geoms = _foot_geoms(survey, leg)
+    geoms = _foot_geoms(data.model, leg)
     if not geoms:
         return np.zeros((0, 3))
     down = -axes[:, 2]
-    points = np.concatenate([_support(survey.model, data, g, down) for g in geoms])
+    points = np.concatenate([_support(data, g, down) for g in geoms])
     points = (points - data.xanchor[leg[-1]]) @ axes
     return points[points[:, 2] <= points[:, 2].min() + _SAME_SOLE]
 
 
 def _support(
-    model: mujoco.MjModel, data: mujoco.MjData, g: int, down: Float[np.ndarray, "3"] = _DOWN
+    data: mujoco.MjData, g: int, down: Float[np.ndarray, "3"] = _DOWN
 ) -> Float[np.ndarray, "n 3"]:
     """Return the corners of a box or the lowest points of a round geom."""
-    shape, size = int(model.geom_type[g]), model.geom_size[g]
+    shape, size = int(data.model.geom_type[g]), data.model.geom_size[g]
     center, R = data.geom_xpos[g], data.geom_xmat[g].reshape(3, 3)
     if shape == _BOX:
         return center + (list(product((-1, 1), repeat=3)) * size) @ R.T
@@ -166,11 +163,9 @@ def _outline(points: Float[np.ndarray, "n 3"], joints: int) -> Float[np.ndarray,
     return np.array([[x, y, z] for x, across in ends for y in (across.max(), across.min())])
 
 
-def _inertia_box(
-    survey: Survey, data: mujoco.MjData, leg: Sequence[int]
-) -> Float[np.ndarray, "4 3"]:
+def _inertia_box(data: mujoco.MjData, leg: Sequence[int]) -> Float[np.ndarray, "4 3"]:
     """Return the lower corners of the box with the mass and inertia of the foot's last body."""
-    model, body = survey.model, int(survey.model.jnt_bodyid[leg[-1]])
+    model, body = data.model, int(data.model.jnt_bodyid[leg[-1]])
     mass, moments = model.body_mass[body], model.body_inertia[body]
     square = 1.5 * (moments.sum() - 2.0 * moments) / max(mass, 1e-9)
     half = np.abs(data.ximat[body].reshape(3, 3)) @ np.sqrt(np.maximum(square, 1e-6))
@@ -179,17 +174,15 @@ def _inertia_box(
 
 
 def _sole(
-    survey: Survey,
     data: mujoco.MjData,
-    leg: int,
+    joint: int,
     contacts: Float[np.ndarray, "c 3"],
     axes: Float[np.ndarray, "3 3"],
     guessed: bool,
 ) -> Sole:
     """Return a sole by points in the frame of the body that the leg's last joint moves."""
-    model, last = survey.model, survey.legs[leg][-1]
-    body = int(model.jnt_bodyid[last])
-    R, origin = data.xmat[body].reshape(3, 3), data.xpos[body] - data.xanchor[last]
+    body = int(data.model.jnt_bodyid[joint])
+    R, origin = data.xmat[body].reshape(3, 3), data.xpos[body] - data.xanchor[joint]
     x, middle = contacts[:, 0], 0.5 * (contacts.min(axis=0) + contacts.max(axis=0))
     aligned = np.allclose(np.abs(axes.T @ R).max(axis=0), 1.0, rtol=0.0, atol=1e-9)
     aligned = aligned and np.abs(origin - np.round(origin, 4)).max() <= 1e-9
@@ -198,7 +191,7 @@ def _sole(
     def rounded(point: Float[np.ndarray, "3"]) -> list[float]:
         return [round(float(x), digits) + 0.0 for x in point]  # no -0.0
 
-    section: dict[str, Any] = {"body": model.body(body).name}
+    section: dict[str, Any] = {"body": data.model.body(body).name}
     section["contacts"] = [*map(rounded, (contacts @ axes.T - origin) @ R)]
     point = np.array([0.0, middle[1], middle[2]])
     if not x.min() < -1e-3 < 1e-3 < x.max():  # the last joint is not above the sole
@@ -212,7 +205,7 @@ def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None
     """Return the soles if each foot has two named spheres and a named site, as HECTOR's have."""
     model, soles = survey.model, []
     for leg in survey.legs:
-        geoms, body = _foot_geoms(survey, leg), int(model.jnt_bodyid[leg[-1]])
+        geoms, body = _foot_geoms(model, leg), int(model.jnt_bodyid[leg[-1]])
         sites = np.flatnonzero(model.site_bodyid == body)
         if len(geoms) != 2 or len(sites) != 1 or not (site := model.site(sites[0])).name:
             return None
@@ -223,7 +216,7 @@ def _named_soles(survey: Survey, data: mujoco.MjData) -> tuple[Sole, ...] | None
             return None
         anchor = data.xanchor[leg[-1]]
         heel, toe = sorted(geoms, key=lambda g: data.geom_xpos[g][0])
-        contacts = np.concatenate([_support(model, data, g) for g in (toe, heel)]) - anchor
+        contacts = np.concatenate([_support(data, g) for g in (toe, heel)]) - anchor
         point = data.site_xpos[sites[0]] - anchor
         if np.abs(contacts[:, 2] - point[2]).max() > 1e-3:
             return None

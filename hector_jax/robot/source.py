@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import did_you_mean
-from hector_jax.robot.checks import ON_FLOOR, expect, listed, lowest_point, require
+from hector_jax.robot.checks import ON_FLOOR, expect, listed, lowest_points, require
 from hector_jax.robot.description import Description
 from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import MASSLESS, Link, links_of
@@ -59,11 +59,14 @@ def build_spec(description: Description) -> Source:
     file = _read(description, root, spec)
     angles, trunk_quat = _standing(file, urdf)
     limits = [_torque_limit(file, joint) for joint in file.joints]
-    changes = ["a URDF, with neither motors nor a floor"] * urdf + _changes(file, limits)
     fixed = {j: angle for j, angle in angles.items() if j not in file.joints}
     links = links_of(file.model, file.trunk, file.joints, fixed)
     _check_links(description, links)
-    notes += _set_options(file)
+    changes = ["a URDF, with neither motors nor a floor"] * urdf + _changes(file, limits, links)
+    options = [name for name, value in SOLVER.items() if getattr(spec.option, name) != value]
+    for name in options:
+        setattr(spec.option, name, SOLVER[name])
+    notes += [f"option {listed(options)} set"] * bool(options)
     if not changes:
         return Source(file.spec, (*notes, *_lower_keyframe(file)))
     leg_angles = [angles[joint] for joint in file.joints]
@@ -98,11 +101,8 @@ def _read(description: Description, root: ElementTree.Element, spec: mujoco.MjSp
         text = f"actuator {motor.name!r} drives no joint {motor.target!r}"
         expect(path, motor.target in names, text + did_you_mean(motor.target, names))
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _JOINT.mjJNT_FREE]
-    expect(
-        path,
-        len(free) < 2,
-        f"{len(free)} free joints, expected exactly one, of the trunk; joints: {listed(names)}",
-    )
+    text = f"{len(free)} free joints, expected exactly one, of the trunk; joints: {listed(names)}"
+    expect(path, len(free) < 2, text)
     fixed = [names[j] for j in free if names[j] in description.weld]
     expect(path, not fixed, f"weld names {listed(fixed)}, the free joint, expected hinges")
     joints = [names.index(joint) for joint in description.joints]
@@ -220,7 +220,7 @@ def _is_motor(motor: mujoco.MjsActuator) -> bool:
     return (motor.gaintype, motor.biastype, motor.dyntype) == _MOTOR
 
 
-def _changes(file: _File, limits: Sequence[float]) -> list[str]:
+def _changes(file: _File, limits: Sequence[float], links: Sequence[Link]) -> list[str]:
     """Return one line per reason to rebuild a robot; none if it has the standard form."""
     description, model = file.description, file.model
     inside = [b for b in range(1, model.nbody) if model.body_rootid[b] == file.trunk]
@@ -239,19 +239,10 @@ def _changes(file: _File, limits: Sequence[float]) -> list[str]:
         ("floor added" if not floor else "floor replaced", bits != [(1, 0)]),
         ("armature of the joints set", description.armature),
         ("contacts placed on the soles", any(f.body is not None for f in description.feet)),
-        ("contact bits, friction and shapes set", not _contacts_match(file)),
+        ("contact bits, friction and shapes set", not _contacts_match(file, links)),
         ("standing pose by angles", not isinstance(description.standing, str)),
     )
     return [line for line, needed in lines if needed]
-
-
-def _set_options(file: _File) -> list[str]:
-    """Set time step and solver in place. Returns the note of the change, if any."""
-    option = file.spec.option
-    wrong = [name for name, value in SOLVER.items() if getattr(option, name) != value]
-    for name in wrong:
-        setattr(option, name, SOLVER[name])
-    return [f"option {listed(wrong)} set"] if wrong else []
 
 
 def _motors_match(file: _File, limits: Sequence[float]) -> bool:
@@ -267,18 +258,17 @@ def _motors_match(file: _File, limits: Sequence[float]) -> bool:
     )
 
 
-def _contacts_match(file: _File) -> bool:
+def _contacts_match(file: _File, links: Sequence[Link]) -> bool:
     """Return whether the robot's geoms have the contact settings of the standard form."""
     model, feet = file.model, file.description.feet
-    leg_roots = [int(model.jnt_bodyid[j]) for j in file.joints[:: file.description.leg_joints]]
+    link_of = {body: index for index, link in enumerate(links) for body in link.bodies}
     contacts = {name for foot in feet for name in foot.contacts}
     for g in map(int, np.flatnonzero(model.geom_contype | model.geom_conaffinity)):
-        root = int(model.geom_bodyid[g])
-        if model.body_rootid[root] != file.trunk:
+        link = link_of.get(int(model.geom_bodyid[g]))
+        if link is None:  # a geom of the world
             continue
-        while root and root not in leg_roots:
-            root = int(model.body_parentid[root])
-        contype, conaffinity = contact_bits(len(feet), leg_roots.index(root) if root else None)
+        leg = (link - 1) // file.description.leg_joints if link else None
+        contype, conaffinity = contact_bits(len(feet), leg)
         if (
             model.geom_contype[g] & ~contype
             or model.geom_conaffinity[g] & ~conaffinity
@@ -294,15 +284,14 @@ def _contacts_match(file: _File) -> bool:
 
 def _lower_keyframe(file: _File) -> list[str]:
     """Lower the keyframe in place so that level soles are on the floor. Returns a note if so."""
-    model, data = file.model, mujoco.MjData(file.model)
+    data = mujoco.MjData(file.model)
     key = next(key for key in file.spec.keys if key.name == file.description.standing)
     data.qpos[:] = key.qpos
-    mujoco.mj_kinematics(model, data)
-    names = {model.geom(g).name for g in range(model.ngeom)}
-    contacts = [str(name) for foot in file.description.feet for name in foot.contacts]
-    if not names.issuperset(contacts):  # `checks.check_model` reports it
+    mujoco.mj_kinematics(file.model, data)
+    contacts = [name for foot in file.description.named_feet for name in foot.contacts]
+    if not all(map(file.spec.geom, contacts)):  # `checks.check_model` reports it
         return []
-    heights = [lowest_point(model, data, name) for name in contacts]
+    heights = lowest_points(data, contacts)
     low = min(heights)
     if abs(low) <= ON_FLOOR or max(heights) - low > ON_FLOOR:
         return []

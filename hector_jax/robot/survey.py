@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hector_jax.core.headless import mujoco
-from hector_jax.core.inputs import InputError
+from hector_jax.robot.checks import expect
 from hector_jax.robot.description import FEWEST_JOINTS, MOST_JOINTS
 from hector_jax.robot.elements import spec_of
 from hector_jax.robot.links import data_at, subtree
@@ -56,18 +56,16 @@ def survey_file(path: Path) -> Survey:
     spec, _ = spec_of(path, root, (), None)
     model = compile_bare(path, root, spec)
     free = [j for j in range(model.njnt) if model.jnt_type[j] == _FREE]
-    if len(free) > 1:
-        names = ", ".join(model.joint(j).name for j in free)
-        raise InputError(f"{path}: free joints {names}, expected one at most, the trunk's")
+    names = ", ".join(model.joint(j).name for j in free)
+    expect(path, len(free) < 2, f"free joints {names}, expected one at most, the trunk's")
     data = data_at(model)
-    legs = _legs(path, model, data, free)
+    legs = _legs(path, data, free)
     trunk = int(model.jnt_bodyid[free[0]] if free else model.body_rootid[_body(model, legs[0][0])])
     others = [j for j in range(model.njnt) if j not in sum(legs, (*free,))]
-    if unnamed := [model.body(_body(model, j)).name for j in others if not model.joint(j).name]:
-        raise InputError(
-            f"{path}: a joint of body {unnamed[0]!r} has no name, expected one: it is to be welded"
-        )
-    knee = _knee(path, model, data, legs[0])
+    for j in others:
+        text = f"a joint of body {model.body(_body(model, j)).name!r} has no name, expected one: "
+        expect(path, model.joint(j).name, f"{text}it is to be welded")
+    knee = _knee(path, data, legs[0])
     return Survey(
         path=path,
         model=model,
@@ -75,7 +73,7 @@ def survey_file(path: Path) -> Survey:
         legs=legs,
         weld=tuple(model.joint(j).name for j in others),
         knee=knee,
-        forwards=tuple(_bends_forwards(model, data, leg, knee) for leg in legs[::2]),
+        forwards=tuple(_bends_forwards(data, leg, knee) for leg in legs[::2]),
     )
 
 
@@ -109,10 +107,9 @@ def _chains(model: mujoco.MjModel, free: Sequence[int]) -> list[tuple[int, ...]]
     return sorted({chain for chain in chains.values() if chain and chain[-1] not in inner})
 
 
-def _legs(
-    path: Path, model: mujoco.MjModel, data: mujoco.MjData, free: Sequence[int]
-) -> tuple[tuple[int, ...], ...]:
+def _legs(path: Path, data: mujoco.MjData, free: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """Return the joints of the legs, pair by pair from the front, the left leg first."""
+    model = data.model
     chains, pairs = _chains(model, free), []
     for first, second in combinations(chains, 2):
         common = sum(i == j for i, j in zip(first, second, strict=False))
@@ -123,54 +120,45 @@ def _legs(
             lowest = min(data.xipos[subtree(model, _body(model, a[-1])), 2])
             if np.abs(offset).max() <= _MIRROR_TOLERANCE:
                 pairs.append((round(lowest, 3), -len(a), a, b))  # to the millimetre
-    if not pairs:
-        ends = (f"{model.joint(chain[-1]).name} ({len(chain)})" for chain in chains)
-        raise InputError(
-            f"{path}: no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} "
-            "hinges that mirror each other; chains by their last joint: "
-            f"{', '.join(ends) or 'none'}"
-        )
+    ends = ", ".join(f"{model.joint(chain[-1]).name} ({len(chain)})" for chain in chains)
+    text = f"no two legs found, expected two chains of {FEWEST_JOINTS} to {MOST_JOINTS} hinges "
+    text += f"that mirror each other; chains by their last joint: {ends or 'none'}"
+    expect(path, pairs, text)
     low, _, lowest_leg, _ = min(pairs)
     tolerance, legs = _HEIGHT_TOLERANCE * (data.xanchor[lowest_leg[0]][2] - low), []
     for lowest, _, *pair in sorted(pairs):
         if lowest - low <= tolerance and not set(sum(pair, ())) & set(sum(sum(legs, []), ())):
             legs.append(pair)
     counts = [len(left) for left, _ in legs]
-    if len(legs) > 2 or len(set(counts)) > 1:
-        ends = ", ".join(model.joint(leg[-1]).name for pair in legs for leg in pair)
-        raise InputError(
-            f"{path}: {len(legs)} pairs of chains of {counts} hinges end as low as legs: {ends}; "
-            "expected one pair, or two of as many hinges"
-        )
+    ends = ", ".join(model.joint(leg[-1]).name for pair in legs for leg in pair)
+    text = f"{len(legs)} pairs of chains of {counts} hinges end as low as legs: {ends}; expected "
+    text += "one pair, or two of as many hinges"
+    expect(path, len(legs) <= 2 and len(set(counts)) == 1, text)
     legs.sort(key=lambda pair: -data.xanchor[pair[0][0]][0])
     for pair in legs:
-        if _is_right(model, data, *pair):
+        if _is_right(data, *pair):
             pair.reverse()
     return tuple(sum(legs, []))
 
 
-def _is_right(
-    model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int], other: Sequence[int]
-) -> bool:
+def _is_right(data: mujoco.MjData, leg: Sequence[int], other: Sequence[int]) -> bool:
     """Return whether a leg is the right one of a pair."""
     y = data.xanchor[leg[0]][1] - data.xanchor[other[0]][1]
     if abs(y) > 1e-3:
         return bool(y < 0.0)
-    name = model.joint(leg[0]).name.lower()
+    name = data.model.joint(leg[0]).name.lower()
     return re.search(r"right|(^|_)r(_|$)", name) is not None
 
 
-def _knee(path: Path, model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int]) -> int:
+def _knee(path: Path, data: mujoco.MjData, leg: Sequence[int]) -> int:
     """Return the index of the knee in a leg."""
     axes, anchors = data.xaxis[list(leg)], data.xanchor[list(leg)]
     pitch = np.flatnonzero(np.abs(axes[:, 1]) >= _MIN_Y).tolist()
-    if len(pitch) < 2:
-        words = ", ".join(f"{model.joint(j).name} {axis_words(data.xaxis[j])}" for j in leg)
-        raise InputError(
-            f"{path}: {len(pitch)} joints of the left leg turn about y, expected hip and knee at "
-            f"least: turn the model so that x is ahead; joints: {words}"
-        )
-    ends = anchors[pitch[0]], data.xipos[_body(model, leg[-1])]
+    words = ", ".join(f"{data.model.joint(j).name} {axis_words(data.xaxis[j])}" for j in leg)
+    text = f"{len(pitch)} joints of the left leg turn about y, expected hip and knee at least: "
+    text += f"turn the model so that x is ahead; joints: {words}"
+    expect(path, len(pitch) >= 2, text)
+    ends = anchors[pitch[0]], data.xipos[_body(data.model, leg[-1])]
 
     def distance(i: int) -> float:
         return float(min(np.linalg.norm(anchors[i] - end) for end in ends))
@@ -178,11 +166,9 @@ def _knee(path: Path, model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[
     return max(pitch[1:], key=distance)
 
 
-def _bends_forwards(
-    model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int], knee: int
-) -> bool:
+def _bends_forwards(data: mujoco.MjData, leg: Sequence[int], knee: int) -> bool:
     """Return whether a knee points ahead when it is bent."""
     joint = leg[knee]
-    side = model.jnt_range[joint].sum() * np.sign(data.xaxis[joint][1])
-    end = data.xipos[_body(model, leg[-1])]
+    side = data.model.jnt_range[joint].sum() * np.sign(data.xaxis[joint][1])
+    end = data.xipos[_body(data.model, leg[-1])]
     return bool(side > 0.0 if abs(side) > 1e-6 else end[0] < data.xanchor[joint][0])

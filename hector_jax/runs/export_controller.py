@@ -249,7 +249,7 @@ def record(
     torques = []
 
     def append(world: Any, data: Any) -> None:
-        torques.append(data.ctrl[world.actuator].copy())
+        torques.append(data.ctrl.copy())
         entries = np.concatenate([data.qpos, data.qvel, np.zeros(1)])
         rows.append(entries[sensing.coordinates(world)])
 
@@ -268,8 +268,7 @@ def record(
     @jax.jit
     def measurements(rows: Array) -> Measurement:
         def measure(yaw: Array, row: Array) -> tuple[Array, Measurement]:
-            reading = sensing.unpack_reading(row)
-            measurement, yaw = sensing.measure(robot, reading, yaw, sensing.no_error(robot))
+            measurement, yaw = sensing.measure(robot, row, yaw, sensing.no_error(robot))
             return yaw, measurement
 
         return lax.scan(measure, jnp.zeros(()), rows)[1]

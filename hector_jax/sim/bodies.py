@@ -15,12 +15,6 @@ from hector_jax.robot.links import rotation_of
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.sim.world import World
 
-_SHAPES = {
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-}
-
 
 class Hinge(NamedTuple):
     """A joint that turns its body about an axis through the body's origin."""
@@ -102,7 +96,7 @@ def shapes(world: World) -> list[Shape]:
         Shape(
             id=i,
             body=int(model.geom_bodyid[i]),
-            kind="plane" if i == world.floor else _SHAPES[mujoco.mjtGeom(model.geom_type[i])],
+            kind=mujoco.mjtGeom(model.geom_type[i]).name.removeprefix("mjGEOM_").lower(),
             size=model.geom_size[i],
             position=model.geom_pos[i],
             rotation=rotation_of(model.geom_quat[i]),
@@ -138,22 +132,18 @@ def touching_pairs(world: World) -> set[tuple[int, int]]:
     }
 
 
-class Spring(NamedTuple):
-    """Compliance of a contact in numbers that every engine understands."""
+def contact_spring(world: World, points: int) -> tuple[float, float]:
+    """Return stiffness and damping under each of the `points` that carry the standing robot.
 
-    stiffness: float  # [N/m] at each contact point
-    damping: float  # [s/m] of Hunt and Crossley: force = stiffness * depth * (1 + damping * speed)
-
-
-def contact_spring(world: World, points: int) -> Spring:
-    """Return spring and damper under each of the `points` that together carry the standing robot.
+    The stiffness is in N/m at each contact point, the damping in s/m as of Hunt and Crossley:
+    force = stiffness * depth * (1 + damping * speed).
 
     A contact of time constant T yields under the robot's weight by g T^2 / 3, as MuJoCo's does
     (measured: 0.31 to 0.47 mm at 10 ms), and its damping is 2 / (g T).
     """
     time, mass = world.model.geom_solref[world.floor, 0], world.model.body_subtreemass[0]
     gravity = np.linalg.norm(world.model.opt.gravity)
-    return Spring(float(3.0 * mass / time**2 / points), float(2.0 / (gravity * time)))
+    return float(3.0 * mass / time**2 / points), float(2.0 / (gravity * time))
 
 
 STICTION = 0.05  # [rad/s] above which dry friction has its full size

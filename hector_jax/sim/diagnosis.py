@@ -78,7 +78,7 @@ def record_walk(config: WalkConfig, robot: Robot, job: Job) -> Record:
         up = rotation_of(data.qpos[3:7])[2]  # z of the trunk's axes in the world
         roll, pitch = np.arctan2(up[1], up[2]), -np.arcsin(np.clip(up[0], -1.0, 1.0))
         height = data.qpos[2] + up @ robot.com_offset
-        torque = data.ctrl[world.actuator] / world.model.actuator_ctrlrange[world.actuator, 1]
+        torque = data.ctrl / world.model.actuator_ctrlrange[:, 1]
         touching[:] = _on_floor(world, data)
         # false for values that are not finite
         upright = height >= min_height and max(abs(roll), abs(pitch)) <= max_tilt

@@ -7,8 +7,7 @@ between the motor's and the gear's hinge. Dry friction is a torque added here: D
 """
 
 import logging
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from itertools import combinations
 
 import numpy as np
@@ -37,18 +36,8 @@ _SHAPES = {
     "capsule": lambda size: geometry.Capsule(size[0], 2.0 * size[1]),
     "box": lambda size: geometry.Box(*(2.0 * size)),
 }
-
-
-@contextmanager
-def _quiet_drake() -> Iterator[None]:
-    """Silence the warning that deformable bodies, of which there are none, miss half spaces."""
-    logger = logging.getLogger("drake")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
+# Drake warns that deformable bodies, of which there are none, miss half spaces
+logging.getLogger("drake").addFilter(lambda record: "deformable" not in record.getMessage())
 
 
 class DrakePlant(Plant):
@@ -64,16 +53,12 @@ class DrakePlant(Plant):
         links, joints = _add_bodies(plant, bodies.bodies(world))
         _add_shapes(plant, scene, links, world)
         plant.Finalize()
-        with _quiet_drake():
-            self._simulator = Simulator(builder.Build())
+        self._simulator = Simulator(builder.Build())
         self.context = plant.GetMyMutableContextFromRoot(self._simulator.get_mutable_context())
         self.plant, self._trunk = plant, links[world.trunk]
         self._com = np.array(world.model.body_ipos[world.trunk])
-        self._foot_of_body = {
-            int(links[world.model.geom_bodyid[geom]].index()): int(foot)
-            for geom, foot in enumerate(world.foot_of_geom)
-            if foot >= 0
-        }
+        soles, feet = bodies.soles(world), world.foot_of_geom
+        self._foot_of_body = {int(links[s.body].index()): int(feet[s.id]) for s in soles}
         self._contacts, self._time, self._failed = PointContacts(len(body.foot_point)), 0, False
         self.joints = joints
         self._index(world)
@@ -204,13 +189,13 @@ def _add_shapes(
 ) -> None:
     """Add the geoms that may touch something, and a filter of the pairs that may not."""
     rough, ids = {world.floor, *(sole.id for sole in bodies.soles(world))}, {}
-    spring = bodies.contact_spring(world, len(rough) - 1)
+    stiffness, damping = bodies.contact_spring(world, len(rough) - 1)
     for shape in bodies.shapes(world):
         friction = world.model.geom_friction[world.floor, 0] * (shape.id in rough)
         properties = geometry.ProximityProperties()
+        cone = multibody.CoulombFriction(friction, friction)
         # two springs in a row have half the stiffness of one
-        stiffness, cone = 2.0 * spring.stiffness, multibody.CoulombFriction(friction, friction)
-        geometry.AddContactMaterial(spring.damping, stiffness, cone, properties)
+        geometry.AddContactMaterial(damping, 2.0 * stiffness, cone, properties)
         place = RigidTransform(RotationMatrix(shape.rotation), shape.position)
         ids[shape.id] = plant.RegisterCollisionGeometry(
             links[shape.body], place, _SHAPES[shape.kind](shape.size), str(shape.id), properties

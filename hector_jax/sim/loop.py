@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, actuate, step_plan
-from hector_jax.control.legs import LegParameters, Measurement
+from hector_jax.control.legs import LegParameters
 from hector_jax.control.parameters import Parameters
 from hector_jax.control.reference import Anchor, Command, reference_at
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
+from hector_jax.robot.checks import expect
 from hector_jax.robot.description import Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import Robot
@@ -62,11 +63,8 @@ def check_plant(robot: Description, plant: Description) -> None:
     Raises:
         InputError: the plant has other joints, or in another order.
     """
-    if robot.joints != plant.joints:
-        raise InputError(
-            f"{plant.path}: joints are {', '.join(plant.joints)}; as a plant of {robot.path} "
-            f"expected {', '.join(robot.joints)}"
-        )
+    text = f"joints are {', '.join(plant.joints)}; as a plant of {robot.path} expected "
+    expect(plant.path, robot.joints == plant.joints, text + ", ".join(robot.joints))
 
 
 class Sample(NamedTuple):
@@ -79,16 +77,6 @@ class Sample(NamedTuple):
     joints: Float[Array, "*batch joints"]
     fallen: Bool[Array, "*batch"]
     legs_touch: Bool[Array, "*batch"]
-
-
-def measure(
-    robot: Robot,
-    reading: Float[Array, " reading"],
-    yaw: Float[Array, ""],
-    error: Float[Array, " errors"],
-) -> Measurement:
-    """Return the measurement, truth plus `error`; `yaw` [rad] is the true one shortly before."""
-    return sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)[0]
 
 
 def plan_tick(
@@ -125,7 +113,7 @@ def plan_tick(
         anchor=anchor,
         tick=tick,
         memory=memory,
-        measurement=measure(robot, reading, yaw, error),
+        measurement=sensing.measure(robot, reading, yaw, error)[0],
         max_contacts=max_contacts,
     )
 
@@ -155,7 +143,7 @@ def motor_torques(
         reading: current coordinates.
         error: of the current state estimate.
     """
-    measurement, yaw = sensing.measure(robot, sensing.unpack_reading(reading), yaw, error)
+    measurement, yaw = sensing.measure(robot, reading, yaw, error)
     torque = actuate(
         config, robot, legs, plan=plan, memory=memory, substep=substep, measurement=measurement
     )

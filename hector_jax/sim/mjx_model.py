@@ -42,7 +42,6 @@ class Places:
     """Indices of the robot's parts in the model, hashable for the compiler."""
 
     coordinates: tuple[int, ...]
-    actuator: tuple[int, ...]
     foot_of_geom: tuple[int, ...]
     boxes: tuple[int, ...]  # geoms that end the walk when they touch the floor
     capsules: tuple[int, ...]
@@ -95,7 +94,6 @@ def find_places(world: World) -> Places:
     boxes, capsules = (tuple(geoms) for geoms in kinds.values())
     return Places(
         coordinates=tuple(sensing.coordinates(world).tolist()),
-        actuator=tuple(world.actuator.tolist()),
         foot_of_geom=tuple(world.foot_of_geom.tolist()),
         boxes=boxes,
         capsules=capsules,

@@ -53,7 +53,7 @@ class MujocoPlant(Plant):
     def step(self, torque: Float[np.ndarray, " joints"], push: Float[np.ndarray, "3"]) -> None:
         """See `Plant`."""
         world = self.world = self._worlds.get(self._time, self.world)
-        self._ctrl[world.actuator] = torque
+        self._ctrl[:] = torque
         self._push[:] = push
         mujoco.mj_step(world.model, self.data)
         sensing.read_contacts(self.data, self._contacts, self._steps)

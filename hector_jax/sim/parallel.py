@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hector_jax.control.controller import Memory, Plan, WalkConfig, contacts_needed, init_memory
-from hector_jax.control.reference import Anchor, Command, anchor_at, standing_anchor
-from hector_jax.control.weights import Weights
+from hector_jax.control.reference import Anchor, anchor_at, standing_anchor
 from hector_jax.core.arrays import Array
 from hector_jax.core.inputs import InputError
 from hector_jax.core.trajectory import Trajectory, Wrench, has_fallen, zero_wrench
@@ -31,7 +30,7 @@ from hector_jax.sim.actuators import Motors, init_actuators
 from hector_jax.sim.loop import Job, Sample, first_tick, substeps
 from hector_jax.sim.mjx_model import mjx
 from hector_jax.sim.sensing import Touches
-from hector_jax.sim.world import Imperfections, Push, build_worlds, push_force, standing_qpos
+from hector_jax.sim.world import build_worlds, push_force, standing_qpos
 
 # On a CPU jaxlib distributes a batched Cholesky to the threads that run the program and waits for
 # them; from a batch of 64 on two cores both threads wait for each other (observed in 0.10.2).
@@ -60,22 +59,11 @@ class _Program:
         return 1 if self.fine else self.substeps
 
 
-class WalkBatch(NamedTuple):
-    """Inputs that differ between the walks of a batch."""
-
-    weights: Weights
-    command: Command
-    plant: Imperfections
-    push: Push
-    start_tick: Int[Array, "*batch"]
-    model: dict[str, Any]  # leaves of the MJX model
-
-
 class _Walk(NamedTuple):
     """Constants of one walk and its plant."""
 
     robot: Robot
-    job: WalkBatch  # of one walk
+    job: Job  # of arrays
     model: mjx.Model
     data: mjx.Data  # its state is set at each step
     error: Float[Array, " errors"]  # of the state estimate: zero
@@ -125,7 +113,7 @@ def _step_physics(
         qpos=physics.qpos,
         qvel=physics.qvel,
         qacc_warmstart=physics.warmstart,
-        ctrl=data.ctrl.at[np.array(places.actuator)].set(torque),
+        ctrl=torque,
         xfrc_applied=data.xfrc_applied.at[places.trunk, :3].set(force),
     )
     with jax.enable_x64(not program.single and jax.config.read("jax_enable_x64")):
@@ -142,7 +130,7 @@ def _millisecond(
     legs = program.config.parameters(job.weights).legs
     state = carry.memory, carry.plan, carry.motors, carry.yaw
     motors, yaw, torque = loop.motor_torques(
-        program.config, robot, legs, job.plant, *state, substep, before, walk.error
+        program.config, robot, legs, job.imperfections, *state, substep, before, walk.error
     )
     force = push_force(job.push, (tick - job.start_tick) * program.substeps + substep)
     physics, data = _step_physics(program, walk, carry.physics, torque=torque, force=force)
@@ -216,7 +204,7 @@ def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
     yaw, false, tick = jnp.zeros(()), jnp.zeros((), bool), jnp.asarray(first_tick(config))
     reading, effect = _read(program, walk, physics), zero_wrench(len(robot.foot_point))
     anchor = standing_anchor(robot)._replace(tick=job.start_tick)
-    memory = init_memory(robot, loop.measure(robot, reading, yaw, walk.error))
+    memory = init_memory(robot, sensing.measure(robot, reading, yaw, walk.error)[0])
     inputs = anchor, tick, memory, yaw, reading, walk.error
     parameters = config.parameters(job.weights)
     plan = partial(loop.plan_tick, config, robot, parameters, job.command, *inputs)
@@ -238,9 +226,14 @@ def _init_carry(program: _Program, walk: _Walk, physics: _Physics) -> _Carry:
 
 
 def _walk_one(
-    program: _Program, robot: Robot, model: mjx.Model, qpos: Float[Array, " nq"], job: WalkBatch
+    program: _Program,
+    robot: Robot,
+    model: mjx.Model,
+    qpos: Float[Array, " nq"],
+    job: Job,
+    varied: dict[str, Array],
 ) -> Trajectory:
-    model = model.replace(**job.model)
+    model = model.replace(**varied)
     data = mjx.make_data(model)
     if program.single:
         model, data = mjx_model.to_single((model, data))
@@ -261,8 +254,8 @@ def _walk_one(
 
 
 @partial(jax.jit, static_argnames="program")
-def _walk_all(program, robot, model, qpos, jobs):
-    return jax.vmap(partial(_walk_one, program, robot, model, qpos))(jobs)
+def _walk_all(program, robot, model, qpos, batch):
+    return jax.vmap(partial(_walk_one, program, robot, model, qpos))(*batch)
 
 
 def _check_batch(jobs: Sequence[Job]) -> None:
@@ -284,13 +277,12 @@ def _check_batch(jobs: Sequence[Job]) -> None:
         raise InputError(f"engine mjx: a plant cannot change, got changes of jobs {changing}")
 
 
-def _in_chunks(jobs: WalkBatch, chunk: int, walk: Any) -> Iterator[Trajectory]:
-    """Yield the walks, computed in chunks of one size, the last chunk filled up."""
-    count = len(jobs.start_tick)
+def _in_chunks(batch: Any, count: int, chunk: int, walk: Any) -> Iterator[Trajectory]:
+    """Yield `count` walks, computed in chunks of one size, the last chunk filled up."""
     size = ceil(count / ceil(count / chunk))
     for first in range(0, count, size):
         rows = np.minimum(np.arange(first, first + size), count - 1)
-        walks = jax.device_get(walk(jax.tree.map(lambda x, rows=rows: x[rows], jobs)))
+        walks = jax.device_get(walk(jax.tree.map(lambda x, rows=rows: x[rows], batch)))
         for i in range(min(size, count - first)):
             yield jax.tree.map(lambda x, i=i: x[i], walks)
 
@@ -337,16 +329,13 @@ def walk_batch(
     worlds = build_worlds([job.imperfections for job in jobs], body.description)
     model, varied = mjx_model.batched_model(worlds, single)
     qpos = jnp.asarray(standing_qpos(worlds[0], body.standing_joints, float(body.trunk_height)))
-    starts = np.array([job.start_tick for job in jobs], np.int32)
     others = {name for job in jobs for name in job.weights.others}
-    batch = WalkBatch(
-        weights=stack([config.with_others(job.weights, others) for job in jobs]),
-        command=stack([job.command for job in jobs]),
-        plant=stack([job.imperfections for job in jobs]),
-        push=stack([job.push for job in jobs]),
-        start_tick=jnp.asarray(starts),
-        model=varied,
-    )
-    places = mjx_model.find_places(worlds[0])
-    program = _Program(config, places, int(starts.max()), ticks, fine, single)
-    return _in_chunks(batch, chunk, partial(_walk_all, program, robot, model, qpos))
+
+    def as_arrays(job: Job) -> Job:
+        weights, start = config.with_others(job.weights, others), np.int32(job.start_tick)
+        return job._replace(weights=weights, start_tick=start, plant=None)
+
+    places, last_start = mjx_model.find_places(worlds[0]), max(int(job.start_tick) for job in jobs)
+    program = _Program(config, places, last_start, ticks, fine, single)
+    batch = stack([as_arrays(job) for job in jobs]), varied
+    return _in_chunks(batch, len(jobs), chunk, partial(_walk_all, program, robot, model, qpos))

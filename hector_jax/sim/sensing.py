@@ -80,7 +80,7 @@ def coordinates(world: World) -> Int[np.ndarray, " reading"]:
     """Return the indices of a flat reading in (qpos, qvel, 0); without backlash slack is the 0."""
     model = world.model
     rigid = np.full(len(world.joint_qpos), model.nq + model.nv)
-    slack = world.slack_qpos if world.slack_qpos.size else rigid
+    slack = model.jnt_qposadr[world.slack] if world.slack.size else rigid
     trunk_rates, joint_rates = model.nq + np.arange(6), model.nq + world.joint_dof
     return np.concatenate([np.arange(7), trunk_rates, world.joint_qpos, joint_rates, slack])
 
@@ -187,10 +187,21 @@ def contacts_of(raw: RawContacts, floor: Int[Array, ""]) -> Contacts:
 
 
 def measure(
-    robot: Robot, reading: Reading, yaw_before: Float[Array, ""], error: Float[Array, " errors"]
+    robot: Robot,
+    row: Float[Array, " reading"],
+    yaw: Float[Array, ""],
+    error: Float[Array, " errors"],
 ) -> tuple[Measurement, Float[Array, ""]]:
-    """Return the controller's measurement, truth plus `error`, and the yaw for the next call."""
-    state = base_state(robot, reading, yaw_before)
+    """Return the controller's measurement, truth plus `error`, and the yaw for the next call.
+
+    Args:
+        robot: nominal robot.
+        row: flat reading.
+        yaw: the true one [rad] shortly before.
+        error: of the state estimate.
+    """
+    reading = unpack_reading(row)
+    state = base_state(robot, reading, yaw)
     estimate = State(*(value + error[3 * i : 3 * i + 3] for i, value in enumerate(state)))
     joints = reading.joints + error[12:]
     return Measurement(estimate, joints, reading.joint_rates), state.euler[2]

@@ -12,7 +12,6 @@ from concurrent.futures import Executor
 from contextlib import suppress
 from functools import cache, partial
 from itertools import repeat
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -44,37 +43,37 @@ from hector_jax.sim.plant import BuildPlant, Plant
 from hector_jax.sim.sensing import Ground
 from hector_jax.sim.world import push_force
 
+_measure = jax.jit(sensing.measure)
 
-@cache
-def _programs(config: WalkConfig) -> SimpleNamespace:
-    """The compiled parts of the loop."""
+
+@jax.jit
+def _begin(robot: Robot, reading: Array) -> Memory:
+    measurement, _ = sensing.measure(robot, reading, jnp.zeros(()), sensing.no_error(robot))
+    return init_memory(robot, measurement)
+
+
+@jax.jit
+def _anchor(robot: Robot, reading: Array, yaw: Array, start_tick: Array) -> Anchor:
+    state = sensing.base_state(robot, sensing.unpack_reading(reading), yaw)
+    return anchor_at(robot, state, start_tick)
+
+
+@partial(jax.jit, static_argnames=("config", "ground_of"))
+def _samples(
+    config, robot, command, anchors, ticks, yaws, readings, contacts, *, ground_of
+) -> Sample:
+    """Return the samples of a block of ticks."""
+
+    def sample(anchor, time, yaw, before, after, ground: Ground) -> Sample:
+        effect = loop.effect_of(robot, before, ground)
+        inputs = robot, command, anchor, time, yaw, after
+        return loop.sample(config, *inputs, effect=effect, touches=ground.touches)
+
     count = substeps(config)
-
-    def begin(robot: Robot, reading: Array) -> Memory:
-        measurement = loop.measure(robot, reading, jnp.zeros(()), sensing.no_error(robot))
-        return init_memory(robot, measurement)
-
-    def samples(robot, command, anchors, ticks, yaws, readings, contacts, *, ground_of) -> Sample:
-        def sample(anchor, time, yaw, before, after, ground: Ground) -> Sample:
-            effect = loop.effect_of(robot, before, ground)
-            inputs = robot, command, anchor, time, yaw, after
-            return loop.sample(config, *inputs, effect=effect, touches=ground.touches)
-
-        times = (ticks[:, None] + (1 + jnp.arange(count)) / count).ravel()
-        anchors, yaws = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), (anchors, yaws))
-        ground = ground_of(robot, contacts)
-        return jax.vmap(sample)(anchors, times, yaws, readings[:-1], readings[1:], ground)
-
-    def anchor(robot: Robot, reading: Array, yaw: Array, start_tick: Array) -> Anchor:
-        state = sensing.base_state(robot, sensing.unpack_reading(reading), yaw)
-        return anchor_at(robot, state, start_tick)
-
-    return SimpleNamespace(
-        begin=jax.jit(begin),
-        anchor=jax.jit(anchor),
-        measure=jax.jit(loop.measure),
-        samples=jax.jit(samples, static_argnames="ground_of"),
-    )
+    times = (ticks[:, None] + (1 + jnp.arange(count)) / count).ravel()
+    anchors, yaws = jax.tree.map(lambda x: jnp.repeat(x, count, axis=0), (anchors, yaws))
+    ground = ground_of(robot, contacts)
+    return jax.vmap(sample)(anchors, times, yaws, readings[:-1], readings[1:], ground)
 
 
 class _Planner:
@@ -176,7 +175,7 @@ def _walk_blocks(
     config: WalkConfig, robot: Robot, job: Job, plant: Plant, ticks: int, retune: Retune | None
 ) -> Iterator[tuple[Plan, Sample]]:
     """Yield plans and samples of each block of ticks (numpy), until t = `ticks` or a fall."""
-    programs, count, first = _programs(config), substeps(config), first_tick(config)
+    count, first = substeps(config), first_tick(config)
     start, steps = job.start_tick, (job.start_tick - first + ticks) * count
     joints, lead = len(robot.joint_lower), steps - ticks * count
     forces = np.asarray(_push_forces(job.push, np.arange(-lead, ticks * count)))
@@ -188,7 +187,7 @@ def _walk_blocks(
     plant.read(readings[0])
     body, command = jax.device_put((robot, with_pieces(job.command)))
     constants = body, _parameters(config, job.weights), command, job.imperfections
-    anchor, memory = standing_anchor(robot, start), programs.begin(body, readings[0])
+    anchor, memory = standing_anchor(robot, start), _begin(body, readings[0])
     state, measured = (np.zeros(joints), yaw, init_actuators(joints)), (readings[0], errors[0])
     of_constants, of_inputs = layout(constants), layout((anchor, clock, memory, yaw, *measured))
     trees = anchor, constants, state, memory
@@ -201,10 +200,10 @@ def _walk_blocks(
         for _ in range(_BLOCK if steps - step >= _BLOCK * count else 1):
             tick, reading, error = first + step // count, readings[step], errors[step]
             if tick == start:
-                anchor = programs.anchor(body, reading, yaw, start)
+                anchor = _anchor(body, reading, yaw, start)
                 packed_anchor = _pack(anchor)
             if retune is not None and planner is not None and tick >= start:
-                measurement = programs.measure(body, reading, yaw, error)
+                measurement, _ = _measure(body, reading, yaw, error)
                 wrench = unpack(planner.layout, np.asarray(packed))[1].wrench
                 carry, weights = retune.step(carry, tick, anchor, measurement, wrench)
                 packed_constants = _pack((body, _parameters(config, weights), *constants[2:]))
@@ -225,7 +224,7 @@ def _walk_blocks(
             if plant.broken:
                 break  # rare: the samples of less than a block are another program
         inputs = *stack(at_start), readings[begin : step + 1], plant.ground()
-        samples = programs.samples(body, command, *inputs, ground_of=plant.ground_of)
+        samples = _samples(config, body, command, *inputs, ground_of=plant.ground_of)
         assert planner is not None  # it has planned
         yield unpack(planner.layout, np.stack(plans))[1], jax.tree.map(np.asarray, samples)
         if plant.broken or np.asarray(samples.fallen).any():

@@ -22,6 +22,7 @@ from jaxtyping import Float, Int
 from hector_jax.core.arrays import Array
 from hector_jax.core.headless import mujoco
 from hector_jax.core.inputs import InputError, unknown
+from hector_jax.robot.checks import expect
 from hector_jax.robot.description import HECTOR, Description
 from hector_jax.robot.mjcf import TIME_STEP
 from hector_jax.robot.model import build_model, quiet_mujoco
@@ -200,22 +201,20 @@ def named_world(name: str, seed: int = 0, description: Description = HECTOR) -> 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A MuJoCo model and the indices of the robot's parts in it."""
+    """A MuJoCo model, whose motors are those of the joints, and indices of the robot's parts."""
 
     model: mujoco.MjModel
     joint_qpos: np.ndarray  # (joints,) motor side, leg by leg
     joint_dof: np.ndarray  # (joints,)
     slack: np.ndarray  # (joints,) backlash joints; empty without backlash
-    slack_qpos: np.ndarray  # (joints,) of the backlash joints; empty without backlash
-    actuator: np.ndarray  # (joints,)
     foot_of_geom: np.ndarray  # (ngeom,) foot of each geom; -1: none
     floor: int  # geom
     trunk: int  # body
 
 
 def _check(imperfections: Imperfections) -> None:
-    flat = {**imperfections._asdict(), **imperfections.estimator._asdict()}
-    del flat["estimator"]
+    flat = imperfections._asdict()
+    flat |= flat.pop("estimator")._asdict()
     for name, value in flat.items():
         signed = name == "trunk_com"
         if not np.all(np.isfinite(value)) or (not signed and np.any(np.asarray(value) < 0.0)):
@@ -261,13 +260,10 @@ def _model(description: Description, slack: bool) -> mujoco.MjModel:
 def _compile(description: Description, slack: bool) -> World:
     model, names = _model(description, slack), description.joints
     floors = [g for g in range(model.ngeom) if model.geom_bodyid[g] == 0 and model.geom_contype[g]]
-    if len(floors) != 1:
-        raise InputError(
-            f"{description.model}: expected one floor that collides, got {len(floors)}"
-        )
+    text = f"expected one floor that collides, got {len(floors)}"
+    expect(description.model, len(floors) == 1, text)
     joints = [model.joint(name) for name in names]
     slacks = [model.joint(name + SLACK) for name in names] if slack else []
-    of_joint = {int(joint): i for i, joint in enumerate(model.actuator_trnid[:, 0])}
     count = description.leg_joints
     feet = [joint.bodyid[0] for joint in joints[count - 1 :: count]]
     return World(
@@ -275,8 +271,6 @@ def _compile(description: Description, slack: bool) -> World:
         joint_qpos=np.array([joint.qposadr[0] for joint in joints]),
         joint_dof=np.array([joint.dofadr[0] for joint in joints]),
         slack=np.array([joint.id for joint in slacks], int),
-        slack_qpos=np.array([joint.qposadr[0] for joint in slacks], int),
-        actuator=np.array([of_joint[joint.id] for joint in joints]),
         foot_of_geom=np.array([feet.index(b) if b in feet else -1 for b in model.geom_bodyid]),
         floor=floors[0],
         trunk=int(model.jnt_bodyid[0]),

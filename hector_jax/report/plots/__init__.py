@@ -206,7 +206,7 @@ def weights(
         axes.axhline(1.0, color="black", linewidth=0.8)
         style.log_axis(axes, "y")
         labels = {"rotation": 60, "ha": "right", "va": "center", "rotation_mode": "anchor"}
-        style.category_axis(axes, [style.weight_label(name) for name in names], 3, **labels)
+        style.category_axis(axes, [name.replace("_", " ") for name in names], 3, **labels)
         axes.set_ylabel("weight / nominal")
     return caption("weights")
 

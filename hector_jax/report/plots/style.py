@@ -142,11 +142,6 @@ def widen(axes: Axes, least: float) -> None:
         axes.set_ylim((low + high) / 2 - least, (low + high) / 2 + least)
 
 
-def weight_label(name: str) -> str:
-    """Format a weight's name as a tick label."""
-    return name.replace("_", " ")
-
-
 def category_axis(axes: Axes, labels: Sequence[str], group: int = 1, **text: Any) -> None:
     """Label the positions 0, 1, ... of an x axis, with a thin line between groups of them."""
     axes.grid(visible=False, axis="x")
