@@ -188,7 +188,7 @@ def fit_nets(
     return carry.best, History(*np.array(rows).T)
 
 
-def _optimiser(learning_rate: float, l2: float) -> optax.GradientTransformation:
+def _optimiser(learning_rate: Any, l2: Any) -> optax.GradientTransformation:
     def kernels(nets: Any) -> Any:
         return jax.tree_util.tree_map_with_path(lambda path, _: path[-1].key == "kernel", nets)
 
@@ -210,7 +210,7 @@ def _squares(output: Callable[[Array, Array], Array], nets: ByKind, samples: Sam
 def _train_epoch(
     output: Callable[[Array, Array], Array],
     size: int,
-    rates: tuple[float, float],
+    rates: tuple[Any, Any],  # numbers or tracers
     scale: ByKind,
     training: Samples,
     validation: Samples,
