@@ -1,5 +1,6 @@
 """GRFM-Net as a phi."""
 
+import pickle
 from functools import partial
 
 import jax
@@ -364,3 +365,7 @@ def test_the_plain_net_returns_every_command_and_has_the_shapes_of_a_trained_one
     assert not any(np.any(load) for load in plain.legs)
     shape = partial(jax.tree.map, lambda x: (x.shape, x.dtype))
     assert shape(plain_net(GaitConfig(), 6)) == shape(ensemble)
+
+
+def test_the_effect_of_the_plain_rigid_body_can_be_sent_to_other_processes():
+    assert pickle.loads(pickle.dumps(last_command)).func is last_command.func

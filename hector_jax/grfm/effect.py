@@ -87,7 +87,9 @@ def in_dtype_of(window: Window, tree: Any) -> Any:
     )
 
 
-@jax.tree_util.Partial
-def last_command(window: Window) -> Effect:
-    """Return the command: the ground of the plain single rigid body."""
+def _last_command(window: Window) -> Effect:
     return ground_effect(jax.tree.map(lambda w: w[0], window.commands))
+
+
+last_command = jax.tree_util.Partial(_last_command)  # no decorator: it could not be pickled
+"""The plain single rigid body: the ground returns what was commanded."""
