@@ -159,9 +159,10 @@ def test_the_total_is_weighted_by_the_alphas():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"L_Eul": -1.0}, {"position": float("nan")}, {"L_ctrl": float("inf")}]
+    "wrong",
+    [{"L_Eul": -1.0}, {"position": float("nan")}, {"L_ctrl": float("inf")}, {"L_pos": True}],
 )
-def test_negative_weights_are_refused(wrong):
+def test_weights_that_are_no_numbers_of_at_least_zero_are_refused(wrong):
     with pytest.raises(ValueError, match="must be a number of at least 0"):
         with_alphas(wrong)
 

@@ -40,6 +40,7 @@ def write_file(path: Path, data: bytes) -> None:
     Raises:
         WriteError: one line with the path, if the folder or the disk cannot be written.
     """
+    path = Path(path)
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PART}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +68,7 @@ def append_file(path: Path, data: bytes) -> None:
         WriteError: one line with the path, if the folder or the disk cannot be written.
     """
     try:
-        with path.open("ab") as file:
+        with Path(path).open("ab") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -82,7 +83,7 @@ def make_folder(folder: Path) -> None:
         InputError: one line with the folder that cannot be created or written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        Path(folder).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
@@ -100,14 +101,14 @@ def locked(folder: Path) -> Iterator[None]:
         InputError: one line with the folder that cannot be created or written.
     """
     make_folder(folder)
-    lock = FileLock(folder / ".lock")
+    lock = FileLock(Path(folder) / ".lock")
     try:
         lock.acquire(blocking=False)
     except Timeout:
         say(f"{folder}: another process is writing there; waiting for it to end")
         lock.acquire()
     try:
-        for part in folder.glob(f".*{_PART}"):
+        for part in Path(folder).glob(f".*{_PART}"):
             part.unlink(missing_ok=True)
         yield
     finally:

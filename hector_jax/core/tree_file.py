@@ -129,6 +129,7 @@ def read_card(path: Path, kind: str | None = None) -> dict[str, Any]:
 
 
 def _read(path: Path, kind: str | None) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    path = Path(path)
     try:
         if path.exists() and not path.is_file():  # a pipe or a device might never end
             raise InputError(f"cannot read {path}: not a plain file")

@@ -71,6 +71,7 @@ def read_log(path: Path, robot: Robot, seconds: float) -> Log:
         raise InputError(f"{path}: expected {wanted} samples of joints, got {count}")
     empty = log_of(no_samples(joints, feet))
     log_shapes = {n: np.shape(leaf) for n, leaf in named_leaves(empty).items()}
+    # where the empty log has no samples, this one has `count`
     shapes = {"period": (), **{n: tuple(x or count for x in s) for n, s in log_shapes.items()}}
     defaults = {"fallen": np.zeros(count, bool), "residual": np.zeros(count)}
     arrays = {"period": np.array(TIME_STEP), **defaults, **arrays}
