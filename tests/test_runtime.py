@@ -95,7 +95,7 @@ def test_processes_load_the_programs_that_one_of_them_compiled(monkeypatch, tmp_
         tunings.compile_programs(pool, config, robot, nominal(), straight)
         tunings.tune(Setup(pool, config, robot), problems, tmp_path / "tunings", title="")
         weights = config.rollout.walk.with_others(nominal(), ["friction"])
-        jobs = [Job(weights, command, hfs(), 0.1) for command, *_ in problems.values()]
+        jobs = [Job(weights, command, hfs(), 0.1) for (command,), *_ in problems.values()]
         list(walk_many(pool, config.rollout.walk, robot, jobs))
     programs = [path.name.split("-")[0] for path in (tmp_path / "hector_jax" / "jax").iterdir()]
     assert programs.count("jit_plan") == 2  # for all feet on the ground, and for one

@@ -204,7 +204,7 @@ def test_the_controller_is_told_the_truth_plus_the_error():
     world = build_world(ideal())
     data = mujoco.MjData(world.model)
     data.qpos[:] = standing_qpos(world, ROBOT.standing_joints, 1.0)
-    reading = flat_reading(world, data)
+    reading = jnp.asarray(flat_reading(world, data))
     true, _ = sensing.measure(ROBOT, reading, jnp.zeros(()), sensing.no_error(ROBOT))
     error = jnp.linspace(0.01, 0.22, 22)
     told, yaw = sensing.measure(ROBOT, reading, jnp.zeros(()), error)

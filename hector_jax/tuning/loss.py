@@ -170,7 +170,7 @@ def alphas(loss: Loss) -> dict[str, float]:
     return {_KEYS.get(term.name, term.name): float(term.weight) for term in loss}
 
 
-def with_alphas(weights: Mapping[str, float], loss: Loss = PAPER_LOSS) -> Loss:
+def with_alphas(weights: Mapping[str, Any], loss: Loss = PAPER_LOSS) -> Loss:
     """Replace weights of a loss, by the name of the term or its key in files.
 
     Raises:
