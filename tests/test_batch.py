@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from hector_jax.tuning.batch import (
     PER_CALL,
     Problem,
     Scenario,
-    choose_devices,
+    choose_rollout,
     lanes_of,
     tail_weights,
     tune_batch,
@@ -32,7 +31,8 @@ from hector_jax.tuning.batch import (
 from hector_jax.tuning.difftune import TuneConfig, tune
 from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.loss import PAPER_LOSS, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, no_variation
+from hector_jax.tuning.parallel_rollout import parallel_rollout
+from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout
 from hector_jax.tuning.status import StepStatus, Stop
 
 ROBOT = load_robot()
@@ -46,7 +46,7 @@ def vector(weights):
     return np.asarray(weights_to_vector(weights))
 
 
-def toy(config, robot, weights, command, anchor, effect, loss, variation=None):
+def toy(config, robot, weights, command, anchor, effect, loss, variation=None, walk=None):
     """A bowl in log-weights about a point that the command moves; with a floor under it."""
     middle = np.log(NOMINAL) + 0.3 * jnp.asarray(command.yaw_rate)[0]
     away = jnp.log(weights_to_vector(weights)) - middle
@@ -118,7 +118,7 @@ def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
 
 def test_a_scenario_without_a_variation_has_that_of_the_robots_tunings(on_toy, monkeypatch):
     given = []
-    spy = lambda *inputs: given.append(inputs[-1]) or toy(*inputs)  # noqa: E731
+    spy = lambda *inputs: given.append(inputs[-2]) or toy(*inputs)  # noqa: E731
     monkeypatch.setattr(batch, "evaluate", spy)
     tuning = replace(ROBOT.description.tuning, estimate_noise=1.0)
     noisy = ROBOT._replace(description=replace(ROBOT.description, tuning=tuning))
@@ -204,18 +204,10 @@ def test_a_cpu_walks_them_one_by_one_and_others_all_at_once():
     assert (lanes_of("cpu"), lanes_of("gpu")) == (1, 0)
 
 
-def test_beside_a_gpu_few_rollouts_take_the_cores_and_many_take_it(monkeypatch):
-    gpu, *cores = (Mock(spec=jax.Device) for _ in range(4))
-    monkeypatch.setattr(jax, "devices", lambda: [gpu])
-    monkeypatch.setattr(jax, "local_devices", lambda backend: cores)
-    assert choose_devices(3) == cores
-    assert choose_devices(4) == [gpu]
-
-    def none(backend):
-        raise RuntimeError(f"no {backend}")
-
-    monkeypatch.setattr(jax, "local_devices", none)
-    assert choose_devices(1) == [gpu]
+def test_a_gpu_walks_the_ticks_of_few_rollouts_at_once():
+    assert choose_rollout("gpu", 16 * 400) is parallel_rollout
+    assert choose_rollout("gpu", 16 * 400 + 1) is rollout
+    assert choose_rollout("cpu", 400) is rollout
 
 
 @pytest.mark.parametrize(

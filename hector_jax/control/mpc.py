@@ -174,7 +174,7 @@ class Condensed(NamedTuple):
     free: State  # (N, 3) each, without inputs
 
 
-def _feet_of_contacts(
+def feet_of_contacts(
     contact: Float[Array, " feet"], max_contacts: int
 ) -> Float[Array, "contacts feet"]:
     """Return the selection matrix from feet to contacts; rows without a foot are zero.
@@ -208,7 +208,7 @@ def condense(config: MpcConfig, problem: MpcProblem, dt: float, max_contacts: in
     data = parameters.weights, state, horizon.lever
     dtype = jnp.result_type(*jax.tree.leaves(data), jnp.float32)
     A, B = jax.vmap(lambda e, r: srbm.linearise(robot, e, r, dt))(horizon.euler, horizon.lever)
-    feet = jax.vmap(lambda c: _feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
+    feet = jax.vmap(lambda c: feet_of_contacts(c.astype(dtype), max_contacts))(horizon.contact)
     G = jax.vmap(partial(_input_map, config.contact_model))(feet, horizon.foot_yaw)
     # inputs change rates and velocities, which persist; angles and positions integrate them
     changes = B[:, 6:9], B[:, 9:12]

@@ -28,16 +28,19 @@ from jaxtyping import Float, Int
 from hector_jax.control.reference import Anchor, Command
 from hector_jax.control.weights import Weights
 from hector_jax.core.arrays import Array
+from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.tuning import difftune
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, TuneState
 from hector_jax.tuning.evaluate import Evaluation, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
-from hector_jax.tuning.rollout import Variation, variation_of
+from hector_jax.tuning.parallel_rollout import parallel_rollout
+from hector_jax.tuning.rollout import Variation, rollout, variation_of
 from hector_jax.tuning.status import Stop
 
 AXIS = "problems"
 PER_CALL = PAPER_ITERATIONS + 1  # rollouts per problem and call of the device: start and ten
+TICKS_AT_ONCE = 16 * 400  # most on a GPU that are faster at once than in turn
 
 
 class Scenario(NamedTuple):
@@ -92,20 +95,13 @@ def lanes_of(backend: str) -> int:
     return 1 if backend == "cpu" else 0
 
 
-def choose_devices(rollouts: int) -> list[Any]:
-    """Choose devices for parallel rollouts: a CPU core each if there are enough, else all devices.
+def choose_rollout(platform: str, ticks: int) -> Callable[..., Trajectory]:
+    """Choose the rollout for a device that computes `ticks` ticks in all.
 
-    A GPU waits in each of a tick's many small steps: it takes almost as long for one rollout as for
-    a hundred, and longer than a CPU core (docs/performance.md).
+    A GPU waits in each of a tick's many small steps, so that few rollouts are faster with all their
+    ticks at once (docs/performance.md).
     """
-    devices = jax.devices()
-    if jax.process_count() > 1:
-        return devices
-    try:
-        cores = jax.local_devices(backend="cpu")
-    except RuntimeError:  # JAX_PLATFORMS excludes the CPU
-        return devices
-    return cores if rollouts <= len(cores) else devices
+    return parallel_rollout if platform == "gpu" and ticks <= TICKS_AT_ONCE else rollout
 
 
 def _map(lanes: int, function: Callable, stacked: Any) -> Any:
@@ -120,6 +116,7 @@ def _map(lanes: int, function: Callable, stacked: Any) -> Any:
 def _evaluate(
     config: TuneConfig,
     lanes: int,
+    walk: Callable[..., Trajectory],
     robot: Robot,
     effects: jax.tree_util.Partial,
     problem: Problem,
@@ -128,24 +125,26 @@ def _evaluate(
     """Evaluate all scenarios of a problem as one."""
     single = all(len(leaf) == 1 for leaf in jax.tree.leaves(effects))
 
-    def walk(scenario: Scenario) -> Evaluation:
+    def of_scenario(scenario: Scenario) -> Evaluation:
         command, anchor, index, loss, scale, variation = scenario
         effect = jax.tree.map(lambda leaf: leaf[0 if single else index], effects)
         variation = variation_of(robot) if variation is None else variation
-        result = evaluate(config.rollout, robot, weights, command, anchor, effect, loss, variation)
+        inputs = robot, weights, command, anchor, effect, loss, variation
+        result = evaluate(config.rollout, *inputs, walk)
         value, terms, gradient = jax.tree.map(lambda x: x / scale, result[:3])
         return result._replace(loss=value, terms=terms, gradient=gradient)
 
-    stacked = _map(lanes, walk, problem.scenarios)
+    stacked = _map(lanes, of_scenario, problem.scenarios)
     weighted_sum = partial(jnp.tensordot, tail_weights(stacked.loss, problem.tail), axes=1)
     loss, terms, gradient = jax.tree.map(weighted_sum, stacked[:3])
     return Evaluation(loss, terms, gradient, jnp.max(stacked.fallen), jnp.max(stacked.residual))
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _advance(
     config: TuneConfig,
     lanes: int,
+    walk: Callable[..., Trajectory],
     mesh: Mesh,
     robot: Robot,
     effects: jax.tree_util.Partial,
@@ -158,7 +157,7 @@ def _advance(
         problem, start = inputs
 
         def step(state: TuneState) -> tuple[TuneState, Iteration]:
-            evaluation = _evaluate(config, lanes, robot, effects, problem, state.trial)
+            evaluation = _evaluate(config, lanes, walk, robot, effects, problem, state.trial)
             return difftune.update(config, state, evaluation)
 
         def record(carry: tuple) -> tuple:
@@ -215,7 +214,7 @@ def tune_batch(
         robot: the body that the controllers assume.
         problems: stacked, see `stack`; the same on every host.
         effects: phis, stacked too; `Scenario.effect` is the index into them.
-        devices: on which to compute; None takes `choose_devices`.
+        devices: on which to compute; None takes all.
         lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend.
         report_progress: takes the number of problems that have ended, the number of all problems
             and a message; see `console.bar`.
@@ -228,7 +227,10 @@ def tune_batch(
         ValueError: no problem, or an index of a phi, a delay or a share out of range.
     """
     count = _check_problems(config, problems, effects)
-    devices = list(devices or choose_devices(np.size(problems.scenarios.scale)))
+    devices = list(devices or jax.devices())
+    rollouts = math.ceil(np.size(problems.scenarios.scale) / len(devices))
+    ticks = config.rollout.lead + config.rollout.ticks
+    walk = choose_rollout(devices[0].platform, rollouts * ticks)
     lanes = lanes_of(devices[0].platform) if lanes is None else lanes
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
@@ -243,7 +245,7 @@ def tune_batch(
     histories, active = [], count
     report_progress(0, count, f"compiling for {len(devices)} devices ({devices[0].device_kind})")
     while active:
-        states, history = _advance(config, lanes, mesh, robot, effects, filled, states)
+        states, history = _advance(config, lanes, walk, mesh, robot, effects, filled, states)
         stop, loss = _fetch((states.stop, states.loss))
         histories.append(_fetch(history))
         active = int(np.sum(stop[:count] == Stop.GOING))

@@ -52,17 +52,19 @@ def evaluate(
     effect: jax.tree_util.Partial,
     loss: Loss,
     variation: Variation | None = None,
+    walk: Callable[..., Trajectory] = rollout,
 ) -> Evaluation:
     """Compute the loss of a weight set on the model and its gradient, in one program.
 
     Args:
         config, robot, weights, command, anchor, effect, variation: see `rollout`.
         loss: terms and their weights.
+        walk: `rollout`, or `parallel_rollout` on a GPU with few rollouts.
 
     Source: Eq. 9, 11.
     """
     inputs = {"command": command, "anchor": anchor, "effect": effect, "variation": variation}
-    return evaluation(partial(rollout, config, robot, **inputs), weights, loss)
+    return evaluation(partial(walk, config, robot, **inputs), weights, loss)
 
 
 evaluate_jit = jax.jit(evaluate, static_argnums=0)

@@ -113,6 +113,20 @@ class Carry(NamedTuple):
     before: Effect | None = None  # of the last tick, world frame; None without a variation
 
 
+def varied(carry: Carry) -> Carry:
+    """Return the parts of a carry that depend on the weights, with None for the others.
+
+    Tangents of a carry have the same structure.
+    """
+    return carry._replace(anchor=carry.anchor._replace(tick=None), fallen=None)
+
+
+def with_constants(parts: Carry, carry: Carry) -> Carry:
+    """Return `varied` parts with the others of a carry."""
+    anchor = parts.anchor._replace(tick=carry.anchor.tick)
+    return parts._replace(anchor=anchor, fallen=carry.fallen)
+
+
 def command_history(command: Wrench) -> Wrench:
     """Return past commands (HISTORY, feet, 3) that all equal `command`."""
     return jax.tree.map(lambda w: jnp.broadcast_to(w, (HISTORY, *jnp.shape(w))), command)
@@ -249,10 +263,12 @@ def step_carry(
     carry: Carry,
     tick: Int[Array, ""],
     variation: Variation | None = None,
+    wrench: Wrench | None = None,
 ) -> tuple[Carry, Trajectory]:
     """Walk one tick of the closed loop: plan, effect, motion.
 
-    Returns the next carry and the tick's sample of the trajectory.
+    Returns the next carry and the tick's sample of the trajectory. A `wrench` takes the place of
+    the planned one.
     """
     walk, dt = config.walk, config.walk.gait.tick
     new_anchor = anchor_at(robot, carry.state, carry.anchor.tick)
@@ -270,6 +286,7 @@ def step_carry(
         disturbance=carry.disturbance,
         max_contacts=contacts_needed(walk, 0),
     )
+    planned = planned if wrench is None else planned._replace(wrench=wrench)
     commands = jax.tree.map(
         lambda new, old: jnp.concatenate([new[None], old[:-1]]), planned.wrench, carry.commands
     )

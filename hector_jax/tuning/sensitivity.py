@@ -26,7 +26,9 @@ from hector_jax.tuning.rollout import (
     from_start,
     init_carry,
     step_carry,
+    varied,
     walked_ticks,
+    with_constants,
 )
 
 
@@ -35,14 +37,6 @@ class Sensitivities(NamedTuple):
 
     state: State  # (n, T, 3) each: dx_j+1 / dtheta
     command: Wrench  # (n, T, feet, 3) each: du_j / dtheta
-
-
-def varied(carry: Carry) -> Carry:
-    """Return the parts of a carry that depend on the weights, with None for the others.
-
-    Tangents of a carry have the same structure.
-    """
-    return carry._replace(anchor=carry.anchor._replace(tick=None), fallen=None)
 
 
 def no_tangents(carry: Carry, weights: Weights) -> Carry:
@@ -76,8 +70,7 @@ def step_sensitivities(
     theta, to_weights = ravel_pytree(weights)
 
     def step(parts: Carry, theta: Float[jax.Array, " n"]) -> tuple:
-        anchor = parts.anchor._replace(tick=carry.anchor.tick)
-        before = parts._replace(anchor=anchor, fallen=carry.fallen)
+        before = with_constants(parts, carry)
         inputs = to_weights(theta), command, effect, before, tick, variation
         after, sample = step_carry(config, robot, *inputs)
         return (varied(after), sample.state, sample.command), (after, sample)

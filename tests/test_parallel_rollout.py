@@ -1,0 +1,87 @@
+"""A rollout of all ticks at once is that of one tick after the other."""
+
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from model import ROBOT, SHORT, small_effect
+
+from hector_jax.control.reference import named_command, standing_anchor
+from hector_jax.control.weights import (
+    nominal,
+    sample_weights,
+    vector_to_weights,
+    weights_to_vector,
+)
+from hector_jax.core.trajectory import State
+from hector_jax.grfm.effect import last_command
+from hector_jax.robot.model import load_robot
+from hector_jax.tuning.parallel_rollout import parallel_rollout
+from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout, rollout_config
+
+EFFECT = small_effect()
+FIELDS = "initial", "state", "reference", "command", "effect", "feet"
+QUADRUPED = load_robot(Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml")
+
+
+def noisy():
+    sigma = State(*(np.full(3, 2e-3) for _ in range(4)))
+    return no_variation()._replace(noise=sigma, delay=np.asarray(0.005), mass=np.asarray(1.05))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def walked(walk, config, robot, effect, weights, variation=None):
+    """A trajectory, and the gradient of a sum that all its numbers are in."""
+    command, anchor = named_command("s"), standing_anchor(robot)
+
+    def mixed(weights):
+        found = walk(config, robot, weights, command, anchor, effect, variation)
+        leaves = jax.tree.leaves([getattr(found, name) for name in FIELDS])
+        rng = np.random.default_rng(0)
+        return sum(jnp.sum(rng.normal(size=x.shape) * x) for x in leaves), found
+
+    gradient, found = jax.grad(mixed, has_aux=True)(weights)
+    return found, weights_to_vector(gradient)
+
+
+def assert_same(config, robot, effect, weights, variation=None):
+    inputs = config, robot, effect, weights, variation
+    (expected, gradient), (found, at_once) = (
+        walked(w, *inputs) for w in (rollout, parallel_rollout)
+    )
+    assert found.residual.max() < 1e-8
+    same = partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9)
+    jax.tree.map(same, found._replace(residual=0), expected._replace(residual=0))
+    np.testing.assert_allclose(at_once, gradient, rtol=1e-6, atol=1e-7 * np.abs(gradient).max())
+
+
+@pytest.mark.parametrize("weights", [nominal(), sample_weights(nominal(), 3.0, 1)[0]])
+def test_at_once_is_one_after_the_other(weights):
+    assert_same(SHORT, ROBOT, EFFECT, weights)
+
+
+@pytest.mark.slow
+def test_at_once_with_lead_noise_and_delay():
+    assert_same(RolloutConfig(ticks=30, lead=20), ROBOT, EFFECT, nominal(), noisy())
+
+
+@pytest.mark.slow
+def test_at_once_on_four_legs():
+    assert_same(rollout_config(QUADRUPED, 40), QUADRUPED, last_command, nominal(QUADRUPED))
+
+
+def test_a_fall_is_seen_at_the_same_tick():
+    # effort so dear that the robot sinks
+    weak = vector_to_weights(weights_to_vector(nominal()).at[12:].set(1.0))
+    expected, found = (
+        walked(walk, SHORT, ROBOT, EFFECT, weak)[0] for walk in (rollout, parallel_rollout)
+    )
+    assert 0 < expected.fallen.sum() < SHORT.ticks
+    np.testing.assert_array_equal(found.fallen, expected.fallen)
+    standing = ~np.asarray(expected.fallen)
+    np.testing.assert_allclose(
+        found.state.position[standing], expected.state.position[standing], atol=1e-9
+    )
