@@ -118,7 +118,7 @@ def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
 
 def test_a_scenario_without_a_variation_has_that_of_the_robots_tunings(on_toy, monkeypatch):
     given = []
-    spy = lambda *inputs: given.append(inputs[-2]) or toy(*inputs)  # noqa: E731
+    spy = lambda *inputs, walk: given.append(inputs[-1]) or toy(*inputs)  # noqa: E731
     monkeypatch.setattr(batch, "evaluate", spy)
     tuning = replace(ROBOT.description.tuning, estimate_noise=1.0)
     noisy = ROBOT._replace(description=replace(ROBOT.description, tuning=tuning))
@@ -205,9 +205,18 @@ def test_a_cpu_walks_them_one_by_one_and_others_all_at_once():
 
 
 def test_a_gpu_walks_the_ticks_of_few_rollouts_at_once():
-    assert choose_rollout("gpu", 16 * 400) is parallel_rollout
-    assert choose_rollout("gpu", 16 * 400 + 1) is rollout
+    assert choose_rollout("gpu", 8 * 400) is parallel_rollout
+    assert choose_rollout("gpu", 8 * 400 + 1) is rollout
     assert choose_rollout("cpu", 400) is rollout
+
+
+def test_a_device_counts_the_ticks_of_whole_problems(on_toy, monkeypatch):
+    given = []
+    monkeypatch.setattr(batch, "choose_rollout", lambda *inputs: given.append(inputs) or rollout)
+    asked = stack([problem(STARTS[0], [scenario(), scenario("s")])] * 3)
+    tune_batch(TOY, ROBOT, asked, last_command)
+    each = -(-3 // len(jax.devices()))
+    assert given == [("cpu", each * 2 * 400)]
 
 
 @pytest.mark.parametrize(
@@ -308,6 +317,18 @@ def test_two_hosts_give_the_numbers_of_one():
     for host in hosts:
         told, wrong = host.communicate(timeout=300)
         assert told.strip().endswith("same"), wrong[-2000:]
+
+
+@pytest.mark.slow
+def test_a_batch_with_all_ticks_at_once_is_that_of_ticks_in_turn():
+    config = TuneConfig(rollout=RolloutConfig(ticks=40), iterations=2)
+    asked = stack([problem(w, [scenario("s"), scenario("c")]) for w in STARTS[:2]])
+    in_turn, at_once = (
+        tune_batch(config, ROBOT, asked, last_command, lanes=0, walk=walk)
+        for walk in (rollout, parallel_rollout)
+    )
+    np.testing.assert_allclose(at_once.loss, in_turn.loss, rtol=1e-9)
+    np.testing.assert_allclose(vector(at_once.converged), vector(in_turn.converged), rtol=1e-7)
 
 
 @pytest.mark.slow  # minutes of compilation

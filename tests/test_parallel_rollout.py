@@ -19,7 +19,7 @@ from hector_jax.control.weights import (
 from hector_jax.core.trajectory import State
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
-from hector_jax.tuning.parallel_rollout import parallel_rollout
+from hector_jax.tuning.parallel_rollout import _newton, _Step, parallel_rollout
 from hector_jax.tuning.rollout import RolloutConfig, no_variation, rollout, rollout_config
 
 EFFECT = small_effect()
@@ -73,6 +73,23 @@ def test_at_once_on_four_legs():
     assert_same(rollout_config(QUADRUPED, 40), QUADRUPED, last_command, nominal(QUADRUPED))
 
 
+@pytest.mark.parametrize("factor", [1.0, float("nan")])
+def test_newton_ends_exact_or_says_that_it_is_not(factor):
+    chaotic = lambda x: 3.9 * x * (1.0 - x)  # noqa: E731
+
+    def linearise(x, tick):
+        return _Step(x, chaotic(x), factor * jnp.diag(3.9 * (1.0 - 2.0 * x)), None)
+
+    carries = np.full((40, 1), 0.3)
+    for i in range(39):
+        carries[i + 1] = chaotic(carries[i])
+    guesses = jnp.full((40, 1), 0.3)
+    steps, converged = _newton(linearise, lambda x: jnp.ones(len(x), bool), guesses, jnp.arange(40))
+    assert bool(converged) == (factor == 1.0)
+    if converged:
+        np.testing.assert_allclose(steps.inputs, carries, atol=1e-4)  # chaos multiplies rounding
+
+
 def test_a_fall_is_seen_at_the_same_tick():
     # effort so dear that the robot sinks
     weak = vector_to_weights(weights_to_vector(nominal()).at[12:].set(1.0))
@@ -81,6 +98,7 @@ def test_a_fall_is_seen_at_the_same_tick():
     )
     assert 0 < expected.fallen.sum() < SHORT.ticks
     np.testing.assert_array_equal(found.fallen, expected.fallen)
+    assert found.residual.max() < 1e-8
     standing = ~np.asarray(expected.fallen)
     np.testing.assert_allclose(
         found.state.position[standing], expected.state.position[standing], atol=1e-9

@@ -40,7 +40,7 @@ from hector_jax.tuning.status import Stop
 
 AXIS = "problems"
 PER_CALL = PAPER_ITERATIONS + 1  # rollouts per problem and call of the device: start and ten
-TICKS_AT_ONCE = 16 * 400  # most on a GPU that are faster at once than in turn
+TICKS_AT_ONCE = 8 * 400  # most on a GPU that are faster at once than in turn
 
 
 class Scenario(NamedTuple):
@@ -130,7 +130,7 @@ def _evaluate(
         effect = jax.tree.map(lambda leaf: leaf[0 if single else index], effects)
         variation = variation_of(robot) if variation is None else variation
         inputs = robot, weights, command, anchor, effect, loss, variation
-        result = evaluate(config.rollout, *inputs, walk)
+        result = evaluate(config.rollout, *inputs, walk=walk)
         value, terms, gradient = jax.tree.map(lambda x: x / scale, result[:3])
         return result._replace(loss=value, terms=terms, gradient=gradient)
 
@@ -205,6 +205,7 @@ def tune_batch(
     *,
     devices: Sequence[Any] | None = None,
     lanes: int | None = None,
+    walk: Callable[..., Trajectory] | None = None,
     report_progress: Callable[[int, int, str], None] = lambda done, total, message: None,
 ) -> Tunings:
     """Tune all problems of a batch.
@@ -216,6 +217,7 @@ def tune_batch(
         effects: phis, stacked too; `Scenario.effect` is the index into them.
         devices: on which to compute; None takes all.
         lanes: problems in parallel on a device, 0 for all; None takes `lanes_of` the backend.
+        walk: `rollout` or `parallel_rollout`; None takes `choose_rollout`.
         report_progress: takes the number of problems that have ended, the number of all problems
             and a message; see `console.bar`.
 
@@ -228,16 +230,17 @@ def tune_batch(
     """
     count = _check_problems(config, problems, effects)
     devices = list(devices or jax.devices())
-    rollouts = math.ceil(np.size(problems.scenarios.scale) / len(devices))
-    ticks = config.rollout.lead + config.rollout.ticks
-    walk = choose_rollout(devices[0].platform, rollouts * ticks)
+    problems_each = math.ceil(count / len(devices))
+    rollouts = problems_each * np.shape(problems.scenarios.scale)[1]
+    ticks = rollouts * (config.rollout.lead + config.rollout.ticks)
+    walk = walk or choose_rollout(devices[0].platform, ticks)
     lanes = lanes_of(devices[0].platform) if lanes is None else lanes
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
     config = replace(config, loss=PAPER_LOSS)  # unused, and so one program for all losses
     states = jax.tree.map(np.asarray, jax.vmap(partial(difftune.init, config))(problems.start))
     # problems that only fill up the last device are stopped before they start
-    rows = np.minimum(np.arange(math.ceil(count / len(devices)) * len(devices)), count - 1)
+    rows = np.minimum(np.arange(problems_each * len(devices)), count - 1)
     filled, states = jax.tree.map(lambda x: x[rows], (problems, states))
     states.stop[count:] = Stop.LIMIT
     filled, states = _place(mesh, filled), _place(mesh, states)

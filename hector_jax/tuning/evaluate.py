@@ -26,7 +26,8 @@ class Evaluation(NamedTuple):
     terms: Terms  # unweighted
     gradient: Weights  # dL/dtheta
     fallen: Float[Array, "*batch"]  # share of the ticks after a fall
-    residual: Float[Array, "*batch"]  # largest of a QP; infinite if a solution is not unique
+    # largest of a QP; infinite if a solution is not unique or `parallel_rollout` did not converge
+    residual: Float[Array, "*batch"]
 
 
 def evaluation(walk: Callable[[Weights], Trajectory], weights: Weights, loss: Loss) -> Evaluation:
@@ -67,7 +68,7 @@ def evaluate(
     return evaluation(partial(walk, config, robot, **inputs), weights, loss)
 
 
-evaluate_jit = jax.jit(evaluate, static_argnums=0)
+evaluate_jit = jax.jit(evaluate, static_argnums=0, static_argnames="walk")
 """`evaluate`, compiled once per rollout and set of terms: new weights, commands, nets and alphas
 need no compilation."""
 

@@ -122,7 +122,7 @@ def varied(carry: Carry) -> Carry:
 
 
 def with_constants(parts: Carry, carry: Carry) -> Carry:
-    """Return `varied` parts with the others of a carry."""
+    """Undo `varied`: put the constant parts of a carry back."""
     anchor = parts.anchor._replace(tick=carry.anchor.tick)
     return parts._replace(anchor=anchor, fallen=carry.fallen)
 
