@@ -205,9 +205,10 @@ def test_a_cpu_walks_them_one_by_one_and_others_all_at_once():
 
 
 def test_a_gpu_walks_the_ticks_of_few_rollouts_at_once():
-    assert choose_rollout("gpu", 8 * 400) is parallel_rollout
-    assert choose_rollout("gpu", 8 * 400 + 1) is rollout
-    assert choose_rollout("cpu", 400) is rollout
+    config = RolloutConfig(ticks=350, lead=50)
+    assert choose_rollout("gpu", config, 8) is parallel_rollout
+    assert choose_rollout("gpu", config, 9) is rollout
+    assert choose_rollout("cpu", config, 1) is rollout
 
 
 def test_a_device_counts_the_ticks_of_whole_problems(on_toy, monkeypatch):
@@ -216,7 +217,7 @@ def test_a_device_counts_the_ticks_of_whole_problems(on_toy, monkeypatch):
     asked = stack([problem(STARTS[0], [scenario(), scenario("s")])] * 3)
     tune_batch(TOY, ROBOT, asked, last_command)
     each = -(-3 // len(jax.devices()))
-    assert given == [("cpu", each * 2 * 400)]
+    assert given == [("cpu", TOY.rollout, each * 2)]
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, 
 from hector_jax.tuning.evaluate import Evaluation, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import Variation, rollout, variation_of
+from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout, variation_of
 from hector_jax.tuning.status import Stop
 
 AXIS = "problems"
@@ -95,12 +95,15 @@ def lanes_of(backend: str) -> int:
     return 1 if backend == "cpu" else 0
 
 
-def choose_rollout(platform: str, ticks: int) -> Callable[..., Trajectory]:
-    """Choose the rollout for a device that computes `ticks` ticks in all.
+def choose_rollout(
+    platform: str, config: RolloutConfig, rollouts: int
+) -> Callable[..., Trajectory]:
+    """Choose how a device computes its rollouts.
 
     A GPU waits in each of a tick's many small steps, so that few rollouts are faster with all their
     ticks at once (docs/performance.md).
     """
+    ticks = rollouts * (config.lead + config.ticks)
     return parallel_rollout if platform == "gpu" and ticks <= TICKS_AT_ONCE else rollout
 
 
@@ -232,8 +235,7 @@ def tune_batch(
     devices = list(devices or jax.devices())
     problems_each = math.ceil(count / len(devices))
     rollouts = problems_each * np.shape(problems.scenarios.scale)[1]
-    ticks = rollouts * (config.rollout.lead + config.rollout.ticks)
-    walk = walk or choose_rollout(devices[0].platform, ticks)
+    walk = walk or choose_rollout(devices[0].platform, config.rollout, rollouts)
     lanes = lanes_of(devices[0].platform) if lanes is None else lanes
     mesh = Mesh(np.array(devices), (AXIS,))
     robot, effects, problems = jax.tree.map(np.asarray, (robot, effects, problems))
