@@ -2,8 +2,6 @@
 
 from enum import IntEnum
 
-import numpy as np
-
 from hector_jax.tuning.evaluate import Evaluation
 
 
@@ -38,11 +36,8 @@ REASONS = {
 
 def status_text(status: StepStatus, evaluation: Evaluation) -> str:
     """Describe why an iteration was rejected; empty if it was accepted."""
-    residual = float(evaluation.residual)
-    size = f"{residual:.1e} too large"
-    if np.isinf(residual):
-        size = "infinite: a solution is not unique, or a parallel rollout has not converged"
-    return REASONS.get(status, "") + (f" {size}" if status == StepStatus.UNSOLVED else "")
+    residual = f" {float(evaluation.residual):.1e} too large"
+    return REASONS.get(status, "") + (residual if status == StepStatus.UNSOLVED else "")
 
 
 def status_of(reason: str) -> StepStatus:
