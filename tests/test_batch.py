@@ -211,13 +211,14 @@ def test_a_gpu_walks_the_ticks_of_few_rollouts_at_once():
     assert choose_rollout("cpu", config, 1) is rollout
 
 
-def test_a_device_counts_the_ticks_of_whole_problems(on_toy, monkeypatch):
-    given = []
-    monkeypatch.setattr(batch, "choose_rollout", lambda *inputs: given.append(inputs) or rollout)
-    asked = stack([problem(STARTS[0], [scenario(), scenario("s")])] * 3)
-    tune_batch(TOY, ROBOT, asked, last_command)
-    each = -(-3 // len(jax.devices()))
-    assert given == [("cpu", TOY.rollout, each * 2)]
+def test_a_device_counts_the_rollouts_of_whole_problems(monkeypatch):
+    def choose(platform, config, rollouts):
+        raise LookupError(rollouts)
+
+    monkeypatch.setattr(batch, "choose_rollout", choose)
+    three = stack([problem(STARTS[0], [scenario(), scenario("s")])] * 3)
+    with pytest.raises(LookupError, match="^4$"):  # one of two devices has two of the problems
+        tune_batch(TOY, ROBOT, three, last_command, devices=2 * jax.devices()[:1])
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def lanes_of(backend: str) -> int:
 def choose_rollout(
     platform: str, config: RolloutConfig, rollouts: int
 ) -> Callable[..., Trajectory]:
-    """Choose how a device computes its rollouts.
+    """Choose `rollout` or `parallel_rollout` for the rollouts that one device computes.
 
     A GPU waits in each of a tick's many small steps, so that few rollouts are faster with all their
     ticks at once (docs/performance.md).

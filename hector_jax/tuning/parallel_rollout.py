@@ -170,6 +170,8 @@ def parallel_rollout(
     Takes what `rollout` takes and returns the same up to a fall, but for rounding. It can be
     differentiated once and by `weights` only; other derivatives are zero. A rollout that has not
     converged after as many iterations as it has ticks has an infinite residual.
+
+    Source: Eq. 12, 13; the method in the module's docstring.
     """
     fixed, robot, command, anchor, effect, variation = jax.lax.stop_gradient(
         (weights, robot, command, anchor, effect, variation)
@@ -199,10 +201,10 @@ def parallel_rollout(
     steps, converged = _newton(linearise, standing, guesses, ticks)
     outputs = _solve_recurrence(steps, pack(weights))  # has the derivative by the weights
     carries = jax.vmap(to_parts)(jnp.concatenate([packed[None], outputs[:, :size]]))
-    before, after = (jax.tree.map(lambda x: x[i : i + len(ticks)], carries) for i in (0, 1))  # noqa: B023
+    after = jax.tree.map(lambda x: x[1:], carries)
     _, to_effect = ravel_pytree(jax.tree.map(lambda w: w[0], start.commands))
     samples = steps.sample._replace(
-        initial=before.state,
+        initial=jax.tree.map(lambda x: x[:-1], carries.state),
         state=after.state,
         reference=jax.vmap(reference)(after.anchor, ticks),
         command=jax.tree.map(lambda w: w[:, 0], after.commands),
