@@ -628,12 +628,12 @@ INTERPRETED = partial(gpu_kernel.guess, interpret=True)
 def as_on_a_gpu(kernel=INTERPRETED):
     """The default solver, its guess traced as on a GPU with this kernel, interpreted here."""
 
-    def guess(qp, factor):
+    def guess(tolerances, qp):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(jax, "default_backend", lambda: "gpu")
             patch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
             patch.setattr(gpu_kernel, "guess", kernel)
-            return first_guess(qp, factor)
+            return first_guess(tolerances, qp)
 
     return QpConfig(solver=Solver("interior_point", approach=approach, guess=guess))
 
@@ -664,9 +664,9 @@ def test_on_a_gpu_the_kernels_point_is_the_solution():
 def test_on_a_gpu_a_wrong_point_of_the_kernel_is_corrected(walking, walked, settled):
     """One that did not settle is not taken, one that did is where the corrections start."""
 
-    def lost(P, q, A, lower, upper):
+    def lost(P, q, A, lower, upper, curvature):
         x, side = jnp.full_like(q, 1.0 if settled else jnp.nan), jnp.ones(len(lower), jnp.int32)
-        return gpu_kernel.Guess(x, jnp.ones_like(lower), side, jnp.int32(settled))
+        return gpu_kernel.Guess(x, jnp.ones_like(lower), side, jnp.int32(settled), jnp.int32(0))
 
     config = as_on_a_gpu(lost)
     for qp, x in zip(walking[:4], walked.x[:4], strict=True):

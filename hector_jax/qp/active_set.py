@@ -18,8 +18,9 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.console import say
 from hector_jax.core.tree import where
 from hector_jax.qp import gpu_kernel
-from hector_jax.qp.linear import block_diagonal, cholesky, matvec, multiplier, plus_gram, rmatvec
-from hector_jax.qp.problem import SIGN, Normal, Point, Tolerances
+from hector_jax.qp.certificates import curvature, only_if
+from hector_jax.qp.linear import cholesky, matvec, multiplier, plus_gram, rmatvec
+from hector_jax.qp.problem import SIGN, Normal, Point, Start, Tolerances
 
 
 class _Fixed(NamedTuple):
@@ -147,29 +148,38 @@ def worst_sides(qp: Normal, wrong: Array, active: Array, error: Array) -> Array:
     return wrong & (error >= threshold).reshape(wrong.shape)
 
 
-def first_guess(qp: Normal, factor: Array) -> tuple[Point, Array, Array]:
-    """Return an initial point, active sides (2, m) and residuals, infinite if not computed.
+def no_guess(tolerances: Tolerances, qp: Normal) -> Start:
+    """Start from zero."""
+    _, definite, convex = curvature(tolerances, qp)
+    none, infinite = jnp.zeros_like(qp.side), jnp.full(3, jnp.inf, qp.q.dtype)
+    point = Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
+    return Start(point, none, infinite, definite, convex)
 
-    Args:
-        qp: the problem.
-        factor: lower Cholesky factor of P.
-    """
+
+def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
+    """Start from the unconstrained minimiser, on a GPU from the kernel's solution."""
     infinite = jnp.full(3, jnp.inf, qp.q.dtype)
 
-    def violated(qp: Normal) -> tuple[Point, Array, Array]:
+    def violated(qp: Normal) -> Start:
+        factor, definite, convex = curvature(tolerances, qp)
         x = -cho_solve((factor, True), qp.q)
         outside, none = qp.violation(x), jnp.zeros_like(qp.side)
-        return Point(x, none.astype(x.dtype)), worst_sides(qp, outside > 0, none, outside), infinite
+        active = worst_sides(qp, outside > 0, none, outside)
+        return Start(Point(x, none.astype(x.dtype)), active, infinite, definite, convex)
 
-    def pivoted(qp: Normal) -> tuple[Point, Array, Array]:
+    def pivoted(qp: Normal) -> Start:
         present = qp.side | qp.equality
         upper, lower = jnp.where(present, qp.bound, jnp.asarray(SIGN, qp.q.dtype) * jnp.inf)
-        x, y, side, settled = gpu_kernel.guess(qp.P, qp.q, block_diagonal(qp.A), lower, upper)
+        x, y, side, settled, definite = gpu_kernel.guess(
+            qp.P, qp.q, qp.A, lower, upper, curvature=tolerances.curvature
+        )
         point = Point(x, jnp.maximum(SIGN * y, 0.0))
         residuals = qp.residuals(point)
         found = point, jnp.stack([side > 0, side < 0]), residuals
         nothing = jax.tree.map(jnp.zeros_like, point), jnp.zeros_like(qp.side), infinite
-        return where((settled > 0) & jnp.all(jnp.isfinite(residuals)), found, nothing)
+        found = where((settled > 0) & jnp.all(jnp.isfinite(residuals)), found, nothing)
+        proved, factorise = definite > 0, lambda qp: curvature(tolerances, qp)[1:]
+        return Start(*found, *only_if(~proved, factorise, (proved, proved), qp))
 
     if jax.default_backend() != "gpu":
         return violated(qp)

@@ -53,7 +53,6 @@ def _jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple[Sol
     eye = jnp.eye(len(qp.q), dtype=dtype)
     factor = cholesky(plus_gram(normal.P + tolerances.proximal * eye, normal.A, weight))
     solved = solution.status == Status.SOLVED
-    factor = jnp.where(solved, factor, eye)
     pull, shift = jnp.zeros_like(solution.x), jnp.zeros_like(solution.y)
     if _nonzero(d.P):
         pull += d.P @ solution.x
@@ -70,6 +69,7 @@ def _jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple[Sol
     for _ in range(2):  # as in `active_set`, the second pass removes the bias of cap and rho
         force = jnp.where(capped, dz, 0.0) + weight * matvec(normal.A, dv) + shift
         step = -cho_solve((factor, True), normal.P @ dv + pull + rmatvec(normal.A, force))
+        step = jnp.where(solved, step, 0.0)  # without a solution the factor can be NaN
         dv, dz = dv + step, force + weight * matvec(normal.A, step)
     zero = jnp.zeros((), dtype)
     none = np.zeros((), jax.dtypes.float0)

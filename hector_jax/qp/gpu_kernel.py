@@ -13,6 +13,9 @@ enter that an inexact point touches by its rounding, and 2 % of the guesses were
 Rows are soft here (c = `stiffness`) and the inverse drifts, so at the end passes of the method of
 multipliers refine the point. Its residuals are computed outside; if they are too large,
 `active_set` corrects it.
+
+What limits the speed is how many programs run at once, which registers decide. So only the inverse
+and the few entries of each row and column of A stay in them; P is read whenever it is needed.
 """
 
 from collections.abc import Callable
@@ -24,11 +27,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
 from jaxtyping import Float, Int
 
 from hector_jax.core.arrays import Array
 
-VARIABLES, ROWS = 64, 128  # size of the kernel's tiles, limited by the registers of a program
+VARIABLES, ROWS = 64, 128  # size of the kernel's vectors, limited by the registers of a program
 _LIMIT = 120  # changes; the second half uses the least-index rule
 _REFINEMENTS = 2  # passes at the end: of 1000 walking QPs one leaves 8e-13, two leave rounding
 
@@ -40,13 +44,14 @@ class Guess(NamedTuple):
     y: Float[Array, " m"]  # positive where the upper bound presses
     side: Int[Array, " m"]  # 1 active at the upper bound, -1 at the lower, 0 inactive
     settled: Int[Array, ""]  # 1 if no row is wrong
+    definite: Int[Array, ""]  # 1 if all eigenvalues of P were proved to be above `curvature`
 
 
 class _Softness(NamedTuple):
     """Parameters for a dtype, for unit diagonal of P and rows of length one."""
 
     stiffness: float  # c of an active row
-    proximal: float  # added to the diagonal of P
+    shift: float  # subtracted from the diagonal of P
     coarse: float  # violations and multipliers up to it count as zero at first
     fine: float  # and up to this one after that
     passes: int  # of the method of multipliers after a change
@@ -55,8 +60,8 @@ class _Softness(NamedTuple):
 def _softness(dtype: jnp.dtype) -> _Softness:
     if jnp.finfo(dtype).bits == 64:
         return _Softness(1e4, 1e-8, 1e-6, 1e-10, 1)
-    # a leaving row divides by 1 / c: 32 bits need a small c
-    return _Softness(30.0, 1e-3, 1e-4, 3e-6, 3)
+    # a leaving row divides by 1 / c: 32 bits need a small c, and a matrix that is easy to invert
+    return _Softness(30.0, -1e-3, 1e-4, 3e-6, 3)
 
 
 def fits(variables: int, rows: int) -> bool:
@@ -67,52 +72,43 @@ def fits(variables: int, rows: int) -> bool:
 def guess(
     P: Float[Array, "n n"],
     q: Float[Array, " n"],
-    A: Float[Array, "m n"],
+    A: Float[Array, "N r b"],
     lower: Float[Array, " m"],
     upper: Float[Array, " m"],
+    *,
+    curvature: float,
     interpret: bool = False,
 ) -> Guess:
     """Solve a normalised QP for which `fits` holds, unproved; `vmap` is the GPU's grid.
 
     Args:
-        P, q, A, lower, upper: the QP, P with unit diagonal, rows of A of length one; a missing
-            bound is infinite.
+        P, q, A, lower, upper: the QP, P with unit diagonal, A block-diagonal by step with rows of
+            length one; a missing bound is infinite.
+        curvature: what the eigenvalues of a definite P exceed; 32 bits prove nothing.
         interpret: interpret the kernel's operations on any device; for tests.
     """
-    n, m, dtype = len(q), len(lower), q.dtype
-    columns, rows = (0, VARIABLES - n), (0, ROWS - m)  # padding
-    tiles = (
-        jnp.pad(P, (columns, columns)),
-        jnp.pad(q, columns),
-        jnp.pad(A, (rows, columns)),
-        jnp.pad(A.T, (columns, rows)),
-        jnp.pad(lower, rows, constant_values=-jnp.inf),
-        jnp.pad(upper, rows, constant_values=jnp.inf),
-    )
-    shapes = {"x": (VARIABLES,), "y": (ROWS,), "side": (ROWS,), "settled": ()}
-    kinds = {"x": dtype, "y": dtype, "side": jnp.int32, "settled": jnp.int32}
-    out: Any = {name: jax.ShapeDtypeStruct(shapes[name], kinds[name]) for name in shapes}
-    options = {}
+    options: Any = {}
+    flag, side = (jax.ShapeDtypeStruct(shape, jnp.int32) for shape in ((), lower.shape))
+    x, y = (jax.ShapeDtypeStruct(v.shape, q.dtype) for v in (q, lower))
+    out: Any = x, y, side, flag, flag
     if not interpret:
-        from jax.experimental.pallas import triton
-
         options["compiler_params"] = triton.CompilerParams(num_warps=4, num_stages=1)
-    outputs = pl.pallas_call(
-        partial(_kernel, n, _softness(dtype)),
-        out_shape=Guess(**out),
+    return pl.pallas_call(
+        partial(_kernel, A.shape, curvature, (lambda: None) if interpret else triton.debug_barrier),
+        out_shape=Guess(*out),
         interpret=interpret,
         **options,
-    )(*tiles)
-    return Guess(outputs.x[:n], outputs.y[:m], outputs.side[:m], outputs.settled)
+    )(P, q, A.ravel(), lower, upper)
 
 
 class _Problem(NamedTuple):
-    """The QP in a program's registers, and parameters of its dtype."""
+    """The QP as a program sees it, and parameters of its dtype."""
 
-    P: Array
+    curve: Callable[[Array], Array]  # returns P x
+    rows: Callable[[Array], Array]  # returns A x
+    pull: Callable[[Array], Array]  # returns A'y
+    row: Callable[[Array], Array]  # returns one row of A
     q: Array
-    A: Array
-    At: Array  # A transposed
     lower: Array
     upper: Array
     number: Array  # index of each row
@@ -128,40 +124,52 @@ def _times(M: Array, v: Array) -> Array:
     return jnp.sum(M * v[:, None], axis=0)
 
 
-def _inverse(n: int, P: Array, proximal: np.ndarray, one: np.ndarray, zero: np.ndarray) -> Array:
-    """Invert P with `proximal` added to its diagonal, by sweeps."""
-    index = lax.broadcasted_iota(jnp.int32, (VARIABLES,), 0)
-    across = lax.broadcasted_iota(jnp.int32, P.shape, 0)
-    down = lax.broadcasted_iota(jnp.int32, P.shape, 1)
-    eye = jnp.where(across == down, one, zero)
+def _indices(shape: tuple[int, ...]) -> list[Array]:
+    return [lax.broadcasted_iota(jnp.int32, shape, i) for i in range(len(shape))]
 
-    def sweep(k: Array, M: Array) -> Array:
-        column = jnp.sum(jnp.where(across == k, M, zero), axis=0)  # M is symmetric
+
+def _inverse(n: int, P: Array, one: np.ndarray, zero: np.ndarray) -> tuple[Array, Array]:
+    """Invert P by sweeps; also return whether it is positive definite."""
+    (index,), (across, down) = _indices((VARIABLES,)), _indices(P.shape)
+    eye, inside = jnp.where(across == down, one, zero), (across < n) & (down < n)
+
+    def sweep(k: Array, column: Array) -> tuple[Array, Array, Array]:
         pivot = jnp.sum(jnp.where(index == k, column, zero))
         # with this entry one rank-one update also sweeps row and column k, and adds 2 at (k, k)
         column = jnp.where(index == k, pivot - one, column)
-        return M - (column * (one / pivot))[:, None] * column[None, :]
+        return column, column * (one / pivot), pivot > zero
 
-    swept = lax.fori_loop(0, n, sweep, P + proximal * eye)
-    return jnp.where((across < n) & (down < n), (one + one) * eye - swept, eye)
+    def sweep_two(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        M, definite = state
+        i, j = 2 * k, 2 * k + 1
+        first, second = (jnp.sum(jnp.where(across == k, M, zero), axis=0) for k in (i, j))
+        first, left, positive = sweep(i, first)
+        definite &= positive
+        second -= jnp.sum(jnp.where(index == j, left, zero)) * first
+        second, right, positive = sweep(j, second)
+        return M - (left[:, None] * first + right[:, None] * second), definite & positive
+
+    start = jnp.where(inside, P, eye), jnp.asarray(True)
+    swept, definite = lax.fori_loop(0, (n + 1) // 2, sweep_two, start)
+    return jnp.where(inside, (one + one) * eye - swept, eye), definite
 
 
 def _correct(qp: _Problem, M: Array, side: Array, x: Array, rows: Array, y: Array) -> tuple:
     """Run one pass of the method of multipliers with the active rows. Returns x, A x and y."""
     active = side != 0
     y = jnp.where(active, y + qp.c * (rows - jnp.where(side > 0, qp.upper, qp.lower)), qp.zero)
-    dx = -_times(M, _times(qp.P, x) + qp.q + _times(qp.A, y))
-    d_rows = _times(qp.At, dx)
+    dx = -_times(M, qp.curve(x) + qp.q + qp.pull(y))
+    d_rows = qp.rows(dx)
     return x + dx, rows + d_rows, jnp.where(active, y + qp.c * d_rows, qp.zero)
 
 
-def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tuple:
+def _pivot(qp: _Problem, state: tuple) -> tuple:
     """Solve with the active rows, then let the worst row enter and the worst row leave."""
-    c, one, zero, number = qp.c, qp.one, qp.zero, qp.number
+    one, number = qp.one, qp.number
 
-    def update(M: Array, row: Array, weight: Array) -> Array:
+    def update(M: Array, row: Array, weight: Any) -> Array:
         """Update the inverse for a weight on one more row."""
-        a = read_row(row)
+        a = qp.row(row)
         v = _times(M, a)
         return M - (weight / (one + weight * jnp.sum(a * v))) * v[:, None] * v[None, :]
 
@@ -178,8 +186,8 @@ def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tu
     outside, negative = jnp.where(allowed, outside, -one), jnp.where(allowed, negative, -one)
     enter, leave = jnp.max(outside) > tolerance, jnp.max(negative) > tolerance
     entering, leaving = lax.argmax(outside, 0, jnp.int32), lax.argmax(negative, 0, jnp.int32)
-    M = update(M, entering, jnp.where(enter, c, zero))
-    M = update(M, leaving, jnp.where(leave, -c, zero))
+    M = lax.cond(enter, lambda: update(M, entering, qp.c), lambda: M)
+    M = lax.cond(leave, lambda: update(M, leaving, -qp.c), lambda: M)
     side = jnp.where(enter & (number == entering), jnp.where(over > under, 1, -1), side)
     side = jnp.where(leave & (number == leaving), 0, side)
     changed = enter | leave
@@ -188,28 +196,79 @@ def _pivot(qp: _Problem, read_row: Callable[[Array], Array], state: tuple) -> tu
     return x, rows, y, side, M, tolerance, count + 1, running
 
 
+def _load(ref: Any, index: Any, inside: Any, other: Any) -> Array:
+    return triton.load(ref.at[index], mask=inside, other=other)
+
+
+def _store(ref: Any, index: Any, inside: Any, value: Any) -> None:
+    triton.store(ref.at[index], value, mask=inside)
+
+
 def _kernel(
-    n: int, soft: _Softness, P_ref, q_ref, A_ref, At_ref, lower_ref, upper_ref, *refs
+    shape: tuple[int, ...],
+    curvature: float,
+    barrier: Callable[[], Any],
+    P_ref: Any,
+    q_ref: Any,
+    A_ref: Any,
+    lower_ref: Any,
+    upper_ref: Any,
+    *refs: Any,
 ) -> None:
     out: Any = Guess(*refs)
-    P, q, A, At = P_ref[...], q_ref[...], A_ref[...], At_ref[...]
-    lower, upper = lower_ref[...], upper_ref[...]
-    c, proximal, coarse, fine = (np.asarray(v, P.dtype) for v in soft[:4])
-    one, zero = np.asarray(1.0, P.dtype), np.asarray(0.0, P.dtype)
-    inverse = _inverse(n, P, proximal, one, zero)
-    number = lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
-    qp = _Problem(P, q, A, At, lower, upper, number, c, fine, one, zero, soft.passes)
-    x = -_times(inverse, q)
-    y, side = jnp.zeros((ROWS,), P.dtype), jnp.zeros((ROWS,), jnp.int32)
+    dtype, soft = P_ref.dtype, _softness(P_ref.dtype)
+    c, shift, coarse, fine = (np.asarray(v, dtype) for v in soft[:4])
+    one, zero, infinite = (np.asarray(v, dtype) for v in (1.0, 0.0, np.inf))
+    (n,), (m,), (_, r, b) = q_ref.shape, lower_ref.shape, map(np.int32, shape)
+    (column,), (number,), (across, down) = map(_indices, ((VARIABLES,), (ROWS,), (VARIABLES,) * 2))
+    in_x, in_y, in_P = column < n, number < m, (across < n) & (down < n)
+
+    # The entries of each row, and of each column, one below the other; tiles have powers of two.
+    entry, of = _indices((1 << int(b - 1).bit_length(), ROWS))
+    in_row, variable = (entry < b) & (of < m), lax.div(of, r) * b + entry
+    A = _load(A_ref, of * b + entry, in_row, zero)
+    entry, of = _indices((1 << int(r - 1).bit_length(), VARIABLES))
+    in_column, pressing = (entry < r) & (of < n), lax.div(of, b) * r + entry
+    At = _load(A_ref, pressing * b + lax.rem(of, b), in_column, zero)
+
+    def rows(x: Array) -> Array:
+        # one thread needs what others hold: through the memory of the outputs
+        _store(out.x, column, in_x, x)
+        barrier()
+        return jnp.sum(A * _load(out.x, variable, in_row, zero), axis=0)
+
+    def pull(y: Array) -> Array:
+        _store(out.y, number, in_y, y)
+        barrier()
+        return jnp.sum(At * _load(out.y, pressing, in_column, zero), axis=0)
+
+    def row(i: Array) -> Array:
+        inside = in_x & (lax.div(column, b) == lax.div(i, r))
+        return _load(A_ref, i * b + lax.rem(column, b), inside, zero)
+
+    def matrix() -> Array:
+        return _load(P_ref, (across, down), in_P, zero)
+
+    inverse, definite = _inverse(n, matrix() - jnp.where(across == down, shift, zero), one, zero)
+    q = _load(q_ref, column, in_x, zero)
+    lower = _load(lower_ref, number, in_y, -infinite)
+    upper = _load(upper_ref, number, in_y, infinite)
+    curve = lambda x: _times(matrix(), x)  # noqa: E731
+    qp = _Problem(curve, rows, pull, row, q, lower, upper, number, c, fine, one, zero, soft.passes)
+    x, y, side = -_times(inverse, q), jnp.zeros((ROWS,), dtype), jnp.zeros((ROWS,), jnp.int32)
     counters = jnp.asarray(coarse), jnp.int32(0), jnp.asarray(True)
-    state = (x, _times(At, x), y, side, inverse, *counters)
     x, _, y, side, inverse, *_, running = lax.while_loop(
         lambda state: state[-1] & (state[-2] < _LIMIT),
-        partial(_pivot, qp, lambda row: A_ref[row, :]),
-        state,
+        partial(_pivot, qp),
+        (x, rows(x), y, side, inverse, *counters),
     )
-    rows = _times(At, x)
+    barrier()  # others still read what `rows` left there
+    product = rows(x)
     for _ in range(_REFINEMENTS):
-        x, rows, y = _correct(qp, inverse, side, x, rows, y)
-    out.x[...], out.y[...], out.side[...] = x, y, side.astype(jnp.int32)
+        x, product, y = _correct(qp, inverse, side, x, product, y)
+    barrier()
+    _store(out.x, column, in_x, x)
+    _store(out.y, number, in_y, y)
+    _store(out.side, number, in_y, side)
     out.settled[...] = jnp.where(running, 0, 1).astype(jnp.int32)
+    out.definite[...] = jnp.where(definite & (soft.shift >= curvature), 1, 0).astype(jnp.int32)

@@ -33,8 +33,8 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.part import Part, choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.tree import where
-from hector_jax.qp.active_set import active_set, first_guess
-from hector_jax.qp.certificates import curvature, is_unique, only_if
+from hector_jax.qp.active_set import active_set, first_guess, no_guess
+from hector_jax.qp.certificates import is_unique, only_if
 from hector_jax.qp.interior_point import approach
 from hector_jax.qp.jaxopt_solver import box_osqp
 from hector_jax.qp.linear import largest, multiplier
@@ -47,6 +47,7 @@ from hector_jax.qp.problem import (
     Normal,
     Point,
     Solution,
+    Start,
     Status,
     Tolerances,
     normalise,
@@ -60,12 +61,12 @@ class Solver(Part):
         approach: approaches a solution of the normalised problem; called as `approach(tolerances,
             qp, enabled, max_iterations=...)`; unless `enabled` it returns infinite residuals and
             no certificate.
-        guess: returns point, active sides and residuals from a Cholesky factor of P, which are
-            tried before `approach`; None starts with `approach`.
+        guess: called as `guess(tolerances, qp)`, returns what is tried before `approach`; None
+            starts with `approach`.
     """
 
     approach: Callable[..., Approach]
-    guess: Callable[[Normal, Array], tuple[Point, Array, Array]] | None
+    guess: Callable[[Tolerances, Normal], Start] | None
 
 
 INTERIOR_POINT = Solver("interior_point", approach=approach, guess=first_guess)
@@ -118,25 +119,20 @@ class _Best(NamedTuple):
 
 
 def _solve_rounds(
-    config: QpConfig, tolerances: Tolerances, qp: Normal, factor: Array, enabled: Array
+    config: QpConfig, tolerances: Tolerances, qp: Normal, start: Start, enabled: Array
 ) -> _Best:
     """Return the best point: a guess, else by the active set from it, else from the approach.
 
     Both rounds are one loop, so that the active set is compiled once.
     """
     solver = cast(Solver, config.solver)
-    if solver.guess is None:
-        start = Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
-        guess, residuals = jnp.zeros_like(qp.side), jnp.full(3, jnp.inf, qp.q.dtype)
-    else:
-        start, guess, residuals = solver.guess(qp, factor)
 
     def attempt(state: _Best) -> _Best:
         approaches = state.running & state.approached
         near = solver.approach(tolerances, qp, approaches, max_iterations=config.max_iterations)
         # compare relative sizes: slacks and multipliers differ widely if the rows, not P, hold x
         pressing = near.point.z * qp.reach > near.slack * largest(near.point.z)
-        begin, active = where(state.approached, (near.point, pressing), (start, guess))
+        begin, active = where(state.approached, (near.point, pressing), (start.point, start.active))
         limit = jnp.where(state.approached, config.max_iterations, config.active_set_tries)
         solvable = state.running & ~jnp.any(near.certified)
         exact, exact_residuals, iterations = active_set(
@@ -150,12 +146,12 @@ def _solve_rounds(
         return _Best(*best, near.certified, iterations, jnp.ones((), bool), running)
 
     first = _Best(
-        start,
-        residuals,
+        start.point,
+        start.residuals,
         jnp.zeros(2, bool),
         jnp.zeros((), jnp.int32),
         jnp.asarray(solver.guess is None),
-        enabled & (jnp.max(residuals) > tolerances.target),
+        enabled & (jnp.max(start.residuals) > tolerances.target),
     )
     return lax.while_loop(lambda state: state.running, attempt, first)
 
@@ -170,10 +166,10 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     # a trivial QP replaces an invalid one, so that no NaN reaches the solver
     trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
     normal = normalise(tolerances, where(valid, qp, trivial))
-    factor, definite, convex = curvature(tolerances, normal)
+    start = (cast(Solver, config.solver).guess or no_guess)(tolerances, normal)
+    definite, valid = start.definite, valid & start.convex
     normal = normal._replace(flat=~definite)
-    valid &= convex
-    best = _solve_rounds(config, tolerances, normal, factor, valid)
+    best = _solve_rounds(config, tolerances, normal, start, valid)
     # without a solution (infeasible, unbounded) residuals and x may be infinite
     usable = valid & jnp.all(jnp.isfinite(best.residuals))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), best.point)
