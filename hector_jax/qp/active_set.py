@@ -18,7 +18,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.console import say
 from hector_jax.core.tree import where
 from hector_jax.qp import gpu_kernel
-from hector_jax.qp.certificates import curvature, only_if
+from hector_jax.qp.certificates import curvature
 from hector_jax.qp.linear import cholesky, matvec, multiplier, plus_gram, rmatvec
 from hector_jax.qp.problem import SIGN, Normal, Point, Start, Tolerances
 
@@ -148,12 +148,11 @@ def worst_sides(qp: Normal, wrong: Array, active: Array, error: Array) -> Array:
     return wrong & (error >= threshold).reshape(wrong.shape)
 
 
-def no_guess(tolerances: Tolerances, qp: Normal) -> Start:
+def no_guess(_: Tolerances, qp: Normal) -> Start:
     """Start from zero."""
-    _, definite, convex = curvature(tolerances, qp)
     none, infinite = jnp.zeros_like(qp.side), jnp.full(3, jnp.inf, qp.q.dtype)
     point = Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
-    return Start(point, none, infinite, definite, convex)
+    return Start(point, none, infinite, jnp.zeros((), bool))
 
 
 def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
@@ -161,11 +160,11 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
     infinite = jnp.full(3, jnp.inf, qp.q.dtype)
 
     def violated(qp: Normal) -> Start:
-        factor, definite, convex = curvature(tolerances, qp)
+        factor, definite, _ = curvature(tolerances, qp)
         x = -cho_solve((factor, True), qp.q)
         outside, none = qp.violation(x), jnp.zeros_like(qp.side)
         active = worst_sides(qp, outside > 0, none, outside)
-        return Start(Point(x, none.astype(x.dtype)), active, infinite, definite, convex)
+        return Start(Point(x, none.astype(x.dtype)), active, infinite, definite)
 
     def pivoted(qp: Normal) -> Start:
         present = qp.side | qp.equality
@@ -178,8 +177,7 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
         found = point, jnp.stack([side > 0, side < 0]), residuals
         nothing = jax.tree.map(jnp.zeros_like, point), jnp.zeros_like(qp.side), infinite
         found = where((settled > 0) & jnp.all(jnp.isfinite(residuals)), found, nothing)
-        proved, factorise = definite > 0, lambda qp: curvature(tolerances, qp)[1:]
-        return Start(*found, *only_if(~proved, factorise, (proved, proved), qp))
+        return Start(*found, definite > 0)
 
     if jax.default_backend() != "gpu":
         return violated(qp)

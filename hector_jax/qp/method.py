@@ -34,7 +34,7 @@ from hector_jax.core.part import Part, choose_part
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, check
 from hector_jax.core.tree import where
 from hector_jax.qp.active_set import active_set, first_guess, no_guess
-from hector_jax.qp.certificates import is_unique, only_if
+from hector_jax.qp.certificates import curvature, is_unique, only_if
 from hector_jax.qp.interior_point import approach
 from hector_jax.qp.jaxopt_solver import box_osqp
 from hector_jax.qp.linear import largest, multiplier
@@ -119,9 +119,9 @@ class _Best(NamedTuple):
 
 
 def _solve_rounds(
-    config: QpConfig, tolerances: Tolerances, qp: Normal, start: Start, enabled: Array
+    config: QpConfig, tolerances: Tolerances, qp: Normal, first: _Best, active: Array
 ) -> _Best:
-    """Return the best point: a guess, else by the active set from it, else from the approach.
+    """Return the best point: by the active set from the first one, else from the approach.
 
     Both rounds are one loop, so that the active set is compiled once.
     """
@@ -132,11 +132,11 @@ def _solve_rounds(
         near = solver.approach(tolerances, qp, approaches, max_iterations=config.max_iterations)
         # compare relative sizes: slacks and multipliers differ widely if the rows, not P, hold x
         pressing = near.point.z * qp.reach > near.slack * largest(near.point.z)
-        begin, active = where(state.approached, (near.point, pressing), (start.point, start.active))
+        begin, sides = where(state.approached, (near.point, pressing), (first.point, active))
         limit = jnp.where(state.approached, config.max_iterations, config.active_set_tries)
         solvable = state.running & ~jnp.any(near.certified)
         exact, exact_residuals, iterations = active_set(
-            tolerances, qp, begin, active=active, enabled=solvable, limit=limit
+            tolerances, qp, begin, active=sides, enabled=solvable, limit=limit
         )
         best = state.point, state.residuals
         for candidate in ((near.point, near.residuals), (exact, exact_residuals)):
@@ -145,15 +145,41 @@ def _solve_rounds(
         running = ~state.approached & (jnp.max(best[1]) > tolerances.target)
         return _Best(*best, near.certified, iterations, jnp.ones((), bool), running)
 
-    first = _Best(
+    return lax.while_loop(lambda state: state.running, attempt, first)
+
+
+def _decide(
+    config: QpConfig, tolerances: Tolerances, qp: Normal, valid: Array
+) -> tuple[_Best, Array, Array]:
+    """Return the best point, whether P is semidefinite, and whether a minimiser is unique.
+
+    If the guess solves the problem and proves P definite, nothing else is computed. A GPU asks its
+    host at each loop whether it runs, so all of that is in one.
+    """
+    solver = cast(Solver, config.solver)
+    start = (solver.guess or no_guess)(tolerances, qp)
+
+    def settle(operands: tuple[Normal, _Best, Array, Array]) -> tuple[_Best, Array, Array]:
+        qp, best, active, definite = operands
+        proofs = lambda qp: curvature(tolerances, qp)[1:]  # noqa: E731
+        definite, convex = only_if(~definite, proofs, (definite, definite), qp)
+        qp, best = qp._replace(flat=~definite), best._replace(running=best.running & convex)
+        best = _solve_rounds(config, tolerances, qp, best, active)
+        solved = jnp.max(best.residuals) <= tolerances.residual
+        test = lambda operands: is_unique(tolerances, *operands)  # noqa: E731
+        return best, convex, only_if(solved & ~definite, test, definite, (qp, best.point))
+
+    unsolved, definite = jnp.max(start.residuals) > tolerances.target, start.definite
+    best = _Best(
         start.point,
         start.residuals,
         jnp.zeros(2, bool),
         jnp.zeros((), jnp.int32),
         jnp.asarray(solver.guess is None),
-        enabled & (jnp.max(start.residuals) > tolerances.target),
+        valid & unsolved,
     )
-    return lax.while_loop(lambda state: state.running, attempt, first)
+    operands = qp, best, start.active, definite
+    return only_if(valid & (unsolved | ~definite), settle, (best, definite, definite), operands)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -166,10 +192,8 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     # a trivial QP replaces an invalid one, so that no NaN reaches the solver
     trivial = QP(jnp.eye(len(qp.q), dtype=qp.q.dtype), *(jnp.zeros_like(v) for v in qp[1:]))
     normal = normalise(tolerances, where(valid, qp, trivial))
-    start = (cast(Solver, config.solver).guess or no_guess)(tolerances, normal)
-    definite, valid = start.definite, valid & start.convex
-    normal = normal._replace(flat=~definite)
-    best = _solve_rounds(config, tolerances, normal, start, valid)
+    best, convex, unique = _decide(config, tolerances, normal, valid)
+    valid &= convex
     # without a solution (infeasible, unbounded) residuals and x may be infinite
     usable = valid & jnp.all(jnp.isfinite(best.residuals))
     point = jax.tree.map(lambda v: jnp.where(usable, v, 0.0), best.point)
@@ -178,8 +202,6 @@ def solve_normal(config: QpConfig, qp: QP) -> tuple[Solution, Array, Normal]:
     # the unavoidable violation; an x that is not a solution does not scale it
     sizes = jnp.min(normal.row_sizes(jnp.where(solved, point.x, normal.reach)), axis=0)
     unmet = jnp.max(normal.unmet / sizes, initial=0.0)
-    test = lambda operands: is_unique(tolerances, *operands)  # noqa: E731
-    unique = only_if(solved & ~definite, test, definite, (normal, point))
     status = jnp.where(best.certified[1], Status.UNBOUNDED, Status.INACCURATE)
     status = jnp.where(best.certified[0], Status.INFEASIBLE, status)
     status = jnp.where(solved, jnp.where(unique, Status.SOLVED, Status.NOT_UNIQUE), status)

@@ -254,13 +254,12 @@ def normalise(tolerances: Tolerances, qp: QP) -> Normal:
 
 
 class Start(NamedTuple):
-    """First guess of a solution, and the curvature of P."""
+    """First guess of a solution."""
 
     point: Point
     active: Array  # (2, m) bool: guess of the active sides
     residuals: Array  # (3,) of the point; infinite if not computed
-    definite: Array  # () bool
-    convex: Array  # () bool: P is semidefinite
+    definite: Array  # () bool: P was proved definite
 
 
 class Approach(NamedTuple):

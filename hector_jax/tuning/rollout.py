@@ -29,7 +29,7 @@ from hector_jax.core.geometry import rotation_from_euler
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import AT_LEAST_ONE, NOT_NEGATIVE, Range, check
 from hector_jax.core.trajectory import State, Trajectory, Wrench, has_fallen
-from hector_jax.core.tree import where
+from hector_jax.core.tree import layout, pack, unpack, where
 from hector_jax.grfm.effect import HISTORY, Effect, Window, from_yaw_frame, ground_effect, turn
 from hector_jax.robot import srbm
 from hector_jax.robot.kinematics import foot_poses
@@ -345,16 +345,25 @@ def rollout(
     Source: Eq. 12, 13.
     """
     policy = jax.checkpoint_policies.save_only_these_names(qp.SAVED)
-    tick = partial(step_carry, config, robot, weights, command, effect, variation=variation)
+    first, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
+
+    # A GPU copies one array of all numbers in a tick faster than many small ones.
+    def tick(packed: jax.Array, number: Int[Array, ""]) -> tuple:
+        carry = unpack(layout(first), packed)
+        after, sample = step_carry(
+            config, robot, weights, command, effect, carry, number, variation
+        )
+        return pack(after), (pack(sample), jax.tree_util.Partial(partial(unpack, layout(sample))))
+
     walk = partial(jax.lax.scan, jax.checkpoint(tick, policy=policy))
-    start, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
+    start = pack(first)
     blocks = -(-len(ticks) // config.block)
     if blocks == 1:
-        _, samples = walk(start, ticks)
+        _, (samples, to_samples) = walk(start, ticks)
     else:
         # equal blocks compile to one loop: the last block has a few more ticks, which are dropped
         size = -(-len(ticks) // blocks)
         padded = ticks[0] + jnp.arange(blocks * size).reshape(blocks, size)
-        _, samples = jax.lax.scan(jax.checkpoint(walk), start, padded)
-        samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: len(ticks)], samples)
-    return from_start(config, samples)
+        _, (samples, to_samples) = jax.lax.scan(jax.checkpoint(walk), start, padded)
+        samples = samples.reshape(-1, samples.shape[-1])[: len(ticks)]
+    return from_start(config, to_samples(samples))
