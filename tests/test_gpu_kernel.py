@@ -7,7 +7,6 @@ import pytest
 from oracles import exact_solution, walking_qp
 
 from hector_jax.qp import gpu_kernel
-from hector_jax.qp.linear import cholesky, cholesky_solver
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -52,28 +51,3 @@ def test_only_small_problems_fit():
     assert gpu_kernel.fits(gpu_kernel.VARIABLES, gpu_kernel.ROWS)
     assert not gpu_kernel.fits(100, 110)
     assert not gpu_kernel.fits(50, 220)
-
-
-@pytest.mark.parametrize("n", [1, 5, 50, 70])
-def test_the_kernels_solve_with_a_positive_definite_matrix(n, monkeypatch):
-    made = np.random.default_rng(n).normal(size=(3, n, n + 1))
-    matrix = jnp.asarray(made @ made.swapaxes(1, 2))
-    b, along = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3, n)))
-
-    def both(matrix, b, along):
-        solve = lambda b: cholesky_solver(matrix)(b)  # noqa: E731
-        return solve(b), jax.grad(lambda b: along @ solve(b))(b)
-
-    def interpreted(*args, cuda, default):
-        return cuda(*args) if cuda is cholesky else cuda(*args, interpret=True)
-
-    usual = jax.vmap(both)(matrix, b, along)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(jax.lax, "platform_dependent", interpreted)
-    for found, expected in zip(jax.vmap(both)(matrix, b, along), usual, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-
-
-def test_the_kernel_has_no_factor_of_an_indefinite_matrix():
-    factor = gpu_kernel.factorise(jnp.diag(jnp.array([1.0, -1.0, 1.0])), interpret=True)
-    assert not np.isfinite(factor).all()

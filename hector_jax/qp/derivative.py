@@ -20,8 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
+from jax.scipy.linalg import cho_solve
 
-from hector_jax.qp.linear import cholesky_solver, matvec, plus_gram, rmatvec
+from hector_jax.qp.linear import cholesky, matvec, plus_gram, rmatvec
 from hector_jax.qp.method import QpConfig, solve_normal
 from hector_jax.qp.problem import QP, Solution, Status
 
@@ -50,7 +51,7 @@ def _jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple[Sol
     weight = ratio[0] + ratio[1]
     capped = weight >= tolerances.cap
     eye = jnp.eye(len(qp.q), dtype=dtype)
-    solve = cholesky_solver(plus_gram(normal.P + tolerances.proximal * eye, normal.A, weight))
+    factor = cholesky(plus_gram(normal.P + tolerances.proximal * eye, normal.A, weight))
     solved = solution.status == Status.SOLVED
     pull, shift = jnp.zeros_like(solution.x), jnp.zeros_like(solution.y)
     if _nonzero(d.P):
@@ -67,7 +68,7 @@ def _jvp(config: QpConfig, primals: tuple[QP], tangents: tuple[QP]) -> tuple[Sol
     dv, dz = jnp.zeros_like(pull), jnp.zeros_like(shift)
     for _ in range(2):  # as in `active_set`, the second pass removes the bias of cap and rho
         force = jnp.where(capped, dz, 0.0) + weight * matvec(normal.A, dv) + shift
-        step = -solve(normal.P @ dv + pull + rmatvec(normal.A, force))
+        step = -cho_solve((factor, True), normal.P @ dv + pull + rmatvec(normal.A, force))
         step = jnp.where(solved, step, 0.0)  # without a solution the factor can be NaN
         dv, dz = dv + step, force + weight * matvec(normal.A, step)
     zero = jnp.zeros((), dtype)

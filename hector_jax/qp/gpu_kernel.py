@@ -87,82 +87,18 @@ def guess(
         curvature: what the eigenvalues of a definite P exceed; 32 bits prove nothing.
         interpret: interpret the kernel's operations on any device; for tests.
     """
+    options: Any = {}
     flag, side = (jax.ShapeDtypeStruct(shape, jnp.int32) for shape in ((), lower.shape))
     x, y = (jax.ShapeDtypeStruct(v.shape, q.dtype) for v in (q, lower))
     out: Any = x, y, side, flag, flag
-    barrier = (lambda: None) if interpret else triton.debug_barrier
-    kernel = partial(_kernel, A.shape, curvature, barrier)
-    return _call(kernel, Guess(*out), interpret, warps=4)(P, q, A.ravel(), lower, upper)
-
-
-def factorise(matrix: Float[Array, "n n"], interpret: bool = False) -> Float[Array, "n n"]:
-    """Return the lower Cholesky factor of up to VARIABLES rows; NaN if not positive definite."""
-    n, dtype = len(matrix), matrix.dtype
-    zero, one = np.asarray(0.0, dtype), np.asarray(1.0, dtype)
-
-    def kernel(matrix_ref: Any, factor_ref: Any) -> None:
-        (index,), (across, down) = _indices((VARIABLES,)), _indices((VARIABLES, VARIABLES))
-        eye, inside = jnp.where(across == down, one, zero), (across < n) & (down < n)
-
-        def eliminate(k: Array, row: Array) -> tuple[Array, Array]:
-            pivot = jnp.sum(jnp.where(index == k, row, zero))
-            row = jnp.where(index > k, row, zero)
-            return row * (one / pivot), row
-
-        def eliminate_two(k: Array, M: Array) -> Array:
-            i, j = 2 * k, 2 * k + 1
-            first, second = (jnp.sum(jnp.where(across == k, M, zero), axis=0) for k in (i, j))
-            left, first = eliminate(i, first)
-            second -= jnp.sum(jnp.where(index == j, left, zero)) * first
-            right, second = eliminate(j, second)
-            return M - (left[:, None] * first + right[:, None] * second)
-
-        tile = jnp.where(inside, _load(matrix_ref, (across, down), inside, zero), eye)
-        tile = lax.fori_loop(0, (n + 1) // 2, eliminate_two, tile)
-        scale = lax.rsqrt(jnp.sum(tile * eye, axis=0))
-        _store(factor_ref, (across, down), inside, jnp.where(down <= across, tile * scale, zero))
-
-    return _call(kernel, jax.ShapeDtypeStruct((n, n), dtype), interpret, warps=4)(matrix)
-
-
-def substitute(
-    factor: Float[Array, "n n"], b: Float[Array, " n"], interpret: bool = False
-) -> Float[Array, " n"]:
-    """Solve L L'x = b for a lower triangular L of any size.
-
-    One warp solves one problem, which is faster than the library's triangular solves of a batch.
-    """
-    (n,), dtype = b.shape, b.dtype
-
-    def kernel(factor_ref: Any, b_ref: Any, x_ref: Any) -> None:
-        (index,) = _indices((1 << (n - 1).bit_length(),))
-        zero, one = np.asarray(0.0, dtype), np.asarray(1.0, dtype)
-        right = _load(b_ref, index, index < n, zero)
-
-        def pivot(k: Array) -> Array:
-            return one / factor_ref[k, k]
-
-        def forward(k: Array, y: Array) -> Array:
-            row = _load(factor_ref, (k, index), index < k, zero)
-            value = jnp.sum(jnp.where(index == k, right, -row * y)) * pivot(k)
-            return jnp.where(index == k, value, y)
-
-        def backward(i: Array, x: Array) -> Array:
-            k = n - 1 - i
-            row = _load(factor_ref, (k, index), index < k, zero)
-            value = jnp.sum(jnp.where(index == k, x, zero)) * pivot(k)
-            return jnp.where(index == k, value, x - row * value)
-
-        y = lax.fori_loop(0, n, forward, jnp.zeros_like(right))
-        _store(x_ref, index, index < n, lax.fori_loop(0, n, backward, y))
-
-    return _call(kernel, jax.ShapeDtypeStruct((n,), dtype), interpret, warps=1)(factor, b)
-
-
-def _call(kernel: Callable, out: Any, interpret: bool, *, warps: int) -> Callable:
-    parameters = triton.CompilerParams(num_warps=warps, num_stages=1)
-    options: Any = {} if interpret else {"compiler_params": parameters}
-    return pl.pallas_call(kernel, out_shape=out, interpret=interpret, **options)
+    if not interpret:
+        options["compiler_params"] = triton.CompilerParams(num_warps=4, num_stages=1)
+    return pl.pallas_call(
+        partial(_kernel, A.shape, curvature, (lambda: None) if interpret else triton.debug_barrier),
+        out_shape=Guess(*out),
+        interpret=interpret,
+        **options,
+    )(P, q, A.ravel(), lower, upper)
 
 
 class _Problem(NamedTuple):

@@ -1,17 +1,10 @@
 """Linear algebra of all methods; A is dense (m, n) or block-diagonal by step (N, r, b)."""
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any
-
-import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Float
 
 from hector_jax.core.arrays import Array, contract
-from hector_jax.qp import gpu_kernel
 
 
 def matvec(A: Array, x: Array) -> Array:
@@ -46,24 +39,6 @@ def plus_gram(P: Array, A: Array, w: Array) -> Array:
 def cholesky(matrix: Array) -> Array:
     """Return the lower Cholesky factor of a symmetric matrix; NaN if not positive definite."""
     return lax.linalg.cholesky(jnp.asarray(matrix), symmetrize_input=False)
-
-
-def cholesky_solver(matrix: Array) -> Callable[[Array], Array]:
-    """Return a function that solves with a positive definite matrix; NaN if it is not definite.
-
-    The function is linear. On a GPU it is kernels, because the library's keep the GPU waiting.
-    """
-    usual = lambda factor, b: cho_solve((factor, True), b)  # noqa: E731
-    if jax.default_backend() != "gpu":
-        return partial(usual, cholesky(matrix))
-    kernel = gpu_kernel.factorise if gpu_kernel.fits(len(matrix), 0) else cholesky
-    factor = lax.platform_dependent(matrix, cuda=kernel, default=cholesky)
-
-    def solve(_: Any, b: Array) -> Array:
-        return lax.platform_dependent(factor, b, cuda=gpu_kernel.substitute, default=usual)
-
-    product = lambda x: matrix @ x  # noqa: E731
-    return lambda b: lax.custom_linear_solve(product, b, solve, symmetric=True)
 
 
 def largest(v: Array) -> Array:
