@@ -626,11 +626,10 @@ INTERPRETED = partial(gpu_kernel.guess, interpret=True)
 
 
 def as_on_a_gpu(kernel=INTERPRETED):
-    """The default solver, its guess traced as on a GPU with this kernel, interpreted here."""
+    """The default solver, its guess as on a GPU with this kernel; needs that backend's name."""
 
     def guess(tolerances, qp):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(jax, "default_backend", lambda: "gpu")
             patch.setattr(jax.lax, "platform_dependent", lambda *args, cuda, default: cuda(*args))
             patch.setattr(gpu_kernel, "guess", kernel)
             return first_guess(tolerances, qp)
@@ -638,7 +637,7 @@ def as_on_a_gpu(kernel=INTERPRETED):
     return QpConfig(solver=Solver("interior_point", approach=approach, guess=guess))
 
 
-def test_on_a_gpu_the_kernels_point_is_the_solution():
+def test_on_a_gpu_the_kernels_point_is_the_solution(monkeypatch):
     config, robot = WalkConfig(), load_robot()
 
     def layer(qp_config, problem):
@@ -651,6 +650,7 @@ def test_on_a_gpu_the_kernels_point_is_the_solution():
 
     problems = draw_problems(config, robot, 100)
     slope, usual = jax.jit(partial(jax.lax.map, partial(layer, QpConfig())))(problems)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     along, found = jax.jit(partial(jax.lax.map, partial(layer, as_on_a_gpu())))(problems)
     assert (found.iterations == 0).all()  # nothing was corrected
     assert (found.status == Status.SOLVED).all()
@@ -661,13 +661,16 @@ def test_on_a_gpu_the_kernels_point_is_the_solution():
 
 
 @pytest.mark.parametrize("settled", [False, True])
-def test_on_a_gpu_a_wrong_point_of_the_kernel_is_corrected(walking, walked, settled):
+def test_on_a_gpu_a_wrong_point_of_the_kernel_is_corrected(
+    walking, walked, settled, monkeypatch
+):
     """One that did not settle is not taken, one that did is where the corrections start."""
 
     def lost(P, q, A, lower, upper, curvature):
         x, side = jnp.full_like(q, 1.0 if settled else jnp.nan), jnp.ones(len(lower), jnp.int32)
         return gpu_kernel.Guess(x, jnp.ones_like(lower), side, jnp.int32(settled), jnp.int32(0))
 
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     config = as_on_a_gpu(lost)
     for qp, x in zip(walking[:4], walked.x[:4], strict=True):
         found = solve(qp, config)

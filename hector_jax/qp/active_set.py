@@ -148,11 +148,12 @@ def worst_sides(qp: Normal, wrong: Array, active: Array, error: Array) -> Array:
     return wrong & (error >= threshold).reshape(wrong.shape)
 
 
-def no_guess(_: Tolerances, qp: Normal) -> Start:
+def no_guess(tolerances: Tolerances, qp: Normal) -> Start:
     """Start from zero."""
+    _, definite, convex = curvature(tolerances, qp)
     none, infinite = jnp.zeros_like(qp.side), jnp.full(3, jnp.inf, qp.q.dtype)
     point = Point(jnp.zeros_like(qp.q), jnp.zeros_like(qp.bound))
-    return Start(point, none, infinite, jnp.zeros((), bool))
+    return Start(point, none, infinite, definite, convex)
 
 
 def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
@@ -160,11 +161,11 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
     infinite = jnp.full(3, jnp.inf, qp.q.dtype)
 
     def violated(qp: Normal) -> Start:
-        factor, definite, _ = curvature(tolerances, qp)
+        factor, definite, convex = curvature(tolerances, qp)
         x = -cho_solve((factor, True), qp.q)
         outside, none = qp.violation(x), jnp.zeros_like(qp.side)
         active = worst_sides(qp, outside > 0, none, outside)
-        return Start(Point(x, none.astype(x.dtype)), active, infinite, definite)
+        return Start(Point(x, none.astype(x.dtype)), active, infinite, definite, convex)
 
     def pivoted(qp: Normal) -> Start:
         present = qp.side | qp.equality
@@ -177,7 +178,7 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
         found = point, jnp.stack([side > 0, side < 0]), residuals
         nothing = jax.tree.map(jnp.zeros_like, point), jnp.zeros_like(qp.side), infinite
         found = where((settled > 0) & jnp.all(jnp.isfinite(residuals)), found, nothing)
-        return Start(*found, definite > 0)
+        return Start(*found, definite > 0, definite > 0)  # if not proved, `method` factorises P
 
     if jax.default_backend() != "gpu":
         return violated(qp)

@@ -153,24 +153,13 @@ def _decide(
 ) -> tuple[_Best, Array, Array]:
     """Return the best point, whether P is semidefinite, and whether a minimiser is unique.
 
-    If the guess solves the problem and proves P definite, nothing else is computed. A GPU asks its
-    host at each loop whether it runs, so all of that is in one.
+    A GPU asks its host at each loop whether it runs. So there all that follows a guess that solves
+    the problem and proves P definite is one loop.
     """
     solver = cast(Solver, config.solver)
     start = (solver.guess or no_guess)(tolerances, qp)
-
-    def settle(operands: tuple[Normal, _Best, Array, Array]) -> tuple[_Best, Array, Array]:
-        qp, best, active, definite = operands
-        proofs = lambda qp: curvature(tolerances, qp)[1:]  # noqa: E731
-        definite, convex = only_if(~definite, proofs, (definite, definite), qp)
-        qp, best = qp._replace(flat=~definite), best._replace(running=best.running & convex)
-        best = _solve_rounds(config, tolerances, qp, best, active)
-        solved = jnp.max(best.residuals) <= tolerances.residual
-        test = lambda operands: is_unique(tolerances, *operands)  # noqa: E731
-        return best, convex, only_if(solved & ~definite, test, definite, (qp, best.point))
-
-    unsolved, definite = jnp.max(start.residuals) > tolerances.target, start.definite
-    best = _Best(
+    unsolved = jnp.max(start.residuals) > tolerances.target
+    first = _Best(
         start.point,
         start.residuals,
         jnp.zeros(2, bool),
@@ -178,8 +167,27 @@ def _decide(
         jnp.asarray(solver.guess is None),
         valid & unsolved,
     )
-    operands = qp, best, start.active, definite
-    return only_if(valid & (unsolved | ~definite), settle, (best, definite, definite), operands)
+
+    def settle(qp: Normal, first: _Best, start: Start) -> tuple[_Best, Array, Array]:
+        qp = qp._replace(flat=~start.definite)
+        first = first._replace(running=first.running & start.convex)
+        best = _solve_rounds(config, tolerances, qp, first, start.active)
+        solved = valid & start.convex & (jnp.max(best.residuals) <= tolerances.residual)
+        test = lambda operands: is_unique(tolerances, *operands)  # noqa: E731
+        unique = only_if(solved & ~start.definite, test, start.definite, (qp, best.point))
+        return best, start.convex, unique
+
+    if jax.default_backend() != "gpu":
+        return settle(qp, first, start)
+
+    def prove(operands: tuple[Normal, _Best, Start]) -> tuple[_Best, Array, Array]:
+        qp, first, start = operands
+        proofs, proved = lambda qp: curvature(tolerances, qp)[1:], (start.definite, start.convex)
+        definite, convex = only_if(~start.definite, proofs, proved, qp)
+        return settle(qp, first, start._replace(definite=definite, convex=convex))
+
+    proved = first, start.convex, start.definite
+    return only_if(valid & (unsolved | ~start.definite), prove, proved, (qp, first, start))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -254,12 +254,13 @@ def normalise(tolerances: Tolerances, qp: QP) -> Normal:
 
 
 class Start(NamedTuple):
-    """First guess of a solution."""
+    """First guess of a solution, and the curvature of P."""
 
     point: Point
     active: Array  # (2, m) bool: guess of the active sides
     residuals: Array  # (3,) of the point; infinite if not computed
-    definite: Array  # () bool: P was proved definite
+    definite: Array  # () bool
+    convex: Array  # () bool: P is semidefinite
 
 
 class Approach(NamedTuple):
