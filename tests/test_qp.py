@@ -661,9 +661,7 @@ def test_on_a_gpu_the_kernels_point_is_the_solution(monkeypatch):
 
 
 @pytest.mark.parametrize("settled", [False, True])
-def test_on_a_gpu_a_wrong_point_of_the_kernel_is_corrected(
-    walking, walked, settled, monkeypatch
-):
+def test_on_a_gpu_a_wrong_point_of_the_kernel_is_corrected(walking, walked, settled, monkeypatch):
     """One that did not settle is not taken, one that did is where the corrections start."""
 
     def lost(P, q, A, lower, upper, curvature):

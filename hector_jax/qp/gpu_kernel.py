@@ -33,6 +33,7 @@ from jaxtyping import Float, Int
 from hector_jax.core.arrays import Array
 
 VARIABLES, ROWS = 64, 128  # size of the kernel's vectors, limited by the registers of a program
+_VECTORS = (VARIABLES,), (ROWS,)
 _LIMIT = 120  # changes; the second half uses the least-index rule
 _REFINEMENTS = 2  # passes at the end: of 1000 walking QPs one leaves 8e-13, two leave rounding
 
@@ -204,6 +205,38 @@ def _store(ref: Any, index: Any, inside: Any, value: Any) -> None:
     triton.store(ref.at[index], value, mask=inside)
 
 
+def _products(
+    shape: tuple[int, ...], barrier: Callable[[], Any], A_ref: Any, out: Any, zero: np.ndarray
+) -> tuple[Callable[[Array], Array], ...]:
+    """Return the functions A x, A'y and one row of A, for blocks of this shape."""
+    _, r, b = map(np.int32, shape)
+    (m,), (n,), (column,), (number,) = out.y.shape, out.x.shape, *map(_indices, _VECTORS)
+    # The entries of each row, and of each column, one below the other; tiles have powers of two.
+    entry, of = _indices((1 << int(b - 1).bit_length(), ROWS))
+    in_row, variable = (entry < b) & (of < m), lax.div(of, r) * b + entry
+    A = _load(A_ref, of * b + entry, in_row, zero)
+    entry, of = _indices((1 << int(r - 1).bit_length(), VARIABLES))
+    in_column, pressing = (entry < r) & (of < n), lax.div(of, b) * r + entry
+    At = _load(A_ref, pressing * b + lax.rem(of, b), in_column, zero)
+
+    def rows(x: Array) -> Array:
+        # one thread needs what others hold: through the memory of the outputs
+        _store(out.x, column, column < n, x)
+        barrier()
+        return jnp.sum(A * _load(out.x, variable, in_row, zero), axis=0)
+
+    def pull(y: Array) -> Array:
+        _store(out.y, number, number < m, y)
+        barrier()
+        return jnp.sum(At * _load(out.y, pressing, in_column, zero), axis=0)
+
+    def row(i: Array) -> Array:
+        inside = (column < n) & (lax.div(column, b) == lax.div(i, r))
+        return _load(A_ref, i * b + lax.rem(column, b), inside, zero)
+
+    return rows, pull, row
+
+
 def _kernel(
     shape: tuple[int, ...],
     curvature: float,
@@ -219,32 +252,9 @@ def _kernel(
     dtype, soft = P_ref.dtype, _softness(P_ref.dtype)
     c, shift, coarse, fine = (np.asarray(v, dtype) for v in soft[:4])
     one, zero, infinite = (np.asarray(v, dtype) for v in (1.0, 0.0, np.inf))
-    (n,), (m,), (_, r, b) = q_ref.shape, lower_ref.shape, map(np.int32, shape)
-    (column,), (number,), (across, down) = map(_indices, ((VARIABLES,), (ROWS,), (VARIABLES,) * 2))
+    (n,), (m,), (column,), (number,) = q_ref.shape, lower_ref.shape, *map(_indices, _VECTORS)
+    across, down = _indices((VARIABLES, VARIABLES))
     in_x, in_y, in_P = column < n, number < m, (across < n) & (down < n)
-
-    # The entries of each row, and of each column, one below the other; tiles have powers of two.
-    entry, of = _indices((1 << int(b - 1).bit_length(), ROWS))
-    in_row, variable = (entry < b) & (of < m), lax.div(of, r) * b + entry
-    A = _load(A_ref, of * b + entry, in_row, zero)
-    entry, of = _indices((1 << int(r - 1).bit_length(), VARIABLES))
-    in_column, pressing = (entry < r) & (of < n), lax.div(of, b) * r + entry
-    At = _load(A_ref, pressing * b + lax.rem(of, b), in_column, zero)
-
-    def rows(x: Array) -> Array:
-        # one thread needs what others hold: through the memory of the outputs
-        _store(out.x, column, in_x, x)
-        barrier()
-        return jnp.sum(A * _load(out.x, variable, in_row, zero), axis=0)
-
-    def pull(y: Array) -> Array:
-        _store(out.y, number, in_y, y)
-        barrier()
-        return jnp.sum(At * _load(out.y, pressing, in_column, zero), axis=0)
-
-    def row(i: Array) -> Array:
-        inside = in_x & (lax.div(column, b) == lax.div(i, r))
-        return _load(A_ref, i * b + lax.rem(column, b), inside, zero)
 
     def matrix() -> Array:
         return _load(P_ref, (across, down), in_P, zero)
@@ -254,6 +264,7 @@ def _kernel(
     lower = _load(lower_ref, number, in_y, -infinite)
     upper = _load(upper_ref, number, in_y, infinite)
     curve = lambda x: _times(matrix(), x)  # noqa: E731
+    rows, pull, row = _products(shape, barrier, A_ref, out, zero)
     qp = _Problem(curve, rows, pull, row, q, lower, upper, number, c, fine, one, zero, soft.passes)
     x, y, side = -_times(inverse, q), jnp.zeros((ROWS,), dtype), jnp.zeros((ROWS,), jnp.int32)
     counters = jnp.asarray(coarse), jnp.int32(0), jnp.asarray(True)
