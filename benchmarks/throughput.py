@@ -21,6 +21,7 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.runtime import setup_jax
 from hector_jax.grfm.effect import last_command
 from hector_jax.robot.model import load_robot
+from hector_jax.tuning.batch import COMPILER_OPTIONS
 from hector_jax.tuning.difftune import TuneConfig, tune_step
 
 DRAWN = 256  # different problems; larger batches repeat them
@@ -56,7 +57,8 @@ def loop_time(batch: int) -> tuple[float, float]:
         lambda w: w * np.exp(rng.uniform(-0.3, 0.3, (batch, *w.shape))), nominal()
     )
     run = jax.jit(
-        jax.vmap(lambda weights: tune_step(config, robot, weights, command, anchor, last_command))
+        jax.vmap(lambda weights: tune_step(config, robot, weights, command, anchor, last_command)),
+        compiler_options=COMPILER_OPTIONS,
     )
     result = jax.block_until_ready(run(weights))
     start = time.perf_counter()

@@ -48,6 +48,7 @@ from hector_jax.runs.export import (
 )
 from hector_jax.runs.export_controller import Check, check, record
 
+pytestmark = pytest.mark.usefixtures("on_cpu")
 ROBOT, CONFIG = load_robot(), WalkConfig()
 EXAMPLE = Path(__file__).parents[1] / "examples" / "run_exported.py"
 

@@ -33,6 +33,7 @@ from hector_jax.tuning.evaluate import Evaluation
 from hector_jax.tuning.rollout import RolloutConfig
 from tests.model import small_net
 
+pytestmark = pytest.mark.usefixtures("on_cpu")
 ROBOT = load_robot()
 TICKS, AT = 24, 9  # of the walk, of the fault
 CONFIG = TuneConfig(rollout=RolloutConfig(ticks=TICKS), iterations=14)

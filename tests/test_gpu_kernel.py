@@ -1,12 +1,16 @@
 """The kernel that solves a QP on a GPU, interpreted here."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles import exact_solution, walking_qp
 
-from hector_jax.qp import gpu_kernel
+import hector_jax.qp
+from hector_jax.qp import active_set, gpu_kernel
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -51,3 +55,19 @@ def test_only_small_problems_fit():
     assert gpu_kernel.fits(gpu_kernel.VARIABLES, gpu_kernel.ROWS)
     assert not gpu_kernel.fits(100, 110)
     assert not gpu_kernel.fits(50, 220)
+
+
+def test_without_triton_a_gpu_takes_the_slower_path(monkeypatch):
+    said = []
+    monkeypatch.setattr(active_set, "say", said.append)
+    monkeypatch.delattr(hector_jax.qp, "gpu_kernel")
+    monkeypatch.setitem(sys.modules, "hector_jax.qp.gpu_kernel", None)
+    assert active_set._kernel.__wrapped__(50, 110, True) is None
+    assert said == [
+        "on a GPU a QP of 50 variables and 110 rows takes the slower path: this JAX has no Triton"
+    ]
+
+
+def test_the_package_loads_without_triton():
+    absent = "import sys; sys.modules['jaxlib.mlir._mlir_libs._triton_ext'] = None"
+    subprocess.run([sys.executable, "-c", f"{absent}; import hector_jax.tuning.batch"], check=True)

@@ -210,7 +210,7 @@ def test_a_qp_larger_than_the_gpu_s_kernel_is_told(monkeypatch):
     monkeypatch.setattr(active_set.jax, "default_backend", lambda: "gpu")
     config, said = replace(CONFIG, mpc=replace(CONFIG.mpc, horizon=9)), []
     monkeypatch.setattr(active_set, "say", said.append)
-    active_set._say_slower.cache_clear()
+    active_set._kernel.cache_clear()
     for count in (4, 4):
         jax.eval_shape(partial(solved.__wrapped__, config, count))  # told where it is traced
     (line,) = said

@@ -7,6 +7,7 @@ points whose residuals are too large.
 """
 
 from functools import cache, partial
+from types import ModuleType
 from typing import NamedTuple
 
 import jax
@@ -17,7 +18,6 @@ from jax.scipy.linalg import cho_solve
 from hector_jax.core.arrays import Array
 from hector_jax.core.console import say
 from hector_jax.core.tree import where
-from hector_jax.qp import gpu_kernel
 from hector_jax.qp.certificates import curvature
 from hector_jax.qp.linear import cholesky, matvec, multiplier, plus_gram, rmatvec
 from hector_jax.qp.problem import SIGN, Normal, Point, Start, Tolerances
@@ -167,10 +167,10 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
         active = worst_sides(qp, outside > 0, none, outside)
         return Start(Point(x, none.astype(x.dtype)), active, infinite, definite, convex)
 
-    def pivoted(qp: Normal) -> Start:
+    def pivoted(kernel: ModuleType, qp: Normal) -> Start:
         present = qp.side | qp.equality
         upper, lower = jnp.where(present, qp.bound, jnp.asarray(SIGN, qp.q.dtype) * jnp.inf)
-        x, y, side, settled, definite = gpu_kernel.guess(
+        x, y, side, settled, definite = kernel.guess(
             qp.P, qp.q, qp.A, lower, upper, curvature=tolerances.curvature
         )
         point = Point(x, jnp.maximum(SIGN * y, 0.0))
@@ -182,15 +182,23 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
 
     if jax.default_backend() != "gpu":
         return violated(qp)
-    if qp.A.ndim != 3 or not gpu_kernel.fits(len(qp.q), len(qp.row)):
-        _say_slower(len(qp.q), len(qp.row))
+    kernel = _kernel(len(qp.q), len(qp.row), qp.A.ndim == 3)
+    if kernel is None:
         return violated(qp)
-    return lax.platform_dependent(qp, cuda=pivoted, default=violated)
+    return lax.platform_dependent(qp, cuda=partial(pivoted, kernel), default=violated)
 
 
-@cache  # print it once for each size
-def _say_slower(variables: int, rows: int) -> None:
-    say(
-        f"on a GPU a QP of {variables} variables and {rows} rows takes the slower path: the kernel "
-        f"holds block-diagonal ones of up to {gpu_kernel.VARIABLES} and {gpu_kernel.ROWS}"
-    )
+@cache  # say it once for each size
+def _kernel(variables: int, rows: int, block_diagonal: bool) -> ModuleType | None:
+    """Return the GPU's kernel for a QP of this size; None, and a message, if there is none."""
+    try:  # Windows has no Triton, and JAX announces that Pallas will lose it
+        from hector_jax.qp import gpu_kernel
+    except ImportError:
+        why = "this JAX has no Triton"
+    else:
+        if block_diagonal and gpu_kernel.fits(variables, rows):
+            return gpu_kernel
+        limits = f"{gpu_kernel.VARIABLES} and {gpu_kernel.ROWS}"
+        why = f"the kernel holds block-diagonal ones of up to {limits}"
+    say(f"on a GPU a QP of {variables} variables and {rows} rows takes the slower path: {why}")
+    return None

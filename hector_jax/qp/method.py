@@ -61,8 +61,8 @@ class Solver(Part):
         approach: approaches a solution of the normalised problem; called as `approach(tolerances,
             qp, enabled, max_iterations=...)`; unless `enabled` it returns infinite residuals and
             no certificate.
-        guess: called as `guess(tolerances, qp)`, returns what is tried before `approach`; None
-            starts with `approach`.
+        guess: called as `guess(tolerances, qp)`, returns what is tried before `approach` and what
+            it proves of P, see `Start`; None starts with `approach`.
     """
 
     approach: Callable[..., Approach]
@@ -172,7 +172,7 @@ def _decide(
         qp = qp._replace(flat=~start.definite)
         first = first._replace(running=first.running & start.convex)
         best = _solve_rounds(config, tolerances, qp, first, start.active)
-        solved = valid & start.convex & (jnp.max(best.residuals) <= tolerances.residual)
+        solved = valid & (jnp.max(best.residuals) <= tolerances.residual)
         test = lambda operands: is_unique(tolerances, *operands)  # noqa: E731
         unique = only_if(solved & ~start.definite, test, start.definite, (qp, best.point))
         return best, start.convex, unique
@@ -182,12 +182,13 @@ def _decide(
 
     def prove(operands: tuple[Normal, _Best, Start]) -> tuple[_Best, Array, Array]:
         qp, first, start = operands
-        proofs, proved = lambda qp: curvature(tolerances, qp)[1:], (start.definite, start.convex)
-        definite, convex = only_if(~start.definite, proofs, proved, qp)
+        signs = lambda qp: curvature(tolerances, qp)[1:]  # noqa: E731
+        known = start.definite, start.convex
+        definite, convex = only_if(~start.definite, signs, known, qp)
         return settle(qp, first, start._replace(definite=definite, convex=convex))
 
-    proved = first, start.convex, start.definite
-    return only_if(valid & (unsolved | ~start.definite), prove, proved, (qp, first, start))
+    as_guessed = first, start.convex, start.definite
+    return only_if(valid & (unsolved | ~start.definite), prove, as_guessed, (qp, first, start))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -254,7 +254,11 @@ def normalise(tolerances: Tolerances, qp: QP) -> Normal:
 
 
 class Start(NamedTuple):
-    """First guess of a solution, and the curvature of P."""
+    """First guess of a solution, and the curvature of P.
+
+    On a GPU false for `definite` and `convex` means that they are not known: `method` computes
+    them then.
+    """
 
     point: Point
     active: Array  # (2, m) bool: guess of the active sides

@@ -163,19 +163,18 @@ def load(path: Path) -> tuple[Dump, TuneConfig, dict[str, Any]]:
 
 
 def replay(path: Path) -> Replay:
-    """Repeat the evaluation of a dump on the CPU, on which tunings run.
+    """Repeat the evaluation of a dump.
 
     Raises:
-        InputError: see `load`.
+        InputError: JAX does not run on the CPU, as in tunings; or see `load`.
     """
     dump, config, about = load(path)
+    if jax.default_backend() != "cpu":  # for which other programs are traced
+        raise InputError("replaying needs JAX on the CPU (JAX_PLATFORMS=cpu)")
     inputs = *dump[:4], effect_of(dump.params, config.rollout.walk)
-    # if the CPU is the default, naming it would compile the program of a tuning once more
-    is_cpu = jax.default_backend() == "cpu"
-    with jax.default_device(None if is_cpu else jax.local_devices(backend="cpu")[0]):
-        evaluation = jax.device_get(tune_step(config, *inputs))
-        walk = partial(jax.jit(rollout, static_argnums=0), config.rollout)
-        trajectory = jax.device_get(walk(*inputs, variation_of(dump.robot)))
+    evaluation = jax.device_get(tune_step(config, *inputs))
+    walk = partial(jax.jit(rollout, static_argnums=0), config.rollout)
+    trajectory = jax.device_get(walk(*inputs, variation_of(dump.robot)))
     same = jax.tree.map(partial(np.array_equal, equal_nan=True), dump.seen, evaluation)
     then, now = about["environment"], environment()
     machines = {name: [then.get(name), now.get(name)] for name in sorted(then.keys() | now.keys())}

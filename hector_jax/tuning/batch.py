@@ -42,6 +42,10 @@ AXIS = "problems"
 PER_CALL = PAPER_ITERATIONS + 1  # rollouts per problem and call of the device: start and ten
 TICKS_AT_ONCE = 8 * 400  # most on a GPU that are faster at once than in turn
 
+COMPILER_OPTIONS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+"""For `jax.jit` of rollouts: on a GPU, small kernels that do not need each other run side by side
+(docs/performance.md); a CPU ignores it."""
+
 
 class Scenario(NamedTuple):
     """A rollout of a problem; leading axes of a batch: problems, scenarios."""
@@ -143,7 +147,7 @@ def _evaluate(
     return Evaluation(loss, terms, gradient, jnp.max(stacked.fallen), jnp.max(stacked.residual))
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(jax.jit, static_argnums=(0, 1, 2, 3), compiler_options=COMPILER_OPTIONS)
 def _advance(
     config: TuneConfig,
     lanes: int,

@@ -347,12 +347,14 @@ def rollout(
     policy = jax.checkpoint_policies.save_only_these_names(qp.SAVED)
     first, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
 
-    # A GPU copies one array of all numbers in a tick faster than many small ones.
+    # A GPU copies one array of all numbers in a tick faster than many small ones. How to unpack a
+    # sample is known only while a tick is traced: the scan returns it as a tree without arrays.
     def tick(packed: jax.Array, number: Int[Array, ""]) -> tuple:
         carry = unpack(layout(first), packed)
         after, sample = step_carry(
             config, robot, weights, command, effect, carry, number, variation
         )
+        assert layout(after) == layout(first)
         return pack(after), (pack(sample), jax.tree_util.Partial(partial(unpack, layout(sample))))
 
     walk = partial(jax.lax.scan, jax.checkpoint(tick, policy=policy))
