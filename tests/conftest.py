@@ -19,6 +19,8 @@ if version("jaxlib").startswith("0.10."):
 os.environ["XLA_FLAGS"] = " ".join(_QUICK + os.environ.get("XLA_FLAGS", "").split())  # last wins
 # The matrices of the tests are small: threads of NumPy and SciPy would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Several processes share a GPU: none takes most of its memory in advance.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
