@@ -50,16 +50,16 @@ class _Softness(NamedTuple):
     """Parameters for a dtype, for unit diagonal of P and rows of length one."""
 
     stiffness: float  # c of an active row
-    shift: float  # subtracted from the diagonal of P
+    shift: float  # subtracted from the diagonal of P; if positive, pivots prove it
     coarse: float  # violations and multipliers up to it count as zero at first
     fine: float  # and up to this one after that
     passes: int  # of the method of multipliers after a change
     refinements: int  # passes at the end
 
 
-def _softness(dtype: jnp.dtype) -> _Softness:
+def _softness(dtype: jnp.dtype, curvature: float) -> _Softness:
     if jnp.finfo(dtype).bits == 64:
-        return _Softness(1e4, 1e-8, 1e-6, 1e-10, 1, 2)
+        return _Softness(1e4, curvature, 1e-6, 1e-10, 1, 2)
     # A leaving row divides by 1 / c: 32 bits need a small c, and a matrix that is easy to invert.
     # So a pass gains less: two at the end left 0.18 N of error in 100 walking QPs, six 0.03 N.
     return _Softness(30.0, -1e-3, 1e-4, 3e-6, 3, 6)
@@ -257,7 +257,7 @@ def _kernel(
     *refs: Any,
 ) -> None:
     out: Any = Guess(*refs)
-    dtype, soft = P_ref.dtype, _softness(P_ref.dtype)
+    dtype, soft = P_ref.dtype, _softness(P_ref.dtype, curvature)
     c, shift, coarse, fine = (np.asarray(v, dtype) for v in soft[:4])
     one, zero, infinite = (np.asarray(v, dtype) for v in (1.0, 0.0, np.inf))
     n, m, [column], [number] = q_ref.size, lower_ref.size, _indices(VARIABLES), _indices(ROWS)
@@ -290,4 +290,4 @@ def _kernel(
     _store(out.y, number, in_y, y)
     _store(out.side, number, in_y, side)
     out.settled[...] = jnp.where(running, 0, 1).astype(jnp.int32)
-    out.definite[...] = jnp.where(definite & (soft.shift >= curvature), 1, 0).astype(jnp.int32)
+    out.definite[...] = jnp.where(definite & (soft.shift > 0), 1, 0).astype(jnp.int32)
