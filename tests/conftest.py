@@ -9,8 +9,8 @@ from pathlib import Path
 
 # A test runs most programs once, so what it waits for is the compiler. Without optimisation it
 # takes a quarter of the time, and programs twice theirs; `make bench` and the golden results are
-# for programs as the user has them. Not on a GPU, where such a program read addresses that it does
-# not own (jax 0.11). What XLA_FLAGS says already stays.
+# for programs as the user has them. Not on a GPU, where such a program ends with an illegal address
+# (jax 0.11). What XLA_FLAGS says already stays.
 _QUICK = []
 if not any(Path("/dev").glob("nvidia[0-9]*")):
     _QUICK.append("--xla_backend_optimization_level=0")

@@ -311,6 +311,16 @@ def test_settings_of_another_version_are_refused_by_name(monkeypatch, capsys, tm
     assert f"{path}: config: rollout: unknown field 'leap'" in line
 
 
+def test_a_dump_is_replayed_on_the_cpu(monkeypatch, dump):
+    on_cpus = []
+    monkeypatch.setattr("hector_jax.cli.main.check_jax", lambda on_cpu: on_cpus.append(on_cpu))
+    assert call(monkeypatch, "replay", dump) == 0
+    assert on_cpus == [True]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.raises(ValueError, match="JAX_PLATFORMS=cpu"):
+        replay.replay(dump)
+
+
 def test_what_is_no_dump_is_refused(monkeypatch, capsys, tmp_path, dump):
     cut, other = tmp_path / "cut.npz", tmp_path / "other.npz"
     cut.write_bytes(dump.read_bytes()[:-100])

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import pallas
 from oracles import exact_solution, walking_qp
 
-import hector_jax.qp
 from hector_jax.qp import active_set, gpu_kernel
 
 
@@ -60,8 +60,8 @@ def test_only_small_problems_fit():
 def test_without_triton_a_gpu_takes_the_slower_path(monkeypatch):
     said = []
     monkeypatch.setattr(active_set, "say", said.append)
-    monkeypatch.delattr(hector_jax.qp, "gpu_kernel")
-    monkeypatch.setitem(sys.modules, "hector_jax.qp.gpu_kernel", None)
+    monkeypatch.delattr(pallas, "triton")
+    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
     assert active_set._kernel.__wrapped__(50, 110, True) is None
     assert said == [
         "on a GPU a QP of 50 variables and 110 rows takes the slower path: this JAX has no Triton"

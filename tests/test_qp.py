@@ -459,8 +459,7 @@ def test_rows_without_bounds_change_nothing():
     for more, part in pairs:
         more, part = more[::each][expected == Status.SOLVED], part[expected == Status.SOLVED]
         rows = part.shape[1]  # nine, or as many as variables
-        rounding = 1e-12 if jax.default_backend() == "cpu" else 1e-7
-        np.testing.assert_allclose(more[:, :rows], part, rtol=0.0, atol=rounding)
+        np.testing.assert_allclose(more[:, :rows], part, rtol=0.0, atol=1e-12)
         assert not more[:, rows:].any()
 
 

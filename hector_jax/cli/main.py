@@ -33,7 +33,7 @@ def _run(words: Sequence[str]) -> None:
         if (cache := cache_folder()) != (default := home_cache()):
             say(f"{default} cannot be written: compiled programs are kept in {cache}")
         with say_if_slow("loading JAX and MuJoCo"):
-            check_jax(on_cpu=isinstance(args, Export | Replay))  # they refuse others
+            check_jax(on_cpu=isinstance(args, Export | Replay))  # these refuse a GPU
             setup_jax()
             from hector_jax.cli import commands  # after the flags: `hector --help` answers at once
     except InputError as error:

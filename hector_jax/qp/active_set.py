@@ -191,11 +191,13 @@ def first_guess(tolerances: Tolerances, qp: Normal) -> Start:
 @cache  # say it once for each size
 def _kernel(variables: int, rows: int, block_diagonal: bool) -> ModuleType | None:
     """Return the GPU's kernel for a QP of this size; None, and a message, if there is none."""
-    try:  # Windows has no Triton, and JAX announces that Pallas will lose it
-        from hector_jax.qp import gpu_kernel
-    except ImportError:
+    try:
+        from jax.experimental.pallas import triton  # noqa: F401
+    except ImportError:  # as on Windows; and JAX has announced that it will go
         why = "this JAX has no Triton"
     else:
+        from hector_jax.qp import gpu_kernel  # imports it
+
         if block_diagonal and gpu_kernel.fits(variables, rows):
             return gpu_kernel
         limits = f"{gpu_kernel.VARIABLES} and {gpu_kernel.ROWS}"

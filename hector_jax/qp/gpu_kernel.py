@@ -50,7 +50,7 @@ class _Softness(NamedTuple):
     """Parameters for a dtype, for unit diagonal of P and rows of length one."""
 
     stiffness: float  # c of an active row
-    shift: float  # subtracted from the diagonal of P; if positive, pivots prove it
+    shift: float  # subtracted from P's diagonal; if positive, positive pivots prove P definite
     coarse: float  # violations and multipliers up to it count as zero at first
     fine: float  # and up to this one after that
     passes: int  # of the method of multipliers after a change
@@ -126,7 +126,7 @@ def _times(M: Array, v: Array) -> Array:
 
 
 def _indices(*shape: int) -> list[Array]:
-    """Return for each axis the index along it, in an array of this shape."""
+    """Return the index along each axis, as arrays of this shape."""
     return [lax.broadcasted_iota(jnp.int32, shape, i) for i in range(len(shape))]
 
 
@@ -141,7 +141,8 @@ def _inverse(n: int, P: Array, one: np.ndarray, zero: np.ndarray) -> tuple[Array
         column = jnp.where(index == k, pivot - one, column)
         return column, column * (one / pivot), pivot > zero
 
-    # Two columns at a time are one pass over M; behind an odd n the unit padding is swept in vain.
+    # Two columns at a time are one pass over M. For an odd n the last pair has a column of the
+    # padding, whose result is not used.
     def sweep_two(pair: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
         M, definite = state
         i, j = 2 * pair, 2 * pair + 1

@@ -183,8 +183,7 @@ def _decide(
     def prove(operands: tuple[Normal, _Best, Start]) -> tuple[_Best, Array, Array]:
         qp, first, start = operands
         signs = lambda qp: curvature(tolerances, qp)[1:]  # noqa: E731
-        known = start.definite, start.convex
-        definite, convex = only_if(~start.definite, signs, known, qp)
+        definite, convex = only_if(~start.definite, signs, (start.definite, start.convex), qp)
         return settle(qp, first, start._replace(definite=definite, convex=convex))
 
     as_guessed = first, start.convex, start.definite

@@ -256,8 +256,8 @@ def normalise(tolerances: Tolerances, qp: QP) -> Normal:
 class Start(NamedTuple):
     """First guess of a solution, and the curvature of P.
 
-    On a GPU false for `definite` and `convex` means that they are not known: `method` computes
-    them then.
+    On a GPU false for `definite` and `convex` means that nothing proved them yet; then `method`
+    computes them.
     """
 
     point: Point

@@ -166,10 +166,10 @@ def replay(path: Path) -> Replay:
     """Repeat the evaluation of a dump.
 
     Raises:
-        InputError: JAX does not run on the CPU, as in tunings; or see `load`.
+        InputError: JAX computes on another device than the CPU; or see `load`.
     """
     dump, config, about = load(path)
-    if jax.default_backend() != "cpu":  # for which other programs are traced
+    if jax.default_backend() != "cpu":  # the dump is from a CPU, whose program a GPU does not trace
         raise InputError("replaying needs JAX on the CPU (JAX_PLATFORMS=cpu)")
     inputs = *dump[:4], effect_of(dump.params, config.rollout.walk)
     evaluation = jax.device_get(tune_step(config, *inputs))
