@@ -43,7 +43,6 @@ DOORS = {
     "botorch": (),
     "torch": (),
     "matplotlib": ("report.plots",),
-    "tensorboardX": ("report.tensorboard",),
     "jinja2": ("report.report",),
     "tyro": ("cli.parse",),
 }

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from pretend import pretend_history
 
 from hector_jax.cli import main as cli
 from hector_jax.control.controller import WalkConfig, walk_config
@@ -29,7 +28,7 @@ from hector_jax.robot.description import Description, TuningSettings, read_descr
 from hector_jax.robot.kinematics import foot_jacobians, foot_poses
 from hector_jax.robot.model import compile_model, describe, load_robot
 from hector_jax.runs import folder as runs
-from hector_jax.runs import nets, replay
+from hector_jax.runs import nets
 from hector_jax.runs.export import find_weights
 from hector_jax.runs.nets import CollectConfig
 from hector_jax.runs.tunings import tune_config
@@ -38,7 +37,6 @@ from hector_jax.sim.mjx_model import batched_model, find_places
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import build_world, hfs, ideal
 from hector_jax.tuning.difftune import TuneConfig
-from hector_jax.tuning.status import StepStatus
 
 STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
 
@@ -266,20 +264,6 @@ def test_a_run_is_exported_and_viewed_with_the_robot_that_it_was_for(strider, tm
     assert runs.read_request(tmp_path).robot == STRIDER
     found, _ = runs.weights_of(tmp_path, "nominal", strider)
     jax.tree.map(np.testing.assert_array_equal, found, nominal(strider))
-
-
-def test_a_dump_knows_the_robot_without_its_files(tmp_path):
-    robot = load_robot(copied(tmp_path))
-    one = pretend_history(1)[0]
-    evaluation = one.evaluation._replace(fallen=np.array(1.0))
-    fell = one._replace(evaluation=evaluation, status=np.array(StepStatus.FELL))
-    what = {"config": TuneConfig(), "robot": robot, "command": named_command("straight")}
-    path = replay.keep(tmp_path / "dumps", "without", fell, **what, net=None)
-    for file in tmp_path.glob("*r*.*"):
-        file.unlink()
-    found, _, _ = replay.load(path)
-    assert found.robot.description == robot.description
-    jax.tree.map(np.testing.assert_array_equal, found.robot, robot)
 
 
 # Feet from joints and joints from feet, in any order of the joints

@@ -4,7 +4,6 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,14 +23,12 @@ from hector_jax.cli.parse import from_file
 from hector_jax.control.weights import (
     between,
     expert,
-    nominal,
     weight_names,
     weights_to_vector,
 )
 from hector_jax.control.weights_file import best, load_weights, save_weights
 from hector_jax.core.console import exit_code
-from hector_jax.core.tree_file import read_card
-from hector_jax.grfm.collection import fingerprint, load_walks
+from hector_jax.grfm.collection import load_walks
 from hector_jax.grfm.dataset import at_interval
 from hector_jax.grfm.effect import last_command
 from hector_jax.report import fidelity
@@ -183,7 +180,7 @@ def test_the_name_best_is_the_set_of_the_robot():
 def test_a_run_folder_that_exists_is_not_touched(monkeypatch, capsys, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "kept").write_text("mine")
-    line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", "--data", tmp_path)
+    line = refused(monkeypatch, capsys, "tune", "--out", tmp_path / "run", "--data", tmp_path)
     assert "exists" in line
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["kept"]
 
@@ -348,13 +345,12 @@ def test_a_table_prints_json_and_nothing_else(monkeypatch, capsys, tmp_path):
 
 @pytest.mark.slow
 def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
-    """From nothing to a verdict, small: data, net, two tunings, one refresh, judges, report."""
+    """From nothing to a verdict, small: data, net, two tunings, judges, report."""
     monkeypatch.chdir(tmp_path)
     small = CollectConfig(walks=6, seconds=1.0)
     monkeypatch.setattr(nets, "CollectConfig", lambda: small)
-    monkeypatch.setattr(nets, "REFRESH", replace(small, walks=4))
-    flags = ("--seeds", "2", "--iterations", "11", "--refresh", "1")
-    assert call(monkeypatch, "tune", *flags, "--run", "run", "--json") == 0
+    flags = ("--seeds", "2", "--iterations", "11")
+    assert call(monkeypatch, "tune", *flags, "--out", "run", "--json") == 0
     out = capsys.readouterr().out
     run = tmp_path / "run"
     assert json.loads(out) == {
@@ -362,12 +358,9 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
         "traj": "straight",
         **json.loads((run / "result.json").read_text()),
     }
-    assert from_file(Tune, run / "config.json") == Tune(
-        seeds=2, iterations=11, refresh=1, json=True
-    )
+    assert from_file(Tune, run / "config.json") == Tune(seeds=2, iterations=11, json=True)
     assert float(json.loads((run / "versions.json").read_text())["seconds"]) > 0.0
-    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "with_refreshed"]
-    names += ["best"]
+    names = ["nominal", "expert", "without_ten", "with_ten", "without", "with", "best"]
     for name in names:
         assert name in out
         assert (run / "weights" / f"{name}.json").exists()
@@ -381,20 +374,13 @@ def test_the_main_job_leaves_what_it_promises(monkeypatch, capsys, tmp_path):
             assert standin[part]["mean"] > 0.0
             assert standin[part]["low"] is None  # two plants have no interval
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert {line["set"] for line in lines} == {"without", "with", "with_refreshed"}
-    without, refreshed, best = (
-        load_weights(run / "weights" / f"{name}.json")
-        for name in ("without", "with_refreshed", "best")
+    assert {line["set"] for line in lines} == {"without", "with"}
+    without, tuned, best = (
+        load_weights(run / "weights" / f"{name}.json") for name in ("without", "with", "best")
     )
     assert best.others == BEST_OTHERS
-    half_way = between(without, refreshed)._replace(others=best.others)
+    half_way = between(without, tuned)._replace(others=best.others)
     jax.tree.map(np.testing.assert_allclose, best, half_way)
-    assert result["refresh"][0].keys() == {"old", "new"}
-    assert len(load_walks(run / "refresh-1" / "walks", load_robot()).job.seed) == 4
-    card = read_card(run / "refresh-1" / "refreshed.npz")["about"]
-    assert card["made_of"] == fingerprint(tmp_path / "data" / "walks")
-    assert card["and_of"] == [fingerprint(run / "refresh-1" / "walks")]
-    assert "### Refresh 1" in (run / "report.md").read_text()
     assert "hardware stand-in" in (run / "report.md").read_text()
     for picture in ("tracking", "path", "losses", "weights", "wrenches", "training"):
         assert (run / "pictures" / f"{picture}.png").stat().st_size > 10_000
@@ -488,34 +474,17 @@ def test_the_table_takes_flags_from_a_file_and_the_line_overrides_it(monkeypatch
     assert made == [table.Flags(config=file, seeds=5, extra=("a=x",))]
 
 
-@pytest.mark.parametrize("more", [(), ("--quick",), ("--help",)])
-def test_the_former_command_of_the_table_says_what_to_call_now(monkeypatch, capsys, more):
-    line = refused(monkeypatch, capsys, "table", *more)
-    assert "python experiments/table.py, with the same flags" in line
-
-
 @pytest.mark.parametrize(
     "wrong",
     [
         ("--processes", "0"),
         ("--iterations", "3"),
         ("--seeds", "0"),
-        ("--refresh", "-1"),
     ],
 )
 def test_wrong_numbers_leave_no_run_folder(monkeypatch, capsys, tmp_path, wrong):
-    line = refused(monkeypatch, capsys, "tune", "--run", tmp_path / "run", *wrong)
+    line = refused(monkeypatch, capsys, "tune", "--out", tmp_path / "run", *wrong)
     assert wrong[0].lstrip("-") in line
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("flag", ["--tune", "--start"])
-def test_a_refresh_takes_q_and_r_alone(monkeypatch, capsys, tmp_path, flag):
-    save_weights(tmp_path / "mine.json", nominal()._replace(others={"turn_lead": np.array(0.8)}))
-    value = "friction" if flag == "--tune" else tmp_path / "mine.json"
-    run = "--run", tmp_path / "run", "--refresh", "1"
-    line = refused(monkeypatch, capsys, "tune", *run, flag, value)
-    assert "neither --tune nor a start with others" in line
     assert not (tmp_path / "run").exists()
 
 

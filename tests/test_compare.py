@@ -1,8 +1,7 @@
-"""Finished runs side by side, and their tunings for TensorBoard."""
+"""Finished runs side by side."""
 
 import io
 import json
-import struct
 import sys
 
 import pytest
@@ -11,9 +10,7 @@ from rich.console import Console
 from hector_jax.cli import main as cli
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
-from hector_jax.core.inputs import InputError
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.report.tensorboard import write_events
 from hector_jax.runs.folder import load_run, read_metrics
 
 
@@ -156,45 +153,3 @@ def test_a_line_that_is_being_written_is_not_read_yet(runs):
     with (runs[0] / "metrics.jsonl").open("a") as file:
         file.write('{"set": "wi')
     assert len(read_metrics(runs[0])) == 3
-
-
-def scalars(folder):
-    """Tags and steps with their values, from the event file in a folder."""
-    from tensorboardX.proto.event_pb2 import Event
-
-    (path,) = folder.iterdir()
-    data, found = path.read_bytes(), {}
-    while data:
-        (length,) = struct.unpack("<Q", data[:8])
-        event = Event.FromString(data[12 : 12 + length])
-        found |= {(value.tag, event.step): value.simple_value for value in event.summary.value}
-        data = data[16 + length :]
-    return found
-
-
-def test_tensorboard_gets_the_numbers_of_the_metrics(runs, tmp_path):
-    pytest.importorskip("tensorboardX")
-    for _ in range(2):  # again while a run goes on: replaced, not doubled
-        (folder,) = write_events(runs[0], tmp_path / "events")
-    assert folder == tmp_path / "events" / "with"
-    found = scalars(folder)
-    assert found["loss/L", 0] == 1e6
-    assert found["loss/L", 2] == 8e5
-    assert ("loss/L", 1) not in found  # it was not finite
-    assert [found["step/accepted", step] for step in range(3)] == [1.0, 0.0, 1.0]
-    assert [found["weights/Q_x", step] for step in range(3)] == [50.0, 51.0, 52.0]
-    assert found["gradient_log/Q_x", 1] == -1.0
-    assert found["gradient/turn_lead", 2] == 3.0
-
-
-def test_events_are_not_written_where_no_folder_can_be(runs, tmp_path):
-    pytest.importorskip("tensorboardX")
-    (tmp_path / "events").write_text("a file")
-    with pytest.raises(InputError, match=r"cannot write to .*/events/with: Not a directory"):
-        write_events(runs[0], tmp_path / "events")
-
-
-def test_without_its_package_tensorboard_says_which(monkeypatch, runs, tmp_path):
-    monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(ValueError, match="pip install 'hector-jax\\[tensorboard\\]'"):
-        write_events(runs[0], tmp_path)

@@ -40,12 +40,6 @@ def test_the_line_beats_the_file_and_the_file_beats_the_default(tmp_path):
     assert parsed("tune").seeds == Tune().seeds
 
 
-def test_what_is_tuned_has_an_older_name(tmp_path):
-    assert parsed("tune", "--also", "turn_lead").tune == ("turn_lead",)
-    for text, tuned in (('["turn_lead"]', ("turn_lead",)), ("[]", ("weights",))):
-        assert from_file(Tune, written(tmp_path, f"also = {text}\n")).tune == tuned
-
-
 def test_the_help_shows_what_the_file_says(tmp_path, capsys):
     path = written(tmp_path, "seeds = 31\n")
     with pytest.raises(SystemExit):

@@ -13,7 +13,7 @@ from hector_jax.control.weights import expert, nominal, weights_to_vector
 from hector_jax.grfm.collection import collect, fingerprint, load_walks
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
-from hector_jax.grfm.jobs import KINDS, NEAR, PIECES, draw_jobs, draw_jobs_near
+from hector_jax.grfm.jobs import KINDS, PIECES, draw_jobs
 from hector_jax.robot import srbm
 from hector_jax.robot.model import load_robot
 from hector_jax.sim.world import Push
@@ -59,22 +59,6 @@ def test_drawn_weights_lie_within_a_third_and_three_times_of_their_centres():
         assert np.all((ratio > 1 / 3.001) & (ratio < 3.001))
     logs = np.log([np.asarray(weights_to_vector(j.weights)) for j in jobs[:4] + jobs[8:12]])
     assert np.all(logs.std(axis=0) > 0.1)
-
-
-def test_jobs_near_a_tuning_take_turns_about_its_path_and_its_end():
-    factors = np.array([1.0, 10.0, 100.0])  # far enough apart to tell which point is meant
-    path = jax.tree.map(lambda w: np.multiply.outer(factors, w), nominal())
-    jobs = draw_jobs_near(0, 24, named_command("c"), path=path)
-    leaves_close(draw_jobs_near(0, 8, named_command("c"), path=path), jobs[:8], 0.0)
-    logs = np.log([weights_to_vector(job.weights) / weights_to_vector(nominal()) for job in jobs])
-    point = np.round(logs.mean(axis=1) / np.log(10)).astype(int)
-    assert np.all(np.abs(logs - point[:, None] * np.log(10)) <= np.log(NEAR) + 1e-12)
-    assert set(point[np.arange(24) // 2 % 2 == 0]) == {0, 1, 2}
-    assert set(point[np.arange(24) // 2 % 2 == 1]) == {2}
-    total = [float(job.command.duration.sum()) for job in jobs[::2]]
-    np.testing.assert_allclose(total, float(named_command("c").duration.sum()))
-    assert len({float(job.command.yaw_rate[0]) for job in jobs[1::2]}) == 12
-    assert len({float(job.imperfections.backlash) for job in jobs}) == 24
 
 
 def test_a_third_of_the_walks_is_pushed_once_or_twice():

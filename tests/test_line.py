@@ -143,7 +143,7 @@ def test_the_last_seed_may_not_pass_the_largest(monkeypatch, capsys):
         (["walk", "--weights"], "own.json"),
         (["walk", "--traj"], "own.toml"),
         (["walk", "--robot"], "own.toml"),
-        (["replay"], "own.npz"),
+        (["report", "runs"], "own.npz"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_told_before_anything_is_loaded(
@@ -180,7 +180,7 @@ def test_latest_is_the_newest_run(monkeypatch, tmp_path):
         run.mkdir(parents=True)
         (run / "config.json").touch()
         os.utime(run / "config.json", (1e9 - age, 1e9 - age))
-    for words in (["view", "latest"], ["export", "latest"], ["tensorboard", "latest"]):
+    for words in (["view", "latest"], ["export", "latest"]):
         assert resolve_latest(from_line(words)).run == Path("runs/strider/s/2")
     found = resolve_latest(from_line(["compare", "runs/c/1", "latest"]))
     assert found.runs == (Path("runs/c/1"), Path("runs/strider/s/2"))

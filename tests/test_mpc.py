@@ -364,10 +364,6 @@ def test_constraints_are_chosen_by_name_in_files():
     assert from_table("robot.toml", MpcConfig, table) == CONFIG
     assert from_table("config.json", MpcConfig, json.loads(json.dumps(asdict(CONFIG)))) == CONFIG
     assert pickle.loads(pickle.dumps(CONFIG)) == CONFIG
-    with pytest.raises(InputError, match="effort_about is the former name of effort_reference"):
-        from_table("x", MpcConfig, {"effort_about": "weight", "effort_reference": "zero"})
-    former = from_table("robot.toml", MpcConfig, {"effort_about": "weight"})
-    assert former == MpcConfig(effort_reference="gravity")
     assert [str(one) for one in MpcConfig(line_friction=False).on("inputs")] == names[:3]
     assert replace(MpcConfig(line_friction=False), line_friction=True) == MpcConfig()
     for wrong in ({"constraints": ["frictoin"]}, {"contact": "round"}, {"constraints": []}):

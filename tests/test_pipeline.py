@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import table
 from model import LEARNS_TOUCHDOWNS
-from pretend import pretend_history, pretend_walk
+from pretend import pretend_walk
 from synthetic import synthetic_walk
 
 from hector_jax.cli import commands, flags
@@ -24,7 +24,7 @@ from hector_jax.core.inputs import InputError
 from hector_jax.core.tree_file import read_card
 from hector_jax.grfm import dataset
 from hector_jax.grfm.collection import collect
-from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
+from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.paper import PaperParams
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.robot.model import load_robot
@@ -36,7 +36,7 @@ from hector_jax.sim.engine import ENGINES, MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs
-from hector_jax.tuning.difftune import TuneConfig, Tuning
+from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.evaluate import Evaluation, mean_over_commands
 from hector_jax.tuning.rollout import RolloutConfig
 
@@ -166,57 +166,6 @@ def test_a_net_of_other_settings_or_other_walks_is_refused_and_stays(tmp_path, r
     nets.train(TrainConfig(epochs=1), robot, tmp_path / "others", path)
     with pytest.raises(InputError, match="grfm.npz: made with content"):
         ground(tmp_path, robot)
-
-
-def test_what_was_held_out_stays_held_out_beside_other_walks(tmp_path, robot):
-    one, two = tmp_path / "one", tmp_path / "two"
-    gather(one, robot)
-    gather(two, robot, draw=1)
-    alone = [nets.samples(robot, folder) for folder in (one, two)]
-    both = nets.samples(robot, one, two)
-    joined = jax.tree.map(lambda *x: np.concatenate(x), *(part[:3] for part in alone))
-    jax.tree.map(np.testing.assert_array_equal, tuple(both[:3]), joined)
-    assert both.dropped == sum(part.dropped for part in alone)
-
-
-def test_a_refresh_walks_where_the_tuning_went_and_tells_the_shift(tmp_path, robot, monkeypatch):
-    old, folder, few = tmp_path / "walks", tmp_path / "refresh-1", CollectConfig(5, engine="c")
-    gather(old, robot)
-    before = nets.train(TrainConfig("paper", epochs=1), robot, old, tmp_path / "grfm.npz")
-    history = pretend_history(14, refused=(12,))
-    tuning = Tuning(history, history[10].weights, history[-1].weights, "")
-    walked, trained = [], []
-
-    def toys(pool, config, robot, jobs, **options):
-        walked.extend(jobs)
-        return (synthetic_walk(100 + job.seed, 12) for job in jobs)
-
-    def train(config, robot, folder, path, more):
-        trained.append((config, folder, path, *more))
-        return before._replace(folders=(folder, *more))
-
-    monkeypatch.setitem(ENGINES, "c", MUJOCO_C._replace(walk=toys))
-    monkeypatch.setattr(nets, "train", train)
-    for _ in range(2):  # the second time takes up the walks
-        after, shift = nets.refresh(
-            ThreadPoolExecutor(1),
-            few,
-            robot,
-            named_command("s"),
-            tuning,
-            net=before,
-            folder=folder,
-        )
-    new = folder / "walks"
-    path = jax.tree.map(lambda w: np.stack(4 * [w]), nominal())  # ten, 11, 13 and 14
-    jobs = draw_jobs_near(0, 5, named_command("s"), path=path)
-    jax.tree.map(np.testing.assert_array_equal, walked, jobs)
-    assert trained == 2 * [(before.config, old, folder / "refreshed.npz", new)]
-    assert after.folders == (old, new)
-    assert shift.keys() == {"old", "new"}
-    assert all(errors.keys() == {"raw", "before", "after"} for errors in shift.values())
-    assert shift["old"]["before"] == before.errors["net"]
-    assert shift["new"]["before"] != shift["old"]["before"]
 
 
 def test_a_net_of_another_variant_is_refused_and_kept(tmp_path, robot):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import jsonschema
 import numpy as np
 import pytest
-from pretend import pretend_history, pretend_walk
+from pretend import pretend_walk
 from test_humanoid import check_engines, check_export, check_gradients
 
 from hector_jax.cli.arguments import with_gait
@@ -42,20 +42,18 @@ from hector_jax.grfm.gated import fit_gated
 from hector_jax.grfm.network import as_effect, effect_of, load_net, save_net
 from hector_jax.grfm.paper import init as init_paper
 from hector_jax.grfm.paper import with_statistics as with_paper_statistics
-from hector_jax.grfm.residual import init, plain_net, with_statistics
+from hector_jax.grfm.residual import init, with_statistics
 from hector_jax.grfm.training import TrainConfig, train
 from hector_jax.qp import active_set
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import replay, verdicts
+from hector_jax.runs import verdicts
 from hector_jax.runs.export import (
     weights_schema,
 )
 from hector_jax.sim.loop import Job
 from hector_jax.sim.walk import walk
 from hector_jax.sim.world import hfs, ideal
-from hector_jax.tuning.difftune import TuneConfig
 from hector_jax.tuning.rollout import RolloutConfig, rollout
-from hector_jax.tuning.status import StepStatus
 
 FILE = Path(__file__).parents[1] / "examples" / "quadruped" / "robot.toml"
 ROBOT = load_robot(FILE)
@@ -366,18 +364,6 @@ def test_the_quadruped_walks_alike_in_both_engines():
 @pytest.mark.slow
 def test_the_controller_of_the_quadruped_is_exported():
     check_export(ROBOT)
-
-
-def test_a_dump_knows_four_feet(tmp_path):
-    weights, one = expert(ROBOT), pretend_history(1)[0]
-    evaluation = one.evaluation._replace(fallen=np.array(1.0), gradient=weights)
-    fell = one._replace(weights=weights, evaluation=evaluation, status=np.array(StepStatus.FELL))
-    what = {"config": TuneConfig(rollout=RolloutConfig(walk=CONFIG)), "robot": ROBOT}
-    what |= {"command": named_command("straight"), "net": plain_net(CONFIG.gait, 3)}
-    found, _, _ = replay.load(replay.keep(tmp_path / "dumps", "with", fell, **what))
-    assert found.robot.structure == ROBOT.structure
-    jax.tree.map(np.testing.assert_array_equal, found.robot, ROBOT)
-    jax.tree.map(np.testing.assert_array_equal, found.weights, weights)
 
 
 def test_the_quadruped_stands_on_all_feet():

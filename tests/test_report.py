@@ -14,7 +14,6 @@ from hector_jax.core.environment import environment
 from hector_jax.report import report
 from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import tuning_section, write_report
-from hector_jax.runs.front import Front
 from hector_jax.runs.metrics import Verdict
 from hector_jax.runs.walks import Change
 from hector_jax.tuning.curvature import Curvature, Direction
@@ -52,12 +51,10 @@ def _report(verdict=None, film="no film: MuJoCo cannot draw here (egl: no device
         config={"traj": "straight", "seeds": 8},
         environment=environment(),
         command="make tune TRAJ=straight",
-        shifts=(),
         proposals=(),
         best_proposal="",
         cases=0,
         chosen={},
-        front=None,
         smooth=1.0,
     )
 
@@ -81,14 +78,6 @@ def test_the_table_fits_a_terminal_of_80_columns():
     text = _printed(pretend_verdict(fallen={("without", 0)}), force_terminal=True, width=80)
     assert "…" not in text
     assert "without_ten" in text
-
-
-def test_the_table_of_a_refresh_fits_too():
-    verdict = pretend_verdict()
-    whole = verdict._replace(scores=verdict.scores | {"with_refreshed": verdict.scores["with"]})
-    text = _printed(whole, force_terminal=True, width=80)
-    assert "…" not in text
-    assert "with_refreshed" in text
 
 
 def test_a_comparison_that_falls_make_void_is_shown_with_a_mark():
@@ -185,24 +174,6 @@ def test_the_report_has_the_weight_of_each_term_of_the_loss(tmp_path):
     assert "| alpha_3 L_ctrl |" in text
 
 
-def test_a_refresh_shows_its_shift_and_a_run_without_one_says_nothing_of_it(tmp_path):
-    plain = write_report(tmp_path, **_report()).read_text()
-    assert "efresh" not in plain
-    error = lambda x: {"force": x, "moment": x / 100}  # noqa: E731
-    shift = {
-        "old": {"raw": error(180.0), "before": error(27.0), "after": error(28.0)},
-        "new": {"raw": error(220.0), "before": error(41.0), "after": error(30.0)},
-    }
-    verdict = pretend_verdict()
-    scores = verdict.scores | {"with_refreshed": verdict.scores["with"]}
-    told = _report(verdict._replace(scores=scores)) | {"shifts": [shift]}
-    text = write_report(tmp_path, **told).read_text()
-    assert "### Refresh 1" in text
-    assert "| new walks, force [N^2] | 220 | 41 | 30 |" in text
-    assert "| old walks, moment [(N m)^2] | 1.8 | 0.27 | 0.28 |" in text
-    assert "Tuned through the net refreshed (`with_refreshed`), the loss is" in text
-
-
 def test_every_table_of_the_report_is_well_formed(tmp_path):
     report = _report(pretend_verdict(fallen={("with", 1)})) | {
         "proposals": WALKED,
@@ -253,12 +224,7 @@ def test_a_tuning_on_walks_shows_each_set_and_its_falls(tmp_path):
     assert "Tuning on walks" not in write_report(tmp_path, **_report()).read_text()
 
 
-def test_a_front_and_what_counted_while_tuning_are_in_the_report(tmp_path):
-    plain = write_report(tmp_path, **_report()).read_text()
-    front = Front(pretend_verdict(), dict.fromkeys(SETS, 3), 64)
-    text = write_report(tmp_path, **{**_report(), "front": front, "smooth": 3.0}).read_text()
-    assert report.front_table(front) in text
-    assert text.count("3 of 64") == len(SETS)
-    for words in ("## The front", "L_ctrl counted 3 times in the tunings"):
-        assert words in text
-        assert words not in plain
+def test_a_report_says_that_changes_of_the_command_counted_more(tmp_path):
+    words = "L_ctrl counted 3 times in the tunings"
+    assert words not in write_report(tmp_path, **_report()).read_text()
+    assert words in write_report(tmp_path, **_report() | {"smooth": 3.0}).read_text()

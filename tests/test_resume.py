@@ -318,7 +318,7 @@ def begun(tmp_path, monkeypatch):
     """A run that was cut at once."""
     monkeypatch.setattr(command, "_tune_in", lambda folder, args: told.append(args))
     told = []
-    command.tune(flags.Tune(traj=("c",), seeds=3, run=tmp_path / "run"))
+    command.tune(flags.Tune(traj=("c",), seeds=3, out=tmp_path / "run"))
     return tmp_path / "run", told
 
 
@@ -332,7 +332,7 @@ def test_what_changes_no_number_stays_as_it_was_unless_another_is_given(tmp_path
     resumed = []
     monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append(args))
     own = {"video": False, "json": True, "processes": 1, "data": tmp_path / "data"}
-    command.tune(flags.Tune(run=tmp_path / "run", **own))
+    command.tune(flags.Tune(out=tmp_path / "run", **own))
     command.tune(flags.Tune(resume=tmp_path / "run"))
     assert {name: getattr(resumed[-1], name) for name in own} == own
     command.tune(flags.Tune(resume=tmp_path / "run", processes=3, data=tmp_path / "moved"))
@@ -356,7 +356,7 @@ def test_a_run_whose_data_are_elsewhere_is_refused_at_once(begun, tmp_path, monk
     [
         ({"iterations": 50}, "run: begun with --iterations 100, got 50"),
         ({"traj": ("s",)}, "run: begun with --traj c, got s"),
-        ({"run": Path("other")}, "only one can be given"),
+        ({"out": Path("other")}, "only one can be given"),
     ],
 )
 def test_another_configuration_is_not_taken_up(begun, asked, message):

@@ -11,7 +11,7 @@ from scenes import Level, SceneConfig, make_scenes
 
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import from_table, to_table
-from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
+from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.robot.description import Description, PlantSizes, read_description
 from hector_jax.robot.model import load_robot
 from hector_jax.runs.tunings import tune_config
@@ -79,23 +79,12 @@ def test_a_plant_has_a_motor_for_each_joint_and_no_linkage_where_there_is_none()
 def test_pushes_of_the_data_have_the_size_of_the_robot():
     robot = load_robot()
     large = robot._replace(description=replace(robot.description, plants=SIZES))
-    weights = draw_jobs(0, 1)[0].weights
-    path = type(weights)(*(part if part is weights.others else _row(part) for part in weights))
-    near = (0, 12, draw_jobs(0, 1)[0].command)
-    pairs = [
-        (draw_jobs(0, 12, robot=large), draw_jobs(0, 12)),
-        (draw_jobs_near(*near, path=path, robot=large), draw_jobs_near(*near, path=path)),
-    ]
-    for ours, theirs in pairs:
-        assert any(np.any(job.push.force) for job in theirs)
-        for one, other in zip(ours, theirs, strict=True):
-            np.testing.assert_allclose(one.push.force, 5.0 * other.push.force)
-            friction = other.imperfections.joint_friction
-            np.testing.assert_allclose(one.imperfections.joint_friction, 3.0 * friction)
-
-
-def _row(part):
-    return type(part)(*(np.asarray(x)[None] for x in part))
+    ours, theirs = draw_jobs(0, 12, robot=large), draw_jobs(0, 12)
+    assert any(np.any(job.push.force) for job in theirs)
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one.push.force, 5.0 * other.push.force)
+        friction = other.imperfections.joint_friction
+        np.testing.assert_allclose(one.imperfections.joint_friction, 3.0 * friction)
 
 
 def test_scenes_push_and_load_as_much_as_the_robot_is_large():

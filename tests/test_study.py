@@ -220,7 +220,7 @@ def test_all_trajectories_are_tuned_one_after_the_other(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(tune, "_tune_in", lambda folder, args: asked.append((folder, args)))
     every = flags.Tune(traj=("all",), each=True)
-    tune.tune(replace(every, run=tmp_path / "run", seeds=2))
+    tune.tune(replace(every, out=tmp_path / "run", seeds=2))
     assert [one.traj for _, one in asked] == [("straight",), ("c",), ("s",)]
     assert [folder.name for folder, _ in asked] == ["straight", "c", "s"]
     assert {one.seeds for _, one in asked} == {2}
@@ -252,8 +252,7 @@ def test_several_trajectories_are_one_run(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"run": Path("a"), "out": Path("b")}, "--out b and --run a: only one can be given"),
-        ({"traj": ("c", "s"), "refresh": 1}, "--refresh takes one trajectory, got 2; add --each"),
+        ({"resume": Path("a"), "out": Path("b")}, "--out b and --resume a: only one can be given"),
         ({"traj": ("c", "short.toml")}, "of one length, got c 4 s, short 2 s; add --each"),
         ({"traj": ("short.toml", "./short.toml")}, "short.toml and ./short.toml are both named s"),
         ({"traj": ("short.toml", "./short.toml"), "each": True}, "are both named short"),

@@ -189,14 +189,6 @@ def test_rollouts_are_as_long_as_the_file_says():
     assert arguments.with_length(config, command_of("c")) == config
 
 
-def test_a_refresh_of_too_many_segments_is_refused_before_anything(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert call(monkeypatch, "tune", "--traj", SLALOM, "--refresh", "1") == 2
-    assert "at most 4 segments, slalom has 5" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("command", ["walk", "evaluate", "tune", "search"])
 def test_a_wrong_file_is_one_line_of_each_command(monkeypatch, capsys, tmp_path, command):
     monkeypatch.chdir(tmp_path)
     path = written(tmp_path, HEAD + "vx = 1")

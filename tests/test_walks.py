@@ -214,10 +214,9 @@ def test_gains_that_start_out_of_their_box_are_refused(robot, tmp_path):
         replace(campaign(tmp_path, robot), start=start, leg_numbers=("kp",))
 
 
-@pytest.mark.parametrize("flags", [{}, {"walks": 8, "front": True}])
-def test_the_numbers_of_the_legs_are_tuned_by_walks_alone_and_in_no_front(robot, flags):
+def test_the_numbers_of_the_legs_are_tuned_by_walks_alone(robot):
     with pytest.raises(InputError, match="--tune kp foot_height: only --walks can tune"):
-        run_folder.trajectories(Tune(tune=("kp", "foot_height"), **flags), robot)
+        run_folder.trajectories(Tune(tune=("kp", "foot_height")), robot)
 
 
 def test_too_few_walks_to_move_the_legs_are_reported(monkeypatch, pool, with_legs, capsys):

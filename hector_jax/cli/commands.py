@@ -1,6 +1,5 @@
 """The function of each command of `hector`; its flags are in flags.py."""
 
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial, singledispatch
@@ -11,20 +10,19 @@ from hector_jax.cli.arguments import print_result
 from hector_jax.control.controller import walk_config
 from hector_jax.control.weights import expert
 from hector_jax.control.weights_file import load_weights, save_weights
-from hector_jax.core.console import Broken, say
+from hector_jax.core.console import say
 from hector_jax.core.environment import versions
 from hector_jax.core.files import locked, make_folder, write_json
 from hector_jax.core.inputs import InputError
 from hector_jax.core.runtime import workers
 from hector_jax.grfm.training import TrainConfig
 from hector_jax.report.compare import compare_runs, print_comparison
-from hector_jax.report.tensorboard import write_events
 from hector_jax.robot.description import description_of
 from hector_jax.robot.model import Robot, load_robot, robot_of
 from hector_jax.robot.propose import as_toml
 from hector_jax.robot.propose import propose as propose_robot
 from hector_jax.robot.table import changes, remarks, table_of, table_of_survey
-from hector_jax.runs import export, nets, replay, searches, tunings
+from hector_jax.runs import export, nets, searches, tunings
 from hector_jax.runs.folder import RESULT, load_run, read_request
 from hector_jax.runs.setup import Setup
 from hector_jax.search.cmaes import SearchConfig
@@ -218,24 +216,3 @@ def _print_check(check: Mapping[str, Any]) -> None:
     times = "p50 {p50:.2f}, p99 {p99:.2f}, max {max:.2f}; CPU {cpu_p50:.2f}, {cpu_p99:.2f}"
     for key, text in (("plan_ms", "with a plan"), ("hold_ms", "between plans")):
         print(f"a call {text} [ms]: {times.format(**check[key])}")
-
-
-@run.register
-def replay_dump(args: flags.Replay) -> None:
-    """Repeat a dumped iteration.
-
-    Raises:
-        Broken: its result differs.
-    """
-    replayed = replay.replay(args.dump)
-    print_result(args.json, replayed._asdict(), lambda: print(replay.in_words(replayed)), indent=2)
-    if not replayed.same:
-        raise Broken(f"{args.dump}: {replayed.verdict}")
-
-
-@run.register
-def tensorboard(args: flags.Tensorboard) -> None:
-    """Write the event files of a run."""
-    out = args.out or args.run / "tensorboard"
-    write_events(args.run, out)
-    print(f"tensorboard --logdir {shlex.quote(str(out))}")

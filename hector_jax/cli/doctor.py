@@ -33,7 +33,6 @@ _EXTRAS = {  # name: (package that it needs, what needs it)
     "export": ("flatbuffers", "hector export"),
     "race": ("botorch", "experiments/race.py"),
     "search": ("cmaes", "hector search, experiments/table.py"),
-    "tensorboard": ("tensorboardX", "hector tensorboard"),
     "view": ("viser", "hector view"),
 }
 

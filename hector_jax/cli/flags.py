@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
+from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import SEED, Range
@@ -124,8 +124,6 @@ class Tune(Configured):
     Example: hector tune --traj straight c s --seeds 32
     """
 
-    RENAMED: ClassVar = {"also": ("tune", {"[]": ["weights"], "()": ["weights"]})}
-
     traj: Trajectories = ("straight",)  # straight, c, s, all, TOML files: one set for all of them
     each: bool = False  # tune the trajectories one by one, each in a run folder of its own
     start: Weights = "nominal"  # where to start: nominal, expert, best or a weights file
@@ -135,20 +133,17 @@ class Tune(Configured):
     iterations: Iterations = 100  # largest number of iterations
     variant: Variant = "residual"  # architecture of the net
     alpha: Literal["paper", "auto"] = "paper"  # loss weights; auto makes the gradient norms alike
-    # of `with` (the last refreshed one) in row `best`; the rest is `without`
+    # of `with` in row `best`; the rest is `without`
     share: Annotated[float, Range(0, 1)] = 0.5
     # times that L_ctrl counts while tuning (not in the table): above 1, smoother commands
     smooth: Annotated[float, Range(0.01, 100)] = 1.0
     # limit [m] of the position error that the MPC sees in `best`: with less it tracks worse and may
     # fall less under pushes; default 0.19 of the robot's height, for the set between two tunings
     safe: Annotated[float | None, Range(0.001, 10)] = None
-    front: bool = False  # tune and walk nine sets around `best`, of other --smooth and --safe
-    refresh: Annotated[int, Range(0, 100)] = 0  # times to collect at the new weights and repeat
     data: Folder = Path("data")  # folder of the walks and the net, which are made if missing
     net: Annotated[Path | None, Source.FILE] = None  # file of another net, instead of that in DATA
     runs: Folder = Path("runs")  # the run folder is RUNS/TRAJ/TIME
     out: Path | None = None  # the run folder itself, which must not exist (with --each: OUT/TRAJ)
-    run: Path | None = None  # the older name of --out
     resume: Annotated[Path | None, Source.RUN] = None  # continue the interrupted run in this folder
     video: bool = True  # make a film of the nominal and the best weights
     # print up to 12 walks more: in other engines, or else with other masses of the robot
@@ -353,17 +348,6 @@ class Compare:
 
 
 @_command
-class Tensorboard:
-    """Write TensorBoard event files of a run, from its metrics.jsonl.
-
-    Example: hector tensorboard latest
-    """
-
-    run: Run  # folder of a run of `hector tune`, or `latest`
-    out: Path | None = None  # folder for the event files; by default `tensorboard` in the run
-
-
-@_command
 class Completion:
     """Print the script that completes `hector` in a shell.
 
@@ -373,27 +357,12 @@ class Completion:
     shell: Literal["bash", "zsh", "fish"]  # shell to write the script for
 
 
-@_command
-class Replay:
-    """Repeat an evaluation that a tuning refused: exit code 0 if all bytes agree, else 1.
-
-    Example: hector replay runs/s/20261121-093442/dumps/with-007-fell.npz
-    """
-
-    dump: Annotated[Path, Source.FILE]  # file in the folder `dumps` of a run
-    json: bool = False  # print JSON instead of the table
-
-
 def command(word: str) -> type[Any]:
     """Return the class of a command's flags.
 
     Raises:
         InputError: there is no such command.
     """
-    if word == "table":
-        raise InputError(
-            "the table is now made by python experiments/table.py, with the same flags"
-        )
     if word not in COMMANDS:
         hint = did_you_mean(word, COMMANDS) or f"; the commands are {', '.join(COMMANDS)}"
         raise InputError((f"unknown command {short_repr(word)}" if word else "no command") + hint)

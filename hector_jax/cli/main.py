@@ -11,7 +11,7 @@ import logging
 import sys
 from collections.abc import Sequence
 
-from hector_jax.cli.flags import Completion, Doctor, Export, Replay
+from hector_jax.cli.flags import Completion, Doctor, Export
 from hector_jax.cli.parse import all_commands, check, from_line, resolve_latest
 from hector_jax.core.console import Broken, exit_code, say, say_if_slow
 from hector_jax.core.inputs import InputError
@@ -33,7 +33,7 @@ def _run(words: Sequence[str]) -> None:
         if (cache := cache_folder()) != (default := home_cache()):
             say(f"{default} cannot be written: compiled programs are kept in {cache}")
         with say_if_slow("loading JAX and MuJoCo"):
-            check_jax(on_cpu=isinstance(args, Export | Replay))  # these refuse a GPU
+            check_jax(on_cpu=isinstance(args, Export))  # an export refuses a GPU
             setup_jax()
             from hector_jax.cli import commands  # after the flags: `hector --help` answers at once
     except InputError as error:

@@ -60,8 +60,6 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     wants_help = any(word in _HELP for word in words)
     options: dict[str, Any] = {"prog": program}
     words = [word for word in words if word not in _HELP]
-    for old, (new, _) in getattr(kind, "RENAMED", {}).items():
-        words = [re.sub(f"^--{old}(?==|$)", f"--{new}", word) for word in words]
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
     flags = [name.removeprefix("no-") for name in names]
     for name in flags:

@@ -12,8 +12,7 @@ from hector_jax.cli import arguments
 from hector_jax.cli.flags import Tune
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.control.controller import walk_config
-from hector_jax.control.parameters import leg_numbers, tunables
-from hector_jax.control.reference import PIECES
+from hector_jax.control.parameters import leg_numbers
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.core.environment import code_hash, environment
 from hector_jax.core.files import make_folder, write_json
@@ -34,14 +33,13 @@ _CODE = (
     "grfm.training",
     "sim.standin",
     "runs.choice",
-    "runs.front",
     "runs.campaign",
     "runs.walks",
 )
 # flags of a call, not of the run that it begins or resumes
-_CALL_FLAGS = ("config", "each", "out", "resume", "run", "runs")
+_CALL_FLAGS = ("config", "each", "out", "resume", "runs")
 # flags that may change when a run is resumed
-_FREE_FLAGS = ("data", "front", "json", "processes", "verdict", "video")
+_FREE_FLAGS = ("data", "json", "processes", "verdict", "video")
 
 
 def exists_error(folder: Path) -> InputError:
@@ -55,46 +53,29 @@ def trajectories(args: Tune, robot: Robot) -> tuple[NamedCommand, ...]:
     """Load the trajectories of a tuning and check them against the other flags.
 
     Raises:
-        InputError: there is no such trajectory, their lengths differ, or --walks or --refresh does
-            not allow them; --walk-engine is not installed; --safe or --front beside a position
-            limit or a refresh; numbers of the legs without --walks, with --front or out of their
-            boxes.
+        InputError: there is no such trajectory, their lengths differ, or --walks is too few for
+            them; --walk-engine is not installed; --safe beside a position limit; numbers of the
+            legs without --walks or out of their boxes.
     """
     loaded = arguments.load_trajectories(args.traj, robot, "; add --each")
-    count, pieces = len(loaded), len(loaded[0].command.duration)
-    plants = max(args.walk_plants, 1)
+    count, plants = len(loaded), max(args.walk_plants, 1)
     if 0 < args.walks < (least := 2 * count * plants):
         walks = f"{plural(count, 'command')} on {plural(plants, 'plant')}, twice"
         raise InputError(f"--walks must be 0 or at least {least} ({walks}), got {args.walks}")
     choose_engine(args.walk_engine)  # whether it is installed
     start, of_legs = arguments.weights(args.start, robot), leg_numbers(args.tune)
-    if of_legs and (args.front or not args.walks):
-        text = "only --walks can tune what the rigid-body model does not have, without --front"
+    if of_legs and not args.walks:
+        text = "only --walks can tune what the rigid-body model does not have"
         raise InputError(f"--tune {' '.join(of_legs)}: {text}")
     with_leg_numbers(walk_config(robot), start, of_legs)  # checks them before anything is tuned
-    others = start.others
-    numbers = *tunables(args.tune), *others
-    if (args.safe or args.front) and "position_limit" in others:
-        raise InputError("--safe and --front set the position limit, which --start has already")
-    if not args.refresh:
-        return loaded
-    if args.front:
-        raise InputError("--front tunes through the first net, so it cannot be with --refresh")
-    if args.net:
-        raise InputError(f"--net {args.net}: --refresh needs the walks that a net was trained on")
-    if numbers:
-        raise InputError("--refresh takes Q and R alone, neither --tune nor a start with others")
-    if count > 1:
-        raise InputError(f"--refresh takes one trajectory, got {count}; add --each")
-    if pieces > PIECES:
-        limit = f"at most {PIECES} segments, {loaded[0].name} has {pieces}"
-        raise InputError(f"--refresh takes trajectories of {limit}")
+    if args.safe and "position_limit" in start.others:
+        raise InputError("--safe sets the position limit, which --start has already")
     return loaded
 
 
 def run_flags(args: Tune) -> Tune:
     """Return the flags of one run without its folders, which do not change the results."""
-    return replace(args, each=False, out=None, run=None, resume=None)
+    return replace(args, each=False, out=None, resume=None)
 
 
 def begin(folder: Path, args: Tune) -> Path:
@@ -120,7 +101,7 @@ def begin(folder: Path, args: Tune) -> Path:
             except OSError as error:
                 if not folder.exists():
                     raise InputError(f"cannot write {folder}: {error.strerror}") from None
-                if args.out or args.run:
+                if args.out:
                     raise exists_error(folder) from None
             later = datetime.strptime(folder.name, TIME) + timedelta(seconds=1)
             folder = folder.with_name(f"{later:{TIME}}")

@@ -30,11 +30,11 @@ from hector_jax.core.runtime import workers
 from hector_jax.core.tree_file import tree_hash
 from hector_jax.grfm.network import as_effect
 from hector_jax.report import fidelity, pictures
-from hector_jax.report.report import VOID, Picture, front_table, print_table
+from hector_jax.report.report import Picture, print_table
 from hector_jax.report.run import write_report
 from hector_jax.report.video import check_film
 from hector_jax.robot.model import load_robot
-from hector_jax.runs import choice, front, metrics, nets, tunings, verdicts
+from hector_jax.runs import choice, metrics, nets, tunings, verdicts
 from hector_jax.runs.folder import CONFIG, METRICS, RESULT, VERSIONS, Journal, read_object
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.verdicts import ScoredWalks
@@ -44,8 +44,9 @@ from hector_jax.sim.world import hfs
 from hector_jax.tuning.curvature import main_directions
 from hector_jax.tuning.difftune import Tuning
 from hector_jax.tuning.evaluate import aligned
+from hector_jax.tuning.loss import smoother
 
-_FOLDERS = ("out", "run", "resume")  # flags that name the run folder
+_FOLDERS = ("out", "resume")  # flags that name the run folder
 
 
 def tune(args: Tune) -> None:
@@ -55,7 +56,7 @@ def tune(args: Tune) -> None:
         raise InputError(f"{' and '.join(folder_flags)}: only one can be given")
     if args.video:
         check_film(Path("film.mp4"))
-    base, robot = args.resume or args.out or args.run, load_robot(args.robot)
+    base, robot = args.resume or args.out, load_robot(args.robot)
     runs = run_folder.by_folder(args, base, robot)
     if args.resume:
         runs = {folder: run_folder.resume(folder, flags) for folder, flags in runs.items()}
@@ -84,8 +85,10 @@ class _Run(NamedTuple):
 
     @property
     def tuning(self) -> Setup:
-        """Setup of the tunings, whose loss may differ from that of the table."""
-        return front.smoothed(self.setup, self.args.smooth)
+        """Setup of the tunings, in which L_ctrl may count more than in the table."""
+        config = self.setup.config
+        loss = smoother(config.loss, self.args.smooth)
+        return self.setup._replace(config=replace(config, loss=loss))
 
     @property
     def artefacts(self) -> Path:
@@ -119,7 +122,6 @@ class _Tuned(NamedTuple):
     """Results of the tunings of a run."""
 
     tunings: dict[str, Tuning]
-    shifts: list[dict[str, Any]]  # of each refresh
     sets: dict[str, Weights]
     choices: dict[str, choice.Choice]  # empty if the last iterations are used
     proposals: list[Row]  # of a tuning on walks; empty without
@@ -152,10 +154,9 @@ def _tune_in(folder: Path, args: Tune) -> None:
         inputs = run.tuning.config, robot, start, run.problems["with"]
         matrix = pool.submit(tunings.gauss_newton_job, *inputs)  # beside the walks
         walks = _walk_sets(run, tuned.sets)
-        points = _walk_front(run) if args.front else None
         case = trajectories[0], run.seconds, run.artefacts / "elsewhere"
         show = small_verdict(run.setup, tuned.sets, *case) if args.verdict else None
-    result, by_name = _result(run, tuned, walks, points)
+    result, by_name = _result(run, tuned, walks)
     write_json(folder / VERSIONS, made_with | {"seconds": f"{time.monotonic() - start_time:.0f}"})
     report = write_report(
         folder,
@@ -165,33 +166,26 @@ def _tune_in(folder: Path, args: Tune) -> None:
         curvature=main_directions(matrix.result(), start),
         errors=run.net.errors,
         tunings=tuned.tunings,
-        shifts=tuned.shifts,
         proposals=changes(tuned.proposals),
         best_proposal=tuned.best_proposal,
         cases=len(tuned.proposals[0].losses) if tuned.proposals else 0,
         chosen=result.get("chosen", {}),
-        front=points,
         smooth=args.smooth,
-        **_draw(run, tuned, *walks[trajectories[0].name], points),
+        **_draw(run, tuned, *walks[trajectories[0].name]),
         config=settings,
         environment=made_with,
         command=as_command("hector tune", run_folder.run_flags(args)),
     )
-    print_text = partial(_print_tables, by_name, args.seeds, points, show)
+    print_text = partial(_print_tables, by_name, args.seeds, show)
     print_result(args.json, {"run": str(folder), "traj": run.name, **result}, print_text)
     say(f"the report is {report}")
 
 
 def _print_tables(
-    verdicts: Mapping[str, metrics.Verdict],
-    seeds: int,
-    points: front.Front | None,
-    show: Callable[[], None] | None,
+    verdicts: Mapping[str, metrics.Verdict], seeds: int, show: Callable[[], None] | None
 ) -> None:
     for name, verdict in verdicts.items():
         print_table(verdict, f"{name}, {plural(seeds, 'plant')}")
-    if points:
-        print(f"sets around `best`\n{front_table(points, VOID)}")
     if show:
         show()
 
@@ -214,42 +208,21 @@ def _note_settings(run: _Run) -> dict[str, Any]:
     run_folder.check_agreement(run.folder, recorded, as_read)
     if recorded.get("start", as_read["start"]) != as_read["start"]:  # a number added or removed
         raise InputError(f"{run.folder}: begun with a start of other numbers beside Q and R")
-    # a front may be added by a later call, and stays
-    flags = recorded.get("flags", {}) | {"front": run.args.front}
-    settings = recorded | settings | {"flags": flags}
+    settings = recorded | settings
     write_json(path, settings)
     return settings
 
 
-def _refresh(
-    run: _Run, done: dict[str, tunings.Tuned], tune_problems: Callable
-) -> list[dict[str, Any]]:
-    """Train the net again at the tuned weights and tune with it, into `done`; return the shifts."""
-    net, name, shifts = run.net, "with", []
-    for count in range(1, run.args.refresh + 1):
-        config = replace(nets.REFRESH, seed=count, seconds=run.seconds)
-        folder = run.folder / f"refresh-{count}"
-        inputs = run.setup.pool, config, run.setup.robot, run.trajectories[0].command
-        net, shift = nets.refresh(*inputs, done[name].tuning, net=net, folder=folder)
-        shifts.append(shift)
-        name = "with_refreshed" + (str(count) if count > 1 else "")
-        problem = {name: run.problems["with"]._replace(params=net.params)}
-        done |= tune_problems(problem, title=f"tuning {run.name} with the net refreshed")
-    return shifts
-
-
 def _tune_sets(run: _Run) -> _Tuned:
-    """Tune without and with the net, and with each refreshed net; write the weights."""
-    tune_problems = partial(
-        tunings.tune,
+    """Tune without and with the net; write the weights."""
+    done = tunings.tune(
         run.tuning,
-        folder=run.artefacts,
+        run.problems,
+        run.artefacts,
+        title=f"tuning {run.name} without and with GRFM-Net",
         start=run.start,
         journal=Journal(run.folder / METRICS),
-        dumps=run.folder / "dumps",
     )
-    done = tune_problems(run.problems, title=f"tuning {run.name} without and with GRFM-Net")
-    shifts, name = _refresh(run, done, tune_problems), list(done)[-1]
     results = {name: entry.tuning for name, entry in done.items()}
     setup, commands = run.setup, list(run.commands.values())
     options = {"seconds": run.seconds, "folder": run.artefacts / "choice"}
@@ -262,7 +235,7 @@ def _tune_sets(run: _Run) -> _Tuned:
         **{name: tuning.converged for name, tuning in results.items()},
         **{name: chosen.weights for name, chosen in choices.items()},
     }
-    compared, pair = {name: sets[name] for name in ("nominal", *results)}, ("without", name)
+    compared, pair = {name: sets[name] for name in ("nominal", *results)}, ("without", "with")
     inputs, safe = (setup, compared, pair, run.args.share, commands), run.args.safe
     sets["best"] = choice.answer(*inputs, safe=safe, **options)
     proposals, best = [], ""
@@ -275,7 +248,7 @@ def _tune_sets(run: _Run) -> _Tuned:
         sets["best"] = stages[best]
     for name, weights in sets.items():
         save_weights(run.folder / "weights" / f"{name}.json", weights)
-    return _Tuned(results, shifts, sets, choices, proposals, best)
+    return _Tuned(results, sets, choices, proposals, best)
 
 
 def _campaign(run: _Run, start: Weights) -> Campaign:
@@ -285,16 +258,6 @@ def _campaign(run: _Run, start: Weights) -> Campaign:
     inputs = run.folder / "walks", config, robot, start, run.commands, plants
     engine = choose_engine(run.args.walk_engine)
     return Campaign(*inputs, leg_numbers=leg_numbers(run.args.tune), engine=engine)
-
-
-def _walk_front(run: _Run) -> front.Front:
-    """Tune and walk the sets of the front; write their weights."""
-    inputs, options = (run.setup, run.commands), {"seconds": run.seconds, "folder": run.artefacts}
-    pairs = front.tune(*inputs, run.problems, start=run.start, **options)
-    sets = front.points(run.setup, pairs, run.args.share)
-    for name, weights in sets.items():
-        save_weights(run.folder / "front" / f"{name}.json", weights)
-    return front.walk(*inputs, sets, **options)
 
 
 def _walk_sets(
@@ -329,10 +292,7 @@ def _say_worse(name: str, on_hfs: ScoredWalks) -> None:
 
 
 def _result(
-    run: _Run,
-    tuned: _Tuned,
-    walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]],
-    points: front.Front | None,
+    run: _Run, tuned: _Tuned, walks: Mapping[str, tuple[ScoredWalks, ScoredWalks]]
 ) -> tuple[dict[str, Any], dict[str, metrics.Verdict]]:
     """Write result.json; return its content and the verdicts, of all walks and by trajectory."""
 
@@ -354,31 +314,24 @@ def _result(
     if len(names) > 1:
         by_name |= {name: verdict([name], 0) for name in names}
         result["trajectories"] = {name: content([name], by_name[name]) for name in names}
-    if tuned.shifts:
-        result["refresh"] = tuned.shifts
     if tuned.proposals:
         result["walks"] = [change._asdict() for change in changes(tuned.proposals)]
         result["best_of_walks"] = tuned.best_proposal
     if tuned.choices:
         choices = tuned.choices.items()
         result["chosen"] = {name: {"iteration": c.iteration, "of": c.of} for name, c in choices}
-    if points:
-        falls = {"falls_pushed": points.falls, "pushed": points.pushed}
-        result["front"] = metrics.as_result(points.calm, "drawn") | falls
     write_json(run.folder / RESULT, result)
     return result, by_name
 
 
-def _draw(
-    run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks, points: front.Front | None
-) -> dict[str, Any]:
+def _draw(run: _Run, tuned: _Tuned, standin: ScoredWalks, on_hfs: ScoredWalks) -> dict[str, Any]:
     """Draw the pictures and the film of a run, for its report."""
     effects = {"linear": as_effect(run.net.linear), "residual": as_effect(run.net.params)}
     batch = jax.tree.map(lambda x: np.asarray(x)[None], on_hfs.first["nominal"])
     with ThreadPoolExecutor(1) as background:  # another process draws the film
         film = background.submit(_film, run, standin)
         curves = fidelity.curves(run.setup.robot, batch, effects)
-        inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history, points
+        inputs = tuned.sets, tuned.tunings, standin.first, curves, run.net.history
         drawings = pictures.of_run(run.folder, run.tuning.config, *inputs)
     return {"pictures": drawings, "film": film.result()}
 

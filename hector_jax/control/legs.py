@@ -7,7 +7,7 @@ target lies slightly below the ground so that the foot does land.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +44,6 @@ class LegParameters(NamedTuple):
 @dataclass(frozen=True)
 class LegConfig:
     """Defaults of the swing path and the joint gains."""
-
-    RENAMED: ClassVar = {"stance_weight": ("gravity_compensation", {})}
 
     height: float = 0.08  # [m] apex of the swing foot
     landing: float = -0.005  # [m] target height at touchdown

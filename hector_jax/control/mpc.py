@@ -17,7 +17,7 @@ see also `contact`.
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -63,8 +63,6 @@ class MpcParameters(NamedTuple):
 @dataclass(frozen=True)
 class MpcConfig:
     """Static configuration of the MPC, and the defaults of its numbers."""
-
-    RENAMED: ClassVar = {"effort_about": ("effort_reference", {"weight": "gravity"})}
 
     horizon: Annotated[int, AT_LEAST_ONE] = 10  # steps N
     step_ticks: Annotated[int, AT_LEAST_ONE] = 3  # ticks per step: dt = 0.03 s

@@ -199,8 +199,7 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
 
     Args:
         where: the file and the place in it, for the message.
-        kind: the dataclass, which checks itself; fields without a default are required. Its
-            optional `RENAMED` maps former field names to the current name and words.
+        kind: the dataclass, which checks itself; fields without a default are required.
         table: read from the file.
 
     Raises:
@@ -212,12 +211,6 @@ def from_table(where: str, kind: type[T], table: Any) -> T:
             f"{where} must be a table of {', '.join(by_name)}, got {short_repr(table)}"
         )
     values = {}
-    for old, (new, words) in getattr(kind, "RENAMED", {}).items():
-        if old in table:
-            if new in table:
-                raise InputError(f"{where}: {old} is the former name of {new}; give one of them")
-            table = {new if name == old else name: value for name, value in table.items()}
-            table[new] = words.get(str(table[new]), table[new])
     for name, value in table.items():
         if name not in by_name:
             raise InputError(f"{where}: {unknown('field', name, by_name)}")

@@ -14,7 +14,6 @@ from hector_jax.sim.world import Push, hfs_drawn
 
 KINDS = (*COMMANDS, "random")  # of commands; job i is of kind i modulo their number
 SPREAD = 3.0  # weights are drawn log-uniformly within x/SPREAD of their centre
-NEAR = 1.5  # and within x/NEAR of the weights of a tuning path
 PUSHES = 2  # of every walk, so that jobs can be stacked; most have zero force
 PUSH_TIME = 0.1  # [s]
 
@@ -60,40 +59,6 @@ def draw_jobs(
         else:
             weights = _draw_weights(rng, centres[centre], SPREAD)
         return _draw_job(rng, i, command, weights, seconds=seconds, robot=robot)
-
-    return [draw(i) for i in range(count)]
-
-
-def draw_jobs_near(
-    seed: int,
-    count: int,
-    command: Command,
-    *,
-    path: Weights,
-    seconds: float = 4.0,
-    robot: Robot | None = None,
-) -> list[Job]:
-    """Draw walks around the path of one tuning.
-
-    Commands take turns: the given command, random velocities. Weights take turns too: each of the
-    24 log-uniform within x/NEAR of a random point of the path, and of its last point. Plants and
-    pushes are drawn as in `draw_jobs`, and job i depends on the seed and on i alone.
-
-    Args:
-        seed: of all random draws.
-        count: number of walks.
-        command: the tuning's command.
-        path: weights along the tuning, stacked along a first axis.
-        seconds: length of each walk.
-        robot: robot of the plants; HECTOR by default.
-    """
-
-    def draw(i: int) -> Job:
-        rng = np.random.default_rng([seed, i])
-        job_command = _random_command(rng) if i % 2 else with_pieces(command)
-        point = -1 if i // 2 % 2 else int(rng.integers(len(path.Q.euler)))
-        weights = _draw_weights(rng, _point(path, point), NEAR)
-        return _draw_job(rng, i, job_command, weights, seconds=seconds, robot=robot)
 
     return [draw(i) for i in range(count)]
 

@@ -18,7 +18,6 @@ from hector_jax.report.video import VideoUnavailable, write_film, write_strip
 from hector_jax.report.view import ViewedWalk
 from hector_jax.robot.model import Robot
 from hector_jax.runs.folder import Histories
-from hector_jax.runs.front import Front
 from hector_jax.tuning.difftune import TuneConfig, Tuning
 from hector_jax.tuning.loss import Loss
 
@@ -31,7 +30,6 @@ def of_run(
     walks: Mapping[str, Trajectory],
     ground: Mapping[str, Wrench],
     training: History,
-    points: Front | None,
 ) -> list[Picture]:
     """Draw the pictures of a tuning into `pictures/` of its folder.
 
@@ -43,7 +41,6 @@ def of_run(
         walks: one walk by set, at the plan interval.
         ground: result of `fidelity.curves`.
         training: errors of the net by epoch.
-        points: result of `front.walk`; None without.
 
     Returns:
         The pictures, in the order of the report.
@@ -61,7 +58,6 @@ def of_run(
         "weights": plots.weights(path / "weights.png", weight_names(sets["nominal"]), vectors),
         "wrenches": plots.wrenches(path / "wrenches.png", tick, ground),
         "training": plots.training(path / "training.png", training),
-        **({"front": plots.front(path / "front.png", points)} if points else {}),
     }
     return [Picture(f"pictures/{name}.png", caption) for name, caption in captions.items()]
 

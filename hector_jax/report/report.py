@@ -20,14 +20,12 @@ from rich.table import Table
 from rich.text import Text
 
 from hector_jax.core.inputs import plural
-from hector_jax.runs.front import Front
 from hector_jax.runs.metrics import (
     BASELINES,
     FEWEST,
     Comparison,
     Summary,
     Verdict,
-    compare,
     rms,
     summarize,
 )
@@ -123,19 +121,6 @@ def baselines(verdict: Verdict) -> list[str]:
 def change_text(comparison: Comparison, part: str = "L", void: str = f" \\{VOID}") -> str:
     """Format a change in % with its interval and, if falls make it void, a mark."""
     return comparison.change[part].text() + ("" if comparison.counts else void)
-
-
-def front_table(front: Front, void: str = f" \\{VOID}") -> str:
-    """Format the results of a front in Markdown; a comparison that falls make void has a mark."""
-    changes = "L against nominal [%]", "L_ctrl against expert [%]"
-    rows = []
-    for name, score in front.calm.scores.items():
-        against = (compare(front.calm, name, baseline) for baseline in BASELINES)
-        parts = zip(against, ("L", "L_ctrl"), strict=True)
-        texts = [change_text(comparison, part, void) for comparison, part in parts]
-        falls = f"{front.falls[name]} of {front.pushed}", f"{score.fallen.sum()} of {score.L.size}"
-        rows.append((name, *texts, *falls))
-    return markdown_table(("set", *changes, "falls under a push", "falls without one"), rows)
 
 
 def legend(verdict: Verdict) -> list[str]:

@@ -11,7 +11,7 @@ from hector_jax.control.parameters import bounds
 from hector_jax.control.weights import Weights, weight_names, weights_to_vector
 from hector_jax.core.files import write_file
 from hector_jax.report.fidelity import error_rows
-from hector_jax.report.report import front_table, render
+from hector_jax.report.report import render
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, Tuning
 from hector_jax.tuning.evaluate import aligned
 
@@ -23,15 +23,13 @@ def write_report(folder: Path, **contents: Any) -> Path:
         folder: where the pictures are.
         contents: all of these:
             trajectory, verdict: names of the trajectories; verdict of all sets on the stand-in.
-            tunings: by set, `without`, `with` and, refreshed, `with_refreshed`.
+            tunings: by set, `without` and `with`.
             norms: gradient norms of the terms in log-weights at nominal, by model.
             curvature: of the loss at the starting weights.
             errors: held-out errors of `raw`, `linear`, `net`, from `training.report`.
-            shifts: result of `nets.refresh` for each refresh.
             proposals, best_proposal, cases: `Change`s of the tuning on walks; name of the set that
                 is `best`; number of walks per weight set.
             chosen: chosen iteration by set, if it is not the last.
-            front: result of `front.walk`; None without.
             smooth: how often L_ctrl counted in the tunings.
             pictures, film: list of `Picture`; `Picture` of the film, or why there is none.
             config, environment: resolved settings, as JSON values; versions and machine.
@@ -40,7 +38,7 @@ def write_report(folder: Path, **contents: Any) -> Path:
     Returns:
         The file.
     """
-    functions = (aligned, error_rows, front_table, tuning_section)
+    functions = (aligned, error_rows, tuning_section)
     values = contents | {function.__name__: function for function in functions}
     write_file(folder / "report.md", render("run.md.j2", **values).encode())
     return folder / "report.md"

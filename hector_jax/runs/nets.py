@@ -11,7 +11,6 @@ import numpy as np
 
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import GaitConfig
-from hector_jax.control.reference import Command
 from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core.console import bar, say, say_if_slow
@@ -19,11 +18,10 @@ from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.settings import POSITIVE, SEED, Range, check, from_table
-from hector_jax.core.tree import stack
 from hector_jax.core.tree_file import check_settings
 from hector_jax.grfm import collection, dataset, network, training
 from hector_jax.grfm.effect import HISTORY, last_command
-from hector_jax.grfm.jobs import draw_jobs, draw_jobs_near
+from hector_jax.grfm.jobs import draw_jobs
 from hector_jax.grfm.nets import History
 from hector_jax.grfm.network import Params, as_effect
 from hector_jax.grfm.paper import LinearMap, fit_linear
@@ -33,7 +31,6 @@ from hector_jax.runs.cache import content_key, robot_hash
 from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 from hector_jax.sim.engine import ENGINES, choose_engine
 from hector_jax.sim.loop import Job
-from hector_jax.tuning.difftune import PAPER_ITERATIONS, Tuning
 
 # modules that determine the numbers, for `code_hash`
 TRAINING_CODE = ("grfm.training",)
@@ -61,9 +58,6 @@ class CollectConfig:
             )
 
 
-REFRESH = CollectConfig(walks=32)  # walks at the current weights, for each refresh
-
-
 class TrainedNet(NamedTuple):
     """A trained GRFM-Net with its training and its errors."""
 
@@ -72,7 +66,7 @@ class TrainedNet(NamedTuple):
     errors: dict[str, Any]  # of raw command, linear map and net on held-out walks
     history: History
     config: TrainConfig
-    folders: tuple[Path, ...]  # of the walks; empty for a net without walks
+    folder: Path | None  # of the walks; None for a net without walks
     held_out_walks: list[int]  # numbers of the walks that were not trained on
 
 
@@ -133,33 +127,23 @@ class Samples(NamedTuple):
     dropped: int  # number of samples dropped for a fall, an unsolved QP or a push
 
 
-def samples(robot: Robot, *folders: Path) -> Samples:
-    """Return samples of the walks under `folders`: 1/5 held out, 1/5 of the rest for validation.
-
-    Each folder is split by itself, so that the same walks are held out whatever other folders are
-    given; walks are numbered by folder.
-    """
-    parts, total = [], 0
-    for folder in folders:
-        job, walk = collection.load_walks(folder, robot)
-        data, dropped = dataset.make_dataset(robot, walk, job.start_tick, push=job.push)
-        rest, held_out = dataset.split_by_walk(data)
-        parts.append((*dataset.split_by_walk(rest, seed=1), held_out))
-        total += dropped
-    training, validation, held_out = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return Samples(training, validation, held_out, total)
+def samples(robot: Robot, folder: Path) -> Samples:
+    """Return samples of the walks under a folder: 1/5 held out, 1/5 of the rest for validation."""
+    job, walk = collection.load_walks(folder, robot)
+    data, dropped = dataset.make_dataset(robot, walk, job.start_tick, push=job.push)
+    rest, held_out = dataset.split_by_walk(data)
+    return Samples(*dataset.split_by_walk(rest, seed=1), held_out, dropped)
 
 
 def held_out_walks(robot: Robot, net: TrainedNet) -> collection.Walks:
-    """Load the held-out walks from the first folder on which a net was trained."""
-    walks = collection.load_walks(net.folders[0], robot)
+    """Load the held-out walks from the folder on which a net was trained."""
+    assert net.folder is not None  # a net without walks has none to load
+    walks = collection.load_walks(net.folder, robot)
     return jax.tree.map(lambda x: x[net.held_out_walks], walks)
 
 
-def train(
-    config: TrainConfig, robot: Robot, folder: Path, path: Path, more: Sequence[Path] = ()
-) -> TrainedNet:
-    """Train a GRFM-Net on the walks under `folder` and `more`, and save it at `path`.
+def train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> TrainedNet:
+    """Train a GRFM-Net on the walks under `folder` and save it at `path`.
 
     Its card describes its walks and their controller.
 
@@ -167,13 +151,12 @@ def train(
         InputError: the folder cannot be written; there are no walks, or damaged ones.
     """
     with locked(path.parent):
-        return _train(config, robot, (folder, *more), path)
+        return _train(config, robot, folder, path)
 
 
-def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: Path) -> TrainedNet:
-    with say_if_slow(f"reading the walks in {', '.join(map(str, folders))}"):
-        parts = samples(robot, *folders)
-    made_of, *others = map(collection.fingerprint, folders)
+def _train(config: TrainConfig, robot: Robot, folder: Path, path: Path) -> TrainedNet:
+    with say_if_slow(f"reading the walks in {folder}"):
+        parts = samples(robot, folder)
     count = plural(len(parts.training.walk), "sample")
     with bar(f"training GRFM-Net ({config.variant}) on {count}") as report_progress:
         report_progress(0, config.epochs, "compiling")
@@ -191,8 +174,7 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
     held_out = np.unique(parts.held_out.walk).tolist()
     sizes = {name: len(part.walk) for name, part in parts._asdict().items() if name != "dropped"}
     about = {
-        "made_of": made_of,
-        **({"and_of": others} if others else {}),
+        "made_of": collection.fingerprint(folder),
         "settings": training_settings(config, robot),
         "samples": {**sizes, "dropped": parts.dropped},
         "held_out": held_out,
@@ -201,7 +183,7 @@ def _train(config: TrainConfig, robot: Robot, folders: tuple[Path, ...], path: P
         "course": {name: np.asarray(rows).tolist() for name, rows in history._asdict().items()},
     }
     network.save_net(path, params, robot=robot, about=about)
-    return TrainedNet(params, linear, errors, history, config, folders, held_out)
+    return TrainedNet(params, linear, errors, history, config, folder, held_out)
 
 
 def net_path(data: Path, variant: str) -> Path:
@@ -232,7 +214,7 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: its card does not tell its training: {error!r}") from None
     inputs = {"settings": settings, "made_of": made_of}
-    return TrainedNet(params, linear, errors, history, config, (), held_out), inputs
+    return TrainedNet(params, linear, errors, history, config, None, held_out), inputs
 
 
 def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:
@@ -265,52 +247,8 @@ def load_or_train(
     check_settings(walks, {name: made_of.get(name) for name in settings}, settings)
     with locked(data):  # a second process waits here, and then loads the net
         if not path.exists():
-            return _train(config, robot, (walks,), path)
+            return _train(config, robot, walks, path)
     net, inputs = load_net(path, robot, config.variant)
     check_settings(path, inputs["settings"], training_settings(config, robot))
     check_settings(path, inputs["made_of"], made_of)
-    return net._replace(folders=(walks,))
-
-
-def refresh(
-    pool: Executor,
-    config: CollectConfig,
-    robot: Robot,
-    command: Command,
-    tuning: Tuning,
-    *,
-    net: TrainedNet,
-    folder: Path,
-) -> tuple[TrainedNet, dict[str, Any]]:
-    """Collect walks along the path of a tuning and train its net again on old and new walks.
-
-    The walks are saved in `folder`/walks and the net in `folder`/refreshed.npz.
-
-    Args:
-        pool: worker processes.
-        config: settings of the collection.
-        robot: robot of the walks.
-        command: command of the tuning.
-        tuning: tuning whose weights, from ten iterations to converged, are walked.
-        net: net of the tuning; the new net has the same training settings.
-        folder: folder of the new walks and the new net.
-
-    Returns:
-        The new net, and the shift: errors of the raw command and of the nets `before` and `after`
-        on held-out walks, `old` and `new`, as `training.report` returns them.
-    """
-    walks = folder / "walks"
-    late = [i.weights for i in tuning.history if i.accepted and i.iteration > PAPER_ITERATIONS]
-    options = {"path": stack([tuning.ten, *late]), "seconds": config.seconds, "robot": robot}
-    jobs = draw_jobs_near(config.seed, config.walks, command, **options)
-    settings = {**asdict(config), "code": code_hash(*COLLECTION_CODE)}  # the rest is in the jobs
-    with locked(walks):
-        _collect(pool, config, robot, jobs, walks, settings)
-    first, *more = (*net.folders, walks)
-    after = train(net.config, robot, first, folder / "refreshed.npz", more)
-    nets = {"before": as_effect(net.params), "after": as_effect(after.params)}
-    effects = {"raw": last_command, **nets}
-    return after, {
-        name: training.report(effects, samples(robot, *folders).held_out)
-        for name, folders in {"old": net.folders, "new": (walks,)}.items()
-    }
+    return net._replace(folder=walks)

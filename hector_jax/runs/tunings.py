@@ -22,7 +22,6 @@ from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
 from hector_jax.robot.model import Robot
-from hector_jax.runs import replay
 from hector_jax.runs.cache import content_key, load_or_make
 from hector_jax.runs.folder import Journal
 from hector_jax.runs.setup import Setup
@@ -130,7 +129,6 @@ def tune(
     title: str,
     start: Weights | None = None,
     journal: Journal | None = None,
-    dumps: Path | None = None,
 ) -> dict[str, Tuned]:
     """Tune several problems in parallel; finished tunings are saved in `folder`.
 
@@ -144,8 +142,6 @@ def tune(
         start: weights at the start; the nominal weights by default.
         title: title of the progress bar.
         journal: journal of the iterations.
-        dumps: folder for rejected evaluations, see `replay.keep`; None: no dumps. A problem with
-            several commands has no dumps, because a dump is of one rollout.
 
     Raises:
         InputError: with the weights at the start the model falls or a QP is not solved; or the
@@ -161,10 +157,6 @@ def tune(
     def on_iteration(name: str, iteration: Iteration) -> None:
         if journal is not None:
             journal.add(name, iteration)
-        commands, net = problems[name]
-        if dumps is not None and len(commands) == 1:
-            inputs = {"config": setup.config, "robot": setup.robot, "command": commands[0]}
-            replay.keep(dumps, name, iteration, net=net, **inputs)
 
     def make(missing: list[str], stored: Mapping[str, Tuned]) -> Iterator[tuple[str, Tuned]]:
         if journal is not None:  # in the order of the problems

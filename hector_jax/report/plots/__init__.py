@@ -23,7 +23,6 @@ from hector_jax.report.motion import COLOURS, Motion
 from hector_jax.report.plots import style
 from hector_jax.report.plots.style import CURVES, ORANGE, SETS, drawing, label_of, looks_of
 from hector_jax.report.report import caption
-from hector_jax.runs.front import Front
 from hector_jax.runs.matrix import Cells, Column, columns_of, sets_of, trajectories_of
 from hector_jax.runs.metrics import BASELINES, Verdict, compare
 from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration
@@ -286,38 +285,6 @@ def training(path: Path, history: History) -> str:
             top = 1.6 * np.percentile(np.concatenate([train, valid]), 90)
             panel.set(title=kind, xlabel="epoch", ylabel=label, ylim=(0.0, top))
     return caption("training")
-
-
-def front(path: Path, result: Front) -> str:
-    """Draw L, L_ctrl and falls of the sets of a front.
-
-    Args:
-        path: file to write.
-        result: the walks.
-    """
-    tunings: dict[str, list[str]] = {}
-    for name in result.falls:
-        tunings.setdefault(name.partition("_safe_")[0], []).append(name)
-    with drawing(path, 9.0, 4.2) as figure:
-        panels = figure.subplots(1, 2, sharey=True)
-        for tuning, look in looks_of(tunings).items():
-            places, label = [], label_of(tuning).replace("_", " ")
-            for name in tunings[tuning]:
-                nominal, expert = (compare(result.calm, name, other) for other in BASELINES)
-                x = expert.change["L_ctrl"].value, result.falls[name]
-                places.append((*x, nominal.change["L"].value))
-                filled = look.color if nominal.counts and expert.counts else "white"
-                dot = dict(look.dot, markerfacecolor=filled)
-                for panel, side in zip(panels, x, strict=True):
-                    panel.plot(side, places[-1][2], **dot, label=label)
-                    label = None  # one entry in the legend
-            *sides, L = zip(*places, strict=True)
-            for panel, side in zip(panels, sides, strict=True):
-                panel.plot(side, L, **look.line)
-        panels[0].set(xlabel="change of L_ctrl against expert [%]")
-        panels[0].set(ylabel="change of L against nominal [%]")
-        panels[1].set(xlabel=f"falls in {result.pushed} walks under a push")
-    return caption("front")
 
 
 def matrix(path: Path, cells: Cells, title_of: Callable[[Column], str]) -> str:
