@@ -116,18 +116,6 @@ def test_a_batch_tunes_other_numbers_as_a_single_tuning_does(monkeypatch):
         np.testing.assert_allclose(vector(ours), vector(alone.converged), rtol=1e-9)
 
 
-def test_a_scenario_without_a_variation_has_that_of_the_robots_tunings(on_toy, monkeypatch):
-    given = []
-    spy = lambda *inputs, walk: given.append(inputs[-1]) or toy(*inputs)  # noqa: E731
-    monkeypatch.setattr(batch, "evaluate", spy)
-    tuning = replace(ROBOT.description.tuning, estimate_noise=1.0)
-    noisy = ROBOT._replace(description=replace(ROBOT.description, tuning=tuning))
-    for robot in (ROBOT, noisy):
-        tune_batch(TOY, robot, stack([problem(STARTS[0], [scenario()])]), last_command)
-    assert given[0] is None
-    assert given[-1] is not None
-
-
 def test_how_many_walk_side_by_side_does_not_matter(on_toy):
     asked = stack([problem(w, [scenario("c")]) for w in STARTS])
     one, *others = (tune_batch(TOY, ROBOT, asked, last_command, lanes=lanes) for lanes in (1, 2, 0))

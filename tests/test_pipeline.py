@@ -124,7 +124,7 @@ def test_data_follow_from_their_own_settings_whatever_command_makes_them(tmp_pat
     monkeypatch.setattr(nets, "collect", collect)
     monkeypatch.setattr(tunings, "compile_programs", lambda *args: [])  # it walks
     for command in (
-        flags.Tune(iterations=10, data=tmp_path / "data", run=tmp_path / "run"),
+        flags.Tune(iterations=10, data=tmp_path / "data", out=tmp_path / "run"),
         flags.Grfm(data=tmp_path / "data", out=tmp_path / "grfm"),
     ):
         with pytest.raises(cut):

@@ -25,7 +25,7 @@ from hector_jax.tuning.difftune import (
 )
 from hector_jax.tuning.evaluate import evaluate_jit, gradient_norms
 from hector_jax.tuning.loss import PAPER_LOSS, losses, total, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, rollout, variation_of
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 LONG = RolloutConfig(ticks=400)
 STRAIGHT = named_command("straight")
@@ -204,8 +204,7 @@ def check_gradient(
             break
     print(f"error against differences {errors}", end=" ")
     assert errors[-1] <= bar, (case, errors)
-    inputs = weights, command, anchor, effect, variation_of(robot)
-    trajectory, columns = propagate(config, robot, *inputs)
+    trajectory, columns = propagate(config, robot, weights, command, anchor, effect)
     _, forward = sensitivity.gradient(PAPER_LOSS, trajectory, columns, weights)
     forward = weights_to_vector(jax.tree.map(jnp.multiply, forward, weights))
     print(f"forward against reverse {relative(forward, reverse):.1e}")

@@ -141,8 +141,8 @@ def robot_with(**settings):
 
 
 def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tunings():
-    assert variation_of(ROBOT) is None
-    variation = variation_of(robot_with(estimate_noise=2.0, delay=0.005))
+    assert variation_of(rollout_config(ROBOT)) is None
+    variation = variation_of(rollout_config(robot_with(estimate_noise=2.0, delay=0.005)))
     np.testing.assert_allclose(variation.noise.velocity, 0.04)
     np.testing.assert_allclose(variation.noise.euler, 0.002)
     assert_same(variation._replace(noise=as_believed().noise, delay=0.0), as_believed())
@@ -150,20 +150,25 @@ def test_the_description_of_a_robot_states_the_noise_and_the_delay_of_its_tuning
 
 
 def test_a_delay_of_more_than_a_tick_is_refused():
-    with pytest.raises(InputError, match=r"tuning.delay must be at most 0.01 s, got 0.02"):
+    with pytest.raises(
+        InputError, match=r"tuning: .*delay must be a number from 0 to 0.01, got 0.02"
+    ):
         rollout_config(robot_with(delay=0.02))
 
 
 def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
-    robot, config = robot_with(estimate_noise=1.0, delay=0.005), RolloutConfig(ticks=10)
+    robot = robot_with(estimate_noise=1.0, delay=0.005)
+    config = rollout_config(robot, ticks=10)
     inputs = nominal(), named_command("straight"), standing_anchor(ROBOT), last_command
     seen = tune_step(TuneConfig(rollout=config), robot, *inputs)
-    expected = evaluate_jit(config, robot, *inputs, PAPER_LOSS, variation_of(robot))
+    expected = evaluate_jit(
+        RolloutConfig(ticks=10), robot, *inputs, PAPER_LOSS, variation_of(config)
+    )
     assert_same(seen, expected)
     plain = evaluate_jit(config, robot, *inputs, PAPER_LOSS, no_variation())
     assert abs(seen.loss / plain.loss - 1.0) > 1e-3
     single = tuple(t._replace(weight=float(t.name == "L_ctrl")) for t in PAPER_LOSS)
-    slope = evaluate_jit(config, robot, *inputs, single, variation_of(robot)).gradient
+    slope = evaluate_jit(config, robot, *inputs, single).gradient
     logs = weights_to_vector(jax.tree.map(jnp.multiply, slope, nominal()))
     norms = gradient_norms(config, robot, *inputs, PAPER_LOSS)
     assert norms["L_ctrl"] == pytest.approx(np.linalg.norm(logs))
@@ -172,7 +177,7 @@ def test_a_tuning_sees_the_noise_and_the_delay_of_the_description():
 @pytest.mark.slow
 def test_the_curvature_of_a_tuning_has_its_noise():
     robot = robot_with(estimate_noise=1.0, delay=0.005)
-    config = TuneConfig(rollout=RolloutConfig(ticks=10), residual=1e-300)
+    config = TuneConfig(rollout=rollout_config(robot, ticks=10), residual=1e-300)
     command, effect = named_command("straight"), effect_of(None, config.rollout.walk)
     seen = tune_step(config, robot, nominal(), command, standing_anchor(robot), effect)
     model = command, standing_anchor(robot), effect

@@ -34,6 +34,7 @@ _CODE = (
     "sim.standin",
     "runs.choice",
     "runs.campaign",
+    "runs.verdicts",
     "runs.walks",
 )
 # flags of a call, not of the run that it begins or resumes

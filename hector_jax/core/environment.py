@@ -5,6 +5,8 @@ import hashlib
 import os
 import platform
 import subprocess
+import sys
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -13,21 +15,35 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-NUMERIC = ("jax", "jaxlib", "mujoco", "numpy")  # packages that determine numerical results
 # modules that do not affect numerical results
 _NO_NUMBERS = (
-    "control.weights_file core.console core.environment core.files core.inputs core.runtime"
-    " core.tree_file"
+    "control.weights_file core.console core.environment core.files core.identity core.inputs"
+    " core.runtime core.tree_file"
 ).split()
-_PACKAGES = "hector-jax jax jaxlib flax numpy mujoco mujoco-mjx cmaes".split()
+# imported names whose package has another name or brings another package that computes
+_PACKAGES_OF = {
+    "jax": ("jax", "jaxlib"),
+    "mujoco": ("mujoco", "mujoco-mjx"),
+    "pinocchio": ("pin",),
+    "pydrake": ("drake",),
+}
+_NO_NUMBER_PACKAGES = ("jaxtyping", "msgspec")  # of types and files
+_PACKAGES = (
+    "hector-jax jax jaxlib jaxopt flax optax numpy scipy mujoco mujoco-mjx cmaes tinygp drake pin"
+).split()
 _ROOT = Path(__file__).parents[1]
 
 
 @cache  # called for the card of every file
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the installed packages that affect results."""
-    installed = {"python": platform.python_version()}
-    for package in _PACKAGES:
+    return {"python": platform.python_version()} | _installed(_PACKAGES)
+
+
+def _installed(packages: Iterable[str]) -> dict[str, str]:
+    """Return the versions of those packages that are installed."""
+    installed = {}
+    for package in packages:
         with suppress(PackageNotFoundError):
             installed[package] = version(package)
     return installed
@@ -68,39 +84,57 @@ def code_hash(*modules: str) -> str:
     """Return a hash (12 hexadecimal digits) of the code and packages that determine a result.
 
     It covers the syntax trees, without docstrings, of the modules and of every module of this
-    package that they import, and the versions of JAX, MuJoCo and NumPy. Comments, layout and
-    modules that only read, write and print do not change it.
+    package that they import, and the versions of all other packages that these import. Comments,
+    layout and modules that only read, write and print do not change it.
 
     Args:
         modules: names such as `sim.walk`, relative to this package.
     """
     trees: dict[str, str] = {}
-    pending = list(modules)
+    pending, packages = list(modules), set[str]()
     while pending:
         name = pending.pop()
         if name in trees or name in _NO_NUMBERS:
             continue
-        trees[name], imported = _syntax(_source(name).read_bytes())
+        trees[name], imported, others = _syntax(_source(name).read_bytes())
         pending += imported
-    numeric = {name: version(name) for name in NUMERIC}
-    return hashlib.sha256(repr((sorted(trees.items()), numeric)).encode()).hexdigest()[:12]
+        packages |= others
+    content = sorted(trees.items()), _installed(sorted(packages))
+    return hashlib.sha256(repr(content).encode()).hexdigest()[:12]
 
 
 @cache  # most modules are in the hashes of several results
-def _syntax(source: bytes) -> tuple[str, list[str]]:
-    """Return the syntax tree of a module, without docstrings, and the modules that it imports."""
+def _syntax(source: bytes) -> tuple[str, list[str], set[str]]:
+    """Return the syntax tree of a module, without docstrings, and what it imports.
+
+    Returns:
+        The tree as text, the modules of this package and the other packages that it imports.
+    """
     tree = ast.parse(source)
     imported = _imported(tree)
+    packages = _packages(tree)
     for node in ast.walk(tree):
         match getattr(node, "body", None):
             case [ast.Expr(ast.Constant(str())), *_] as body:
                 body.pop(0)
-    return ast.dump(tree), imported
+    return ast.dump(tree), imported, packages
 
 
 def _source(module: str) -> Path:
     path = _ROOT.joinpath(*module.split("."))
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _packages(tree: ast.Module) -> set[str]:
+    """Return the installed packages, other than this one, that a module imports."""
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add(str(node.module).partition(".")[0])
+    names -= {_ROOT.name, *sys.stdlib_module_names, *_NO_NUMBER_PACKAGES}
+    return {package for name in names for package in _PACKAGES_OF.get(name, (name,))}
 
 
 def _imported(tree: ast.Module) -> list[str]:

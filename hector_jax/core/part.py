@@ -7,15 +7,16 @@ A kind of part is a subclass that annotates its functions; a part is an instance
 
     JAXOPT = Solver("jaxopt", approach=box_osqp)
 
-A part is a `str`, so that TOML, JSON and messages show its name. Two parts are equal if their names
-and functions are: a jitted function with a part in its static config is recompiled for another part
-of the same name. Its `repr`, which identifies stored results, has only the names of the functions:
-use functions of a module, not closures or lambdas, which can share a name.
+A part is a `str`, so that TOML, JSON and messages show its name. It equals another part of its kind
+with the same name and functions, and no plain text: a jitted function with a part in its static
+config is recompiled for another part of the same name. Its `repr`, which identifies stored results,
+has the content of a user's functions.
 """
 
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import choose
 
@@ -30,19 +31,18 @@ class Part(str):
         return part
 
     def __eq__(self, other: object) -> bool:
-        same_name = str.__eq__(self, other)
-        return same_name and (not isinstance(other, Part) or self.__dict__ == other.__dict__)
+        same = type(self) is type(other) and str.__eq__(self, other)
+        return same and self.__dict__ == other.__dict__
 
     def __ne__(self, other: object) -> bool:
         return not self == other
 
-    __hash__ = str.__hash__
+    def __hash__(self) -> int:
+        return hash((type(self), str(self)))
 
     def __repr__(self) -> str:
         values = (
-            f"{name}={value.__module__}.{value.__qualname__}"
-            if hasattr(value, "__qualname__")
-            else f"{name}={value!r}"
+            f"{name}={function_id(value) if callable(value) else repr(value)}"
             for name, value in self.__dict__.items()
         )
         return f"{type(self).__name__}({str(self)!r}, {', '.join(values)})"

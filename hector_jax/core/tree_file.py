@@ -18,13 +18,14 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from hector_jax.core.environment import NUMERIC, versions
+from hector_jax.core.environment import versions
 from hector_jax.core.files import write_file
 from hector_jax.core.inputs import InputError, one_line, short_repr
 from hector_jax.core.settings import convert
 
 FORMAT = 1
 ROBOT_DIGITS = 9  # of a robot's numbers; rounding on another machine gives the same hash
+OTHER_CODE = "by other code or other versions of jax, jaxlib, mujoco or another package"
 _SHA256 = 64  # hexadecimal digits
 
 Tree = TypeVar("Tree")
@@ -175,7 +176,7 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Check that the settings recorded in a file equal those of the current command.
+    """Check that the settings recorded in a file or folder equal those of the current command.
 
     Raises:
         InputError: one line naming the file and the first setting that differs.
@@ -186,5 +187,5 @@ def check_settings(path: Path, made: Mapping[str, Any], expected: Mapping[str, A
             continue
         what = f"with {name} {short_repr(before)}, this command expects {short_repr(now)}"
         if name == "code":
-            what = f"by other code or other versions of {', '.join(NUMERIC)}"
+            what = OTHER_CODE
         raise InputError(f"{path}: made {what}; remove it, or name another folder")

@@ -94,7 +94,9 @@ class TuningSettings:
     touchdown_error: bool = False  # the net learns the distance from planned to actual touchdown
     estimate_noise: Annotated[float, NOT_NEGATIVE] = 0.0  # factor on that of a real robot's sensors
     delay: Annotated[float, NOT_NEGATIVE] = 0.0  # [s] of the ground's reaction, at most a tick
-    choice_plants: Annotated[int, NOT_NEGATIVE] = 0  # plants to choose the iteration; 0: the last
+    # plants to choose the iteration, 0: the last; not in the repr, which is hashed to identify a
+    # robot: no stored walk, net or tuning depends on it
+    choice_plants: Annotated[int, NOT_NEGATIVE] = field(default=0, repr=False)
 
     def __post_init__(self) -> None:
         check(self)
@@ -123,8 +125,7 @@ class Description:
     expert: tuple[Triple, ...] | None = None  # in the order of _Diagonals; None: HECTOR's
     loss: tuple[tuple[str, float], ...] = ()  # alphas by term; missing ones are the paper's
     plants: PlantSizes = PlantSizes()
-    # not in the repr, which is hashed to identify a robot: walks do not depend on it
-    tuning: TuningSettings = field(default=TuningSettings(), repr=False)
+    tuning: TuningSettings = TuningSettings()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "control", _as_tuples(self.control))

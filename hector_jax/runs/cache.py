@@ -33,7 +33,9 @@ def robot_hash(robot: Robot) -> str:
 
 
 def content_key(*parts: Any, code: Sequence[str]) -> str:
-    """Return a hash (12 hexadecimal digits) of all inputs of a result, exact in every bit.
+    """Return a hash (12 hexadecimal digits) of all inputs of a result.
+
+    It is exact in every bit, but for the numbers of a robot, of which it has ROBOT_DIGITS digits.
 
     Args:
         parts: settings (hashed by their repr), robots and trees of numbers.

@@ -1,8 +1,7 @@
 """The steps `collect` and `fit`: collection of walks, and training of nets on them."""
 
-from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +15,7 @@ from hector_jax.control.weights import nominal
 from hector_jax.core.console import bar, say, say_if_slow
 from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, plural, short_repr
 from hector_jax.core.settings import POSITIVE, SEED, Range, check, from_table
 from hector_jax.core.tree_file import check_settings
@@ -30,7 +30,6 @@ from hector_jax.robot.model import Robot
 from hector_jax.runs.cache import content_key, robot_hash
 from hector_jax.runs.tunings import TUNING_CODE, compile_programs, tune_config, tuning_paths
 from hector_jax.sim.engine import ENGINES, choose_engine
-from hector_jax.sim.loop import Job
 
 # modules that determine the numbers, for `code_hash`
 TRAINING_CODE = ("grfm.training",)
@@ -72,13 +71,15 @@ class TrainedNet(NamedTuple):
 
 def collection_settings(config: CollectConfig, robot: Robot) -> dict[str, Any]:
     """Return all inputs of the walks of a collection, as JSON values for their card."""
-    paths = tune_config(robot)
+    paths, engine = tune_config(robot), choose_engine(config.engine)
     return {
         **asdict(config),
+        "engine": engine.key,
+        "physics_bits": engine.bits(False),
         "controller": repr(paths.rollout.walk),
         "paths": content_key(paths, robot, nominal(robot), code=()),
         "robot": robot_hash(robot),
-        "code": code_hash(*COLLECTION_CODE),
+        "code": code_hash(*COLLECTION_CODE, *engine.modules),
     }
 
 
@@ -89,33 +90,21 @@ def collect(pool: Executor, config: CollectConfig, robot: Robot, folder: Path) -
         InputError: the folder cannot be written, which is checked before the walks; or it holds
             walks of other settings.
     """
+    engine = choose_engine(config.engine)
+    what = f"{plural(config.walks, 'walk')} on the high-fidelity simulator, engine {engine.name}"
     with locked(folder):
         compile_programs(pool, tune_config(robot), robot, nominal(robot), command_of("straight"))
         paths = tuning_paths(pool, robot, folder / "paths")
         jobs = draw_jobs(config.seed, config.walks, paths, seconds=config.seconds, robot=robot)
-        _collect(pool, config, robot, jobs, folder, collection_settings(config, robot))
-
-
-def _collect(
-    pool: Executor,
-    config: CollectConfig,
-    robot: Robot,
-    jobs: Sequence[Job],
-    folder: Path,
-    settings: Mapping[str, Any],
-) -> None:
-    engine = choose_engine(config.engine)
-    what = f"{plural(len(jobs), 'walk')} on the high-fidelity simulator, engine {engine.name}"
-    with bar(f"collecting {what}") as report_progress:
-        collection.collect(
-            folder,
-            jobs,
-            lambda missing: engine.walk(pool, walk_config(robot), robot, missing, exact=False),
-            robot=robot,
-            settings=settings,
-            about={"engine": engine.name, "physics_bits": engine.bits(False)},
-            progress=lambda done, total: report_progress(done, total, "" if done else "compiling"),
-        )
+        with bar(f"collecting {what}") as report_progress:
+            collection.collect(
+                folder,
+                jobs,
+                lambda missing: engine.walk(pool, walk_config(robot), robot, missing, exact=False),
+                robot=robot,
+                settings=collection_settings(config, robot),
+                progress=lambda done, n: report_progress(done, n, "" if done else "compiling"),
+            )
 
 
 class Samples(NamedTuple):
@@ -207,7 +196,7 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
         linear = jax.tree.unflatten(structure, map(np.array, about["linear"]))
         held_out = list(about["held_out"])
         settings, made_of = dict(about["settings"]), dict(about["made_of"])
-        trained = {k: v for k, v in settings.items() if k not in ("code", "touchdown_error")}
+        trained = {field.name: settings[field.name] for field in fields(TrainConfig)}
         config = from_table(f"{path}: about.settings", TrainConfig, trained)
         history = History(**{n: np.array(about["course"][n], float) for n in History._fields})
         errors = {name: about["errors"][name] for name in ("raw", "linear", "net")}
@@ -219,8 +208,12 @@ def load_net(path: Path, robot: Robot, variant: str) -> tuple[TrainedNet, dict[s
 
 def training_settings(config: TrainConfig, robot: Robot) -> dict[str, Any]:
     """Return all inputs of a net other than its walks, as JSON values for its card."""
-    touchdown_error = robot.description.tuning.touchdown_error
-    return {**asdict(config), "touchdown_error": touchdown_error, "code": code_hash(*TRAINING_CODE)}
+    return {
+        **asdict(config),
+        "functions": [function_id(f) for f in network.VARIANTS[config.variant][2:5]],
+        "touchdown_error": robot.description.tuning.touchdown_error,
+        "code": code_hash(*TRAINING_CODE),
+    }
 
 
 def load_or_train(

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from hector_jax.control.reference import COMMANDS, Command, named_command
 from hector_jax.control.weights import Weights
 from hector_jax.core.console import bar, say
+from hector_jax.core.environment import code_hash
 from hector_jax.core.files import locked
 from hector_jax.core.inputs import plural
 from hector_jax.core.trajectory import SOLVED
@@ -80,7 +81,9 @@ def search(
     """
     size, tune, robot = config.population * len(commands), setup.config, setup.robot
     all_commands = {name: named_command(name) for name in COMMANDS} | dict(commands)
-    about = {  # without the engine: the losses of both agree to seven digits
+    about = {
+        "code": code_hash("runs.searches", *engine.modules),
+        "engine": engine.key,
         "seconds": tune.rollout.ticks * tune.rollout.walk.gait.tick,
         "controller": repr(tune.rollout.walk),
         "loss": repr(tune.loss),

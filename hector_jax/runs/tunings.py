@@ -18,6 +18,7 @@ from hector_jax.control.reference import COMMANDS, Command, named_command, stand
 from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import Weights, nominal
 from hector_jax.core.console import bar
+from hector_jax.core.identity import function_id
 from hector_jax.core.runtime import message_queue
 from hector_jax.core.tree import stack
 from hector_jax.grfm import network
@@ -149,9 +150,9 @@ def tune(
     """
     start = nominal(setup.robot) if start is None else start
     key = partial(content_key, setup.config, setup.robot, start, code=TUNING_CODE)
-    paths = {  # whose keys hash the first command before the net and the others after it
-        name: folder / f"tuning-{name}-{key(first, net, tuple(others))}.npz"
-        for name, ((first, *others), net) in problems.items()
+    paths = {
+        name: folder / f"tuning-{name}-{key(commands, net, _phi_of(net))}.npz"
+        for name, (commands, net) in problems.items()
     }
 
     def on_iteration(name: str, iteration: Iteration) -> None:
@@ -168,6 +169,11 @@ def tune(
     if journal is not None:
         journal.write({name: result.tuning.history for name, result in tuned.items()})
     return tuned
+
+
+def _phi_of(net: network.Params | None) -> str:
+    """Return what identifies the functions of a net in the key of a tuning."""
+    return "" if net is None else function_id(network.variant_of(net).apply)
 
 
 def _norms_job(config: TuneConfig, robot: Robot, problem: Problem) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """The step `judge`: walks of weight sets on plants, each score an artefact (cache.py)."""
 
 from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,6 +72,7 @@ def walk_jobs(
 def walk_rigid_body(robot: Robot, weights: Weights, command: Command, seconds: float) -> Trajectory:
     """Return a walk of `seconds` on the plain rigid body, without a tuning's noise and delay."""
     config = rollout_config(robot, round(seconds / walk_config(robot).gait.tick))
+    config = replace(config, estimate_noise=0.0, delay=0.0)
     inputs = config, robot, weights, command, standing_anchor(robot), last_command
     return jax.device_get(jax.jit(rollout, static_argnums=0)(*inputs))
 
@@ -98,7 +100,7 @@ def _like(setup: Setup, with_walk: bool) -> Any:
 
 def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engine) -> str:
     _, config, robot, _ = setup
-    inputs = engine.name, engine.version, config.rollout.walk, repr(config.loss), robot, job
+    inputs = engine.key, config.rollout.walk, repr(config.loss), robot, job
     key = content_key(*inputs, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
     name, seed = case
     return f"{'walk' if with_walk else 'score'}-{name}-{seed}-{key}.npz"

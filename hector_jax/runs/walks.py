@@ -27,6 +27,7 @@ from hector_jax.control.reference import Command
 from hector_jax.control.weights import Weights, largest_changes
 from hector_jax.control.weights_file import save_weights, weights_tree
 from hector_jax.core.console import bar, say
+from hector_jax.core.environment import code_hash
 from hector_jax.core.files import write_json
 from hector_jax.core.inputs import InputError, one_line, plural
 from hector_jax.core.settings import read_json
@@ -40,7 +41,6 @@ from hector_jax.runs.walk_log import Log, ScoredLog, evaluate_log, log_of, traje
 from hector_jax.search import few_walks
 from hector_jax.search.cmaes import add_row, read_journal
 from hector_jax.search.few_walks import Model, Proposal, Space, WalkResult
-from hector_jax.sim.engine import MUJOCO_C
 from hector_jax.sim.loop import Job
 from hector_jax.tuning.difftune import step_status
 from hector_jax.tuning.evaluate import Evaluation
@@ -122,23 +122,22 @@ def read_history(campaign: Campaign) -> list[Row]:
     Raises:
         InputError: the folder holds the record of another campaign, or a damaged one.
     """
-    size = len(box_of(campaign))
+    size, engine = len(box_of(campaign)), campaign.engine
     head: dict[str, Any] = {
-        "format": 1,
+        "format": 2,
         "robot": robot_hash(campaign.robot),
         "settings": content_key(campaign.config, code=()),
         "start": weights_tree(campaign.start),
         "commands": {name: tree_hash(command) for name, command in campaign.commands.items()},
         "plants": [plant and tree_hash(plant) for plant in campaign.plants],
         "seed": campaign.seed,
+        "leg_numbers": list(campaign.leg_numbers),
+        "methods": list(campaign.methods),
+        "grounded": campaign.grounded,
     }
-    later = {  # with the defaults of folders that were begun before they existed
-        "leg_numbers": (list(campaign.leg_numbers), []),
-        "engine": (campaign.engine.name, MUJOCO_C.name),
-        "methods": (list(campaign.methods), list(few_walks.METHODS)),
-        "grounded": (campaign.grounded, True),
-    }
-    head |= {name: value for name, (value, default) in later.items() if value != default}
+    if None not in campaign.plants:  # simulated here
+        code = code_hash("runs.walks", *engine.modules)
+        head |= {"engine": engine.key, "code": code}
 
     def parse(row: Mapping[str, Any]) -> Row:
         point, losses = np.array(row["point"], float), np.array(row["losses"], float)

@@ -34,6 +34,7 @@ from hector_jax.control.weights_file import weights_tree
 from hector_jax.core.files import append_file, as_json, write_file
 from hector_jax.core.inputs import InputError, require_package
 from hector_jax.core.settings import AT_LEAST_ONE, POSITIVE, SEED, Range, check
+from hector_jax.core.tree_file import OTHER_CODE
 
 FORMAT = 1
 T = TypeVar("T")
@@ -266,10 +267,9 @@ def read_journal(
     if differs:
         name = differs[0]
         got, expected = (str(settings.get(name))[:80] for settings in (written, head))
-        raise InputError(
-            f"{path}: record of another {what}: its {name} is {got}, expected {expected}; "
-            "choose another folder"
-        )
+        reason = f"its {name} is {got}, expected {expected}"
+        reason = OTHER_CODE if name == "code" else reason
+        raise InputError(f"{path}: record of another {what}: {reason}; choose another folder")
     rows = []
     for number, line in enumerate(lines, 2):
         try:

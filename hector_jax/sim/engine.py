@@ -15,6 +15,7 @@ from typing import NamedTuple
 import jax
 
 from hector_jax.control.controller import WalkConfig
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError
 from hector_jax.core.settings import choose
 from hector_jax.core.trajectory import Trajectory
@@ -47,6 +48,11 @@ class Engine(NamedTuple):
     # differences of its plants from MuJoCo C, for reports; empty means the same physics, and a walk
     # that falls in the start-up is then diagnosed in MuJoCo C
     differs: str = ""
+
+    @property
+    def key(self) -> str:
+        """What identifies it in keys of stored walks, beside the code of `modules`."""
+        return f"{self.name} {self.version} {function_id(self.walk)}"
 
     @property
     def version(self) -> str | None:

@@ -35,7 +35,7 @@ from hector_jax.tuning.difftune import PAPER_ITERATIONS, Iteration, TuneConfig, 
 from hector_jax.tuning.evaluate import Evaluation, evaluate
 from hector_jax.tuning.loss import PAPER_LOSS, Loss
 from hector_jax.tuning.parallel_rollout import parallel_rollout
-from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout, variation_of
+from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 from hector_jax.tuning.status import Stop
 
 AXIS = "problems"
@@ -55,7 +55,7 @@ class Scenario(NamedTuple):
     effect: Int[Array, "*batch"]  # index of a phi of the batch
     loss: Loss  # its weights have the same leading axes
     scale: Float[Array, "*batch"]  # divisor of the loss
-    variation: Variation | None = None  # None: that of the robot's tunings, see `variation_of`
+    variation: Variation | None = None  # None: the noise and delay of the config
 
 
 class Problem(NamedTuple):
@@ -135,7 +135,6 @@ def _evaluate(
     def of_scenario(scenario: Scenario) -> Evaluation:
         command, anchor, index, loss, scale, variation = scenario
         effect = jax.tree.map(lambda leaf: leaf[0 if single else index], effects)
-        variation = variation_of(robot) if variation is None else variation
         inputs = robot, weights, command, anchor, effect, loss, variation
         result = evaluate(config.rollout, *inputs, walk=walk)
         value, terms, gradient = jax.tree.map(lambda x: x / scale, result[:3])

@@ -19,7 +19,7 @@ from hector_jax.core.arrays import Array
 from hector_jax.core.trajectory import State, Trajectory, Wrench
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, losses, total
-from hector_jax.tuning.rollout import RolloutConfig, rollout, variation_of
+from hector_jax.tuning.rollout import RolloutConfig, rollout
 
 _NAMED = 0.35  # a direction is named by the weights of at least this share of its largest entry
 _FLAT = 1e-3  # a direction or weight that changes the loss by less than this share does not matter
@@ -73,7 +73,7 @@ def gauss_newton(
 
     def walk(logs: Float[Array, " n"]) -> tuple[tuple[State, Wrench], Trajectory]:
         scaled = scale_weights(weights, logs)
-        trajectory = rollout(config, robot, scaled, command, anchor, effect, variation_of(robot))
+        trajectory = rollout(config, robot, scaled, command, anchor, effect)
         return (trajectory.state, trajectory.command), trajectory
 
     def tangent_of(direction: Float[Array, " n"]) -> tuple:

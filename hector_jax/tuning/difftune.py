@@ -38,7 +38,7 @@ from hector_jax.core.tree import where
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.evaluate import Evaluation, evaluate_jit
 from hector_jax.tuning.loss import PAPER_LOSS, Loss, alphas, check_loss, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, variation_of
+from hector_jax.tuning.rollout import RolloutConfig
 from hector_jax.tuning.status import StepStatus, Stop, status_text
 
 PAPER_ITERATIONS = 10
@@ -170,8 +170,7 @@ def tune_step(
     effect: jax.tree_util.Partial,
 ) -> Evaluation:
     """Evaluate weights with the rollout and the loss of a tuning, compiled."""
-    inputs = robot, weights, command, anchor, effect, config.loss, variation_of(robot)
-    return evaluate_jit(config.rollout, *inputs)
+    return evaluate_jit(config.rollout, robot, weights, command, anchor, effect, config.loss)
 
 
 def relative_step(

@@ -16,7 +16,7 @@ from hector_jax.core.inputs import InputError, unknown
 from hector_jax.core.trajectory import Trajectory
 from hector_jax.robot.model import Robot
 from hector_jax.tuning.loss import Loss, Terms, losses, total, with_alphas
-from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout, variation_of
+from hector_jax.tuning.rollout import RolloutConfig, Variation, rollout
 
 
 class Evaluation(NamedTuple):
@@ -114,8 +114,7 @@ def gradient_norms(
 
     def norm(name: str) -> float:
         single = tuple(term._replace(weight=float(term.name == name)) for term in loss)
-        inputs = robot, weights, command, anchor, effect, single, variation_of(robot)
-        evaluation = evaluate_jit(config, *inputs)
+        evaluation = evaluate_jit(config, robot, weights, command, anchor, effect, single)
         logs = jax.tree.map(jnp.multiply, evaluation.gradient, weights)
         return float(jnp.linalg.norm(weights_to_vector(logs)))
 

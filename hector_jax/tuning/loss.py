@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
 from hector_jax.core.arrays import Array
+from hector_jax.core.identity import function_id
 from hector_jax.core.inputs import InputError, short_repr, unknown
 from hector_jax.core.settings import NOT_NEGATIVE, validation_error
 from hector_jax.core.trajectory import Trajectory, Wrench
@@ -41,7 +42,7 @@ class LossTerm(NamedTuple):
     """A term of the loss.
 
     As a pytree it has one leaf, its weight: another weight needs no compilation, another function
-    does. In cache keys a function is identified by its name.
+    does.
     """
 
     name: str  # "L_Eul": in tables, logs and files; begins with L_
@@ -50,7 +51,8 @@ class LossTerm(NamedTuple):
     of: Callable[[Trajectory], Float[Array, ""]]  # the unweighted term of one walk
 
     def __repr__(self) -> str:
-        of = f"{self.of.__module__}.{self.of.__qualname__}"
+        # identifies it in keys of stored results
+        of = function_id(self.of)
         return f"LossTerm({self.name!r}, {self.unit!r}, {self.weight!r}, {of})"
 
 

@@ -39,6 +39,7 @@ from hector_jax.tuning.rollout import (
     from_start,
     init_carry,
     step_carry,
+    variation_of,
     varied,
     walked_ticks,
     with_constants,
@@ -173,6 +174,7 @@ def parallel_rollout(
 
     Source: Eq. 12, 13; the method in the module's docstring.
     """
+    variation = variation_of(config) if variation is None else variation
     fixed, robot, command, anchor, effect, variation = jax.lax.stop_gradient(
         (weights, robot, command, anchor, effect, variation)
     )

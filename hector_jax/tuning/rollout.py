@@ -45,9 +45,13 @@ class RolloutConfig:
     ticks: int = 400  # T; 4 s
     lead: int = 0  # ticks in place before t = 0, outside the loss
     block: int = 500  # most ticks with stored solves; longer rollouts are computed twice
+    estimate_noise: float = 0.0  # factor on the noise of a real robot's estimate
+    delay: float = 0.0  # [s] of the ground's reaction, at most a tick
 
     def __post_init__(self) -> None:
-        check(self, ticks=Range(2), lead=NOT_NEGATIVE, block=AT_LEAST_ONE)
+        not_negative = dict.fromkeys(("lead", "estimate_noise"), NOT_NEGATIVE)
+        delay = Range(0.0, self.walk.gait.tick)
+        check(self, ticks=Range(2), block=AT_LEAST_ONE, delay=delay, **not_negative)
         if self.lead > -self.walk.gait.first_tick:
             raise InputError(
                 "RolloutConfig.lead must not reach back before the gait starts "
@@ -62,13 +66,11 @@ def rollout_config(robot: Robot, ticks: int = RolloutConfig.ticks) -> RolloutCon
         InputError: one line naming the file, the key and what was expected.
     """
     walk, tuning = walk_config(robot), robot.description.tuning
-    path, tick = robot.description.path, walk.gait.tick
-    if tuning.delay > tick:
-        raise InputError(f"{path}: tuning.delay must be at most {tick} s, got {tuning.delay}")
+    settings = {name: getattr(tuning, name) for name in ("lead", "estimate_noise", "delay")}
     try:
-        return RolloutConfig(walk=walk, ticks=ticks, lead=tuning.lead)
+        return RolloutConfig(walk=walk, ticks=ticks, **settings)
     except InputError as error:
-        raise InputError(f"{path}: tuning: {error}") from None
+        raise InputError(f"{robot.description.path}: tuning: {error}") from None
 
 
 class Variation(NamedTuple):
@@ -90,14 +92,13 @@ def no_variation() -> Variation:
     return Variation(one, one, zeros, np.asarray(1e3), zero, noise, np.asarray(0))
 
 
-def variation_of(robot: Robot) -> Variation | None:
-    """Return the variation of a robot's tunings from its description; None if it has none."""
-    tuning = robot.description.tuning
-    if not tuning.estimate_noise and not tuning.delay:
+def variation_of(config: RolloutConfig) -> Variation | None:
+    """Return the variation by the noise and the delay of a config; None if it has neither."""
+    if not config.estimate_noise and not config.delay:
         return None
     names = ("angle", "position", "ang_velocity", "velocity")
-    noise = State(*(np.full(3, tuning.estimate_noise * ESTIMATE_NOISE[name]) for name in names))
-    variation = no_variation()._replace(noise=noise, delay=np.asarray(tuning.delay))
+    noise = State(*(np.full(3, config.estimate_noise * ESTIMATE_NOISE[name]) for name in names))
+    variation = no_variation()._replace(noise=noise, delay=np.asarray(config.delay))
     return jax.tree.map(jnp.asarray, variation)
 
 
@@ -336,7 +337,7 @@ def rollout(
         command: commanded velocities.
         anchor: standing pose and gait tick of t = 0, see `reference.standing_anchor`.
         effect: phi, `Window -> Effect`.
-        variation: difference from the controller's model; None compiles without it.
+        variation: difference from the controller's model; None: the noise and delay of `config`.
 
     Returns:
         Trajectory of T samples from t = 0. Nothing raises: check `fallen` and `residual` before
@@ -345,6 +346,7 @@ def rollout(
     Source: Eq. 12, 13.
     """
     policy = jax.checkpoint_policies.save_only_these_names(qp.SAVED)
+    variation = variation_of(config) if variation is None else variation
     first, ticks = init_carry(robot, anchor, variation), walked_ticks(config, anchor)
 
     # A GPU copies one array of all numbers in a tick faster than many small ones. How to unpack a

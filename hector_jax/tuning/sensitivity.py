@@ -26,6 +26,7 @@ from hector_jax.tuning.rollout import (
     from_start,
     init_carry,
     step_carry,
+    variation_of,
     varied,
     walked_ticks,
     with_constants,
@@ -95,6 +96,7 @@ def propagate(
     variation: Variation | None = None,
 ) -> tuple[Trajectory, Sensitivities]:
     """Compute a rollout and its sensitivities by forward recursion. Source: Eq. 10."""
+    variation = variation_of(config) if variation is None else variation
 
     def tick(carried: tuple[Carry, Carry], j: Int[Array, ""]):
         carry, tangents, sample, columns = step_sensitivities(

@@ -1,0 +1,297 @@
+"""A stored result is used again only if all that made it is the same."""
+
+import importlib.util
+import json
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from model import CONFIG, ROBOT
+
+from hector_jax.control.contact import InputConstraint, Rows
+from hector_jax.control.mpc import MpcConfig
+from hector_jax.control.reference import named_command
+from hector_jax.control.weights import nominal
+from hector_jax.core import environment
+from hector_jax.core.identity import function_id
+from hector_jax.core.inputs import InputError
+from hector_jax.core.part import Part
+from hector_jax.qp import INTERIOR_POINT, QpConfig, Solver
+from hector_jax.robot.description import TuningSettings
+from hector_jax.runs import nets, searches, verdicts, walks
+from hector_jax.runs.cache import content_key, robot_hash
+from hector_jax.runs.campaign import Campaign
+from hector_jax.runs.nets import CollectConfig, collection_settings
+from hector_jax.runs.setup import Setup
+from hector_jax.runs.tunings import tune_config
+from hector_jax.search.cmaes import SearchConfig
+from hector_jax.sim.engine import ENGINES, MUJOCO_C
+from hector_jax.sim.loop import Job
+from hector_jax.sim.world import hfs
+from hector_jax.tuning.loss import PAPER_LOSS, LossTerm
+from hector_jax.tuning.rollout import variation_of
+
+key = partial(content_key, code=())
+
+
+def robot_with(**settings):
+    description = replace(ROBOT.description, tuning=TuningSettings(**settings))
+    return ROBOT._replace(description=description)
+
+
+@pytest.mark.parametrize("setting", [{"delay": 0.005}, {"estimate_noise": 1.0}])
+def test_noise_and_delay_of_a_tuning_are_in_its_settings_and_keys(setting):
+    noisy = robot_with(**setting)
+    one, other = tune_config(ROBOT), tune_config(noisy)
+    assert variation_of(one.rollout) is None
+    assert variation_of(other.rollout) is not None
+    assert key(one) != key(other)
+    assert robot_hash(ROBOT) != robot_hash(noisy)
+    config = CollectConfig(engine="c")
+    paths = [collection_settings(config, robot)["paths"] for robot in (ROBOT, noisy)]
+    assert paths[0] != paths[1]
+
+
+def test_the_plants_of_the_choice_are_in_no_key():
+    assert robot_hash(robot_with(choice_plants=4)) == robot_hash(ROBOT)
+
+
+# Functions of the user
+
+
+def module(tmp_path, text, name="mine"):
+    """A module of the user, loaded anew."""
+    path = tmp_path / f"{name}.py"
+    path.write_text(text)
+    spec = importlib.util.spec_from_file_location(name, path)
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+TEXT = """
+import functools
+import jax
+import numpy as np
+
+GAIN = {gain}
+TABLE = np.array([1.0, {entry}])
+
+class Scale:
+    def __call__(self, x):
+        return {scale} * x
+
+def helper(x):
+    return {inner} * x
+
+def made(factor):
+    return lambda walk: factor * walk.period
+
+@jax.jit
+def term(walk, power={power}):
+    # {comment}
+    return Scale()(helper(GAIN * walk.period ** power)) + TABLE[1]
+
+closure = made({closure})
+bound = functools.partial(helper, {bound})
+"""
+SAME = dict(gain=2.0, entry=3.0, scale=4.0, inner=5.0, power=1, closure=6.0, bound=7.0, comment="a")
+
+
+@pytest.mark.parametrize("changed", ["gain", "entry", "scale", "inner", "power"])
+def test_a_function_that_computes_something_else_is_another_one(tmp_path, changed):
+    before = module(tmp_path, TEXT.format(**SAME))
+    again = module(tmp_path, TEXT.format(**SAME | {"comment": "another"}))
+    after = module(tmp_path, TEXT.format(**SAME | {changed: 9}))
+    assert function_id(before.term) == function_id(again.term) != function_id(after.term)
+    assert function_id(before.closure) == function_id(after.closure)
+
+
+@pytest.mark.parametrize("name", ["closure", "bound"])
+def test_values_that_a_function_holds_are_of_its_content(tmp_path, name):
+    one, other = (module(tmp_path, TEXT.format(**SAME | {name: x})) for x in (6.0, 8.0))
+    assert function_id(getattr(one, name)) != function_id(getattr(other, name))
+    assert function_id(one.made) == function_id(other.made)
+
+
+def test_our_functions_and_installed_ones_have_their_names():
+    assert function_id(variation_of) == "hector_jax.tuning.rollout.variation_of"
+    assert function_id(jax.jit(variation_of)) == "hector_jax.tuning.rollout.variation_of"
+    assert function_id(np.linalg.norm) == "numpy.linalg.norm"
+
+
+def walk_alone(pool, config, robot, jobs, **options):
+    raise NotImplementedError
+
+
+def walk_otherwise(pool, config, robot, jobs, **options):
+    raise NotImplementedError("otherwise")
+
+
+walk_otherwise.__name__ = walk_otherwise.__qualname__ = "walk_alone"
+
+
+def test_parts_whose_body_changed_have_other_keys():
+    def term(walk):
+        return 2.0 * jnp.sum(walk.residual)
+
+    def other(walk):
+        return 3.0 * jnp.sum(walk.residual)
+
+    def rows(contact):
+        return Rows(contact.moment[2:], -2.0, 2.0)
+
+    def other_rows(contact):
+        return Rows(contact.moment[2:], -1.0, 1.0)
+
+    def short(*inputs, max_iterations):
+        return INTERIOR_POINT.approach(*inputs, max_iterations=3)
+
+    def shorter(*inputs, max_iterations):
+        return INTERIOR_POINT.approach(*inputs, max_iterations=2)
+
+    for one, two in ((term, other), (rows, other_rows), (short, shorter)):
+        two.__qualname__ = one.__qualname__  # as if its body was edited
+    losses = [(*PAPER_LOSS, LossTerm("L_mine", "", 1.0, f)) for f in (term, other)]
+    assert key(replace(CONFIG, loss=losses[0])) != key(replace(CONFIG, loss=losses[1]))
+    constraints = MpcConfig().constraints
+    mpcs = [
+        MpcConfig(constraints=(*constraints, InputConstraint("a", of=f)))
+        for f in (rows, other_rows)
+    ]
+    assert key(mpcs[0]) != key(mpcs[1])
+    solvers = [QpConfig(solver=Solver("a", approach=f, guess=None)) for f in (short, shorter)]
+    assert key(solvers[0]) != key(solvers[1])
+    engines = [MUJOCO_C._replace(walk=walk) for walk in (walk_alone, walk_otherwise)]
+    job = Job(nominal(), named_command("s"), hfs())
+    names = {
+        verdicts._file_name(Setup(Executor(), CONFIG, ROBOT), ("a", 0), job, False, engine)
+        for engine in engines
+    }
+    assert len(names) == 2
+
+
+def test_equality_of_parts_is_an_equivalence():
+    class Kind(Part):
+        of: object
+
+    class Other(Part):
+        of: object
+
+    one, same, third = Kind("a", of=len), Kind("a", of=len), Kind("a", of=max)
+    assert one == same
+    assert hash(one) == hash(same)
+    for other in (third, Other("a", of=len), "a"):
+        assert one != other
+        assert other != one
+    assert len({one, same, third, "a"}) == 3
+    assert f"{one}" == "a"
+
+
+# Journals and collections
+
+
+def search(folder, engine, monkeypatch):
+    losses = lambda setup, sets, **_: {name: np.arange(4.0) for name in sets}  # noqa: E731
+    monkeypatch.setattr(searches, "losses_on_hfs", losses)
+    config = SearchConfig(budget=4, population=4)
+    commands = {"s": named_command("s")}
+    setup = Setup(Executor(), CONFIG, ROBOT)
+    options = {"commands": commands, "engine": engine, "folder": folder}
+    return searches.search(setup, config, nominal(), **options)
+
+
+def journal(folder, engine, monkeypatch):
+    inputs = folder, CONFIG, ROBOT, nominal(), {"s": named_command("s")}, [hfs()]
+    return walks.read_history(Campaign(*inputs, engine=engine))
+
+
+@pytest.fixture(params=[search, journal])
+def record(request, tmp_path, monkeypatch):
+    """A record that a search or a tuning on walks began; what continues it with an engine."""
+    folder = tmp_path / "record"
+    begin = partial(request.param, folder, monkeypatch=monkeypatch)
+    begin(MUJOCO_C)
+    files = {path: path.read_bytes() for path in folder.rglob("*.jsonl")}
+    yield begin
+    assert {path: path.read_bytes() for path in files} == files
+
+
+def test_a_record_goes_on_with_the_same_engine_and_code_only(record, monkeypatch):
+    record(MUJOCO_C)
+    with pytest.raises(InputError, match="its engine is c .*, expected other"):
+        record(MUJOCO_C._replace(name="other"))
+    with pytest.raises(InputError, match="its engine is c .*, expected c "):
+        record(MUJOCO_C._replace(walk=walk_alone))
+    for file in (searches, walks):
+        monkeypatch.setattr(file, "code_hash", lambda *modules: "another")
+    with pytest.raises(
+        InputError, match="record of another .*: by other code or other versions of"
+    ):
+        record(MUJOCO_C)
+
+
+def test_walks_of_two_engines_are_two_collections():
+    settings = {
+        name: collection_settings(CollectConfig(engine=name), ROBOT)
+        for name in ("c", "mjx", "auto")
+    }
+    assert settings["c"] != settings["mjx"]
+    assert settings["auto"] == settings["c"]  # on a CPU
+    assert json.loads(json.dumps(settings)) == settings
+
+
+# Code and packages
+
+
+@pytest.fixture
+def version_of(monkeypatch):
+    """Pretends another version of a package."""
+    installed = environment.version
+
+    def pretend(package):
+        other = lambda name: "0.0.1" if name == package else installed(name)  # noqa: E731
+        monkeypatch.setattr(environment, "version", other)
+        environment.code_hash.cache_clear()
+
+    environment.code_hash.cache_clear()
+    yield pretend
+    monkeypatch.undo()
+    environment.code_hash.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("modules", "packages"),
+    [
+        (("grfm.training",), ("flax", "optax", "jax", "jaxlib", "numpy")),
+        (("tuning.difftune",), ("optax", "jaxopt", "scipy")),
+        (("runs.searches", "sim.walk"), ("cmaes", "mujoco")),
+        (("runs.walks",), ("cmaes", "tinygp", "scipy")),
+        (ENGINES["mjx"].modules, ("mujoco-mjx",)),
+        (ENGINES["drake"].modules, ("drake",)),
+        (ENGINES["pinocchio"].modules, ("pin",)),
+    ],
+)
+def test_the_code_of_a_result_has_the_versions_of_all_packages_that_compute(
+    version_of, modules, packages
+):
+    before = environment.code_hash(*modules)
+    for package in packages:
+        if importlib.util.find_spec({"pin": "pinocchio", "drake": "pydrake"}.get(package, "jax")):
+            version_of(package)
+            assert environment.code_hash(*modules) != before, package
+    version_of("msgspec")
+    assert environment.code_hash(*modules) == before
+
+
+def test_a_net_of_a_variant_whose_functions_changed_is_refused(monkeypatch):
+    config = nets.TrainConfig()
+    before = nets.training_settings(config, ROBOT)
+    phi = nets.network.VARIANTS[config.variant]
+    changed = phi._replace(fit=walk_alone)
+    monkeypatch.setitem(nets.network.VARIANTS, config.variant, changed)
+    assert nets.training_settings(config, ROBOT) != before
