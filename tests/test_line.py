@@ -9,10 +9,13 @@ from typing import get_args
 
 import pytest
 
+from hector_jax.cli import commands
+from hector_jax.cli.arguments import flag_folder
 from hector_jax.cli.flags import COMMANDS, Compare, Evaluate, Export, Tune, View, Walk
 from hector_jax.cli.main import main
 from hector_jax.cli.parse import check, from_line, resolve_latest
 from hector_jax.core.inputs import InputError
+from hector_jax.robot.model import load_robot
 
 
 def refused(monkeypatch, capsys, *words):
@@ -206,3 +209,43 @@ def test_help_shows_no_python(monkeypatch, capsys):
         shown = capsys.readouterr().out
         assert "None" not in shown
         assert "{None}" not in shown
+
+
+SLALOM = Path(__file__).parents[1] / "examples" / "slalom.toml"
+STRIDER = Path(__file__).parents[1] / "examples" / "strider" / "robot.toml"
+
+
+@pytest.mark.parametrize(
+    "words", [["walk"], ["evaluate"], ["verdict", "--weights", "nominal", "expert"]]
+)
+@pytest.mark.parametrize("given", [4, 5])
+def test_a_given_length_is_refused_where_the_trajectory_has_one(words, given):
+    args = from_line([*words, "--traj", str(SLALOM), "--seconds", str(given)])
+    with pytest.raises(InputError, match=f"slalom lasts 6 s, as its file says, got {given}"):
+        commands.run(args)
+
+
+@pytest.mark.parametrize("name", ["collect", "search"])
+def test_a_given_folder_is_taken_as_it_is_for_another_robot_too(name):
+    robot = load_robot(STRIDER)
+    default = from_line([name, "--robot", str(STRIDER)])
+    given = from_line([name, "--robot", str(STRIDER), "--out", str(default.out)])
+    assert flag_folder(given, "out", robot) == default.out
+    first, *rest = default.out.parts
+    assert flag_folder(default, "out", robot) == Path(first, "strider", *rest)
+
+
+@pytest.mark.parametrize("given", [("--seeds", "8"), ("--first-seed", "3")])
+@pytest.mark.parametrize("world", ["ideal", "hfs"])
+def test_a_world_of_one_plant_takes_no_number_of_plants(given, world):
+    with pytest.raises(InputError, match=f"{' '.join(given)}: --world {world} is one plant"):
+        commands.run(from_line(["evaluate", "--world", world, *given]))
+
+
+def test_what_was_given_is_noted_through_files_and_latest(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "night.toml").write_text("first-seed = 0\n")
+    args = resolve_latest(from_line(["evaluate", "--config", "night.toml", "--seeds=8"]))
+    assert args.given == {"config", "first_seed", "seeds"}
+    assert args.is_given("first_seed")
+    assert not args.is_given("world")

@@ -1,6 +1,7 @@
 """Cut anywhere, taken up again: the same bytes; and who may write, and how a program is stopped."""
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from killed import look
 
 from hector_jax.cli import flags, run_folder
 from hector_jax.cli import tune as command
+from hector_jax.cli.parse import from_line
 from hector_jax.control.trajectories import command_of
 from hector_jax.control.weights import nominal
 from hector_jax.core import files as core_files
@@ -455,3 +457,52 @@ def test_a_run_is_not_resumed_from_another_start(tmp_path):
     command._note_settings(run(turn_lead=0.8))
     with pytest.raises(InputError, match=r"begun with turn_lead 0.8, here is 0.9"):
         command._note_settings(run(turn_lead=0.9))
+
+
+# A flag that was given is a flag that was given, also at its default
+
+
+def line(*words):
+    return from_line(["tune", *map(str, words)])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("--seeds", 8), "run: begun with --seeds 3, got 8"),
+        (("--traj", "straight"), "run: begun with --traj c, got straight"),
+        (("--share", 0.5), "run: begun with --share 0.25, got 0.5"),
+        (("--walk-plants", 2), "run: begun with --walk-plants 1, got 2"),
+        (("--start", "nominal"), "run: begun with --start expert, got nominal"),
+    ],
+)
+@pytest.mark.parametrize("way", ["line", "file"])
+def test_a_given_default_is_not_taken_for_the_flag_of_the_run(
+    tmp_path, monkeypatch, given, message, way
+):
+    resumed = []
+    monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append(args))
+    (tmp_path / "data").mkdir()
+    own = {"seeds": 3, "share": 0.25, "walk_plants": 1, "start": "expert", "traj": ("c",)}
+    folder = tmp_path / "run"
+    command.tune(flags.Tune(out=folder, data=tmp_path / "data", **own))
+    if way == "file":
+        text = f"{given[0][2:]} = {json.dumps(given[1])}\n"
+        (tmp_path / "given.toml").write_text(text)
+        given = ("--config", tmp_path / "given.toml")
+    with pytest.raises(InputError, match=message):
+        command.tune(line("--resume", folder, *given))
+    command.tune(line("--resume", folder, "--seeds", 3, "--processes", 2))
+    assert {name: getattr(resumed[-1], name) for name in own} == own
+
+
+def test_runs_of_each_trajectory_are_resumed_together(tmp_path, monkeypatch):
+    resumed = []
+    monkeypatch.setattr(command, "_tune_in", lambda folder, args: resumed.append((folder, args)))
+    command.tune(line("--each", "--traj", "c", "s", "--out", tmp_path / "run"))
+    (tmp_path / "data").mkdir()
+    command.tune(line("--each", "--resume", tmp_path / "run", "--data", tmp_path / "data"))
+    assert [(folder.name, args.traj) for folder, args in resumed[2:]] == [
+        ("c", ("c",)),
+        ("s", ("s",)),
+    ]

@@ -189,6 +189,7 @@ def test_rollouts_are_as_long_as_the_file_says():
     assert arguments.with_length(config, command_of("c")) == config
 
 
+@pytest.mark.parametrize("command", ["walk", "evaluate", "tune", "search"])
 def test_a_wrong_file_is_one_line_of_each_command(monkeypatch, capsys, tmp_path, command):
     monkeypatch.chdir(tmp_path)
     path = written(tmp_path, HEAD + "vx = 1")

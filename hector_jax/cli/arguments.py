@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hector_jax.cli.flags import View, Walk
+from hector_jax.cli.flags import Collect, Evaluate, Search, Train, Verdict, View, Walk
 from hector_jax.control import trajectories
 from hector_jax.control.controller import walk_config
 from hector_jax.control.gait import gait_named
@@ -91,11 +91,12 @@ def robot_of(run: Path, request: RunRequest) -> Robot:
     return robot
 
 
-def flag_folder(flag: Path, default: Path, path: Path | None, robot: Robot) -> Path:
+def flag_folder(args: Collect | Train | Search, name: str, robot: Robot) -> Path:
     """Return the folder of a flag; for another robot its default DATA/... is DATA/NAME/..."""
-    if path is None or flag != default:
-        return flag
-    return robot_folder(Path(default.parts[0]), path, robot).joinpath(*default.parts[1:])
+    folder = getattr(args, name)
+    if args.is_given(name):
+        return folder
+    return robot_folder(Path(folder.parts[0]), args.robot, robot).joinpath(*folder.parts[1:])
 
 
 def plants(world: str, seeds: range, description: Description) -> list[Imperfections]:
@@ -186,18 +187,18 @@ def load_trajectories(
     return loaded
 
 
-def walk_seconds(flag: float, trajectory: NamedCommand) -> float:
-    """Return the length of a walk [s]: from the trajectory's file if it has one, else the flag.
+def walk_seconds(args: Evaluate | Verdict | Walk | View, trajectory: NamedCommand) -> float:
+    """Return the length of a walk [s]: from the trajectory's file if it has one, else --seconds.
 
     Raises:
         InputError: both set a length.
     """
     if trajectory.seconds is None:
-        return flag
-    if flag != Walk.seconds:
+        return args.seconds
+    if args.is_given("seconds"):
         raise InputError(
             f"--seconds is for built-in trajectories: {trajectory.name} lasts "
-            f"{trajectory.seconds:g} s, as its file says, got {flag:g}"
+            f"{trajectory.seconds:g} s, as its file says, got {args.seconds:g}"
         )
     return trajectory.seconds
 
@@ -220,7 +221,7 @@ def walk_once(
 ) -> Trajectory:
     """Walk once in the world of the flags; `plant` is another model of the robot."""
     if args.world == "srbm":
-        seconds = walk_seconds(args.seconds, trajectory)
+        seconds = walk_seconds(args, trajectory)
         return verdicts.walk_rigid_body(robot, weights, trajectory.command, seconds)
     job = job_of(args, robot, trajectory, weights, plant)
     return next(engine.walk(None, walk_config(robot), robot, [job]))
@@ -232,5 +233,5 @@ def job_of(
     """Return the walk of the flags in a world of MuJoCo; `plant` is another model of the robot."""
     body = (plant or robot).description
     (imperfections,) = plants(args.world, range(args.seed, args.seed + 1), body)
-    seconds = walk_seconds(args.seconds, trajectory)
+    seconds = walk_seconds(args, trajectory)
     return Job(weights, trajectory.command, imperfections, seconds, args.seed, plant=plant)

@@ -51,7 +51,7 @@ def collect(args: flags.Collect) -> None:
     """Walk on the simulator with random plants and commands, and save the walks."""
     config = nets.CollectConfig(args.walks, args.seconds, args.seed, args.engine)
     robot = load_robot(args.robot)
-    out = arguments.flag_folder(args.out, flags.Collect.out, args.robot, robot)
+    out = arguments.flag_folder(args, "out", robot)
     with workers(args.processes) as pool:
         nets.collect(pool, config, robot, out)
     say(f"the walks are in {out}")
@@ -62,7 +62,7 @@ def train(args: flags.Train) -> None:
     """Train a net on walks."""
     config = TrainConfig(args.variant, epochs=args.epochs, seed=args.seed)
     robot = load_robot(args.robot)
-    data = arguments.flag_folder(args.data, flags.Train.data, args.robot, robot)
+    data = arguments.flag_folder(args, "data", robot)
     path = args.out or nets.net_path(data.parent, args.variant)
     errors = nets.train(config, robot, data, path).errors
     result = {"net": str(path), "errors": errors}
@@ -80,7 +80,7 @@ def search(args: flags.Search) -> None:
     engine = choose_engine(args.engine)
     tuning = arguments.with_length(tunings.tune_config(robot), trajectories[0])
     start = arguments.weights(args.start, robot)
-    out = arguments.flag_folder(args.out, flags.Search.out, args.robot, robot)
+    out = arguments.flag_folder(args, "out", robot)
     make_folder(out)
     shared: dict[str, Any] = {"commands": commands, "engine": engine}
     with workers(args.processes) as pool:

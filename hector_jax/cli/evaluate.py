@@ -44,9 +44,14 @@ def evaluate(args: Evaluate) -> None:
     robot = arguments.with_gait(load_robot(args.robot), args.gait)
     plant = arguments.plant_of(args.plant, robot)
     trajectory = arguments.load_trajectory(args.traj, robot)
-    seconds = arguments.walk_seconds(args.seconds, trajectory)
-    # ideal and hfs have one plant each and nothing random
-    count = args.seeds if args.world not in ("ideal", "hfs") else 1
+    seconds = arguments.walk_seconds(args, trajectory)
+    count = args.seeds
+    if args.world in ("ideal", "hfs"):  # one plant each, and nothing random
+        for name in ("seeds", "first_seed"):
+            if args.is_given(name) and getattr(args, name) != {"seeds": 1}.get(name, 0):
+                flag = f"--{name.replace('_', '-')} {getattr(args, name)}"
+                raise InputError(f"{flag}: --world {args.world} is one plant without a seed")
+        count = 1
     seeds = range(args.first_seed, args.first_seed + count)
     sets = {text: arguments.weights(text, robot) for text in args.weights}
     plants = arguments.plants(args.world, seeds, (plant or robot).description)

@@ -1,9 +1,10 @@
 """The flags of each command; a field's comment is its help text, its type contains its range."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
 
 from hector_jax.core.inputs import InputError, did_you_mean, short_repr
 from hector_jax.core.settings import SEED, Range
@@ -64,8 +65,27 @@ def _command(kind: type[T]) -> type[T]:
     return dataclass(frozen=True)(kind)
 
 
+@dataclass(frozen=True)
+class Flags:
+    """The flags of a command."""
+
+    # names of those that the line or its file gave; others have their default
+    given: ClassVar[frozenset[str]] = frozenset()
+
+    def is_given(self, name: str) -> bool:
+        """Tell whether a flag was given: on the line, in a file, or in Python by another value."""
+        default = next(field.default for field in fields(self) if field.name == name)
+        return name in self.given or getattr(self, name) != default
+
+
+def with_given(flags: T, names: Iterable[str]) -> T:
+    """Note which flags were given; `replace` makes flags of which none is."""
+    object.__setattr__(flags, "given", frozenset(names))
+    return flags
+
+
 @dataclass(frozen=True, kw_only=True)
-class Configured:
+class Configured(Flags):
     """A command whose flags may come from a file."""
 
     config: Path | None = None  # TOML file of flags, or a run's config.json; the line overrides it
@@ -158,7 +178,7 @@ class Tune(Configured):
 
 
 @_command
-class Propose:
+class Propose(Flags):
     """Say which weights a robot, or a simulator elsewhere, is to walk with next.
 
     Example: hector propose runs/robot --traj s
@@ -176,7 +196,7 @@ class Propose:
 
 
 @_command
-class Report:
+class Report(Flags):
     """Take the logs of the walks with the weights that `hector propose` named.
 
     Example: hector report runs/robot log.npz
@@ -279,7 +299,7 @@ class Walk(Configured):
 
 
 @_command
-class Robot:
+class Robot(Flags):
     """Report what a robot's model holds and what is wrong with it, and propose its TOML file.
 
     Of a TOML file: check it. Example: hector robot h1.xml --out h1.toml
@@ -290,7 +310,7 @@ class Robot:
 
 
 @_command
-class Doctor:
+class Doctor(Flags):
     """Report versions, devices, precision, cache and video of this machine, and test it.
 
     The exit code is 1 if something is broken. Example: hector doctor --json
@@ -300,7 +320,7 @@ class Doctor:
 
 
 @_command
-class Export:
+class Export(Flags):
     """Export weights, lines for the open C++ controller, and the compiled controller.
 
     Example: hector export latest
@@ -317,14 +337,15 @@ class Export:
 
 
 @_command
-class View:
+class View(Flags):
     """Show a run in the browser: walks before and after, ground forces, tuning in progress.
 
     Example: hector view latest --world standin
     """
 
     run: Run  # folder of a run of `hector tune`, finished or in progress, or `latest`
-    sets: tuple[str, str] = ("nominal", "with")  # weight sets of the run: before and after
+    # weight sets of the run: before and after; while it is tuned, `with` in place of `best`
+    sets: tuple[str, str] = ("nominal", "best")
     world: World = "hfs"  # where both walk
     seed: Seed = 0  # seed of the plant and of the estimator's noise
     seconds: Annotated[float, Range(0.1, 600)] = 4.0  # length of each walk [s]
@@ -336,7 +357,7 @@ class View:
 
 
 @_command
-class Compare:
+class Compare(Flags):
     """Compare finished runs: losses, falls, iterations, versions, settings.
 
     Example: hector compare runs/straight/*
@@ -348,7 +369,7 @@ class Compare:
 
 
 @_command
-class Completion:
+class Completion(Flags):
     """Print the script that completes `hector` in a shell.
 
     Example: hector completion bash > ~/.local/share/bash-completion/completions/hector

@@ -18,7 +18,15 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from hector_jax.cli.flags import COMMANDS, NAMED_WEIGHTS, Propose, Source, Tune, command
+from hector_jax.cli.flags import (
+    COMMANDS,
+    NAMED_WEIGHTS,
+    Propose,
+    Source,
+    Tune,
+    command,
+    with_given,
+)
 from hector_jax.core.inputs import InputError, check_file, did_you_mean, one_line, short_repr
 from hector_jax.core.settings import SEED, convert, from_table, read_json, read_toml, to_table
 
@@ -61,14 +69,17 @@ def read_flags(kind: type[Flags], words: Sequence[str], program: str) -> Flags:
     options: dict[str, Any] = {"prog": program}
     words = [word for word in words if word not in _HELP]
     names = [word[2:].partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
-    flags = [name.removeprefix("no-") for name in names]
-    for name in flags:
-        if flags.count(name) > 1:
+    given = [name.removeprefix("no-") for name in names]
+    for name in given:
+        if given.count(name) > 1:
             raise InputError(f"--{name} is given twice")
-    if "config" in flags:
+    if "config" in given:
         flags_of_line: Any = _quietly(kind, words, **options)
-        options["default"] = from_file(kind, flags_of_line.config)
-    return _tyro(kind, ["--help"], **options) if wants_help else _quietly(kind, words, **options)
+        options["default"] = default = from_file(kind, flags_of_line.config)
+        given += getattr(default, "given", ())
+    if wants_help:
+        return _tyro(kind, ["--help"], **options)
+    return with_given(_quietly(kind, words, **options), (x.replace("-", "_") for x in given))
 
 
 def all_commands(*words: str) -> Any:
@@ -159,7 +170,7 @@ def from_file(kind: type[Flags], path: Path) -> Flags:
         values[name] = value
     if kind in (Tune, Propose) and isinstance(values.get("traj"), str):
         values["traj"] = [values["traj"]]  # older runs were tuned on one trajectory
-    return from_table(str(path), kind, values)
+    return with_given(from_table(str(path), kind, values), values)
 
 
 def as_table(flags: Any) -> dict[str, Any]:
@@ -269,4 +280,5 @@ def resolve_latest(flags: Flags) -> Flags:
         if value is not None and _source(field.type) in (Source.RUN, Source.EXPORTABLE):
             is_tuple = isinstance(value, tuple)
             values[field.name] = tuple(map(newest, value)) if is_tuple else newest(value)
-    return replace(flags, **values)  # pyright: ignore[reportArgumentType]
+    latest = replace(flags, **values)  # pyright: ignore[reportArgumentType]
+    return with_given(latest, getattr(flags, "given", ()))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hector_jax.cli import arguments
-from hector_jax.cli.flags import Tune
+from hector_jax.cli.flags import Flags, Tune, with_given
 from hector_jax.cli.parse import as_table, from_file
 from hector_jax.control.controller import walk_config
 from hector_jax.control.parameters import leg_numbers
@@ -25,7 +25,7 @@ from hector_jax.runs.folder import CONFIG, VERSIONS, read_object
 from hector_jax.runs.nets import COLLECTION_CODE
 from hector_jax.sim.engine import choose_engine
 
-Flags = TypeVar("Flags")
+F = TypeVar("F", bound=Flags)
 
 TIME = "%Y%m%d-%H%M%S"  # names a run
 _CODE = (
@@ -109,10 +109,9 @@ def begin(folder: Path, args: Tune) -> Path:
 
 
 def resume(folder: Path, args: Tune) -> Tune:
-    """Return the flags of the run in `folder`; the flags of this call must agree with them.
+    """Return the flags of the run in `folder`; those that were given must agree with them.
 
-    A flag at its default counts as not set. Flags that change no number may differ; this call's
-    value is used.
+    Flags that change no number may differ; this call's value is used.
 
     Raises:
         InputError: one line naming the file: no run, other flags, other code, another robot, or
@@ -140,28 +139,29 @@ def resume(folder: Path, args: Tune) -> Tune:
     return flags
 
 
-def merge_flags(folder: Path, begun: Flags, args: Flags, call_flags: Sequence[str]) -> Flags:
+def merge_flags(folder: Path, begun: F, args: F, call_flags: Sequence[str]) -> F:
     """Merge the flags of a folder with those of this call, which must agree.
 
     Args:
         folder: for the message.
-        begun, args: flags of the folder and of this call, where a default counts as not set.
+        begun, args: flags of the folder and of this call.
         call_flags: names of the flags that are taken from this call alone.
 
     Raises:
         InputError: one line with the first flag that differs.
     """
     flags = {}
-    for field in dataclasses.fields(begun):  # pyright: ignore[reportArgumentType]
+    for field in dataclasses.fields(begun):
         name = field.name
         if name in call_flags:
             continue
         old, new = getattr(begun, name), getattr(args, name)
-        flags[name] = old if new == field.default else new
+        flags[name] = new if args.is_given(name) else old
         if name not in _FREE_FLAGS and flags[name] != old:
             old, new = (" ".join(x) if isinstance(x, tuple) else x for x in (old, new))
-            raise InputError(f"{folder}: begun with --{name} {old}, got {new}")
-    return replace(args, **flags)  # pyright: ignore[reportArgumentType]
+            flag = f"--{name.replace('_', '-')}"
+            raise InputError(f"{folder}: begun with {flag} {old}, got {new}")
+    return replace(args, **flags)
 
 
 def check_agreement(folder: Path, recorded: Mapping[str, Any], current: Mapping[str, Any]) -> None:
@@ -191,14 +191,19 @@ def by_folder(args: Tune, base: Path | None, robot: Robot) -> dict[Path, Tune]:
     Raises:
         InputError: two trajectories have one name, or --resume lacks --each.
     """
+    if args.resume:
+        single = sorted(path.parent for path in args.resume.glob(f"*/{CONFIG}"))
+        if single and not args.each:
+            raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
+        if not args.is_given("traj"):  # those of the run
+            return dict.fromkeys(single if args.each else [args.resume], args)
     names = arguments.trajectories_by_name(args.traj)
-    if args.resume and not args.each and (args.resume / next(iter(names)) / CONFIG).exists():
-        raise InputError(f"{args.resume}: its trajectories were tuned one by one; add --each")
     now = f"{datetime.now():{TIME}}"
     parent = arguments.robot_folder(args.runs, args.robot, robot)
     if args.each:
         folders = {name: base / name if base else parent / name / now for name in names}
-        return {folders[name]: replace(args, traj=(text,)) for name, text in names.items()}
-    if not (args.resume and args.traj == Tune.traj):  # with --resume, the default is the run's
-        args = replace(args, traj=tuple(names.values()))
-    return {base or parent / "-".join(names) / now: args}
+        runs = {folders[name]: replace(args, traj=(text,)) for name, text in names.items()}
+    else:
+        folder = base or parent / "-".join(names) / now
+        runs = {folder: replace(args, traj=tuple(names.values()))}
+    return {folder: with_given(flags, args.given) for folder, flags in runs.items()}

@@ -90,7 +90,7 @@ def plan_of(args: Verdict) -> Plan:
     trajectories = {}
     for name, text in arguments.trajectories_by_name(args.traj).items():
         trajectory = arguments.load_trajectory(text, robot)
-        trajectories[name] = trajectory, arguments.walk_seconds(args.seconds, trajectory)
+        trajectories[name] = trajectory, arguments.walk_seconds(args, trajectory)
     models = {OWN: Model()} | (_OTHER_MASSES if args.light_heavy else {})
     for path in args.plant:
         plant = arguments.plant_of(path, robot)
