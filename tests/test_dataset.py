@@ -10,6 +10,7 @@ from synthetic import CYCLE, synthetic_walk, turn_walk
 
 from hector_jax.control.reference import Anchor, named_command, reference_at
 from hector_jax.control.weights import expert, nominal, weights_to_vector
+from hector_jax.core.tree import stack
 from hector_jax.grfm.collection import collect, fingerprint, load_walks
 from hector_jax.grfm.dataset import at_interval, make_dataset, split_by_walk, with_mirror
 from hector_jax.grfm.effect import HISTORY, turn
@@ -313,3 +314,10 @@ def test_the_legs_get_what_the_wrench_does_not_explain(three, robot):
     feet = jnp.asarray(three.feet[walk, j - 1 : j + 1].mean(axis=0))
     push = srbm.unexplained(robot, before, after, wrench, feet, 0.01)
     leaves_close(turn(push, -before.euler[2]), jax.tree.map(lambda x: x[row], data.legs), 1e-8)
+
+
+def test_the_axes_of_samples_do_not_depend_on_what_was_measured(robot):
+    data, _ = make_dataset(robot, stack([synthetic_walk(0, 12)]))
+    still = data._replace(label=jax.tree.map(np.zeros_like, data.label))
+    few = jax.tree.map(lambda x: x[:1], still)
+    assert (data.axes, still.axes, few.axes) == (6, 6, 6)

@@ -167,6 +167,11 @@ def test_weights_that_are_no_numbers_of_at_least_zero_are_refused(wrong):
         with_alphas(wrong)
 
 
+def test_a_weight_without_a_name_is_refused():
+    with pytest.raises(ValueError, match="unknown term ''"):
+        with_alphas({"": 3.0})
+
+
 def sway_loss(trajectory):
     """A term of one's own: squared sideways velocity."""
     return jnp.sum(trajectory.state.velocity[:, 1] ** 2)

@@ -194,7 +194,7 @@ def test_what_stands_is_never_half_of_a_file(tmp_path):
 # Signals: a program with a worker that would sleep for an hour.
 
 PROGRAM = """
-import sys, time
+import signal, sys, time
 from hector_jax.core.console import exit_code
 from hector_jax.core.runtime import workers
 
@@ -204,6 +204,7 @@ def work():
         pool.submit(time.sleep, 3600).result()
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGALRM, lambda *inputs: None)  # a handler of the user
     sys.exit(exit_code("toy", work))
 """
 
@@ -228,8 +229,9 @@ def is_gone(process):
         ([signal.SIGINT, signal.SIGINT], 130, "toy: interrupted"),
         ([signal.SIGTERM], 143, "toy: terminated"),
         ([signal.SIGKILL], -9, ""),
+        ([signal.SIGALRM, signal.SIGINT], 130, "toy: interrupted"),
     ],
-    ids=["SIGINT", "twice", "SIGTERM", "SIGKILL"],
+    ids=["SIGINT", "twice", "SIGTERM", "SIGKILL", "another"],
 )
 def test_a_signal_ends_a_program_and_its_workers_in_one_line(tmp_path, signals, code, line):
     (tmp_path / "program.py").write_text(PROGRAM)

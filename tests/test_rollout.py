@@ -94,10 +94,10 @@ def test_a_foot_in_the_air_gets_no_wrench():
 def test_commands_respect_friction_force_and_line_foot():
     trajectory = long_walk(nominal, "s")
     force = np.asarray(trajectory.command.force)[np.asarray(trajectory.contact)]
-    assert (np.abs(force[:, :2]) <= 0.5 * force[:, 2:] + 1e-4).all()
     assert (force[:, 2] >= -1e-6).all()
     assert (force[:, 2] <= 500).all()
-    assert (np.abs(force[:, :2]).sum(axis=1) <= 0.6 * force[:, 2] + 1e-4).all()  # MuJoCo's diamond
+    grip = np.abs(force[:, :2]).sum(axis=1) / force[:, 2]  # of MuJoCo's diamond
+    assert grip.max() == pytest.approx(0.6, abs=1e-6)  # a bound that is reached
 
 
 def test_a_line_foot_is_pressed_between_heel_and_toe_and_has_no_moment_about_its_length(robot):

@@ -320,6 +320,15 @@ def test_wrong_input_is_one_line_before_anything_is_walked(
     assert not (tmp_path / "out").exists()
 
 
+def test_walks_of_models_and_trajectories_with_hyphens_are_told_apart():
+    walks = {name: (NamedCommand(name, named_command("s")), 1.0) for name in ("y-z", "z")}
+    sets = {name: {"nominal": nominal()} for name in walks}
+    models = {"x": command.Model(), "x-y": command.Model(mass=1.1)}
+    columns = {Column("c", model): range(1) for model in models}
+    plan = command.Plan(load_robot(), "standin", walks, sets, models, columns, {"c": MUJOCO_C})
+    assert len(command._jobs(plan, "c")) == 4
+
+
 def small(folder):
     """The walks that `hector tune --verdict` adds, and their table."""
     robot = load_robot()

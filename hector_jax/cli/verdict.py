@@ -181,17 +181,12 @@ def walk_cells(setup: Setup, plan: Plan, folder: Path) -> Cells:
     cells = {}
     for column, seeds in plan.columns.items():
         for trajectory, sets in plan.sets.items():
-            case, where = partial(_case, column, trajectory), report.cell_text((column, trajectory))
-            walks = {name: [scored[case(name, seed)][0] for seed in seeds] for name in sets}
+            case, where = (*column, trajectory), report.cell_text((column, trajectory))
+            walks = {name: [scored[*case, name, seed][0] for seed in seeds] for name in sets}
             verdicts.say_faults({f"{name} on {where}": of_set for name, of_set in walks.items()})
             scores = {name: [walk.score for walk in of_set] for name, of_set in walks.items()}
             cells[column, trajectory] = metrics.make_verdict(setup.config.loss, seeds, scores)
     return cells
-
-
-def _case(column: Column, trajectory: str, name: str, seed: int) -> verdicts.Case:
-    """Return the name and the seed under which a walk is stored."""
-    return "-".join([*column, trajectory, name]), seed
 
 
 def _jobs(plan: Plan, engine: str) -> dict[verdicts.Case, Job]:
@@ -207,7 +202,7 @@ def _jobs(plan: Plan, engine: str) -> dict[verdicts.Case, Job]:
             for trajectory, (command, seconds) in plan.trajectories.items():
                 for name, weights in plan.sets[trajectory].items():
                     job = Job(weights, command.command, plant, seconds, seed, plant=model.plant)
-                    jobs[_case(column, trajectory, name, seed)] = job
+                    jobs[*column, trajectory, name, seed] = job
     return jobs
 
 

@@ -120,10 +120,16 @@ def _stoppable(name: str) -> Iterator[None]:
             handled.set()
             raise Stopped(number)
 
+    def next_signal() -> bytes:
+        """Wait for a signal of `_SIGNALS`, even if the main thread is busy; b"" at the end."""
+        while (number := os.read(reading, 1)) and number[0] not in _SIGNALS:
+            pass  # another one, of a handler of the user
+        return number
+
     def watch() -> None:
-        number = os.read(reading, 1)  # returns at once, even if the main thread is busy
+        number = next_signal()
         if number and not select.select([reading], [], [], _PATIENCE)[0] and handled.is_set():
-            number = os.read(reading, 1)
+            number = next_signal()
         if number:
             if console.is_terminal:
                 os.write(2, b"\x1b[?25h")  # show the cursor, which a progress bar hides

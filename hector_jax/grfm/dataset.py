@@ -49,6 +49,7 @@ class Dataset(NamedTuple):
     state: State  # (n, 3) each, true state at the start of the tick, world frame
     walk: Int[Array, " n"]  # index of the walk
     tick: Int[Array, " n"]  # tick within the walk
+    moments: Bool[Array, " n"]  # the robot's feet can exert moments, the same for all samples
 
     @property
     def feet(self) -> int:
@@ -58,7 +59,7 @@ class Dataset(NamedTuple):
     @property
     def axes(self) -> int:
         """Number of axes of a foot's wrench: 6, or 3 for feet without moments."""
-        return 6 if np.any(self.label.moment) else 3
+        return 6 if np.all(self.moments) else 3
 
 
 def at_interval(walk: Trajectory, interval: float) -> Trajectory:
@@ -151,8 +152,8 @@ def _samples(
         return jnp.concatenate([x[1:], x[-1:]])
 
     commands = to_yaw_frame(jax.tree.map(newest_first, walk.command))
-    effect = current.effect
-    if config.mpc.contact_model.axes == 3:  # what a rolling ball adds belongs to the legs' load
+    effect, has_moments = current.effect, config.mpc.contact_model.axes == 6
+    if not has_moments:  # what a rolling ball adds belongs to the legs' load
         effect = effect._replace(moment=jnp.zeros_like(effect.moment))
     label = to_yaw_frame(effect)
     legs = jax.vmap(partial(srbm.unexplained, robot, dt=config.gait.tick))(
@@ -178,8 +179,8 @@ def _samples(
     begin, end = config.gait.tick * tick[:, None], config.gait.tick * (tick[:, None] + 1)
     pushed = (push.start < end) & (push.start + push.duration > begin) & push.force.any(axis=-1)
     usable = jnp.stack([~current.fallen, solved, ~pushed.any(axis=1), *finite]).all(axis=0)
-    walks = jnp.full_like(tick, number)
-    return Dataset(window, label, legs, error, lands, previous, walks, tick), usable
+    same = jnp.full_like(tick, number), tick, jnp.full_like(tick, has_moments, dtype=bool)
+    return Dataset(window, label, legs, error, lands, previous, *same), usable
 
 
 def _planned_touchdowns(

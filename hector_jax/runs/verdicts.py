@@ -31,8 +31,8 @@ from hector_jax.tuning.rollout import rollout, rollout_config
 # modules that determine the numbers, for `content_key`
 _CODE = ("sim.diagnosis", "runs.metrics")
 
-Case = tuple[str, int]
-"""Name of a set, with further labels if its plant walks several times, and seed."""
+Case = tuple[str | int, ...]
+"""Labels of a walk, the last the seed of its plant."""
 
 
 class ScoredWalk(NamedTuple):
@@ -102,8 +102,7 @@ def _file_name(setup: Setup, case: Case, job: Job, with_walk: bool, engine: Engi
     _, config, robot, _ = setup
     inputs = engine.key, config.rollout.walk, repr(config.loss), robot, job
     key = content_key(*inputs, *([job.plant] if job.plant else []), code=(*engine.modules, *_CODE))
-    name, seed = case
-    return f"{'walk' if with_walk else 'score'}-{name}-{seed}-{key}.npz"
+    return "-".join(["walk" if with_walk else "score", *map(str, case), f"{key}.npz"])
 
 
 def say_faults(walks: Mapping[str, Sequence[ScoredWalk]]) -> None:
@@ -129,7 +128,7 @@ def score_jobs(
 
     Args:
         setup: workers, controller and loss, nominal body.
-        jobs: jobs by case; the names of cases are parts of the names of files.
+        jobs: jobs by case; its labels are parts of the names of files.
         title: title of the progress bar.
         folder: folder of the scores; None: nothing is saved.
         engine: engine of the walks.
@@ -196,5 +195,6 @@ def judge(
     results = score_jobs(setup, jobs, title=title, folder=folder, engine=engine, with_walk=first)
     by_set = {name: [results[name, seed][0] for seed in seeds] for name in sets}
     say_faults(by_set)
-    walks = {name: walk for (name, _), (_, walk) in results.items() if walk is not None}
+    firsts = {name: results[name, seeds[0]][1] for name in sets}
+    walks = {name: walk for name, walk in firsts.items() if walk is not None}
     return ScoredWalks(by_set, walks)

@@ -1,6 +1,6 @@
 """The physics engines as values: their names, packages, and functions that walk jobs.
 
-An engine is chosen once, by `choose_engine`, and passed down; no other module asks which it is.
+An engine is chosen once, by `choose_engine`, and passed down.
 """
 
 import sys

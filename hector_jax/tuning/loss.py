@@ -181,7 +181,7 @@ def with_alphas(weights: Mapping[str, Any], loss: Loss = PAPER_LOSS) -> Loss:
     >>> [term.weight for term in with_alphas({"L_Eul": 3.0, "position": 5.0})]
     [3.0, 5.0, 1.0]
     """
-    names = {key: term.name for term in loss for key in (term.name, _KEYS.get(term.name, ""))}
+    names = {key: t.name for t in loss for key in (t.name, _KEYS.get(t.name, t.name))}
     for key in weights:
         if key not in names:
             raise InputError(unknown("term", key, (term.name for term in loss)))
