@@ -16,14 +16,13 @@ from hector_jax.control.trajectories import NamedCommand
 from hector_jax.control.weights import expert, nominal
 from hector_jax.control.weights_file import save_weights
 from hector_jax.core.inputs import InputError
-from hector_jax.core.tree import stack
 from hector_jax.report import matrix as report
 from hector_jax.report import plots
 from hector_jax.robot.description import HECTOR
 from hector_jax.robot.model import load_robot
 from hector_jax.runs import matrix, verdicts
 from hector_jax.runs.matrix import Column
-from hector_jax.runs.metrics import Verdict, family_of
+from hector_jax.runs.metrics import family_of, make_verdict
 from hector_jax.runs.setup import Setup
 from hector_jax.runs.tunings import tune_config
 from hector_jax.sim.engine import MUJOCO_C
@@ -38,10 +37,10 @@ def cell(seeds=8, fallen=(), nominal=4e6, tuned=1e6):
     """Walks of sets on plants of which the losses differ alike; `fallen` pairs of set and seed."""
     plant = 1.0 + 0.1 * np.arange(seeds)
     scores = {
-        name: stack([pretend_score(L * p, (name, i) in fallen) for i, p in enumerate(plant)])
+        name: [pretend_score(L * p, (name, i) in fallen) for i, p in enumerate(plant)]
         for name, L in zip(SETS, (nominal, 3e6, tuned), strict=True)
     }
-    return Verdict(np.arange(seeds), scores, PAPER_LOSS)
+    return make_verdict(PAPER_LOSS, range(seeds), {"s": scores})
 
 
 def said(cells, differs=None):

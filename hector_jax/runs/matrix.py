@@ -144,8 +144,8 @@ def worst(cells: Cells, name: str, baseline: str) -> Worst:
         score = verdict.scores[name]
         change = 100.0 * (score.L / verdict.scores[baseline].L - 1.0)
         i = int(np.argmax(change))
-        seed, fallen = int(verdict.seeds[i]), bool(score.fallen[i])
-        candidates.append(Worst(column, trajectory, seed, float(change[i]), fallen))
+        seed, fallen = int(verdict.seeds[i]), bool(score.fallen[i, 0])
+        candidates.append(Worst(column, trajectory, seed, float(change[i, 0]), fallen))
     return max(candidates, key=lambda candidate: candidate.change)
 
 
@@ -224,7 +224,7 @@ def _cell(verdict: Verdict) -> dict[str, Any]:
     for name, worlds in metrics.as_result(verdict)["sets"].items():
         row, score = worlds["standin"], verdict.scores[name]
         row["falls_share"] = fall_share(row["falls"], len(verdict.seeds))._asdict()
-        row["L"] |= {"median": float(np.median(score.L)), "by_seed": score.L.tolist()}
+        row["L"] |= {"median": float(np.median(score.L)), "by_seed": score.L[:, 0].tolist()}
         sets[name] = row
     return sets
 
